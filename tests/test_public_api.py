@@ -32,6 +32,8 @@ PAIRS: dict[str, tuple[str, set[str], set[str]]] = {
         {"stripe", "method"},
     ),
     "uwlts camera": ("uwlts.calibrate_camera", WRITES, set()),
+    # The times of arrays; files have a column of them.
+    "uwlts mount": ("uwlts.calibrate_mount", WRITES, {"profile_times_s", "pose_times_s"}),
     "uwlts refresh": ("uwlts.refresh", WRITES | METHOD, {"stripe"}),
     "uwlts polynomials": ("uwlts.calibrate_polynomials", WRITES | METHOD, {"stripe"}),
     "uwlts design": ("uwlts.design", set(), set()),

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from uwlts.calibration.calibrate import calibrate
     from uwlts.calibration.joint.refresh import Refreshed, refresh
     from uwlts.calibration.model_comparison.comparison import Comparison, compare_models
+    from uwlts.calibration.mount import calibrate_mount
     from uwlts.calibration.photographs import CameraCalibration, calibrate_camera, write_camera
     from uwlts.calibration.polynomial import PolynomialResult, calibrate_polynomials
     from uwlts.desk.guided import record_guided
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from uwlts.model.calibration import Calibration
     from uwlts.model.errors import Error
     from uwlts.model.library import load_sensor
+    from uwlts.model.mount import Mount
     from uwlts.model.polynomial_calibration import PolynomialCalibration
     from uwlts.model.sensor import Sensor
     from uwlts.optics.nominal import nominal
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
     from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
     from uwlts.storage.export_ import export
     from uwlts.storage.import_ import Imported, import_images
+    from uwlts.storage.mount_files import read_mount, write_mount
     from uwlts.storage.truth import Truth, read_truth
     from uwlts.stripe import StripeOptions
     from uwlts.thesis.report import ThesisReport, evaluate_thesis
@@ -56,6 +59,7 @@ __all__ = [
     "Frame",
     "GuidedRecording",
     "Imported",
+    "Mount",
     "PointCloud",
     "PolynomialCalibration",
     "PolynomialResult",
@@ -69,6 +73,7 @@ __all__ = [
     "Verification",
     "calibrate",
     "calibrate_camera",
+    "calibrate_mount",
     "calibrate_polynomials",
     "check_certificate",
     "compare_models",
@@ -85,6 +90,7 @@ __all__ = [
     "open_capture",
     "plot",
     "read_cloud",
+    "read_mount",
     "read_truth",
     "reconstruct",
     "record_guided",
@@ -100,6 +106,7 @@ __all__ = [
     "write_cloud",
     "write_evaluation",
     "write_models",
+    "write_mount",
     "write_report",
 ]
 
@@ -114,6 +121,7 @@ _MODULES = {
     "Frame": "uwlts.storage.capture",
     "GuidedRecording": "uwlts.hardware.guided.recording",
     "Imported": "uwlts.storage.import_",
+    "Mount": "uwlts.model.mount",
     "PointCloud": "uwlts.storage.cloud",
     "PolynomialCalibration": "uwlts.model.polynomial_calibration",
     "PolynomialResult": "uwlts.calibration.polynomial",
@@ -127,6 +135,7 @@ _MODULES = {
     "Verification": "uwlts.measurement.verification",
     "calibrate": "uwlts.calibration.calibrate",
     "calibrate_camera": "uwlts.calibration.photographs",
+    "calibrate_mount": "uwlts.calibration.mount",
     "calibrate_polynomials": "uwlts.calibration.polynomial",
     "check_certificate": "uwlts.report.certificate",
     "compare_models": "uwlts.calibration.model_comparison.comparison",
@@ -143,6 +152,7 @@ _MODULES = {
     "open_capture": "uwlts.storage.capture",
     "plot": "uwlts.report.plot",
     "read_cloud": "uwlts.storage.cloud",
+    "read_mount": "uwlts.storage.mount_files",
     "read_truth": "uwlts.storage.truth",
     "reconstruct": "uwlts.measurement.reconstruction",
     "record_guided": "uwlts.desk.guided",
@@ -158,6 +168,7 @@ _MODULES = {
     "write_cloud": "uwlts.storage.cloud",
     "write_evaluation": "uwlts.measurement.evaluation",
     "write_models": "uwlts.report.model_comparison",
+    "write_mount": "uwlts.storage.mount_files",
     "write_report": "uwlts.report.campaign_page",
 }
 

@@ -190,6 +190,62 @@ def camera(
 
 
 @app.command
+def mount(
+    profiles: Path,
+    poses: Path | None = None,
+    *,
+    out: Path,
+    artefact: Literal["sphere", "plane"] = "sphere",
+    radius_mm: float | None = None,
+    pose_format: str = "matrix",
+    profile_unit: Literal["mm", "m"] = "mm",
+    pose_unit: Literal["mm", "m"] = "mm",
+    scale: Flag = False,
+    time: Flag = False,
+    overwrite: Overwrite = False,
+) -> None:
+    """Calibrate the mount of any laser profiler on a robot or stage, from its profiles of a sphere or plane.
+
+    The artefact stands still at an unknown place. Prints the transform from the sensor to the platform with its
+    uncertainty, the poses that were left out, what the motions determine badly, and the pose to add next.
+
+    Example: uwlts mount profiles poses.csv --pose-format quaternion-wxyz --radius-mm 19.05 --out mount.json
+
+    Args:
+        profiles: Folder with one CSV file (columns x and z) for each pose, one CSV file with a column pose, a cloud
+            whose frames are the poses, or a description of everything (.toml; docs/how-to/calibrate-a-mount.md).
+        poses: CSV file with the pose of the platform in the base frame for each profile.
+        out: Mount to write (JSON).
+        artefact: What the profiles show.
+        radius_mm: Radius of the sphere; estimated unless given.
+        pose_format: matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about the moved
+            axes), euler-zyx-deg (about the fixed axes) or another order, -rad for radians.
+        profile_unit: Unit of the profiles.
+        pose_unit: Unit of the positions.
+        scale: Estimate the robot's scale too.
+        time: Estimate the offset to add to the profiles' times (columns time_s; the poses are a trajectory).
+    """
+    from uwlts.report.mount_lines import mount_lines
+
+    refuse_unsuitable(out, overwrite=overwrite)
+    found = uwlts.calibrate_mount(
+        profiles,
+        poses,
+        artefact=artefact,
+        radius_mm=radius_mm,
+        pose_format=pose_format,
+        profile_unit=profile_unit,
+        pose_unit=pose_unit,
+        scale=scale,
+        time=time,
+    )
+    uwlts.write_mount(out, found, overwrite=overwrite)
+    show(mount_lines(found))
+    warn(*found.weaknesses)
+    print(f"wrote {out}")
+
+
+@app.command
 def refresh(
     calibration: Path,
     *,

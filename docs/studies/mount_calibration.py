@@ -1,0 +1,83 @@
+"""Mounts calibrated from simulated profiles of a sphere: errors, coverage, and points on a sphere that was held out."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from stripe_tables import table
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from tests.uwlts.mount_views import MOUNT, RADIUS_MM, Campaign, errors_of, sphere_campaign
+from uwlts.calibration.mount import calibrate_mount
+from uwlts.model.mount import Mount, SphereFound
+
+
+def held_out_ratio(mount: Mount, campaign: Campaign) -> float:
+    """Scatter of a new campaign's points about a sphere of their own, over the same by the true mount."""
+
+    def rms(transform: np.ndarray) -> float:
+        off = []
+        for profile, pose in zip(campaign.profiles, campaign.poses, strict=True):
+            seen = profile[np.isfinite(profile).all(axis=1)]
+            points = np.column_stack([seen[:, 0], np.zeros(len(seen)), seen[:, 1], np.ones(len(seen))])
+            off.append((pose @ transform @ points.T)[:3].T)
+        points = np.vstack(off)
+        centre = mount_centre
+        for _ in range(10):
+            away = points - centre
+            distance = np.linalg.norm(away, axis=1)
+            near = np.abs(distance - RADIUS_MM) < 1.0
+            centre = centre + np.linalg.lstsq(away[near] / distance[near, None], distance[near] - RADIUS_MM)[0]
+        distance = np.linalg.norm(points - centre, axis=1) - RADIUS_MM
+        return float(np.sqrt(np.mean(distance[np.abs(distance) < 1.0] ** 2)))
+
+    assert isinstance(mount.artefact, SphereFound)
+    mount_centre = np.array(mount.artefact.centre_mm)
+    return rms(mount.transform()) / rms(MOUNT)
+
+
+def main(campaigns: int = 200) -> None:
+    """Print the table of the documentation."""
+    rows = []
+    for poses, robot, noise, radius in [
+        (15, 0.0, 0.02, RADIUS_MM),
+        (15, 0.0, 0.05, RADIUS_MM),
+        (15, 0.05, 0.03, RADIUS_MM),
+        (15, 0.05, 0.03, None),
+        (40, 0.05, 0.03, RADIUS_MM),
+    ]:
+        shifts, turns, within, ratios = [], [], [], []
+        for seed in range(campaigns):
+            rng = np.random.default_rng([seed, poses])
+            mount = calibrate_mount(
+                *_of(sphere_campaign(rng, poses=poses, noise_mm=noise, robot_mm=robot)), radius_mm=radius
+            )
+            shift, turn = errors_of(mount.transform())
+            shifts.append(np.linalg.norm(shift))
+            turns.append(np.degrees(np.linalg.norm(turn)))
+            within.append(np.abs(np.append(shift, turn)) < mount.coverage_factor * mount.std())
+            held = sphere_campaign(rng, poses=30, noise_mm=noise, robot_mm=robot, background=False)
+            ratios.append(held_out_ratio(mount, held))
+        rows.append(
+            [
+                f"{poses}",
+                f"{robot:g}",
+                f"{noise:g}",
+                "known" if radius else "unknown",
+                f"{np.median(shifts):.3f} / {np.quantile(shifts, 0.95):.3f}",
+                f"{np.median(turns):.4f} / {np.quantile(turns, 0.95):.4f}",
+                f"{100 * np.mean(within):.1f} %",
+                f"{np.median(ratios):.3f} / {np.quantile(ratios, 0.95):.3f}",
+            ]
+        )
+    head = ["poses", "robot mm", "noise mm", "radius", "shift, median / 95 % mm", "turn, median / 95 % deg"]
+    print(table([*head, "within 95 % interval", "held-out sphere over robot's own, median / 95 %"], rows))
+
+
+def _of(campaign: Campaign) -> tuple[list[np.ndarray], np.ndarray]:
+    return campaign.profiles, campaign.poses
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))

@@ -1,0 +1,472 @@
+"""Calibration of the mount of a laser profiler on a moving platform, from its profiles of an unknown fixed artefact."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+from scipy.stats import chi2, t
+
+from uwlts.calibration.mount_model import Motion, Problem, Scatter, State
+from uwlts.calibration.mount_next_pose import next_pose
+from uwlts.calibration.mount_profiles import LEAST_POINTS, Arc, Line, find_arc, find_line
+from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere
+from uwlts.model.errors import CalibrationError
+from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound
+from uwlts.storage.mount_files import MountEvidence, PoseFormat, Unit, read_mount_evidence
+
+_FEWEST_POSES = {"sphere": 5, "plane": 8}
+"""Poses whose profiles have more numbers (three each, or two) than there are unknowns (nine or ten), with some over."""
+_MOST_POINTS = 100_000
+"""Points of all profiles together; more take time and hardly lower the uncertainty, as poses err too."""
+_ROUNDS = 8
+_LARGEST_ROUGH = 6.0
+"""Times the median misfit of a pose: of 45 normal poses one in millions lies farther out."""
+_FALSE_ALARM = 1e-3
+"""Probability that any pose of a campaign without wrong ones is left out."""
+_NO_FIT = 0.1
+"""Share of a sphere's radius by which platforms do not err; a wrong format of the poses gives more."""
+_OPEN_MM, _OPEN_RAD = 5.0, np.radians(1.0)
+"""Standard uncertainties from which a mount counts as not determined; a ruler and a protractor do better."""
+_WEAK = 5.0
+"""Times the best determined direction: so much worse is worth a further pose."""
+_LEAST_TURN_RAD = np.radians(5.0)
+"""Root mean square of turns about an axis below which a note says that there are too few."""
+
+
+def calibrate_mount(
+    profiles: str | Path | Sequence[np.ndarray],
+    poses: str | Path | np.ndarray | None = None,
+    *,
+    artefact: Literal["sphere", "plane"] = "sphere",
+    radius_mm: float | None = None,
+    pose_format: PoseFormat = "matrix",
+    profile_unit: Unit = "mm",
+    pose_unit: Unit = "mm",
+    scale: bool = False,
+    time: bool = False,
+    profile_times_s: np.ndarray | None = None,
+    pose_times_s: np.ndarray | None = None,
+) -> Mount:
+    """Find ``T_platform_sensor`` of any laser profiler from profiles of a sphere or a plane at an unknown fixed place.
+
+    The platform's poses ``T_base_platform`` are known, as a robot's flange's. The artefact's place and the mount are
+    estimated together by least squares of the distances of all points from the artefact, weighted by the noise of the
+    points and the scatter of the poses, which are estimated too (restricted maximum likelihood). Background beside
+    the artefact, and poses that contradict the others, are left out.
+
+    Parameters
+    ----------
+    profiles
+        One array for each pose: (N, 2) with x along the profile and z, or (N, 3) with x, y, z in the sensor's frame, in
+        the order along the profile, mm, NaN where nothing was seen. Or a file or folder: a description (.toml) of
+        everything, a folder of CSV files, or one CSV file with a column ``pose``, or a cloud of `uwlts.reconstruct`
+        whose frames are the poses.
+    poses
+        ``T_base_platform`` (P, 4, 4), mm, or a CSV file with one pose a line.
+    artefact, radius_mm
+        What is seen; the radius of the sphere where it is known.
+    pose_format, profile_unit, pose_unit
+        How files are to be read; see `uwlts.storage.mount_files.read_poses`.
+    scale
+        Estimate by which factor the robot's lengths are too short.
+    time
+        Estimate the offset to add to the times of the profiles; both have times then.
+    profile_times_s, pose_times_s
+        Times (P,) of the profiles and (M,) of the poses, which are then a trajectory of any number M of poses:
+        positions are interpolated linearly and rotations along great circles.
+
+    Raises
+    ------
+    DescriptionError
+        Files or options that cannot be read or do not go together.
+    CalibrationError
+        Too few profiles show the artefact, or the motions do not determine the mount; which are missing is said.
+
+    Examples
+    --------
+    >>> mount = uwlts.calibrate_mount("profiles", "poses.csv", pose_format="quaternion-wxyz", radius_mm=19.05)
+    >>> mount.transform(), mount.std()
+    """
+    evidence = read_mount_evidence(
+        profiles,
+        poses,
+        artefact=artefact,
+        radius_mm=radius_mm,
+        pose_format=pose_format,
+        profile_unit=profile_unit,
+        pose_unit=pose_unit,
+        scale=scale,
+        time=time,
+        profile_times_s=profile_times_s,
+        pose_times_s=pose_times_s,
+    )
+    try:
+        return _Calibration(evidence).result()
+    except _NoFit as error:
+        raise CalibrationError(f"{error}. {_advice(evidence)}") from error
+
+
+class _NoFit(CalibrationError):
+    """Profiles and poses contradict each other."""
+
+
+def _advice(evidence: MountEvidence) -> str:
+    """What makes the profiles fit, of the usual mistakes, in words."""
+    inverse = "the poses are T_platform_base: give their inverses"
+    mistakes = [(replace(evidence, poses=np.linalg.inv(evidence.poses)), inverse)]
+    if evidence.radius_mm is not None:
+        mistakes.append((replace(evidence, radius_mm=None), "the sphere has another radius"))
+    for name, poses in evidence.other_readings():
+        mistakes.append((replace(evidence, poses=poses), f"the poses are {name}, not {evidence.pose_format}"))
+    for changed, words in mistakes:
+        try:
+            found = _Calibration(changed).result()
+        except CalibrationError:
+            continue
+        used = sum(pose.reason is None for pose in found.poses)
+        if 2 * used > len(found.poses):
+            size = f", {found.artefact.radius_mm:.3f} mm" if isinstance(found.artefact, SphereFound) else ""
+            where = size if changed.radius_mm is None and evidence.radius_mm is not None else ""
+            return f"They do fit, with {found.rms_mm:.3g} mm rms, if {words}{where}"
+    return (
+        "Are the poses T_base_platform, is their format right, are the units right, and do profiles and poses come in "
+        "the same order?"
+    )
+
+
+class _Calibration:
+    """The steps of one calibration, in the order in which `result` needs them."""
+
+    def __init__(self, evidence: MountEvidence) -> None:
+        self.evidence = evidence
+        self.sphere = evidence.artefact == "sphere"
+        self.rng = np.random.default_rng(0)
+        most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
+        self.profiles = [_thinned(_seen(profile), most) for profile in evidence.profiles]
+        self.sheet = _sheet_frame(self.profiles)
+        self.flat = [((each - self.sheet[:3, 3]) @ self.sheet[:3, :3])[:, [0, 2]] for each in self.profiles]
+        self.reasons: dict[int, str] = {}
+
+    def result(self) -> Mount:
+        """The mount with all that is known of it."""
+        shapes = [self._shape(points) for points in self.flat]
+        for number, shape in enumerate(shapes):
+            if shape is None:
+                self.reasons[number] = f"no {self.evidence.artefact} found in the profile"
+        self._require_enough()
+        kept = np.array([shape is not None for shape in shapes])
+        members = [
+            np.zeros(len(p), dtype=bool) if s is None else s.members for p, s in zip(self.flat, shapes, strict=True)
+        ]
+        whole = Problem(
+            self.profiles,
+            _motion(self.evidence),
+            self.sphere,
+            self.evidence.radius_mm,
+            self.evidence.scale,
+            self.evidence.time,
+        )
+        problem = whole.selected(kept, [p[m] for p, m in zip(self.profiles, members, strict=True)])
+        arcs = [shape for shape in shapes if isinstance(shape, Arc)]
+        lines = [shape for shape in shapes if isinstance(shape, Line)]
+        state = (
+            start_of_sphere(problem, arcs, self.sheet, self.rng)
+            if self.sphere
+            else start_of_plane(problem, lines, self.sheet, self.rng)
+        )
+        misfit = misfits(problem, state)
+        noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
+        good = misfit < max(_LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
+        scatter = Scatter(max(noise, 1e-6), max(float(np.median(misfit)), noise), 1e-3)
+        # What the first search got wrong in single profiles is searched again near the artefact that the others show.
+        for _ in range(2):
+            state, scatter = _refined(problem.selected(good), state, scatter)
+            members = self._found_again(whole, state, scatter)
+            kept = np.array([np.count_nonzero(each) >= LEAST_POINTS for each in members])
+            problem = whole.selected(kept, [p[m] for p, m in zip(self.profiles, members, strict=True)])
+            good = np.ones(len(problem.points), dtype=bool)
+            self._require_enough(np.flatnonzero(kept))
+        while True:
+            used = problem.selected(good)
+            state, scatter = _refined(used, state, scatter)
+            limit = float(chi2.isf(_FALSE_ALARM / len(kept), used.per_pose))
+            excess = _left_out_excess(used, state, scatter)
+            if excess.max() <= limit:
+                break
+            good[np.flatnonzero(good)[np.argmax(excess)]] = False
+            self._require_enough(np.flatnonzero(kept)[good])
+        numbers = np.flatnonzero(kept)
+        names = self.evidence.names
+        for number in range(len(names)):
+            if number in numbers[good]:
+                self.reasons.pop(number, None)
+            elif number in numbers:
+                off = misfits(problem, state)[np.flatnonzero(numbers == number)[0]]
+                self.reasons[number] = f"contradicts the other poses: {off:.3g} mm off"
+            else:
+                self.reasons.setdefault(number, f"no {self.evidence.artefact} found where the other poses show it")
+        self._require_fit(used, state, scatter)
+        return self._summary(used, state, scatter, members)
+
+    def _shape(self, points: np.ndarray) -> Arc | Line | None:
+        return find_arc(points, self.evidence.radius_mm, self.rng) if self.sphere else find_line(points, self.rng)
+
+    def _require_enough(self, numbers: np.ndarray | None = None) -> None:
+        poses, needed = len(self.profiles), _FEWEST_POSES[self.evidence.artefact]
+        usable = poses - len(self.reasons) if numbers is None else len(numbers)
+        if usable < needed:
+            raise CalibrationError(
+                f"{usable} of {poses} profiles show the {self.evidence.artefact} and agree; at least {needed} are "
+                "needed. Record more poses, or check artefact, radius and units"
+            )
+
+    def _require_fit(self, used: Problem, state: State, scatter: Scatter) -> None:
+        extent = float(np.median([np.linalg.norm(np.ptp(each, axis=0)) for each in self.flat if len(each)]))
+        limit = _NO_FIT * (state.artefact[3] if self.sphere else 0.1 * extent)
+        if scatter.pose_mm > limit:
+            raise _NoFit(
+                f"no mount makes the profiles fit: {len(used.points)} of {len(self.profiles)} poses would be wrong by "
+                f"{scatter.pose_mm:.3g} mm (rms)"
+            )
+
+    def _found_again(self, whole: Problem, state: State, scatter: Scatter) -> list[np.ndarray]:
+        """Masks of the points near the artefact as all poses show it, mm."""
+        off = np.abs(whole.distances(state))
+        reach = 4 * np.hypot(scatter.point_mm, 2 * scatter.pose_mm)
+        found = []
+        for points, own in zip(self.flat, np.split(off, np.cumsum(whole.counts)[:-1]), strict=True):
+            near = own < reach
+            mask = np.zeros(len(points), dtype=bool)
+            shape = self._shape(points[near])
+            if shape is not None:
+                mask[np.flatnonzero(near)[shape.members]] = True
+            found.append(mask)
+        return found
+
+    def _summary(self, used: Problem, state: State, scatter: Scatter, members: list[np.ndarray]) -> Mount:
+        information = used.information(state, scatter)
+        covariance = _inverse(information.sum(axis=0))
+        self._require_determined(used, state, scatter, covariance)
+        held = _held_out(used, state, scatter, information)
+        own, numbers = misfits(used, state), [n for n in range(len(members)) if n not in self.reasons]
+        order = {number: place for place, number in enumerate(numbers)}
+        poses = []
+        for number, name in enumerate(self.evidence.names):
+            seen, place = int(members[number].sum()), order.get(number)
+            poses.append(
+                MountPose(
+                    name=name,
+                    points=seen if place is not None else 0,
+                    points_left_out=len(self.profiles[number]) - (seen if place is not None else 0),
+                    rms_mm=None if place is None else float(own[place]),
+                    held_out_mm=None if place is None else float(held[place]),
+                    reason=self.reasons.get(number),
+                )
+            )
+        std, at = np.sqrt(np.diag(covariance)), 9 + (self.sphere and used.radius_mm is None)
+        found = (
+            SphereFound(
+                centre_mm=tuple(state.artefact[:3].tolist()),
+                radius_mm=float(state.artefact[3]),
+                radius_std_mm=float(std[9]) if used.radius_mm is None else None,
+            )
+            if self.sphere
+            else PlaneFound(normal=tuple(state.artefact[:3].tolist()), distance_mm=float(state.artefact[3]))
+        )
+        transform = np.eye(4)
+        transform[:3, :3], transform[:3, 3] = Rotation.from_matrix(state.rotation).as_matrix(), state.translation
+        weights = used.counts / used.counts.sum()
+        return Mount(
+            T_platform_sensor=tuple(tuple(row) for row in transform.tolist()),
+            covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
+            coverage_factor=_coverage_factor(used, state, scatter, covariance),
+            artefact=found,
+            robot_scale=state.scale if used.scale else None,
+            robot_scale_std=float(std[at]) if used.scale else None,
+            time_offset_s=state.offset_s if used.time else None,
+            time_offset_std_s=float(std[at + used.scale]) if used.time else None,
+            point_std_mm=scatter.point_mm,
+            pose_std_mm=scatter.pose_mm,
+            rms_mm=float(np.sqrt(weights @ own**2)),
+            held_out_rms_mm=float(np.sqrt(weights @ held**2)),
+            poses=tuple(poses),
+            weaknesses=tuple(_weaknesses(used, state, covariance)),
+            next_pose=next_pose(used, state, scatter, self.sheet, [self.evidence.names[n] for n in numbers]),
+            inputs=self.evidence.digests,
+        )
+
+    def _require_determined(self, used: Problem, state: State, scatter: Scatter, covariance: np.ndarray) -> None:
+        shift = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+        turn = float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))
+        if shift <= _OPEN_MM and turn <= _OPEN_RAD:
+            return
+        # A wrong radius or format also makes the scatter large.
+        if self.sphere and scatter.pose_mm > 0.2 * _NO_FIT * state.artefact[3]:
+            raise _NoFit(f"no mount makes the profiles fit: the poses would be wrong by {scatter.pose_mm:.3g} mm (rms)")
+        numbers = [name for n, name in enumerate(self.evidence.names) if n not in self.reasons]
+        advised = next_pose(used, state, scatter, self.sheet, numbers)
+        raise CalibrationError(
+            f"the poses do not determine the mount: {'; '.join(_weaknesses(used, state, covariance))}"
+            f"{'' if advised is None else f'. Next pose to add: {advised.words}'}"
+        )
+
+
+def _seen(profile: np.ndarray) -> np.ndarray:
+    """Points (N, 3) that were seen, of a profile (N, 2) or (N, 3)."""
+    points = profile[np.isfinite(profile).all(axis=1)]
+    return points if points.shape[1] == 3 else np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]])
+
+
+def _thinned(points: np.ndarray, most: int) -> np.ndarray:
+    if len(points) <= most:
+        return points
+    return points[np.linspace(0, len(points) - 1, most).astype(int)]
+
+
+def _sheet_frame(profiles: list[np.ndarray]) -> np.ndarray:
+    """Frame (4, 4) of the plane of all points, with x and z in it; the sensor's where that is its y = 0."""
+    points = np.vstack(profiles)
+    frame = np.eye(4)
+    if not points[:, 1].any():
+        return frame
+    middle = points.mean(axis=0)
+    extents, axes = np.linalg.svd(_thinned(points - middle, 20_000), full_matrices=False)[1:]
+    if extents[2] > 0.02 * extents[1]:
+        raise CalibrationError(
+            "the profiles do not lie in one plane of the sensor's frame: expected the points of a laser sheet, in the "
+            "sensor's frame and without the motion of the platform"
+        )
+    frame[:3, :3] = np.column_stack([axes[0], np.cross(axes[1], axes[0]), axes[1]])
+    frame[:3, 3] = middle
+    return frame
+
+
+def _motion(evidence: MountEvidence) -> Motion:
+    """Rotations and positions of the platform at the profiles, by the offset of their times."""
+    rotations, positions = evidence.poses[:, :3, :3], evidence.poses[:, :3, 3]
+    if evidence.pose_times_s is None or evidence.profile_times_s is None:
+        return lambda offset: (rotations, positions)
+    times, wanted = evidence.pose_times_s, evidence.profile_times_s
+    slerp = Slerp(times, Rotation.from_matrix(rotations))
+
+    def motion(offset: float) -> tuple[np.ndarray, np.ndarray]:
+        at = np.clip(wanted + offset, times[0], times[-1])
+        return slerp(at).as_matrix(), np.column_stack([np.interp(at, times, each) for each in positions.T])
+
+    return motion
+
+
+def _refined(problem: Problem, state: State, scatter: Scatter) -> tuple[State, Scatter]:
+    """Solution and scatter by turns, until the scatter stays."""
+    for _ in range(_ROUNDS):
+        state = problem.solved(state, scatter)
+        before, scatter = scatter, problem.scatter_at(state, scatter)
+        if abs(scatter.pose_mm - before.pose_mm) <= 0.02 * before.pose_mm + 0.02 * before.point_mm:
+            break
+    return problem.solved(state, scatter), scatter
+
+
+def _inverse(information: np.ndarray) -> np.ndarray:
+    """Covariance of an information matrix; directions without information get huge variances."""
+    size = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
+    values, vectors = np.linalg.eigh(size[:, None] * information * size)
+    return size[:, None] * (vectors / np.maximum(values, 1e-13)) @ vectors.T * size
+
+
+def _each_left_out(
+    problem: Problem, state: State, scatter: Scatter, information: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """For every pose the step of the parameters without it (a Gauss-Newton step), and their covariance then."""
+    derivatives, errors = problem.derivatives(state), problem.errors(state)
+    whitened = problem.whitening(errors, scatter)
+    split = np.cumsum(problem.counts)[:-1]
+    rows = np.split(whitened(derivatives), split)
+    distances = np.split(whitened(problem.distances(state)), split)
+    total, steps = information.sum(axis=0), []
+    gradient = sum(row.T @ own for row, own in zip(rows, distances, strict=True))
+    for row, own, one in zip(rows, distances, information, strict=True):
+        covariance = _inverse(total - one)
+        steps.append((-covariance @ (gradient - row.T @ own), covariance))
+    return steps
+
+
+def _held_out(problem: Problem, state: State, scatter: Scatter, information: np.ndarray) -> np.ndarray:
+    """Root mean square distance (P,) of each pose's points from the artefact by the mount of all other poses."""
+    left_out = _each_left_out(problem, state, scatter, information)
+    return np.array([misfits(problem, problem.stepped(state, step))[n] for n, (step, _) in enumerate(left_out)])
+
+
+def _left_out_excess(problem: Problem, state: State, scatter: Scatter) -> np.ndarray:
+    """How far each pose lies from what the others predict (P,), chi-square with as many degrees as its profile says."""
+    derivatives, errors = problem.derivatives(state), problem.errors(state)
+    split = np.cumsum(problem.counts)[:-1]
+    excess = []
+    left_out = _each_left_out(problem, state, scatter, problem.information(state, scatter))
+    moved = [np.split(problem.distances(state, step), split)[n] for n, (step, _) in enumerate(left_out)]
+    sizes = np.full(3, scatter.pose_mm) if problem.sphere else np.array([scatter.pose_mm, scatter.turn_rad])
+    for off, rows, error, (_, covariance) in zip(
+        moved, np.split(derivatives, split), np.split(errors, split), left_out, strict=True
+    ):
+        # All that poses, mount and artefact can do lies in what the errors of the pose span.
+        basis = np.linalg.qr(error)[0]
+        across, by_pose = basis.T @ rows, basis.T @ (error * sizes)
+        spread = across @ covariance @ across.T + by_pose @ by_pose.T + scatter.point_mm**2 * np.eye(basis.shape[1])
+        seen = basis.T @ off
+        excess.append(float(seen @ np.linalg.solve(spread, seen)))
+    return np.array(excess)
+
+
+def axis_words(direction: np.ndarray) -> str:
+    """A direction of the platform in words."""
+    place = int(np.argmax(np.abs(direction)))
+    if abs(direction[place]) > 0.94:  # within 20 deg
+        return f"the platform's {'xyz'[place]} axis"
+    return f"the platform's direction ({', '.join(f'{each:.2f}' for each in direction)})"
+
+
+def _coverage_factor(problem: Problem, state: State, scatter: Scatter, covariance: np.ndarray) -> float:
+    """Student's factor for 95 %, with degrees of freedom by Welch and Satterthwaite (GUM, G.4).
+
+    The share of the variances that the points' noise makes is known from very many points, the rest from the poses.
+    """
+    by_points = _inverse(problem.information(state, Scatter(scatter.point_mm, 0.0)).sum(axis=0))
+    share = min(float(np.mean(np.diag(by_points)[:6] / np.diag(covariance)[:6])), 1.0)
+    of_poses = max(problem.per_pose * len(problem.points) - problem.size, 1)
+    of_points = max(int(problem.counts.sum()) - problem.per_pose * len(problem.points), 1)
+    return float(t.ppf(0.975, 1 / (share**2 / of_points + (1 - share) ** 2 / of_poses)))
+
+
+def _weaknesses(problem: Problem, state: State, covariance: np.ndarray) -> list[str]:
+    """Directions that are known badly, and motions that are missing, in words."""
+    lines = []
+    variances, axes = np.linalg.eigh(covariance[:3, :3])
+    stds = np.sqrt(variances)
+    for std, axis in zip(stds, axes.T, strict=True):
+        if std > min(_WEAK * stds[0], _OPEN_MM) and std > 0.01:
+            lines.append(f"the shift along {axis_words(axis)} is {_known(std, _OPEN_MM, 'mm')}")
+    variances, axes = np.linalg.eigh(covariance[3:6, 3:6])
+    turns = np.sqrt(variances)
+    for std, axis in zip(turns, axes.T, strict=True):
+        if std > min(_WEAK * turns[0], _OPEN_RAD) and std > np.radians(0.005):
+            lines.append(
+                f"the turn about {axis_words(axis)} is {_known(np.degrees(std), np.degrees(_OPEN_RAD), 'deg')}: the "
+                "artefact stays at nearly the same place of the profile"
+            )
+    every = Rotation.from_matrix(problem.motion(state.offset_s)[0])
+    vectors = (every.mean().inv() * every).as_rotvec()
+    # Turns about two axes are enough: those about one leave the shift along it open.
+    if np.linalg.eigvalsh(vectors.T @ vectors / len(vectors))[1] < _LEAST_TURN_RAD**2:
+        rms = np.sqrt(np.mean(vectors**2, axis=0))
+        lines += [
+            f"insufficient rotation about {axis_words(axis)} ({np.degrees(size):.1f} deg rms)"
+            for size, axis in zip(rms, np.eye(3), strict=True)
+            if size < _LEAST_TURN_RAD
+        ]
+    return lines
+
+
+def _known(std: float, limit: float, unit: str) -> str:
+    return f"known to {std:.2g} {unit} only" if std < limit else "open"

@@ -1,0 +1,270 @@
+"""Model of a profiler on a platform before a fixed sphere or plane: distances, derivatives, weights and variances."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import least_squares, minimize
+from scipy.spatial.transform import Rotation
+
+Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
+"""Rotations (P, 3, 3) and positions (P, 3) of the platform in the base frame for a time offset, s."""
+
+_TIME_STEP_S = 1e-4
+_SMALLEST_SHARE = 1e-3
+"""Of the points' noise; smaller scatter of the poses does not show."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Values of all unknowns: mount, artefact (centre and radius, or normal and distance (4,)), scale and offset."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    artefact: np.ndarray
+    scale: float = 1.0
+    offset_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Standard deviations: of a point, of each coordinate of a pose, and of its turn (planes only; rad)."""
+
+    point_mm: float
+    pose_mm: float
+    turn_rad: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Points (n, 3) of every pose in the sensor's frame, mm, and which unknowns there are.
+
+    The parameters are steps from a `State`: translation (3), rotation about the platform's axes (3), centre (3) and, if
+    it is unknown, radius of a sphere, or two turns of the normal and the distance of a plane, then scale and offset.
+    """
+
+    points: Sequence[np.ndarray]
+    motion: Motion
+    sphere: bool
+    radius_mm: float | None
+    scale: bool = False
+    time: bool = False
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        return np.array([len(each) for each in self.points])
+
+    @cached_property
+    def poses(self) -> np.ndarray:
+        """Number of each point's pose (N,)."""
+        return np.repeat(np.arange(len(self.points)), self.counts)
+
+    @cached_property
+    def _all(self) -> np.ndarray:
+        return np.vstack(self.points)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return 9 + (self.sphere and self.radius_mm is None) + self.scale + self.time
+
+    @property
+    def per_pose(self) -> int:
+        """Numbers that the profile of one pose determines: a circle's three, or a line's two."""
+        return 3 if self.sphere else 2
+
+    def selected(self, kept: np.ndarray, points: Sequence[np.ndarray] | None = None) -> "Problem":
+        """The problem of some of the poses (a mask), perhaps with other points of all poses."""
+        given, motion, numbers = points or self.points, self.motion, np.flatnonzero(kept)
+        return replace(
+            self,
+            points=[given[number] for number in numbers],
+            motion=lambda offset: tuple(each[numbers] for each in motion(offset)),
+        )
+
+    def thinned(self, most: int) -> "Problem":
+        """The problem with at most so many points of each pose, evenly chosen."""
+        chosen = [each[np.unique(np.linspace(0, len(each) - 1, most).astype(int))] for each in self.points]
+        return replace(self, points=chosen)
+
+    def stepped(self, state: State, step: np.ndarray) -> State:
+        """The state after a step of the parameters."""
+        turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ state.rotation
+        if self.sphere:
+            radius = state.artefact[3] + (step[9] if self.radius_mm is None else 0.0)
+            artefact, used = np.append(state.artefact[:3] + step[6:9], radius), 9 + (self.radius_mm is None)
+        else:
+            normal = state.artefact[:3] + step[6:8] @ _across(state.artefact[:3])
+            artefact, used = np.append(normal / np.linalg.norm(normal), state.artefact[3] + step[8]), 9
+        return State(
+            turned,
+            state.translation + step[:3],
+            artefact,
+            state.scale + (step[used] if self.scale else 0.0),
+            state.offset_s + (step[used + self.scale] if self.time else 0.0),
+        )
+
+    def distances(self, state: State, step: np.ndarray | None = None) -> np.ndarray:
+        """Signed distances (N,) of all points from the artefact, mm, after a step from a state."""
+        state = state if step is None else self.stepped(state, step)
+        base = self._base(state)
+        if self.sphere:
+            return np.linalg.norm(base - state.artefact[:3], axis=1) - state.artefact[3]
+        return base @ state.artefact[:3] - state.artefact[3]
+
+    def _base(self, state: State) -> np.ndarray:
+        rotations, positions = self.motion(state.offset_s)
+        platform = self._all @ state.rotation.T + state.translation
+        return np.einsum("nij,nj->ni", rotations[self.poses], platform) + state.scale * positions[self.poses]
+
+    def errors(self, state: State) -> np.ndarray:
+        """Derivatives (N, K) of the distances by the error of their pose.
+
+        A pose errs by a shift in three directions of the base. Beside a plane it errs by a shift along the normal, and
+        by a turn that inclines the line of the profile. (A turn that a sphere sees is a shift of its centre.)
+        """
+        base = self._base(state)
+        if self.sphere:
+            away = base - state.artefact[:3]
+            return away / np.linalg.norm(away, axis=1, keepdims=True)
+        return np.column_stack([np.ones(len(base)), self._along(base)])
+
+    def derivatives(self, state: State) -> np.ndarray:
+        """Derivatives (N, size) of the distances at a state by the parameters."""
+        rotations, positions = self.motion(state.offset_s)
+        turned, base = self._all @ state.rotation.T, self._base(state)
+        if self.sphere:
+            away = base - state.artefact[:3]
+            normals = away / np.linalg.norm(away, axis=1, keepdims=True)
+        else:
+            normals = np.broadcast_to(state.artefact[:3], base.shape)
+        in_platform = np.einsum("nij,ni->nj", rotations[self.poses], normals)
+        columns = [in_platform, np.cross(turned, in_platform)]
+        if self.sphere:
+            columns += [-normals, *([np.full((len(base), 1), -1.0)] if self.radius_mm is None else [])]
+        else:
+            columns += [base @ _across(state.artefact[:3]).T, np.full((len(base), 1), -1.0)]
+        if self.scale:
+            columns.append(np.sum(normals * positions[self.poses], axis=1, keepdims=True))
+        if self.time:
+            later, earlier = (
+                self._base(replace(state, offset_s=state.offset_s + s)) for s in (_TIME_STEP_S, -_TIME_STEP_S)
+            )
+            columns.append(np.sum(normals * (later - earlier), axis=1, keepdims=True) / (2 * _TIME_STEP_S))
+        return np.hstack(columns)
+
+    def _along(self, base: np.ndarray) -> np.ndarray:
+        """Positions (N,) along the line of each profile from its middle, mm."""
+        along = np.empty(len(base))
+        for number in range(len(self.points)):
+            own = self.poses == number
+            centred = base[own] - base[own].mean(axis=0)
+            along[own] = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
+        return along
+
+    def whitening(self, errors: np.ndarray, scatter: Scatter) -> Callable[[np.ndarray], np.ndarray]:
+        """Function that gives distances (N, ...) the unit covariance, for points' noise and errors of poses (N, K)."""
+        sizes = _sizes(errors.shape[1], scatter)
+        parts = []
+        for own in np.split(np.arange(len(errors)), np.cumsum(self.counts)[:-1]):
+            basis, upper = np.linalg.qr(errors[own] * sizes)
+            values, vectors = np.linalg.eigh(upper @ upper.T)
+            shrink = 1 - scatter.point_mm / np.sqrt(scatter.point_mm**2 + np.maximum(values, 0))
+            parts.append((own, basis @ vectors, shrink))
+
+        def whitened(values: np.ndarray) -> np.ndarray:
+            result = values / scatter.point_mm
+            for own, basis, shrink in parts:
+                result[own] -= (basis * shrink) @ (basis.T @ result[own])
+            return result
+
+        return whitened
+
+    def solved(self, state: State, scatter: Scatter, *, loss: str = "linear") -> State:
+        """The state of least weighted squares of the distances."""
+        whitened = self.whitening(self.errors(state), scatter)
+
+        def jacobian(step: np.ndarray) -> np.ndarray:
+            derivatives = self.derivatives(self.stepped(state, step))
+            derivatives[:, 3:6] = derivatives[:, 3:6] @ _left_jacobian(step[3:6])
+            return whitened(derivatives)
+
+        found = least_squares(
+            lambda step: whitened(self.distances(state, step)),
+            np.zeros(self.size),
+            jacobian,
+            loss=loss,
+            x_scale="jac",
+            max_nfev=60,
+        )
+        return self.stepped(state, found.x)
+
+    def information(self, state: State, scatter: Scatter) -> np.ndarray:
+        """Information (P, size, size) that the profile of each pose holds on the parameters."""
+        derivatives, errors = self.derivatives(state), self.errors(state)
+        weighted = np.split(self.whitening(errors, scatter)(derivatives), np.cumsum(self.counts)[:-1])
+        return np.array([each.T @ each for each in weighted])
+
+    def scatter_at(self, state: State, start: Scatter) -> Scatter:
+        """Scatter of points and poses by restricted maximum likelihood at a solution.
+
+        Patterson and Thompson 1971: minus twice the likelihood of what is left of the distances after the parameters.
+        """
+        derivatives, errors = self.derivatives(state), self.errors(state)
+        k, size = errors.shape[1], derivatives.shape[1]
+        # Columns of size one, for the determinant.
+        columns = np.hstack([errors, derivatives / np.linalg.norm(derivatives, axis=0), self.distances(state)[:, None]])
+        grams = np.array([each.T @ each for each in np.split(columns, np.cumsum(self.counts)[:-1])])
+        total, poses = int(self.counts.sum()), len(self.counts)
+
+        def scatter_of(logs: np.ndarray) -> Scatter:
+            point, *others = np.exp(np.clip(logs, -20, 5))
+            return Scatter(
+                point, *(max(each, _SMALLEST_SHARE * point * unit) for each, unit in zip(others, units, strict=True))
+            )
+
+        units = [1.0] if k == 3 else [1.0, 1e-3]
+
+        def minus_twice_likelihood(logs: np.ndarray) -> float:
+            scatter = scatter_of(logs)
+            sizes, variance = _sizes(k, scatter), scatter.point_mm**2
+            inner = np.eye(k) * variance + sizes[:, None] * grams[:, :k, :k] * sizes
+            cross = sizes[:, None] * grams[:, :k, k:]
+            left = (grams[:, k:, k:] - np.swapaxes(cross, 1, 2) @ np.linalg.solve(inner, cross)).sum(axis=0) / variance
+            information = left[:size, :size] + 1e-12 * np.trace(left[:size, :size]) * np.eye(size)
+            squares = left[size, size] - left[size, :size] @ np.linalg.solve(information, left[:size, size])
+            weights = (total - poses * k) * np.log(variance) + np.linalg.slogdet(inner)[1].sum()
+            return float(weights + np.linalg.slogdet(information)[1] + squares)
+
+        begin = np.log([start.point_mm, start.pose_mm, *([start.turn_rad] if k == 2 else [])])
+        found = minimize(
+            minus_twice_likelihood, begin, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-3, "maxiter": 300}
+        )
+        return scatter_of(found.x)
+
+
+def _sizes(k: int, scatter: Scatter) -> np.ndarray:
+    """Standard deviations (K,) of the errors of a pose."""
+    return np.full(3, scatter.pose_mm) if k == 3 else np.array([scatter.pose_mm, scatter.turn_rad])
+
+
+def _across(normal: np.ndarray) -> np.ndarray:
+    """Unit directions (2, 3) square to a normal and to each other."""
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(normal, first)])
+
+
+def cross_matrix(vector: np.ndarray) -> np.ndarray:
+    """Matrix (3, 3) of the cross product with a vector (3,)."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _left_jacobian(vector: np.ndarray) -> np.ndarray:
+    """Derivative of exp(v + dv) exp(-v) by dv as a rotation vector (J. Sola and others 2018, arXiv:1812.01537, 145)."""
+    angle, cross = float(np.linalg.norm(vector)), cross_matrix(vector)
+    if angle < 1e-6:
+        return np.eye(3) + cross / 2
+    return np.eye(3) + (1 - np.cos(angle)) / angle**2 * cross + (angle - np.sin(angle)) / angle**3 * cross @ cross

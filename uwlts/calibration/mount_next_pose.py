@@ -1,0 +1,128 @@
+"""The further pose that would lower the uncertainty of a mount most, by the information that its profile would hold."""
+
+from itertools import product
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwlts.calibration.mount_model import Problem, Scatter, State, cross_matrix
+from uwlts.model.mount import NextPose
+
+_TURN_RAD = np.radians(30)
+"""A robot turns so far easily with the artefact in view."""
+_POINTS = 100
+_UNKNOWN_MM, _UNKNOWN_RAD = 100.0, 0.5
+"""Standard uncertainty of a mount of which nothing is known, so that open directions can be compared."""
+
+
+def next_pose(problem: Problem, state: State, scatter: Scatter, sheet: np.ndarray, names: list[str]) -> NextPose | None:
+    """The best of turns by 30 deg about each axis of the platform, with the artefact at several places of the profile.
+
+    None where the plane would be too steep in all of them. Judged by the standard uncertainty of a point in the middle
+    of all points seen. ``sheet`` (4, 4) maps the sheet's frame to the sensor's; ``names`` are those of the poses.
+    """
+    rotations, positions = problem.motion(state.offset_s)
+    every = Rotation.from_matrix(rotations)
+    nearest = int(np.argmin((every.mean().inv() * every).magnitude()))
+    middle = np.vstack(problem.points).mean(axis=0)
+    prior = np.zeros(problem.size)
+    prior[:3], prior[3:6] = _UNKNOWN_MM**-2.0, _UNKNOWN_RAD**-2.0
+    known = problem.information(state, scatter).sum(axis=0) + np.diag(prior)
+    to_point = np.hstack([np.eye(3), -cross_matrix(state.rotation @ middle)])
+
+    def point_std(information: np.ndarray) -> float:
+        size = 1 / np.sqrt(np.diag(information))
+        covariance = size[:, None] * np.linalg.pinv(size[:, None] * information * size, hermitian=True) * size
+        return float(np.sqrt(np.trace(to_point @ covariance[:6, :6] @ to_point.T) / 3))
+
+    best: tuple[float, str, np.ndarray] | None = None
+    for axis, side in product(range(3), (1, -1)):
+        turned = rotations[nearest] @ Rotation.from_rotvec(side * _TURN_RAD * np.eye(3)[axis]).as_matrix()
+        for points, seen, where in _views(problem, state, sheet):
+            platform = state.rotation @ seen + state.translation
+            if problem.sphere:
+                position = (state.artefact[:3] - turned @ platform) / state.scale
+            else:
+                normal = state.artefact[:3]
+                off = normal @ (turned @ platform + state.scale * positions[nearest]) - state.artefact[3]
+                position = positions[nearest] - off * normal / state.scale
+                points = _on_plane(points, seen, turned @ state.rotation, normal, sheet)
+            if points is None:
+                continue
+            added = _one_pose(problem, points, turned, position).information(state, scatter)[0]
+            after = point_std(known + added)
+            if best is None or after < best[0]:
+                words = (
+                    f"turn the platform by {np.degrees(side * _TURN_RAD):+.0f} deg about its {'xyz'[axis]} axis from "
+                    f"pose {names[nearest]}, with the {'sphere' if problem.sphere else 'plane'} {where}"
+                )
+                pose = np.eye(4)
+                pose[:3, :3], pose[:3, 3] = turned, position
+                best = after, words, pose
+    if best is None:
+        return None
+    after, words, pose = best
+    return NextPose(
+        words=words,
+        T_base_platform=tuple(tuple(row) for row in pose.tolist()),
+        before_mm=point_std(known),
+        after_mm=after,
+    )
+
+
+def _one_pose(problem: Problem, points: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> Problem:
+    # Without a trajectory the pose says nothing about the offset of the times.
+    return Problem(
+        [points],
+        lambda offset: (rotation[None], position[None]),
+        problem.sphere,
+        problem.radius_mm,
+        problem.scale,
+        problem.time,
+    )
+
+
+def _views(problem: Problem, state: State, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
+    """Points (n, 3) of the artefact in the sensor's frame, its place (3,) there, and that in words, for each view."""
+    flat = [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in problem.points]
+    low, high = np.quantile(np.vstack(flat), (0.1, 0.9), axis=0)
+    views = []
+    if problem.sphere:
+        rotations, positions = problem.motion(state.offset_s)
+        platform = np.einsum("pji,pj->pi", rotations, state.artefact[:3] - state.scale * positions) - state.translation
+        centres = (platform @ state.rotation - sheet[:3, 3]) @ sheet[:3, :3]
+        low, high = np.quantile(centres[:, [0, 2]], (0.1, 0.9), axis=0)
+        radius = float(state.artefact[3])
+        depth = min(max(float(np.quantile(np.abs(centres[:, 1]), 0.8)), 0.4 * radius), 0.7 * radius)
+        facing = np.vstack([each - centre[[0, 2]] for each, centre in zip(flat, centres, strict=True)])
+        middle = np.arctan2(*facing.mean(axis=0)[::-1])
+        angle = middle + np.linspace(-1, 1, _POINTS) * np.radians(60)
+        for u, w, y in product((low[0], high[0]), (low[1], high[1]), (depth, -depth)):
+            section = np.sqrt(radius**2 - y**2)
+            arc = np.column_stack([u + section * np.cos(angle), np.zeros(_POINTS), w + section * np.sin(angle)])
+            views.append((_to_sensor(arc, sheet), _to_sensor(np.array([u, y, w]), sheet), _place(sheet, u, y, w)))
+    else:
+        for u, w in product((low[0], high[0]), (low[1], high[1])):
+            line = np.column_stack([np.linspace(low[0], high[0], _POINTS), np.zeros(_POINTS), np.full(_POINTS, w)])
+            views.append((_to_sensor(line, sheet), _to_sensor(np.array([u, 0.0, w]), sheet), _place(sheet, u, 0.0, w)))
+    return views
+
+
+def _place(sheet: np.ndarray, u: float, y: float, w: float) -> str:
+    at = _to_sensor(np.array([u, y, w]), sheet)
+    return f"at x = {at[0]:.0f}, y = {at[1]:.0f}, z = {at[2]:.0f} mm of the sensor's frame"
+
+
+def _to_sensor(points: np.ndarray, sheet: np.ndarray) -> np.ndarray:
+    return points @ sheet[:3, :3].T + sheet[:3, 3]
+
+
+def _on_plane(
+    points: np.ndarray, seen: np.ndarray, to_base: np.ndarray, normal: np.ndarray, sheet: np.ndarray
+) -> np.ndarray | None:
+    """Points moved along the sheet's z axis onto the plane through a point; None where it is too steep to be seen."""
+    inside, down = normal @ to_base, sheet[:3, 2]
+    steep = float(inside @ down)
+    if abs(steep) < 0.5:  # 60 deg
+        return None
+    return points - np.outer((points - seen) @ inside / steep, down)

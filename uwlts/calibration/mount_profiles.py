@@ -1,0 +1,147 @@
+"""The part of a profile that shows the artefact: an arc of a sphere beside its background, or the line of a plane."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.metrology.fits import algebraic_centres
+from uwlts.metrology.least_squares import MAD_TO_STD
+
+LEAST_POINTS = 12
+"""Points on the artefact that a profile needs: four for each of a circle's three parameters."""
+_TRIALS = 400
+"""Curves proposed for a profile: with a tenth of it on the artefact, and neighbours as proposals, some 40 are right."""
+_REJECTED_BEYOND = 4.0
+"""Robust standard deviations; of normal noise six points in a hundred thousand lie farther out."""
+_LEAST_ARC = np.radians(30)
+"""Smaller arcs are like straight lines, and their centres move by more than the noise along the sagitta."""
+_LARGEST_ROUNDS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Arc:
+    """Points of a profile on a circle: their mask (N,), its centre (2,) and radius, mm, and the points' scatter, mm."""
+
+    members: np.ndarray
+    centre_mm: np.ndarray
+    radius_mm: float
+    std_mm: float
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """Points of a profile on a line: their mask (N,), their middle (2,), the line's direction (2,) and the scatter."""
+
+    members: np.ndarray
+    middle_mm: np.ndarray
+    direction: np.ndarray
+    std_mm: float
+
+
+def noise_of(points: np.ndarray) -> float:
+    """Scatter of a profile (N, 2) from second differences across it, robust against edges, mm."""
+    depth = points[:, 1] - np.interp(points[:, 0], points[[0, -1], 0], points[[0, -1], 1])
+    # The variance of a second difference is 1 + 4 + 1 times that of a point.
+    second = np.diff(depth, 2)
+    return MAD_TO_STD * float(np.median(np.abs(second - np.median(second)))) / 6**0.5
+
+
+def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generator) -> Arc | None:
+    """The best supported arc of a sphere's section in a profile (N, 2), mm, in the order along it, or None.
+
+    Circles through three points in their order along the profile are judged by the number of points near them (RANSAC);
+    none is larger than the sphere, or than the profile where the sphere's radius is not known.
+    """
+    count = len(points)
+    if count < LEAST_POINTS:
+        return None
+    tolerance = max(_REJECTED_BEYOND * noise_of(points), 1e-4)
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    largest = extent if radius_mm is None else radius_mm + 2 * tolerance
+    span = rng.integers(LEAST_POINTS // 2, max(count // 2, LEAST_POINTS // 2 + 1), size=_TRIALS)
+    first = (rng.random(_TRIALS) * np.maximum(count - 2 * span, 1)).astype(int)
+    picked = points[np.minimum(first[:, None] + span[:, None] * np.arange(3), count - 1)]
+    centres, radii = _circles_through(picked)
+    fits = np.isfinite(radii) & (radii < largest) & (radii > 10 * tolerance)
+    if not fits.any():
+        return None
+    centres, radii = centres[fits], radii[fits]
+    off = np.abs(np.linalg.norm(points - centres[:, None], axis=2) - radii[:, None])
+    for best in np.argsort(-np.count_nonzero(off < tolerance, axis=1))[:5]:
+        arc = _refined_arc(points, off[best] < tolerance, tolerance)
+        if arc is not None and arc.radius_mm < largest:
+            return arc
+    return None
+
+
+def _circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (M, 2) and radii (M,) of circles through triples (M, 3, 2); infinite where these lie on a line."""
+    b, c = triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        double = 2 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
+        bb, cc = np.sum(b**2, axis=1), np.sum(c**2, axis=1)
+        away = np.stack([c[:, 1] * bb - b[:, 1] * cc, b[:, 0] * cc - c[:, 0] * bb], axis=1) / double[:, None]
+    return triples[:, 0] + away, np.linalg.norm(away, axis=1)
+
+
+def _refined_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> Arc | None:
+    centre, radius, std = np.zeros(2), 0.0, 0.0
+    for _ in range(_LARGEST_ROUNDS):
+        if np.count_nonzero(members) < LEAST_POINTS:
+            return None
+        centre, radius = _fitted_circle(points[members])
+        off = np.linalg.norm(points - centre, axis=1) - radius
+        std = MAD_TO_STD * float(np.median(np.abs(off[members])))
+        before, members = members, np.abs(off) < min(max(_REJECTED_BEYOND * std, 1e-4), 2 * tolerance)
+        if np.array_equal(before, members):
+            break
+    if np.count_nonzero(members) < LEAST_POINTS or _arc_angle(points[members] - centre) < _LEAST_ARC:
+        return None
+    return Arc(members, centre, radius, std)
+
+
+def _fitted_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Circle with the least sum of squared distances, by Gauss-Newton steps from the algebraic one."""
+    middle = points.mean(axis=0)
+    centre, radius = algebraic_centres(points - middle)
+    centre = middle + centre
+    radius = float(radius)
+    for _ in range(5):
+        away = points - centre
+        distance = np.linalg.norm(away, axis=1)
+        design = np.column_stack([away / distance[:, None], np.ones(len(points))])
+        step, *_ = np.linalg.lstsq(design, distance - radius, rcond=None)
+        centre, radius = centre + step[:2], radius + float(step[2])
+    return centre, abs(radius)
+
+
+def _arc_angle(away: np.ndarray) -> float:
+    angles = np.sort(np.arctan2(away[:, 1], away[:, 0]))
+    gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
+    return float(2 * np.pi - gaps.max())
+
+
+def find_line(points: np.ndarray, rng: np.random.Generator) -> Line | None:
+    """The best supported straight line in a profile (N, 2), mm, in the order along it, or None."""
+    if len(points) < LEAST_POINTS:
+        return None
+    tolerance = max(_REJECTED_BEYOND * noise_of(points), 1e-4)
+    first, second = rng.integers(len(points), size=(2, _TRIALS))
+    along = points[second] - points[first]
+    length = np.linalg.norm(along, axis=1)
+    proper = length > 0
+    normals = np.column_stack([-along[:, 1], along[:, 0]])[proper] / length[proper, None]
+    off = np.abs(points @ normals.T - np.sum(points[first[proper]] * normals, axis=1)).T
+    members = off[np.argmax(np.count_nonzero(off < tolerance, axis=1))] < tolerance
+    middle, direction, std = np.zeros(2), np.zeros(2), 0.0
+    for _ in range(_LARGEST_ROUNDS):
+        if np.count_nonzero(members) < LEAST_POINTS:
+            return None
+        middle = points[members].mean(axis=0)
+        direction = np.linalg.svd(points[members] - middle, full_matrices=False)[2][0]
+        off = (points - middle) @ np.array([-direction[1], direction[0]])
+        std = MAD_TO_STD * float(np.median(np.abs(off[members])))
+        before, members = members, np.abs(off) < min(max(_REJECTED_BEYOND * std, 1e-4), 2 * tolerance)
+        if np.array_equal(before, members):
+            break
+    return Line(members, middle, direction, std)

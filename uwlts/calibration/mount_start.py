@@ -1,0 +1,141 @@
+"""Start values of a mount: in closed form from the circles of a sphere, or by search from the lines of a plane."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from uwlts.calibration.mount_model import Problem, Scatter, State
+from uwlts.calibration.mount_profiles import Arc, Line
+
+_SUBSETS, _SUBSET = 40, 8
+"""Random choices of poses: with a fifth of the poses wrong one of six choices of eight has none of these."""
+_TRIED = 4
+_THINNED = 9
+_TURNS, _TURNS_TRIED = 5000, 10
+"""Rotations tried for a plane, some 12 deg apart, and how many of the best are refined."""
+_RADII = (1.02, 1.15, 1.5)
+"""Radius of an unknown sphere over that of its largest section."""
+_ROUGH = Scatter(point_mm=0.1, pose_mm=0.3, turn_rad=3e-3)
+"""Scatter for the weights of the search, whose robust loss begins beyond it."""
+
+
+def start_of_sphere(problem: Problem, arcs: list[Arc], sheet: np.ndarray, rng: np.random.Generator) -> State:
+    """State near the solution from the arcs found in the profiles; ``sheet`` (4, 4) maps (x, y, z) of the sheet's frame
+    to the sensor's.
+
+    Without its part across the sheet, y = +-sqrt(R2 - r2), the centre of a circle of radius r in the profile is the
+    sphere's centre in the sensor's frame, and R s + t = A^T (c - a) is linear in R's columns, t and c for poses (A, a).
+    The side of the sheet on which the centre lies follows from the solution; both sides are tried where it does not.
+    """
+    rotations, positions = problem.motion(0.0)
+    centres, radii = np.array([arc.centre_mm for arc in arcs]), np.array([arc.radius_mm for arc in arcs])
+    everything = np.arange(len(arcs))
+    subsets = [everything]
+    if len(arcs) > _SUBSET:
+        subsets += [rng.choice(everything, _SUBSET, replace=False) for _ in range(_SUBSETS)]
+    found: list[tuple[float, State]] = []
+    largest = float(np.quantile(radii, 0.9))
+    for radius in [problem.radius_mm] if problem.radius_mm else [share * largest for share in _RADII]:
+        depth = np.sqrt(np.maximum(radius**2 - radii**2, 0))
+        for subset in subsets:
+            for state in _linear_solutions(rotations, positions, centres, depth, subset, radius):
+                found.append((_misfit(rotations, positions, centres, depth, state), state))
+    found.sort(key=lambda each: each[0])
+    rough = problem.thinned(_THINNED)
+    return _best(rough, [_in_sensor_frame(state, sheet) for _, state in found[:_TRIED]])
+
+
+def _linear_solutions(
+    rotations: np.ndarray,
+    positions: np.ndarray,
+    centres: np.ndarray,
+    depth: np.ndarray,
+    subset: np.ndarray,
+    radius: float,
+) -> list[State]:
+    back, shift = np.swapaxes(rotations, 1, 2)[subset], _turned_back(rotations, -positions)[subset]
+    states, one = [], np.broadcast_to(np.eye(3), back.shape)
+    for side in (0.0, 1.0, -1.0):
+        sides = np.full(len(subset), side)
+        across = np.zeros(3)
+        rotation, translation, centre = np.eye(3), np.zeros(3), np.zeros(3)
+        for _ in range(3):
+            u, w = centres[subset].T
+            known = shift - (sides * depth[subset])[:, None] * across
+            design = np.concatenate([u[:, None, None] * one, w[:, None, None] * one, one, -back], axis=2)
+            solution = np.linalg.lstsq(design.reshape(-1, 12), known.ravel(), rcond=1e-10)[0]
+            left, _, right = np.linalg.svd(solution[:6].reshape(2, 3).T, full_matrices=False)
+            first, third = (left @ right).T
+            across = np.cross(third, first)
+            rotation = np.column_stack([first, across, third])
+            places = np.column_stack([u, sides * depth[subset], w]) @ rotation.T
+            both = np.linalg.lstsq(
+                np.concatenate([one, -back], axis=2).reshape(-1, 6), (shift - places).ravel(), rcond=1e-10
+            )[0]
+            translation, centre = both[:3], both[3:]
+            if side == 0.0:
+                sides = np.sign((_turned_back(rotations, centre - positions)[subset] - translation) @ across)
+        states.append(State(rotation, translation, np.append(centre, radius)))
+    return states
+
+
+def _turned_back(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Vectors (P, 3) of the base frame along the axes of the platform."""
+    return np.einsum("pji,pj->pi", rotations, vectors)
+
+
+def _misfit(
+    rotations: np.ndarray, positions: np.ndarray, centres: np.ndarray, depth: np.ndarray, state: State
+) -> float:
+    """Median over the poses of the distance between the centre of the sphere and where the profile says it is."""
+    seen = (_turned_back(rotations, state.artefact[:3] - positions) - state.translation) @ state.rotation
+    off = np.hypot(*(seen[:, [0, 2]] - centres).T)
+    return float(np.median(np.hypot(off, np.abs(seen[:, 1]) - depth)))
+
+
+def _in_sensor_frame(state: State, sheet: np.ndarray) -> State:
+    """The state of a sheet's frame as one of the sensor's."""
+    rotation = state.rotation @ sheet[:3, :3].T
+    return State(rotation, state.translation - rotation @ sheet[:3, 3], state.artefact)
+
+
+def start_of_plane(problem: Problem, lines: list[Line], sheet: np.ndarray, rng: np.random.Generator) -> State:
+    """State near the solution from the lines found in the profiles; ``sheet`` as in `start_of_sphere`.
+
+    The lines' directions in the base are square to the plane's normal whatever the translation: of many rotations the
+    best are kept by the smallest eigenvalue of the directions' scatter, whose vector is the normal. Translation and
+    distance are linear then.
+    """
+    rotations, positions = problem.motion(0.0)
+    middles = _in_space(np.array([line.middle_mm for line in lines]))
+    directions = _in_space(np.array([line.direction for line in lines]))
+    turns = Rotation.random(_TURNS, rng=rng).as_matrix()
+    seen = np.einsum("pij,tjk,pk->tpi", rotations, turns, directions)
+    values, vectors = np.linalg.eigh(np.einsum("tpi,tpj->tij", seen, seen))
+    states = []
+    for number in np.argsort(values[:, 0])[:_TURNS_TRIED]:
+        normal = vectors[number, :, 0]
+        # Half a turn about the sheet's normal leaves the directions as they are.
+        for turn in (turns[number], turns[number] * np.array([-1.0, 1.0, -1.0])):
+            places = np.einsum("pij,jk,pk->pi", rotations, turn, middles) + positions
+            design = np.column_stack([np.einsum("pji,j->pi", rotations, normal), -np.ones(len(lines))])
+            solution = np.linalg.lstsq(design, -places @ normal, rcond=1e-10)[0]
+            states.append(State(turn, solution[:3], np.append(normal, solution[3])))
+    return _best(problem.thinned(_THINNED), [_in_sensor_frame(state, sheet) for state in states])
+
+
+def _in_space(flat: np.ndarray) -> np.ndarray:
+    """Points or directions (P, 2) of the sheet in its frame (P, 3)."""
+    return np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
+
+
+def _best(rough: Problem, states: list[State]) -> State:
+    """The state of smallest median distance after a robust refinement from each, scale and time left as they are."""
+    fixed = Problem(rough.points, rough.motion, rough.sphere, rough.radius_mm)
+    refined = [fixed.solved(state, _ROUGH, loss="cauchy") for state in states]
+    return min(refined, key=lambda state: float(np.median(misfits(fixed, state))))
+
+
+def misfits(problem: Problem, state: State) -> np.ndarray:
+    """Root mean square distance (P,) of the points of each pose."""
+    squares = problem.distances(state) ** 2
+    return np.sqrt(np.bincount(problem.poses, squares) / problem.counts)

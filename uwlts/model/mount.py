@@ -1,0 +1,103 @@
+"""The mount of a laser profiler on a moving platform, as `uwlts.calibrate_mount` finds it and `mount.json` holds it."""
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from uwlts.model.calibration import is_rigid
+from uwlts.model.sensor import Description, NotNegative, Positive, Vector
+
+Matrix4 = tuple[tuple[float, float, float, float], ...]
+
+
+class MountPose(Description):
+    """One pose of the platform and what its profile says.
+
+    ``rms_mm`` is the root mean square distance of its points from the artefact, ``held_out_mm`` the same where the
+    mount was calculated without this pose. A pose that was not used has a ``reason``.
+    """
+
+    name: str
+    points: Annotated[int, Field(ge=0)]
+    points_left_out: Annotated[int, Field(ge=0)]
+    rms_mm: NotNegative | None = None
+    held_out_mm: NotNegative | None = None
+    reason: str | None = None
+
+
+class NextPose(Description):
+    """The candidate pose that would lower the uncertainty most, in words and as ``T_base_platform``.
+
+    ``before_mm`` and ``after_mm`` are the standard uncertainty of a point in the middle of the field of view.
+    """
+
+    words: str
+    T_base_platform: Matrix4
+    before_mm: NotNegative
+    after_mm: NotNegative
+
+
+class SphereFound(Description):
+    """The sphere: centre in the base frame, and its radius, given or found."""
+
+    kind: Literal["sphere"] = "sphere"
+    centre_mm: Vector
+    radius_mm: Positive
+    radius_std_mm: NotNegative | None = None
+
+
+class PlaneFound(Description):
+    """The plane: the points p of the base frame with normal . p = distance_mm."""
+
+    kind: Literal["plane"] = "plane"
+    normal: Vector
+    distance_mm: float
+
+
+class Mount(Description):
+    """Transform from the sensor to the platform that carries it, with its uncertainty and the evidence.
+
+    ``T_platform_sensor`` (4, 4) maps points of the sensor's frame (x and z of the profiles, y = z x x across the sheet)
+    to the frame of the platform (a robot's flange), mm. ``covariance`` (6, 6) is of the translation (mm), then of a
+    further rotation (rad) about the platform's axes, R_true = exp(rotation) R. ``coverage_factor`` times a standard
+    uncertainty is half of the 95 % interval (Student's t). ``point_std_mm`` is the noise of a point of a profile,
+    ``pose_std_mm`` that of the platform's position for each coordinate; both are estimated from the profiles.
+    ``inputs`` holds the SHA-256 of every file that was read.
+    """
+
+    T_platform_sensor: Matrix4
+    covariance: tuple[tuple[float, float, float, float, float, float], ...]
+    coverage_factor: Positive
+    artefact: Annotated[SphereFound | PlaneFound, Field(discriminator="kind")]
+    robot_scale: Positive | None = None
+    robot_scale_std: NotNegative | None = None
+    time_offset_s: float | None = None
+    time_offset_std_s: NotNegative | None = None
+    point_std_mm: NotNegative
+    pose_std_mm: NotNegative
+    rms_mm: NotNegative
+    held_out_rms_mm: NotNegative
+    poses: tuple[MountPose, ...]
+    weaknesses: tuple[str, ...] = ()
+    next_pose: NextPose | None = None
+    inputs: dict[str, str] = {}
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Mount":
+        if np.shape(self.T_platform_sensor) != (4, 4) or not is_rigid(self.transform(), within=1e-6):
+            raise ValueError("T_platform_sensor must be a rigid 4x4 matrix")
+        covariance = np.array(self.covariance)
+        if covariance.shape != (6, 6) or np.abs(covariance - covariance.T).max() > 1e-9 * np.abs(covariance).max():
+            raise ValueError("covariance must be a symmetric 6x6 matrix")
+        if not np.all(np.diag(covariance) > 0):
+            raise ValueError("covariance must have positive variances")
+        return self
+
+    def transform(self) -> np.ndarray:
+        """``T_platform_sensor`` as an array (4, 4), mm."""
+        return np.array(self.T_platform_sensor)
+
+    def std(self) -> np.ndarray:
+        """Standard uncertainties (6,): translation, mm, and rotation about the platform's axes, rad."""
+        return np.sqrt(np.diag(np.array(self.covariance)))
