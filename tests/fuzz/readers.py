@@ -13,6 +13,7 @@ import trimesh
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
+from tests.uwlts.mount_views import sphere_campaign
 from tests.uwlts.storage.test_capture import a_header, interrupted, record, small_sensor
 from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
 from tests.uwlts.storage.test_truth import a_header as truth_header
@@ -24,6 +25,7 @@ from twin.scene.description import Mesh, load_scene
 from twin.scene.finish import read_grey
 from twin.scene.objects import _surface_from_file
 from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.mount import calibrate_mount
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import load_plan
@@ -42,6 +44,7 @@ from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import read_intrinsics, with_intrinsics
 from uwlts.storage.import_.description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows
+from uwlts.storage.mount_files import read_mount, read_poses, read_profiles, write_mount
 from uwlts.storage.truth import read_truth, write_truth
 from uwlts.thesis.results import CampaignResults, LineProfile, Measurement, SpacingInterval, WindowChoice, WindowProfile
 from uwlts.thesis.tables import load_published
@@ -190,6 +193,19 @@ def _table(path: Path) -> None:
     path.write_text("file,light,stage_mm,exposure_ms,time_s\na1.png,laser,1.0,2.5,0\na2.png,lamp,1.5,2.5,1\n")
 
 
+def _mount(path: Path) -> None:
+    campaign = sphere_campaign(np.random.default_rng(3), poses=8)
+    write_mount(path, calibrate_mount(campaign.profiles, campaign.poses, radius_mm=20.0))
+
+
+def _poses(path: Path) -> None:
+    path.write_text("x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n1.5,2,3,0.6,0,0,0.8\n")
+
+
+def _profiles(path: Path) -> None:
+    path.write_text("pose;x;z;time_s\n1;0,5;2,5;0,1\n1;;;0,1\n2;0,5;2,25;0,2\n")
+
+
 _CAMERA = """image_width: 640
 image_height: 480
 camera_matrix:
@@ -290,6 +306,9 @@ READERS = {
         Reader("artefact", ".toml", "toml", _artefact, read_artefact),
         Reader("import", ".toml", "toml", _import_description, _read_import),
         Reader("table", ".csv", "lines", _table, read_rows),
+        Reader("mount", ".json", "json", _mount, read_mount),
+        Reader("poses", ".csv", "lines", _poses, lambda path: read_poses(path, pose_format="quaternion-xyzw")),
+        Reader("profiles", ".csv", "lines", _profiles, read_profiles),
         Reader("intrinsics-ros", ".yaml", "lines", _ros, _sensor_with),
         Reader("intrinsics-opencv", ".yml", "lines", _opencv, _sensor_with),
         Reader("intrinsics-xml", ".xml", "lines", _opencv, _sensor_with),

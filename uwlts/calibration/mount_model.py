@@ -79,7 +79,7 @@ class Problem:
         given, motion, numbers = points or self.points, self.motion, np.flatnonzero(kept)
         return replace(
             self,
-            points=[given[number] for number in numbers],
+            points=[given[number] for number in numbers.tolist()],
             motion=lambda offset: tuple(each[numbers] for each in motion(offset)),
         )
 
@@ -193,7 +193,7 @@ class Problem:
         found = least_squares(
             lambda step: whitened(self.distances(state, step)),
             np.zeros(self.size),
-            jacobian,
+            jacobian,  # pyright: ignore[reportArgumentType]
             loss=loss,
             x_scale="jac",
             max_nfev=60,

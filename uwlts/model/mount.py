@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import Description, NotNegative, Positive, Vector
 
-Matrix4 = tuple[tuple[float, float, float, float], ...]
+Rows = tuple[tuple[float, ...], ...]
 
 
 class MountPose(Description):
@@ -33,7 +33,7 @@ class NextPose(Description):
     """
 
     words: str
-    T_base_platform: Matrix4
+    T_base_platform: Rows
     before_mm: NotNegative
     after_mm: NotNegative
 
@@ -66,8 +66,8 @@ class Mount(Description):
     ``inputs`` holds the SHA-256 of every file that was read.
     """
 
-    T_platform_sensor: Matrix4
-    covariance: tuple[tuple[float, float, float, float, float, float], ...]
+    T_platform_sensor: Rows
+    covariance: Rows
     coverage_factor: Positive
     artefact: Annotated[SphereFound | PlaneFound, Field(discriminator="kind")]
     robot_scale: Positive | None = None
@@ -85,10 +85,12 @@ class Mount(Description):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Mount":
-        if np.shape(self.T_platform_sensor) != (4, 4) or not is_rigid(self.transform(), within=1e-6):
+        if [*map(len, self.T_platform_sensor)] != [4] * 4 or not is_rigid(self.transform(), within=1e-6):
             raise ValueError("T_platform_sensor must be a rigid 4x4 matrix")
+        if [*map(len, self.covariance)] != [6] * 6:
+            raise ValueError("covariance must be a symmetric 6x6 matrix")
         covariance = np.array(self.covariance)
-        if covariance.shape != (6, 6) or np.abs(covariance - covariance.T).max() > 1e-9 * np.abs(covariance).max():
+        if np.abs(covariance - covariance.T).max() > 1e-9 * np.abs(covariance).max():
             raise ValueError("covariance must be a symmetric 6x6 matrix")
         if not np.all(np.diag(covariance) > 0):
             raise ValueError("covariance must have positive variances")

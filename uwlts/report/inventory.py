@@ -18,6 +18,7 @@ from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics import design as formulas
+from uwlts.report.mount_lines import mount_lines
 from uwlts.report.numbers import numbers_in
 from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT
 from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
@@ -25,6 +26,8 @@ from uwlts.storage.calibration_file import read_calibration, read_polynomials
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud
 from uwlts.storage.json_files import read_json
+from uwlts.storage.mount_files import FORMAT as MOUNT_FORMAT
+from uwlts.storage.mount_files import read_mount
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth
 
 
@@ -143,9 +146,11 @@ def _json_lines(path: Path) -> list[str]:
             return polynomial_lines(read_polynomials(path))
         if found == EVALUATION_FORMAT:
             return evaluation_lines(read_evaluation(path))
+        if found == MOUNT_FORMAT:
+            return mount_lines(read_mount(path))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CaptureError(f"{path} is damaged: something in it is missing or no number ({error})") from error
-    raise CaptureError(f"{path} is neither a calibration nor an evaluation: format is {found!r}")
+    raise CaptureError(f"{path} is neither a calibration, a mount nor an evaluation: format is {found!r}")
 
 
 def capture_lines(capture: Capture) -> list[str]:

@@ -34,6 +34,8 @@ _ROUNDED = 2e-3
 _EULER = re.compile(r"euler-([xyz]{3}|[XYZ]{3})-(deg|rad)")
 _FORMATS = "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg"
 _MOST_POSES = 20_000
+_FARTHEST_MM = 1e7
+"""Ten kilometres: no platform reaches farther, and squares of larger numbers would lose the noise."""
 _OFTEN_MEANT = (
     "quaternion-xyzw",
     "quaternion-wxyz",
@@ -166,7 +168,10 @@ def _checked_profile(profile: np.ndarray, number: int) -> np.ndarray:
         raise DescriptionError(
             f"profile {number + 1} has the shape {points.shape}; expected (N, 2) with x and z or (N, 3) with x, y and z"
         )
-    return np.where(np.isfinite(points), points, np.nan)
+    points = np.where(np.isfinite(points), points, np.nan)
+    if np.any(np.abs(points) > _FARTHEST_MM):
+        raise DescriptionError(f"profile {number + 1} has points beyond {_FARTHEST_MM:g} mm: is its unit right?")
+    return points
 
 
 def _checked_times(
@@ -243,7 +248,7 @@ def _points_of(columns: dict[str, np.ndarray], path: Path) -> np.ndarray:
     return np.column_stack([columns[name] for name in ("x", "y", "z") if name in columns])
 
 
-def _checked_unit(unit: str) -> Unit:
+def _checked_unit(unit: Unit) -> Unit:
     if unit not in get_args(Unit):
         raise DescriptionError(f"the unit is {unit!r}; expected mm or m")
     return unit
@@ -268,7 +273,7 @@ def _read_columns(path: Path, digests: dict[str, str], *, named: bool = True) ->
     if delimiter == b" ":
         lines = [b" ".join(line.split()) for line in lines]
     cells = [cell.strip().strip('"') for cell in lines[0].decode("utf-8", "replace").split(delimiter.decode())]
-    has_names = not all(_is_number(cell) for cell in cells)
+    has_names = not any(_is_number(cell) for cell in cells)
     if has_names:
         names = [_COLUMN_NAMES.sub("", cell.lower()) if cell.lower() != "time_s" else "time_s" for cell in cells]
         lines = lines[1:]
@@ -382,6 +387,8 @@ def _checked_matrices(matrices: np.ndarray, source: object) -> np.ndarray:
     for number, matrix in enumerate(matrices):
         if not np.isfinite(matrix).all():
             raise DescriptionError(f"{source}: pose {number + 1} has a number that is not finite")
+        if np.abs(matrix[:3, 3]).max() > _FARTHEST_MM:
+            raise DescriptionError(f"{source}: pose {number + 1} lies beyond {_FARTHEST_MM:g} mm: is its unit right?")
         if not is_rigid(matrix, within=_ROUNDED):
             hint = ""
             if is_rigid(matrix.T, within=_ROUNDED):
