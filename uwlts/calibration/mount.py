@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2, t
 
-from uwlts.calibration.mount_model import Motion, Problem, Scatter, State
+from uwlts.calibration.mount_model import Motion, MountState, Problem, Scatter
 from uwlts.calibration.mount_next_pose import next_pose
-from uwlts.calibration.mount_profiles import LEAST_POINTS, Arc, Line, find_arc, find_line
+from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLine, find_arc, find_line
 from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere
 from uwlts.model.errors import CalibrationError
 from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound
@@ -170,8 +170,8 @@ class _Calibration:
             self.evidence.time,
         )
         problem = whole.selected(kept, [p[m] for p, m in zip(self.profiles, members, strict=True)])
-        arcs = [shape for shape in shapes if isinstance(shape, Arc)]
-        lines = [shape for shape in shapes if isinstance(shape, Line)]
+        arcs = [shape for shape in shapes if isinstance(shape, ProfileArc)]
+        lines = [shape for shape in shapes if isinstance(shape, ProfileLine)]
         state = (
             start_of_sphere(problem, arcs, self.sheet, self.rng)
             if self.sphere
@@ -211,7 +211,7 @@ class _Calibration:
         self._require_fit(used, state, scatter)
         return self._summary(used, state, scatter, members)
 
-    def _shape(self, points: np.ndarray) -> Arc | Line | None:
+    def _shape(self, points: np.ndarray) -> ProfileArc | ProfileLine | None:
         return find_arc(points, self.evidence.radius_mm, self.rng) if self.sphere else find_line(points, self.rng)
 
     def _require_enough(self, numbers: np.ndarray | None = None) -> None:
@@ -223,7 +223,7 @@ class _Calibration:
                 "needed. Record more poses, or check artefact, radius and units"
             )
 
-    def _require_fit(self, used: Problem, state: State, scatter: Scatter) -> None:
+    def _require_fit(self, used: Problem, state: MountState, scatter: Scatter) -> None:
         extent = float(np.median([np.linalg.norm(np.ptp(each, axis=0)) for each in self.flat if len(each)]))
         limit = _NO_FIT * (state.artefact[3] if self.sphere else 0.1 * extent)
         if scatter.pose_mm > limit:
@@ -232,7 +232,7 @@ class _Calibration:
                 f"{scatter.pose_mm:.3g} mm (rms)"
             )
 
-    def _found_again(self, whole: Problem, state: State, scatter: Scatter) -> list[np.ndarray]:
+    def _found_again(self, whole: Problem, state: MountState, scatter: Scatter) -> list[np.ndarray]:
         """Masks of the points near the artefact as all poses show it, mm."""
         off = np.abs(whole.distances(state))
         reach = 4 * np.hypot(scatter.point_mm, 2 * scatter.pose_mm)
@@ -246,7 +246,7 @@ class _Calibration:
             found.append(mask)
         return found
 
-    def _summary(self, used: Problem, state: State, scatter: Scatter, members: list[np.ndarray]) -> Mount:
+    def _summary(self, used: Problem, state: MountState, scatter: Scatter, members: list[np.ndarray]) -> Mount:
         information = used.information(state, scatter)
         covariance = _inverse(information.sum(axis=0))
         self._require_determined(used, state, scatter, covariance)
@@ -298,7 +298,7 @@ class _Calibration:
             inputs=self.evidence.digests,
         )
 
-    def _require_determined(self, used: Problem, state: State, scatter: Scatter, covariance: np.ndarray) -> None:
+    def _require_determined(self, used: Problem, state: MountState, scatter: Scatter, covariance: np.ndarray) -> None:
         shift = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         turn = float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))
         if shift <= _OPEN_MM and turn <= _OPEN_RAD:
@@ -359,7 +359,7 @@ def _motion(evidence: MountEvidence) -> Motion:
     return motion
 
 
-def _refined(problem: Problem, state: State, scatter: Scatter) -> tuple[State, Scatter]:
+def _refined(problem: Problem, state: MountState, scatter: Scatter) -> tuple[MountState, Scatter]:
     """Solution and scatter by turns, until the scatter stays."""
     for _ in range(_ROUNDS):
         state = problem.solved(state, scatter)
@@ -377,7 +377,7 @@ def _inverse(information: np.ndarray) -> np.ndarray:
 
 
 def _each_left_out(
-    problem: Problem, state: State, scatter: Scatter, information: np.ndarray
+    problem: Problem, state: MountState, scatter: Scatter, information: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """For every pose the step of the parameters without it (a Gauss-Newton step), and their covariance then."""
     derivatives, errors = problem.derivatives(state), problem.errors(state)
@@ -393,13 +393,13 @@ def _each_left_out(
     return steps
 
 
-def _held_out(problem: Problem, state: State, scatter: Scatter, information: np.ndarray) -> np.ndarray:
+def _held_out(problem: Problem, state: MountState, scatter: Scatter, information: np.ndarray) -> np.ndarray:
     """Root mean square distance (P,) of each pose's points from the artefact by the mount of all other poses."""
     left_out = _each_left_out(problem, state, scatter, information)
     return np.array([misfits(problem, problem.stepped(state, step))[n] for n, (step, _) in enumerate(left_out)])
 
 
-def _left_out_excess(problem: Problem, state: State, scatter: Scatter) -> np.ndarray:
+def _left_out_excess(problem: Problem, state: MountState, scatter: Scatter) -> np.ndarray:
     """How far each pose lies from what the others predict (P,), chi-square with as many degrees as its profile says."""
     derivatives, errors = problem.derivatives(state), problem.errors(state)
     split = np.cumsum(problem.counts)[:-1]
@@ -427,7 +427,7 @@ def axis_words(direction: np.ndarray) -> str:
     return f"the platform's direction ({', '.join(f'{each:.2f}' for each in direction)})"
 
 
-def _coverage_factor(problem: Problem, state: State, scatter: Scatter, covariance: np.ndarray) -> float:
+def _coverage_factor(problem: Problem, state: MountState, scatter: Scatter, covariance: np.ndarray) -> float:
     """Student's factor for 95 %, with degrees of freedom by Welch and Satterthwaite (GUM, G.4).
 
     The share of the variances that the points' noise makes is known from very many points, the rest from the poses.
@@ -439,7 +439,7 @@ def _coverage_factor(problem: Problem, state: State, scatter: Scatter, covarianc
     return float(t.ppf(0.975, 1 / (share**2 / of_points + (1 - share) ** 2 / of_poses)))
 
 
-def _weaknesses(problem: Problem, state: State, covariance: np.ndarray) -> list[str]:
+def _weaknesses(problem: Problem, state: MountState, covariance: np.ndarray) -> list[str]:
     """Directions that are known badly, and motions that are missing, in words."""
     lines = []
     variances, axes = np.linalg.eigh(covariance[:3, :3])

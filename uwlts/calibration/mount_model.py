@@ -17,7 +17,7 @@ _SMALLEST_SHARE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class MountState:
     """Values of all unknowns: mount, artefact (centre and radius, or normal and distance (4,)), scale and offset."""
 
     rotation: np.ndarray
@@ -40,8 +40,9 @@ class Scatter:
 class Problem:
     """Points (n, 3) of every pose in the sensor's frame, mm, and which unknowns there are.
 
-    The parameters are steps from a `State`: translation (3), rotation about the platform's axes (3), centre (3) and, if
-    it is unknown, radius of a sphere, or two turns of the normal and the distance of a plane, then scale and offset.
+    The parameters are steps from a `MountState`: translation (3), rotation about the platform's axes (3), centre (3)
+    and, if it is unknown, radius of a sphere, or two turns of the normal and the distance of a plane, then scale and
+    offset.
     """
 
     points: Sequence[np.ndarray]
@@ -88,7 +89,7 @@ class Problem:
         chosen = [each[np.unique(np.linspace(0, len(each) - 1, most).astype(int))] for each in self.points]
         return replace(self, points=chosen)
 
-    def stepped(self, state: State, step: np.ndarray) -> State:
+    def stepped(self, state: MountState, step: np.ndarray) -> MountState:
         """The state after a step of the parameters."""
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ state.rotation
         if self.sphere:
@@ -97,7 +98,7 @@ class Problem:
         else:
             normal = state.artefact[:3] + step[6:8] @ _across(state.artefact[:3])
             artefact, used = np.append(normal / np.linalg.norm(normal), state.artefact[3] + step[8]), 9
-        return State(
+        return MountState(
             turned,
             state.translation + step[:3],
             artefact,
@@ -105,7 +106,7 @@ class Problem:
             state.offset_s + (step[used + self.scale] if self.time else 0.0),
         )
 
-    def distances(self, state: State, step: np.ndarray | None = None) -> np.ndarray:
+    def distances(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
         """Signed distances (N,) of all points from the artefact, mm, after a step from a state."""
         state = state if step is None else self.stepped(state, step)
         base = self._base(state)
@@ -113,12 +114,12 @@ class Problem:
             return np.linalg.norm(base - state.artefact[:3], axis=1) - state.artefact[3]
         return base @ state.artefact[:3] - state.artefact[3]
 
-    def _base(self, state: State) -> np.ndarray:
+    def _base(self, state: MountState) -> np.ndarray:
         rotations, positions = self.motion(state.offset_s)
         platform = self._all @ state.rotation.T + state.translation
         return np.einsum("nij,nj->ni", rotations[self.poses], platform) + state.scale * positions[self.poses]
 
-    def errors(self, state: State) -> np.ndarray:
+    def errors(self, state: MountState) -> np.ndarray:
         """Derivatives (N, K) of the distances by the error of their pose.
 
         A pose errs by a shift in three directions of the base. Beside a plane it errs by a shift along the normal, and
@@ -130,7 +131,7 @@ class Problem:
             return away / np.linalg.norm(away, axis=1, keepdims=True)
         return np.column_stack([np.ones(len(base)), self._along(base)])
 
-    def derivatives(self, state: State) -> np.ndarray:
+    def derivatives(self, state: MountState) -> np.ndarray:
         """Derivatives (N, size) of the distances at a state by the parameters."""
         rotations, positions = self.motion(state.offset_s)
         turned, base = self._all @ state.rotation.T, self._base(state)
@@ -181,7 +182,7 @@ class Problem:
 
         return whitened
 
-    def solved(self, state: State, scatter: Scatter, *, loss: str = "linear") -> State:
+    def solved(self, state: MountState, scatter: Scatter, *, loss: str = "linear") -> MountState:
         """The state of least weighted squares of the distances."""
         whitened = self.whitening(self.errors(state), scatter)
 
@@ -200,13 +201,13 @@ class Problem:
         )
         return self.stepped(state, found.x)
 
-    def information(self, state: State, scatter: Scatter) -> np.ndarray:
+    def information(self, state: MountState, scatter: Scatter) -> np.ndarray:
         """Information (P, size, size) that the profile of each pose holds on the parameters."""
         derivatives, errors = self.derivatives(state), self.errors(state)
         weighted = np.split(self.whitening(errors, scatter)(derivatives), np.cumsum(self.counts)[:-1])
         return np.array([each.T @ each for each in weighted])
 
-    def scatter_at(self, state: State, start: Scatter) -> Scatter:
+    def scatter_at(self, state: MountState, start: Scatter) -> Scatter:
         """Scatter of points and poses by restricted maximum likelihood at a solution.
 
         Patterson and Thompson 1971: minus twice the likelihood of what is left of the distances after the parameters.

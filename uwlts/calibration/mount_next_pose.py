@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount_model import Problem, Scatter, State, cross_matrix
+from uwlts.calibration.mount_model import MountState, Problem, Scatter, cross_matrix
 from uwlts.model.mount import NextPose
 
 _TURN_RAD = np.radians(30)
@@ -15,7 +15,9 @@ _UNKNOWN_MM, _UNKNOWN_RAD = 100.0, 0.5
 """Standard uncertainty of a mount of which nothing is known, so that open directions can be compared."""
 
 
-def next_pose(problem: Problem, state: State, scatter: Scatter, sheet: np.ndarray, names: list[str]) -> NextPose | None:
+def next_pose(
+    problem: Problem, state: MountState, scatter: Scatter, sheet: np.ndarray, names: list[str]
+) -> NextPose | None:
     """The best of turns by 30 deg about each axis of the platform, with the artefact at several places of the profile.
 
     None where the plane would be too steep in all of them. Judged by the standard uncertainty of a point in the middle
@@ -82,7 +84,7 @@ def _one_pose(problem: Problem, points: np.ndarray, rotation: np.ndarray, positi
     )
 
 
-def _views(problem: Problem, state: State, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
+def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
     """Points (n, 3) of the artefact in the sensor's frame, its place (3,) there, and that in words, for each view."""
     flat = [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in problem.points]
     low, high = np.quantile(np.vstack(flat), (0.1, 0.9), axis=0)

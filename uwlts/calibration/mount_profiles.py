@@ -19,7 +19,7 @@ _LARGEST_ROUNDS = 20
 
 
 @dataclass(frozen=True, eq=False)
-class Arc:
+class ProfileArc:
     """Points of a profile on a circle: their mask (N,), its centre (2,) and radius, mm, and the points' scatter, mm."""
 
     members: np.ndarray
@@ -29,7 +29,7 @@ class Arc:
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class ProfileLine:
     """Points of a profile on a line: their mask (N,), their middle (2,), the line's direction (2,) and the scatter."""
 
     members: np.ndarray
@@ -46,7 +46,7 @@ def noise_of(points: np.ndarray) -> float:
     return MAD_TO_STD * float(np.median(np.abs(second - np.median(second)))) / 6**0.5
 
 
-def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generator) -> Arc | None:
+def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generator) -> ProfileArc | None:
     """The best supported arc of a sphere's section in a profile (N, 2), mm, in the order along it, or None.
 
     Circles through three points in their order along the profile are judged by the number of points near them (RANSAC);
@@ -84,7 +84,7 @@ def _circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return triples[:, 0] + away, np.linalg.norm(away, axis=1)
 
 
-def _refined_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> Arc | None:
+def _refined_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> ProfileArc | None:
     centre, radius, std = np.zeros(2), 0.0, 0.0
     for _ in range(_LARGEST_ROUNDS):
         if np.count_nonzero(members) < LEAST_POINTS:
@@ -97,7 +97,7 @@ def _refined_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> A
             break
     if np.count_nonzero(members) < LEAST_POINTS or _arc_angle(points[members] - centre) < _LEAST_ARC:
         return None
-    return Arc(members, centre, radius, std)
+    return ProfileArc(members, centre, radius, std)
 
 
 def _fitted_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -121,7 +121,7 @@ def _arc_angle(away: np.ndarray) -> float:
     return float(2 * np.pi - gaps.max())
 
 
-def find_line(points: np.ndarray, rng: np.random.Generator) -> Line | None:
+def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | None:
     """The best supported straight line in a profile (N, 2), mm, in the order along it, or None."""
     if len(points) < LEAST_POINTS:
         return None
@@ -144,4 +144,4 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> Line | None:
         before, members = members, np.abs(off) < min(max(_REJECTED_BEYOND * std, 1e-4), 2 * tolerance)
         if np.array_equal(before, members):
             break
-    return Line(members, middle, direction, std)
+    return ProfileLine(members, middle, direction, std)

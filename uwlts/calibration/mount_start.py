@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount_model import Problem, Scatter, State
-from uwlts.calibration.mount_profiles import Arc, Line
+from uwlts.calibration.mount_model import MountState, Problem, Scatter
+from uwlts.calibration.mount_profiles import ProfileArc, ProfileLine
 
 _SUBSETS, _SUBSET = 40, 8
 """Random choices of poses: with a fifth of the poses wrong one of six choices of eight has none of these."""
@@ -18,9 +18,11 @@ _ROUGH = Scatter(point_mm=0.1, pose_mm=0.3, turn_rad=3e-3)
 """Scatter for the weights of the search, whose robust loss begins beyond it."""
 
 
-def start_of_sphere(problem: Problem, arcs: list[Arc], sheet: np.ndarray, rng: np.random.Generator) -> State:
-    """State near the solution from the arcs found in the profiles; ``sheet`` (4, 4) maps (x, y, z) of the sheet's frame
-    to the sensor's.
+def start_of_sphere(
+    problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, rng: np.random.Generator
+) -> MountState:
+    """State near the solution from the arcs found in the profiles; ``sheet`` (4, 4) maps the sheet's frame to the
+    sensor's.
 
     Without its part across the sheet, y = +-sqrt(R2 - r2), the centre of a circle of radius r in the profile is the
     sphere's centre in the sensor's frame, and R s + t = A^T (c - a) is linear in R's columns, t and c for poses (A, a).
@@ -32,7 +34,7 @@ def start_of_sphere(problem: Problem, arcs: list[Arc], sheet: np.ndarray, rng: n
     subsets = [everything]
     if len(arcs) > _SUBSET:
         subsets += [rng.choice(everything, _SUBSET, replace=False) for _ in range(_SUBSETS)]
-    found: list[tuple[float, State]] = []
+    found: list[tuple[float, MountState]] = []
     largest = float(np.quantile(radii, 0.9))
     for radius in [problem.radius_mm] if problem.radius_mm else [share * largest for share in _RADII]:
         depth = np.sqrt(np.maximum(radius**2 - radii**2, 0))
@@ -51,7 +53,7 @@ def _linear_solutions(
     depth: np.ndarray,
     subset: np.ndarray,
     radius: float,
-) -> list[State]:
+) -> list[MountState]:
     back, shift = np.swapaxes(rotations, 1, 2)[subset], _turned_back(rotations, -positions)[subset]
     states, one = [], np.broadcast_to(np.eye(3), back.shape)
     for side in (0.0, 1.0, -1.0):
@@ -74,7 +76,7 @@ def _linear_solutions(
             translation, centre = both[:3], both[3:]
             if side == 0.0:
                 sides = np.sign((_turned_back(rotations, centre - positions)[subset] - translation) @ across)
-        states.append(State(rotation, translation, np.append(centre, radius)))
+        states.append(MountState(rotation, translation, np.append(centre, radius)))
     return states
 
 
@@ -84,7 +86,7 @@ def _turned_back(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 
 
 def _misfit(
-    rotations: np.ndarray, positions: np.ndarray, centres: np.ndarray, depth: np.ndarray, state: State
+    rotations: np.ndarray, positions: np.ndarray, centres: np.ndarray, depth: np.ndarray, state: MountState
 ) -> float:
     """Median over the poses of the distance between the centre of the sphere and where the profile says it is."""
     seen = (_turned_back(rotations, state.artefact[:3] - positions) - state.translation) @ state.rotation
@@ -92,13 +94,15 @@ def _misfit(
     return float(np.median(np.hypot(off, np.abs(seen[:, 1]) - depth)))
 
 
-def _in_sensor_frame(state: State, sheet: np.ndarray) -> State:
+def _in_sensor_frame(state: MountState, sheet: np.ndarray) -> MountState:
     """The state of a sheet's frame as one of the sensor's."""
     rotation = state.rotation @ sheet[:3, :3].T
-    return State(rotation, state.translation - rotation @ sheet[:3, 3], state.artefact)
+    return MountState(rotation, state.translation - rotation @ sheet[:3, 3], state.artefact)
 
 
-def start_of_plane(problem: Problem, lines: list[Line], sheet: np.ndarray, rng: np.random.Generator) -> State:
+def start_of_plane(
+    problem: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
+) -> MountState:
     """State near the solution from the lines found in the profiles; ``sheet`` as in `start_of_sphere`.
 
     The lines' directions in the base are square to the plane's normal whatever the translation: of many rotations the
@@ -119,7 +123,7 @@ def start_of_plane(problem: Problem, lines: list[Line], sheet: np.ndarray, rng: 
             places = np.einsum("pij,jk,pk->pi", rotations, turn, middles) + positions
             design = np.column_stack([np.einsum("pji,j->pi", rotations, normal), -np.ones(len(lines))])
             solution = np.linalg.lstsq(design, -places @ normal, rcond=1e-10)[0]
-            states.append(State(turn, solution[:3], np.append(normal, solution[3])))
+            states.append(MountState(turn, solution[:3], np.append(normal, solution[3])))
     return _best(problem.thinned(_THINNED), [_in_sensor_frame(state, sheet) for state in states])
 
 
@@ -128,14 +132,14 @@ def _in_space(flat: np.ndarray) -> np.ndarray:
     return np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
 
 
-def _best(rough: Problem, states: list[State]) -> State:
+def _best(rough: Problem, states: list[MountState]) -> MountState:
     """The state of smallest median distance after a robust refinement from each, scale and time left as they are."""
     fixed = Problem(rough.points, rough.motion, rough.sphere, rough.radius_mm)
     refined = [fixed.solved(state, _ROUGH, loss="cauchy") for state in states]
     return min(refined, key=lambda state: float(np.median(misfits(fixed, state))))
 
 
-def misfits(problem: Problem, state: State) -> np.ndarray:
+def misfits(problem: Problem, state: MountState) -> np.ndarray:
     """Root mean square distance (P,) of the points of each pose."""
     squares = problem.distances(state) ** 2
     return np.sqrt(np.bincount(problem.poses, squares) / problem.counts)
