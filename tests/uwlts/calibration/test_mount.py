@@ -127,7 +127,7 @@ def test_usual_mistakes_are_named(rng, radius, says):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("robot_mm", "campaigns"), [(0.0, 60), (0.05, 60)])
+@pytest.mark.parametrize(("robot_mm", "campaigns"), [(0.0, 20), (0.05, 40)])
 def test_intervals_hold_as_often_as_stated(robot_mm, campaigns):
     """At least 92 % of the six values of a campaign lie within their 95 % intervals.
 
