@@ -41,7 +41,12 @@ PAIRS: dict[str, tuple[str, set[str], set[str]]] = {
     "uwlts info": ("uwlts.describe", set(), set()),
     "uwlts import": ("uwlts.import_images", set(), set()),
     "uwlts export": ("uwlts.export", set(), set()),
-    "uwlts reconstruct": ("uwlts.reconstruct", WRITES | METHOD | {"peak"}, {"stripe", "with_uncertainty"}),
+    # The trajectory is read by read_trajectory.
+    "uwlts reconstruct": (
+        "uwlts.reconstruct",
+        WRITES | METHOD | {"peak", "pose_format", "pose_unit"},
+        {"stripe", "with_uncertainty"},
+    ),
     "uwlts evaluate": ("uwlts.evaluate", WRITES | {"coloured"}, {"source"}),
     "uwlts report": ("uwlts.write_report", set(), set()),
     "uwlts thesis": ("uwlts.evaluate_thesis", set(), set()),

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from uwlts.model.mount import Mount
     from uwlts.model.polynomial_calibration import PolynomialCalibration
     from uwlts.model.sensor import Sensor
+    from uwlts.model.trajectory import Trajectory
     from uwlts.optics.nominal import nominal
     from uwlts.report import plot
     from uwlts.report.camera_page import write_camera_page
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from uwlts.storage.export_ import export
     from uwlts.storage.import_ import Imported, import_images
     from uwlts.storage.mount_files import read_mount, write_mount
+    from uwlts.storage.pose_files import read_trajectory
     from uwlts.storage.truth import Truth, read_truth
     from uwlts.stripe import StripeOptions
     from uwlts.thesis.report import ThesisReport, evaluate_thesis
@@ -69,6 +71,7 @@ __all__ = [
     "Sensor",
     "StripeOptions",
     "ThesisReport",
+    "Trajectory",
     "Truth",
     "Verification",
     "calibrate",
@@ -91,6 +94,7 @@ __all__ = [
     "plot",
     "read_cloud",
     "read_mount",
+    "read_trajectory",
     "read_truth",
     "reconstruct",
     "record_guided",
@@ -131,6 +135,7 @@ _MODULES = {
     "Sensor": "uwlts.model.sensor",
     "StripeOptions": "uwlts.stripe",
     "ThesisReport": "uwlts.thesis.report",
+    "Trajectory": "uwlts.model.trajectory",
     "Truth": "uwlts.storage.truth",
     "Verification": "uwlts.measurement.verification",
     "calibrate": "uwlts.calibration.calibrate",
@@ -153,6 +158,7 @@ _MODULES = {
     "plot": "uwlts.report.plot",
     "read_cloud": "uwlts.storage.cloud",
     "read_mount": "uwlts.storage.mount_files",
+    "read_trajectory": "uwlts.storage.pose_files",
     "read_truth": "uwlts.storage.truth",
     "reconstruct": "uwlts.measurement.reconstruction",
     "record_guided": "uwlts.desk.guided",

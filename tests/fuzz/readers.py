@@ -44,7 +44,8 @@ from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import read_intrinsics, with_intrinsics
 from uwlts.storage.import_.description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows
-from uwlts.storage.mount_files import read_mount, read_poses, read_profiles, write_mount
+from uwlts.storage.mount_files import read_mount, read_profiles, write_mount
+from uwlts.storage.pose_files import read_trajectory
 from uwlts.storage.truth import read_truth, write_truth
 from uwlts.thesis.results import CampaignResults, LineProfile, Measurement, SpacingInterval, WindowChoice, WindowProfile
 from uwlts.thesis.tables import load_published
@@ -198,8 +199,8 @@ def _mount(path: Path) -> None:
     write_mount(path, calibrate_mount(campaign.profiles, campaign.poses, radius_mm=20.0))
 
 
-def _poses(path: Path) -> None:
-    path.write_text("x,y,z,qx,qy,qz,qw\n1,2,3,0,0,0,1\n1.5,2,3,0.6,0,0,0.8\n")
+def _trajectory(path: Path) -> None:
+    path.write_text("time_s,x,y,z,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n0.5,1.5,2,3,0.6,0,0,0.8\n")
 
 
 def _profiles(path: Path) -> None:
@@ -307,7 +308,13 @@ READERS = {
         Reader("import", ".toml", "toml", _import_description, _read_import),
         Reader("table", ".csv", "lines", _table, read_rows),
         Reader("mount", ".json", "json", _mount, read_mount),
-        Reader("poses", ".csv", "lines", _poses, lambda path: read_poses(path, pose_format="quaternion-xyzw")),
+        Reader(
+            "trajectory",
+            ".csv",
+            "lines",
+            _trajectory,
+            lambda path: read_trajectory(path, pose_format="quaternion-xyzw"),
+        ),
         Reader("profiles", ".csv", "lines", _profiles, read_profiles),
         Reader("intrinsics-ros", ".yaml", "lines", _ros, _sensor_with),
         Reader("intrinsics-opencv", ".yml", "lines", _opencv, _sensor_with),

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, t
 
 from uwlts.calibration.mount_model import Motion, MountState, Problem, Scatter
@@ -15,7 +15,9 @@ from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLi
 from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere
 from uwlts.model.errors import CalibrationError
 from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound
-from uwlts.storage.mount_files import MountEvidence, PoseFormat, Unit, read_mount_evidence
+from uwlts.model.trajectory import Trajectory
+from uwlts.storage.mount_files import MountEvidence, read_mount_evidence
+from uwlts.storage.pose_files import PoseFormat, Unit
 
 _FEWEST_POSES = {"sphere": 5, "plane": 8}
 """Poses whose profiles have more numbers (three each, or two) than there are unknowns (nine or ten), with some over."""
@@ -69,14 +71,14 @@ def calibrate_mount(
     artefact, radius_mm
         What is seen; the radius of the sphere where it is known.
     pose_format, profile_unit, pose_unit
-        How files are to be read; see `uwlts.storage.mount_files.read_poses`.
+        How files are to be read; see `uwlts.storage.pose_files.read_poses`.
     scale
         Estimate by which factor the robot's lengths are too short.
     time
         Estimate the offset to add to the times of the profiles; both have times then.
     profile_times_s, pose_times_s
-        Times (P,) of the profiles and (M,) of the poses, which are then a trajectory of any number M of poses:
-        positions are interpolated linearly and rotations along great circles.
+        Times (P,) of the profiles and (M,) of the poses, which are then a trajectory of any number M of poses
+        (`uwlts.Trajectory`).
 
     Raises
     ------
@@ -349,12 +351,12 @@ def _motion(evidence: MountEvidence) -> Motion:
     rotations, positions = evidence.poses[:, :3, :3], evidence.poses[:, :3, 3]
     if evidence.pose_times_s is None or evidence.profile_times_s is None:
         return lambda offset: (rotations, positions)
-    times, wanted = evidence.pose_times_s, evidence.profile_times_s
-    slerp = Slerp(times, Rotation.from_matrix(rotations))
+    trajectory, wanted = Trajectory(evidence.pose_times_s, evidence.poses), evidence.profile_times_s
+    first, last = trajectory.times_s[[0, -1]]
 
     def motion(offset: float) -> tuple[np.ndarray, np.ndarray]:
-        at = np.clip(wanted + offset, times[0], times[-1])
-        return slerp(at).as_matrix(), np.column_stack([np.interp(at, times, each) for each in positions.T])
+        poses = trajectory.poses_at(np.clip(wanted + offset, first, last))
+        return poses[:, :3, :3], poses[:, :3, 3]
 
     return motion
 

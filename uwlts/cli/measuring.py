@@ -142,6 +142,11 @@ def reconstruct(
     *,
     calibration: Path,
     out: Path,
+    mount: Path | None = None,
+    trajectory: Path | None = None,
+    pose_format: str = "matrix",
+    pose_unit: Literal["mm", "m"] = "mm",
+    clock_offset_s: float | None = None,
     index: Index = None,
     method: Method = None,
     stripe: Stripe = (),
@@ -157,13 +162,31 @@ def reconstruct(
         calibration: Calibration of the sensor, or one by polynomials.
         out: Cloud to write, PLY or by its ending HDF5 (.h5), with intensity, frame and line of every point, and from a
             joint calibration its uncertainty.
+        mount: Where the sensor is on its platform (uwlts mount). Poses are the platform's then, and points are given in
+            the frame of the poses.
+        trajectory: CSV file with times and poses of the platform (of the sensor without a mount), which replace poses
+            in the capture and the stage.
+        pose_format: Format of the trajectory: tum, matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg,
+            euler-ZYX-deg (about the moved axes), euler-zyx-deg (about the fixed axes) or another order, -rad.
+        pose_unit: Unit of the trajectory's positions.
+        clock_offset_s: What to add to the times of the images for those of the trajectory; as the mount says unless
+            given.
         peak: Which of several stripes on a line counts; the strongest, or as the sensor's table [stripe] says.
     """
     refuse_unsuitable(out, overwrite=overwrite)
     known = uwlts.load_calibration(calibration)
+    path = None if trajectory is None else uwlts.read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
     with uwlts.open_capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
-        settings = stripe_settings(stripe, method, peak)
-        cloud = uwlts.reconstruct(opened, known, stripe=settings, index=index, progress=progress)
+        cloud = uwlts.reconstruct(
+            opened,
+            known,
+            mount=mount,
+            trajectory=path,
+            clock_offset_s=clock_offset_s,
+            stripe=stripe_settings(stripe, method, peak),
+            index=index,
+            progress=progress,
+        )
         lit = int(opened.laser_on.sum())
     uwlts.write_cloud(out, cloud, overwrite=overwrite)
     warn(*cloud.warnings)

@@ -116,7 +116,9 @@ def point_uncertainty(
     along = np.array(header.stage_direction)
     position = np.where(posed[frame, :, 0], 0.0, header.sensor.uncertainty.stage_position_mm * along)
     return PointUncertainty(
-        np.vstack(random).astype(np.float32), position.astype(np.float32), _patterns(np.concatenate(moved, axis=1))
+        np.vstack(random).astype(np.float32),
+        position.astype(np.float32),
+        independent_patterns(np.concatenate(moved, axis=1)),
     )
 
 
@@ -151,7 +153,7 @@ def _derivatives(
     return derivatives
 
 
-def _patterns(moved: np.ndarray) -> np.ndarray:
+def independent_patterns(moved: np.ndarray) -> np.ndarray:
     """Patterns (M, N, 3), orthogonal over the points, from any (R, N, 3) that together have their covariance."""
     flat = moved.reshape(len(moved), -1)
     values, vectors = np.linalg.eigh(flat @ flat.T)

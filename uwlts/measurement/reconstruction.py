@@ -1,22 +1,26 @@
 """Reconstruction of captures: point clouds from the stripes of all laser images by a calibration of any kind."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from uwlts.measurement.moving import carried, platform_poses, with_mount
 from uwlts.measurement.point_uncertainty import point_uncertainty
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest, check_fits
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
+from uwlts.model.mount import Mount
 from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.model.trajectory import Trajectory
 from uwlts.optics.brightness import beside_sheet, sharp_lines, slopes_of_brightness
 from uwlts.optics.reconstruction import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, FrameTable, opened_capture
 from uwlts.storage.cloud import PointCloud
+from uwlts.storage.mount_files import read_mount
 from uwlts.stripe import FoundStripes, StripeSettings, find_stripes
 
 
@@ -46,6 +50,9 @@ def reconstruct(
     capture: Capture | str | Path,
     calibration: AnyCalibration | str | Path,
     *,
+    mount: Mount | str | Path | None = None,
+    trajectory: Trajectory | None = None,
+    clock_offset_s: float | None = None,
     stripe: StripeSettings = None,
     index: float | None = None,
     with_uncertainty: bool | None = None,
@@ -57,6 +64,12 @@ def reconstruct(
     ----------
     capture : Capture or path
     calibration : Calibration, PolynomialCalibration or path
+    mount : Mount or path, optional
+        Where the sensor is on its platform. The poses of the capture's images are then the platform's.
+    trajectory : Trajectory, optional
+        Path of the platform (of the sensor without a mount), in place of poses in the capture and of the stage.
+    clock_offset_s : float, optional
+        What to add to the times of the images for those of the trajectory; by default as the mount says, or nothing.
     stripe : StripeOptions or dict, optional
         How stripes are found: all options, or settings in place of those in the sensor's table [stripe].
     index : float, optional
@@ -69,19 +82,32 @@ def reconstruct(
     Returns
     -------
     ScanCloud
-        ``points_mm`` (N, 3) in the object coordinate system, ``covariance_mm2`` (N, 3, 3) or None.
+        ``points_mm`` (N, 3) in the object coordinate system, or in the frame in which poses or trajectory are given;
+        ``covariance_mm2`` (N, 3, 3) or None, to which a mount adds its own. Errors of poses are not part of it.
 
     Raises
     ------
     CaptureError, CalibrationError, RangeError
-        As `find_stripes` and `reconstruct_stripes`; or a file cannot be read.
+        As `find_stripes` and `reconstruct_stripes`; a file cannot be read; or images have no pose where one is needed.
+    DescriptionError
+        Images were taken before or after the trajectory.
     """
     calibration = loaded_calibration(calibration)
     with opened_capture(capture) as scan:
         check_fits(scan.header, calibration, source=scan.path.name)
-        stripes = find_stripes(scan, options=stripe, progress=progress)
         known = calibration.joint is not None if with_uncertainty is None else with_uncertainty
-        return reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known)
+        if mount is None and trajectory is None and clock_offset_s is None:
+            stripes = find_stripes(scan, options=stripe, progress=progress)
+            return reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known)
+        mount = read_mount(mount) if isinstance(mount, str | Path) else mount
+        poses = platform_poses(scan, trajectory, mount=mount, clock_offset_s=clock_offset_s)
+        stripes = find_stripes(scan, options=stripe, progress=progress)
+        table = carried(scan, poses, mount)
+        cloud = reconstruct_stripes(table, stripes, calibration, index=index, with_uncertainty=known)
+        if cloud.uncertainty is None or mount is None:
+            return cloud
+        own = with_mount(cloud.uncertainty, cloud.points_mm, poses[cloud.frame], mount)
+        return replace(cloud, uncertainty=own)
 
 
 def reconstruct_stripes(

@@ -12,7 +12,8 @@ from tests.uwlts.mount_views import MOUNT, RADIUS_MM, SPHERE_MM, Campaign, error
 from uwlts.cli import main
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount, PlaneFound, SphereFound
-from uwlts.storage.mount_files import read_mount, read_poses, read_profiles
+from uwlts.storage.mount_files import read_mount, read_profiles
+from uwlts.storage.pose_files import read_poses
 
 
 def mount_of(campaign: Campaign, **options) -> Mount:

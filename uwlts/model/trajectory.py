@@ -1,0 +1,76 @@
+"""The path of a platform: its poses at known times, and between them."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from uwlts.model.calibration import is_rigid
+from uwlts.model.errors import DescriptionError
+
+_ROUNDED = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses of a platform at growing times.
+
+    Between them positions follow a cubic spline and rotations one with continuous angular acceleration (SciPy's
+    `CubicSpline` and `RotationSpline`), so that velocity and rate of turn are continuous.
+
+    Attributes
+    ----------
+    times_s : (N,) float64
+    poses : (N, 4, 4) float64
+        ``T_base_platform``, mm.
+
+    Raises
+    ------
+    DescriptionError
+        Fewer than two poses, times that are not finite or do not grow, or matrices that are not rigid.
+    """
+
+    times_s: np.ndarray
+    poses: np.ndarray
+
+    def __post_init__(self) -> None:
+        times, poses = np.array(self.times_s, dtype=np.float64), np.array(self.poses, dtype=np.float64)
+        if times.ndim != 1 or poses.shape != (len(times), 4, 4) or len(times) < 2:
+            raise DescriptionError(
+                f"a trajectory has times (N,) and poses (N, 4, 4) for two or more times; found {times.shape} and "
+                f"{poses.shape}"
+            )
+        if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
+            wrong = int(np.argmin(np.append(np.inf, np.diff(times)) > 0))
+            raise DescriptionError(
+                f"the times of a trajectory must be finite and grow: pose {wrong + 1} is at {times[wrong]:g} s"
+            )
+        if not is_rigid(poses, within=_ROUNDED):
+            raise DescriptionError("the poses of a trajectory must be rotations with a shift (0 0 0 1 as last row)")
+        for name, values in (("times_s", times), ("poses", poses)):
+            values.flags.writeable = False
+            object.__setattr__(self, name, values)
+
+    @cached_property
+    def _positions(self) -> CubicSpline:
+        return CubicSpline(self.times_s, self.poses[:, :3, 3])
+
+    @cached_property
+    def _rotations(self) -> RotationSpline:
+        return RotationSpline(self.times_s, Rotation.from_matrix(self.poses[:, :3, :3]))
+
+    def poses_at(self, times_s: np.ndarray) -> np.ndarray:
+        """``T_base_platform`` (M, 4, 4) at times (M,), mm; DescriptionError for times before or after the path."""
+        wanted = np.asarray(times_s, dtype=np.float64)
+        first, last = self.times_s[[0, -1]]
+        if outside := int(np.count_nonzero(~((wanted >= first) & (wanted <= last)))):
+            raise DescriptionError(
+                f"{outside} of {wanted.size} times, {wanted.min():.3f} to {wanted.max():.3f} s, lie outside the "
+                f"trajectory, which lasts from {first:.3f} to {last:.3f} s: is the offset of the clocks right?"
+            )
+        poses = np.tile(np.eye(4), (len(wanted), 1, 1))
+        poses[:, :3, :3] = self._rotations(wanted).as_matrix()
+        poses[:, :3, 3] = self._positions(wanted)
+        return poses

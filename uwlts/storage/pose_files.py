@@ -1,0 +1,209 @@
+"""Files of poses of any platform: tables of numbers, matrices, quaternions, rotation vectors and Euler angles."""
+
+import re
+from io import BytesIO
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import pyarrow as pa
+from pyarrow import csv
+from scipy.spatial.transform import Rotation
+
+from uwlts.model.calibration import is_rigid
+from uwlts.model.errors import DescriptionError
+from uwlts.model.input_file import read_bytes
+from uwlts.model.trajectory import Trajectory
+from uwlts.storage.files import sha256_of
+
+Unit = Literal["mm", "m"]
+PoseFormat = str
+"""matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, or euler-ORDER-deg, euler-ORDER-rad."""
+MM_PER_UNIT: dict[Unit, float] = {"mm": 1.0, "m": 1000.0}
+FARTHEST_MM = 1e7
+"""Ten kilometres: no platform reaches farther, and squares of larger numbers would lose the noise."""
+
+_MOST_BYTES = 512 * 2**20
+_ROUNDED = 2e-3
+"""Departure from a rigid matrix or a unit quaternion by three printed decimals."""
+_EULER = re.compile(r"euler-([xyz]{3}|[XYZ]{3})-(deg|rad)")
+_FORMATS = "matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-zyx-deg (fixed axes), euler-ZYX-deg"
+_MOST_POSES = 20_000
+
+
+def checked_unit(unit: Unit) -> Unit:
+    if unit not in get_args(Unit):
+        raise DescriptionError(f"the unit is {unit!r}; expected mm or m")
+    return unit
+
+
+_COLUMN_NAMES = re.compile(r"(?:_| *[\[(])(?:mm|m)[\])]?$")
+
+
+def read_columns(path: Path, digests: dict[str, str], *, named: bool = True) -> dict[str, np.ndarray]:
+    """Columns of a CSV file, with commas, semicolons (then decimal commas), tabs or blanks; without lines of #.
+
+    Names are as in the first line, in lower case and without unit, or x and z, or numbers where the file has no names.
+    """
+    content = read_bytes(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table")
+    digests[path.name] = sha256_of(path)
+    lines = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").split(b"\n")
+    lines = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
+    if not lines:
+        raise DescriptionError(f"{path} is empty: expected a table of numbers")
+    first = lines[0]
+    delimiter = next((mark for mark in (b";", b"\t", b",") if mark in first), b" ")
+    if delimiter == b" ":
+        lines = [b" ".join(line.split()) for line in lines]
+    cells = [cell.strip().strip('"') for cell in lines[0].decode("utf-8", "replace").split(delimiter.decode())]
+    has_names = not any(_is_number(cell) for cell in cells)
+    if has_names:
+        names = [_COLUMN_NAMES.sub("", cell.lower()) if cell.lower() != "time_s" else "time_s" for cell in cells]
+        lines = lines[1:]
+    else:
+        names = ["x", "z"] if named and len(cells) == 2 else [str(number) for number in range(len(cells))]
+    if len(set(names)) < len(names):
+        raise DescriptionError(f"{path} has the columns {', '.join(names)}: expected each name once")
+    try:
+        table = csv.read_csv(
+            BytesIO(b"\n".join(lines) + b"\n"),
+            read_options=csv.ReadOptions(column_names=names, use_threads=False),
+            parse_options=csv.ParseOptions(delimiter=delimiter.decode()),
+            convert_options=csv.ConvertOptions(
+                column_types=dict.fromkeys(names, pa.float64()),
+                null_values=["", "NaN", "nan", "NAN", "-nan", "null", "None"],
+                decimal_point="," if delimiter == b";" and b"," in b"".join(lines[:100]) else ".",
+            ),
+        )
+    except (pa.ArrowInvalid, pa.ArrowException) as error:
+        raise DescriptionError(f"{path} is no table of numbers: {str(error).splitlines()[0]}") from error
+    return {name: table[name].to_numpy(zero_copy_only=False).astype(np.float64) for name in names}
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text.replace(",", ".") or "nan")
+    except ValueError:
+        return False
+    return True
+
+
+def read_poses(path: str | Path, *, pose_format: PoseFormat, unit: Unit = "mm") -> tuple[np.ndarray, np.ndarray | None]:
+    """``T_base_platform`` (P, 4, 4), mm, and their times (P,) or None, from a CSV file with one pose a line.
+
+    Columns ``pose`` and ``time_s``, recognised by name, come in addition. The others are, in this order, 12 or 16
+    elements of the matrix row by row; or the translation, then a quaternion (``quaternion-xyzw``, ``quaternion-wxyz``),
+    a rotation vector (``rotvec-rad``, ``rotvec-deg``) or three Euler angles: ``euler-ZYX-deg`` turns about the moved
+    axes (intrinsic), the first letter first; ``euler-zyx-deg`` about the fixed axes (extrinsic), as SciPy's
+    `Rotation.from_euler`. DescriptionError for a wrong count, numbers that are not finite, matrices that are not rigid,
+    quaternions without unit length and angles that look like degrees where radians are stated.
+    """
+    path = Path(path)
+    rows, times = pose_rows(path, {})
+    return scaled(matrices_of(rows, pose_format, path), unit), times
+
+
+def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit = "mm") -> Trajectory:
+    """The path of a platform from a file as for `read_poses` with a column ``time_s``.
+
+    With the format ``tum`` each line is the time in s, the position in m and the quaternion x y z w, separated by
+    blanks and without names, as the RGB-D benchmark of TU Munich has them. DescriptionError as `read_poses` and
+    `Trajectory`, and where there are no times.
+    """
+    path = Path(path)
+    rows, times = pose_rows(path, {})
+    if pose_format == "tum":
+        if rows.shape[1] != 8:
+            raise DescriptionError(f"{path} has {rows.shape[1]} columns; expected time, x, y, z and a quaternion (tum)")
+        times, rows, pose_format, unit = rows[:, 0], rows[:, 1:], "quaternion-xyzw", "m"
+    if times is None:
+        raise DescriptionError(f"{path} has no column time_s: a trajectory needs the time of each pose")
+    poses = scaled(matrices_of(rows, pose_format, path), unit)
+    try:
+        return Trajectory(times, poses)
+    except DescriptionError as error:
+        raise DescriptionError(f"{path}: {error}") from error
+
+
+def pose_rows(path: Path, digests: dict[str, str]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Numbers (P, K) of the poses in a file, and their times (P,) or None."""
+    columns = read_columns(path, digests, named=False)
+    times = columns.pop("time_s", None)
+    columns.pop("pose", None)
+    rows = np.column_stack(list(columns.values())) if columns else np.empty((0, 0))
+    if len(rows) > _MOST_POSES:
+        raise DescriptionError(f"{path} has {len(rows):,} poses; this program reads up to {_MOST_POSES:,}")
+    wrong = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if len(wrong):
+        raise DescriptionError(f"{path}: pose {wrong[0] + 1} has a number that is missing or not finite")
+    return rows, times
+
+
+def scaled(matrices: np.ndarray, unit: Unit) -> np.ndarray:
+    matrices[:, :3, 3] *= MM_PER_UNIT[checked_unit(unit)]
+    return matrices
+
+
+def matrices_of(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
+    euler = _EULER.fullmatch(pose_format)
+    counts = {
+        "matrix": (12, 16),
+        "quaternion-xyzw": (7,),
+        "quaternion-wxyz": (7,),
+        "rotvec-rad": (6,),
+        "rotvec-deg": (6,),
+    }
+    expected = (6,) if euler else counts.get(pose_format)
+    if expected is None:
+        raise DescriptionError(f"the format of the poses is {pose_format!r}; expected {_FORMATS}, or another order")
+    if rows.shape[1] not in expected:
+        raise DescriptionError(
+            f"{path} has {rows.shape[1]} columns of numbers; a pose as {pose_format} has "
+            f"{' or '.join(map(str, expected))} (columns 'pose' and 'time_s' are recognised by their names)"
+        )
+    result = np.tile(np.eye(4), (len(rows), 1, 1))
+    if pose_format == "matrix":
+        result[:, : rows.shape[1] // 4] = rows.reshape(len(rows), -1, 4)
+        return checked_matrices(result, path)
+    result[:, :3, 3] = rows[:, :3]
+    turns = rows[:, 3:]
+    if pose_format.startswith("quaternion"):
+        lengths = np.linalg.norm(turns, axis=1)
+        wrong = np.flatnonzero(np.abs(lengths - 1) > _ROUNDED)
+        if len(wrong):
+            raise DescriptionError(
+                f"{path}: the quaternion of pose {wrong[0] + 1} has the length {lengths[wrong[0]]:.4g}; expected 1. "
+                "Come x, y, z of the position first, then the quaternion?"
+            )
+        rotations = Rotation.from_quat(turns, scalar_first=pose_format == "quaternion-wxyz")
+    else:
+        if pose_format.endswith("-rad") and np.abs(turns).max() > 2 * np.pi + 0.01:
+            raise DescriptionError(f"{path} has angles up to {np.abs(turns).max():g} rad: are they degrees (-deg)?")
+        angles = np.radians(turns) if pose_format.endswith("-deg") else turns
+        rotations = Rotation.from_euler(euler[1], angles) if euler else Rotation.from_rotvec(angles)
+    result[:, :3, :3] = rotations.as_matrix()
+    return result
+
+
+def checked_matrices(matrices: np.ndarray, source: object) -> np.ndarray:
+    """Rigid matrices (P, 4, 4), their rotations freed from rounding; DescriptionError where they are not."""
+    if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
+        raise DescriptionError(f"{source}: the poses have the shape {matrices.shape}; expected (P, 4, 4)")
+    for number, matrix in enumerate(matrices):
+        if not np.isfinite(matrix).all():
+            raise DescriptionError(f"{source}: pose {number + 1} has a number that is not finite")
+        if np.abs(matrix[:3, 3]).max() > FARTHEST_MM:
+            raise DescriptionError(f"{source}: pose {number + 1} lies beyond {FARTHEST_MM:g} mm: is its unit right?")
+        if not is_rigid(matrix, within=_ROUNDED):
+            hint = ""
+            if is_rigid(matrix.T, within=_ROUNDED):
+                hint = " It is given column by column: expected row by row"
+            elif np.linalg.det(matrix[:3, :3]) < 0:
+                hint = " It mirrors"
+            raise DescriptionError(
+                f"{source}: pose {number + 1} is not a rotation and a shift (with 0 0 0 1 as last row).{hint}"
+            )
+    result = np.array(matrices)
+    left, _, right = np.linalg.svd(matrices[:, :3, :3])
+    result[:, :3, :3], result[:, 3] = left @ right, (0, 0, 0, 1)
+    return result
