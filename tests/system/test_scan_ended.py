@@ -65,6 +65,9 @@ class Bench:
 
         def limit() -> None:
             resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            # As in a terminal, where the tests themselves run by nohup or in a script's background.
+            for number in (signal.SIGHUP, signal.SIGINT, signal.SIGQUIT):
+                signal.signal(number, signal.SIG_DFL)
             if largest_file is not None:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
 

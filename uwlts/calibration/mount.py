@@ -166,6 +166,7 @@ class _Calibration:
         whole = Problem(
             self.profiles,
             _motion(self.evidence),
+            self.sheet[:3, 1],
             self.sphere,
             self.evidence.radius_mm,
             self.evidence.scale,
@@ -382,10 +383,9 @@ def _each_left_out(
     problem: Problem, state: MountState, scatter: Scatter, information: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """For every pose the step of the parameters without it (a Gauss-Newton step), and their covariance then."""
-    derivatives, errors = problem.derivatives(state), problem.errors(state)
-    whitened = problem.whitening(errors, scatter)
+    whitened = problem.whitening(state, scatter)
     split = np.cumsum(problem.counts)[:-1]
-    rows = np.split(whitened(derivatives), split)
+    rows = np.split(whitened(problem.derivatives(state)), split)
     distances = np.split(whitened(problem.distances(state)), split)
     total, steps = information.sum(axis=0), []
     gradient = sum(row.T @ own for row, own in zip(rows, distances, strict=True))
@@ -403,11 +403,12 @@ def _held_out(problem: Problem, state: MountState, scatter: Scatter, information
 
 def _left_out_excess(problem: Problem, state: MountState, scatter: Scatter) -> np.ndarray:
     """How far each pose lies from what the others predict (P,), chi-square with as many degrees as its profile says."""
-    derivatives, errors = problem.derivatives(state), problem.errors(state)
+    share = problem.noise_along(state)
+    derivatives, errors = problem.derivatives(state) / share, problem.errors(state) / share
     split = np.cumsum(problem.counts)[:-1]
     excess = []
     left_out = _each_left_out(problem, state, scatter, problem.information(state, scatter))
-    moved = [np.split(problem.distances(state, step), split)[n] for n, (step, _) in enumerate(left_out)]
+    moved = [np.split(problem.distances(state, step) / share[:, 0], split)[n] for n, (step, _) in enumerate(left_out)]
     sizes = np.full(3, scatter.pose_mm) if problem.sphere else np.array([scatter.pose_mm, scatter.turn_rad])
     for off, rows, error, (_, covariance) in zip(
         moved, np.split(derivatives, split), np.split(errors, split), left_out, strict=True

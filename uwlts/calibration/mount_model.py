@@ -14,6 +14,8 @@ Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 _TIME_STEP_S = 1e-4
 _SMALLEST_SHARE = 1e-3
 """Of the points' noise; smaller scatter of the poses does not show."""
+_LEAST_SHARE = 1e-3
+"""Of the noise that the distances from a plane have: it leans by less than 0.06 deg from the sheet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,8 @@ class Problem:
 
     points: Sequence[np.ndarray]
     motion: Motion
+    across: np.ndarray
+    """Normal (3,) of the sheet in the sensor's frame: points have no noise along it."""
     sphere: bool
     radius_mm: float | None
     scale: bool = False
@@ -129,7 +133,7 @@ class Problem:
         if self.sphere:
             away = base - state.artefact[:3]
             return away / np.linalg.norm(away, axis=1, keepdims=True)
-        return np.column_stack([np.ones(len(base)), self._along(base)])
+        return np.column_stack([np.ones(len(base)), self._along])
 
     def derivatives(self, state: MountState) -> np.ndarray:
         """Derivatives (N, size) of the distances at a state by the parameters."""
@@ -153,19 +157,50 @@ class Problem:
                 self._base(replace(state, offset_s=state.offset_s + s)) for s in (_TIME_STEP_S, -_TIME_STEP_S)
             )
             columns.append(np.sum(normals * (later - earlier), axis=1, keepdims=True) / (2 * _TIME_STEP_S))
-        return np.hstack(columns)
+        derivatives = np.hstack(columns)
+        if self.sphere:
+            return derivatives
+        return self._on_lines(derivatives)
 
-    def _along(self, base: np.ndarray) -> np.ndarray:
+    @cached_property
+    def _along(self) -> np.ndarray:
         """Positions (N,) along the line of each profile from its middle, mm."""
-        along = np.empty(len(base))
-        for number in range(len(self.points)):
-            own = self.poses == number
-            centred = base[own] - base[own].mean(axis=0)
-            along[own] = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
-        return along
+        along = []
+        for own in self.points:
+            centred = own - own.mean(axis=0)
+            along.append(centred @ np.linalg.svd(centred, full_matrices=False)[2][0])
+        return np.concatenate(along)
 
-    def whitening(self, errors: np.ndarray, scatter: Scatter) -> Callable[[np.ndarray], np.ndarray]:
-        """Function that gives distances (N, ...) the unit covariance, for points' noise and errors of poses (N, K)."""
+    @cached_property
+    def _lines(self) -> list[np.ndarray]:
+        """Orthonormal bases (n, 2) of what a shift and a turn of each profile's line do to its distances."""
+        every = np.column_stack([np.ones(len(self._along)), self._along])
+        return [np.linalg.qr(each)[0] for each in np.split(every, np.cumsum(self.counts)[:-1])]
+
+    def _on_lines(self, values: np.ndarray) -> np.ndarray:
+        """Values (N, ...) beside a plane as those of the lines of the profiles.
+
+        With the points' own noise in them, a plane far from the true one would seem to explain this noise.
+        """
+        ends = np.cumsum(self.counts)[:-1]
+        parts = zip(self._lines, np.split(values, ends), strict=True)
+        return np.concatenate([basis @ (basis.T @ own) for basis, own in parts])
+
+    def noise_along(self, state: MountState) -> np.ndarray:
+        """Share (N, 1) of the points' noise, which stays in the sheet, that their distances have.
+
+        A plane that leans against the sheet shows less of it. If this were left out, a plane along the sheet would fit
+        points without any noise. Spheres are cut near their middle.
+        """
+        if self.sphere:
+            return np.ones((len(self.poses), 1))
+        normals = self.motion(state.offset_s)[0] @ (state.rotation @ self.across)
+        return np.sqrt(np.maximum(1 - (normals @ state.artefact[:3]) ** 2, _LEAST_SHARE**2))[self.poses, None]
+
+    def whitening(self, state: MountState, scatter: Scatter) -> Callable[[np.ndarray], np.ndarray]:
+        """Function that gives distances (N,) or their derivatives (N, ...) near a state the unit covariance."""
+        share = self.noise_along(state)
+        errors = self.errors(state) / share
         sizes = _sizes(errors.shape[1], scatter)
         parts = []
         for own in np.split(np.arange(len(errors)), np.cumsum(self.counts)[:-1]):
@@ -175,7 +210,7 @@ class Problem:
             parts.append((own, basis @ vectors, shrink))
 
         def whitened(values: np.ndarray) -> np.ndarray:
-            result = values / scatter.point_mm
+            result = values / (scatter.point_mm * (share if values.ndim > 1 else share[:, 0]))
             for own, basis, shrink in parts:
                 result[own] -= (basis * shrink) @ (basis.T @ result[own])
             return result
@@ -184,15 +219,19 @@ class Problem:
 
     def solved(self, state: MountState, scatter: Scatter, *, loss: str = "linear") -> MountState:
         """The state of least weighted squares of the distances."""
-        whitened = self.whitening(self.errors(state), scatter)
+        whitened = self.whitening(state, scatter)
 
         def jacobian(step: np.ndarray) -> np.ndarray:
             derivatives = self.derivatives(self.stepped(state, step))
             derivatives[:, 3:6] = derivatives[:, 3:6] @ _left_jacobian(step[3:6])
             return whitened(derivatives)
 
+        def misfit(step: np.ndarray) -> np.ndarray:
+            off = self.distances(state, step)
+            return whitened(off if self.sphere else self._on_lines(off))
+
         found = least_squares(
-            lambda step: whitened(self.distances(state, step)),
+            misfit,
             np.zeros(self.size),
             jacobian,  # pyright: ignore[reportArgumentType]
             loss=loss,
@@ -203,8 +242,7 @@ class Problem:
 
     def information(self, state: MountState, scatter: Scatter) -> np.ndarray:
         """Information (P, size, size) that the profile of each pose holds on the parameters."""
-        derivatives, errors = self.derivatives(state), self.errors(state)
-        weighted = np.split(self.whitening(errors, scatter)(derivatives), np.cumsum(self.counts)[:-1])
+        weighted = np.split(self.whitening(state, scatter)(self.derivatives(state)), np.cumsum(self.counts)[:-1])
         return np.array([each.T @ each for each in weighted])
 
     def scatter_at(self, state: MountState, start: Scatter) -> Scatter:
@@ -212,10 +250,12 @@ class Problem:
 
         Patterson and Thompson 1971: minus twice the likelihood of what is left of the distances after the parameters.
         """
-        derivatives, errors = self.derivatives(state), self.errors(state)
+        share = self.noise_along(state)
+        errors = self.errors(state) / share
+        # Any basis of the derivatives has the same likelihood. They are nearly dependent where the base is far away.
+        derivatives = np.linalg.qr(self.derivatives(state) / share)[0]
         k, size = errors.shape[1], derivatives.shape[1]
-        # Columns of size one, for the determinant.
-        columns = np.hstack([errors, derivatives / np.linalg.norm(derivatives, axis=0), self.distances(state)[:, None]])
+        columns = np.hstack([errors, derivatives, self.distances(state)[:, None] / share])
         grams = np.array([each.T @ each for each in np.split(columns, np.cumsum(self.counts)[:-1])])
         total, poses = int(self.counts.sum()), len(self.counts)
 
@@ -233,7 +273,7 @@ class Problem:
             inner = np.eye(k) * variance + sizes[:, None] * grams[:, :k, :k] * sizes
             cross = sizes[:, None] * grams[:, :k, k:]
             left = (grams[:, k:, k:] - np.swapaxes(cross, 1, 2) @ np.linalg.solve(inner, cross)).sum(axis=0) / variance
-            information = left[:size, :size] + 1e-12 * np.trace(left[:size, :size]) * np.eye(size)
+            information = left[:size, :size]
             squares = left[size, size] - left[size, :size] @ np.linalg.solve(information, left[:size, size])
             weights = (total - poses * k) * np.log(variance) + np.linalg.slogdet(inner)[1].sum()
             return float(weights + np.linalg.slogdet(information)[1] + squares)

@@ -1,5 +1,6 @@
 """The further pose that would lower the uncertainty of a mount most, by the information that its profile would hold."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -74,14 +75,7 @@ def next_pose(
 
 def _one_pose(problem: Problem, points: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> Problem:
     # Without a trajectory the pose says nothing about the offset of the times.
-    return Problem(
-        [points],
-        lambda offset: (rotation[None], position[None]),
-        problem.sphere,
-        problem.radius_mm,
-        problem.scale,
-        problem.time,
-    )
+    return replace(problem, points=[points], motion=lambda offset: (rotation[None], position[None]))
 
 
 def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:

@@ -134,7 +134,7 @@ def _in_space(flat: np.ndarray) -> np.ndarray:
 
 def _best(rough: Problem, states: list[MountState]) -> MountState:
     """The state of smallest median distance after a robust refinement from each, scale and time left as they are."""
-    fixed = Problem(rough.points, rough.motion, rough.sphere, rough.radius_mm)
+    fixed = Problem(rough.points, rough.motion, rough.across, rough.sphere, rough.radius_mm)
     refined = [fixed.solved(state, _ROUGH, loss="cauchy") for state in states]
     return min(refined, key=lambda state: float(np.median(misfits(fixed, state))))
 
