@@ -103,6 +103,12 @@ def record(campaign: str, **options: Any) -> None:
     print(f"wrote {twin.record(campaign, **options, show_progress=True)}")
 
 
+@_command(twin.dataset)
+def dataset(description: str, **options: Any) -> None:
+    """Example: twin dataset stripe-clean --scenes 20 --out runs/stripes"""
+    print(f"wrote {twin.dataset(description, **options, show_progress=True)}")
+
+
 @_command(twin.reproduce)
 def reproduce(campaign: str | None = None, **options: Any) -> None:
     """Example: twin reproduce --campaigns 1 --every 10 --out runs/quick"""
@@ -177,14 +183,14 @@ def sweep(
 
 @app.command
 def scenes() -> None:
-    """List the scenes, sensors, campaigns, studies and waters that ship with the program.
+    """List the scenes, sensors, campaigns, data sets, studies and waters that ship with the program.
 
     Example: twin scenes
     """
     for name in names():
         scene = load_scene(name)
         print(f"{name:24s} {scene.title}; placements: {', '.join(scene.placements)}")
-    for folder in ("sensors", "campaigns", "studies"):
+    for folder in ("sensors", "campaigns", "datasets", "studies"):
         print(f"{folder}: {', '.join(names(folder))}")
     print(f"waters: {', '.join(WATERS)}, or a turbidity from 0 to 3")
     for name, water in WATERS.items():

@@ -18,6 +18,7 @@ import numpy as np
 Float: TypeAlias = Any
 Bool: TypeAlias = Any
 UInt32: TypeAlias = Any
+Int32: TypeAlias = Any
 Point2f: TypeAlias = Any
 Point3f: TypeAlias = Any
 Vector3f: TypeAlias = Any

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal, cast
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from twin.design.figures import FIGURES
 from twin.design.parameters import Follow
+from twin.scene.paths import Value, value_at
 from uwlts.model.errors import DescriptionError
 from uwlts.model.input_file import is_regular_file
 from uwlts.model.library import find, load_sensor, read_table, validated
@@ -21,7 +22,6 @@ OTHER_COLUMNS = ("design", "violation", "failure")
 FOLLOWING: dict[Follow, str] = {"focus": "camera.focus_distance_mm", "waist": "laser.waist_distance_mm"}
 """Parameters that follow the stand-off and could be free as well."""
 MOST_DESIGNS = 10**8
-Value = float | int | str | bool
 
 
 class Variable(Description):
@@ -227,17 +227,3 @@ def load_study(study: str | Path | Study, *, designs: int | None = None, verify:
     counted = [name for name in found.variables if type(value_at(found.sensor, name, path)) is int]
     whole = {name: found.variables[name].model_copy(update={"whole": True}) for name in counted}
     return found.model_copy(update={"variables": found.variables | whole})
-
-
-def value_at(sensor: Sensor, name: str, source: str | Path = "the study") -> Value | None:
-    """Value at a path of a sensor's description; DescriptionError where it does not exist or leads to a table."""
-    found: object = sensor.model_dump()
-    for key in name.split("."):
-        if not isinstance(found, dict) or key not in found:
-            there = ", ".join(map(str, found)) if isinstance(found, dict) else "nothing"
-            missing = f"the sensor's description has no '{name}': there is no '{key}', but {there}"
-            raise DescriptionError(f"{source}: {missing}")
-        found = found[key]
-    if isinstance(found, dict):
-        raise DescriptionError(f"{source}: '{name}' is a table; name one of its values: {', '.join(map(str, found))}")
-    return cast("Value | None", found)

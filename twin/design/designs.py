@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.stats import qmc
 
-from twin.design.description import OTHER_COLUMNS, Study, Value, value_at
+from twin.design.description import OTHER_COLUMNS, Study
 from twin.design.figures import FIGURES, Figures, figures_of
 from twin.design.parameters import followed, numbers_of, parameters_of, stacked
+from twin.scene.paths import Value, value_at, with_values
 from uwlts.model.errors import DesignError, Error
 from uwlts.model.library import validated
 from uwlts.model.sensor import Sensor
@@ -78,7 +79,7 @@ def sensor_of(study: Study, design: Design, *, described: dict[str, Any] | None 
     for name, value in design.values.items():
         changes |= study.choices[name][str(value)] if name in study.choices else {name: value}
     described = study.sensor.model_dump(exclude_none=True) if described is None else described
-    return _changed(described, changes, f"design {design.number}")
+    return validated(Sensor, with_values(described, changes), f"design {design.number}")
 
 
 def built(study: Study, design: Design) -> Sensor:
@@ -91,19 +92,7 @@ def built(study: Study, design: Design) -> Sensor:
         "volume": {"volume.near_mm": found.near_mm, "volume.far_mm": found.far_mm},
     }
     changes: dict[str, Value] = {path: value.item() for name in study.follow for path, value in numbers[name].items()}
-    return _changed(sensor.model_dump(exclude_none=True), changes, f"design {design.number}")
-
-
-def _changed(described: dict[str, Any], changes: Mapping[str, Value], source: str) -> Sensor:
-    """The sensor of a table in which values at paths are replaced; the table stays as it is."""
-    table = dict(described)
-    for path, value in changes.items():
-        *parents, key = path.split(".")
-        place = table
-        for parent in parents:
-            place[parent] = place = dict(place.get(parent, {}))
-        place[key] = value
-    return validated(Sensor, table, source)
+    return validated(Sensor, with_values(sensor.model_dump(exclude_none=True), changes), f"design {design.number}")
 
 
 def judged(study: Study, designs: Sequence[Design]) -> Columns:
@@ -148,7 +137,7 @@ def described(study: Study, label: str, sensor: Sensor) -> EvaluatedDesign:
     figures, (reason,) = figures_of(numbers, reflectance=study.reflectance, water_depth_m=study.water_depth_m)
     if reason:
         raise DesignError(f"{label}: {reason}")
-    values = {name: label if name in study.choices else value_at(sensor, name) for name in study.free()}
+    values = {name: label if name in study.choices else value_at(sensor, name, label) for name in study.free()}
     numbers = {name: column.item() for name, column in vars(figures).items()}
     return EvaluatedDesign(-1, values, numbers, violations(study, figures).item(), "")
 

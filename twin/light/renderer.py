@@ -56,11 +56,13 @@ _TRAVEL_STEP_MM = 0.2
 class LaserFrame:
     """Irradiance on the image sensor in W/mm2: (H, W) of the scattered light, and the stripe's pixels on their own.
 
-    ``rows`` and ``columns`` (P,) name the stripe's pixels, ``stripe`` (P,) is the light that came straight from the lit
-    surface; ``polarisation`` and ``roughness_um`` (P,) are that surface's, for speckle.
+    ``scattered`` is all light on longer ways, ``haze`` (H, W) the part of it that the water scattered once out of the
+    sheet into the camera's rays. ``rows`` and ``columns`` (P,) name the stripe's pixels, ``stripe`` (P,) is the light
+    that came straight from the lit surface; ``polarisation`` and ``roughness_um`` (P,) are that surface's, for speckle.
     """
 
     scattered: np.ndarray
+    haze: np.ndarray
     rows: np.ndarray
     columns: np.ndarray
     stripe: np.ndarray
@@ -71,6 +73,12 @@ class LaserFrame:
         """All light (H, W), the stripe's multiplied by ``factors`` (P,)."""
         image = self.scattered.copy()
         image[self.rows, self.columns] += self.stripe * factors
+        return image
+
+    def direct(self) -> np.ndarray:
+        """The stripe's light alone (H, W), without speckle."""
+        image = np.zeros_like(self.scattered)
+        image[self.rows, self.columns] = self.stripe
         return image
 
 
@@ -122,9 +130,11 @@ class Renderer:
         """The light of the laser on the image sensor; see `irradiance`."""
         pose = SensorPose(scene_from_object, travel)
         direct, mirrored = lights(self._sheets, pose, self._mirrors)
-        lit, image = self._laser_nodes(pose, direct, mirrored)
+        lit, haze = self._laser_nodes(pose, direct, mirrored)
+        image = haze.copy()
         walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm)
-        self._add_walks(image, lit, walker, seed=seed, walks=math.ceil(spp * self._walks_per_sample))
+        if walker.finds_light:
+            self._add_walks(image, lit, walker, seed=seed, walks=math.ceil(spp * self._walks_per_sample))
         rows, columns = np.nonzero(self._repeated(lit))
         facts = [
             self._fine(self._stripe_sums, pose, r, c, direct + mirrored, spp=spp)
@@ -132,7 +142,7 @@ class Renderer:
         ]
         stripe, polarised, rough = np.concatenate([np.zeros((3, 0), np.float32), *facts], axis=1)
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
-        return LaserFrame(image, rows, columns, stripe, np.clip(polarised / bright, 0, 1), rough / bright)
+        return LaserFrame(image, haze, rows, columns, stripe, np.clip(polarised / bright, 0, 1), rough / bright)
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the pixels whose chief rays meet the first laser's own stripe."""

@@ -80,11 +80,16 @@ class Walker:
     def _scatters(self) -> bool:
         return self.effects.multiple_scattering and self.scattering.coefficient > 0
 
+    @property
+    def finds_light(self) -> bool:
+        """Whether any light on longer ways is rendered."""
+        return self._scatters or self.effects.secondary_light
+
     def radiance(self, bundle: Rays, cell: UInt32, cells: int, *, seed: int) -> np.ndarray:
         """Sum (cells,) over the rays of each cell of their weight times the light that came on a longer way."""
         width = dr.width(cell)
         total = np.zeros(cells)
-        if not (self._scatters or self.effects.secondary_light):
+        if not self.finds_light:
             return total
         walks = _Walks(
             bundle.origin,

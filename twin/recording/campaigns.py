@@ -160,7 +160,7 @@ def _record_all(
     # Two at once would take each other's unfinished recordings for interrupted ones.
     with one_writer(folder / PLAN):
         files = {file for job in jobs for file in job.files}
-        _keep_to_plan(folder, plan, files, recorded=recorded, overwrite=overwrite)
+        keep_to_plan(folder, plan, files, recorded=recorded, called="recordings", overwrite=overwrite)
         for place in {job.path.parent for job in jobs}:
             place.mkdir(exist_ok=True)
         if overwrite:
@@ -176,10 +176,14 @@ def _record_all(
         work_through(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
 
 
-def _keep_to_plan(
-    folder: Path, plan: dict[str, JsonValue], files: set[Path], *, recorded: str, overwrite: bool
+def keep_to_plan(
+    folder: Path, plan: dict[str, JsonValue], files: set[Path], *, recorded: str, called: str, overwrite: bool
 ) -> None:
-    """Write the settings of a folder's campaigns, or check that they are the same as before; ``files`` are theirs."""
+    """Write the settings of what a folder holds, or check that they are the same as before.
+
+    ``files`` are those that belong to the plan, ``recorded`` is the pattern of such files and ``called`` what they are.
+    DescriptionError where the folder holds some of another plan, unless ``overwrite`` replaces all of them.
+    """
     path = folder / PLAN
     text = json.dumps(plan, indent=2) + "\n"
     plan = json.loads(text)
@@ -198,11 +202,11 @@ def _keep_to_plan(
         how = f"made with {another(known, plan)}"
     if found and not overwrite:
         raise DescriptionError(
-            f"{folder} holds recordings {how}: give another folder, the same settings, or --overwrite to start afresh"
+            f"{folder} holds {called} {how}: give another folder, the same settings, or --overwrite to start afresh"
         )
     if kept := found - files:
         raise DescriptionError(
-            f"{folder} would keep recordings {how}, such as {min(kept)}: give another folder, or remove them first"
+            f"{folder} would keep {called} {how}, such as {min(kept)}: give another folder, or remove them first"
         )
     with written_aside(path, overwrite=True) as aside:
         aside.write_text(text, encoding="utf-8")

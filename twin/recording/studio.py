@@ -14,7 +14,7 @@ import numpy as np
 
 from twin.backend.arrays import Float, to_jit, to_numpy
 from twin.light.pose import SensorPose, Travel
-from twin.light.renderer import Renderer
+from twin.light.renderer import LaserFrame, Renderer
 from twin.options import Options
 from twin.scene.description import Light, Printed, Scene, Shot, altered
 from twin.scene.finish import shift_points
@@ -37,6 +37,12 @@ BRIGHT_SHARE = 0.98
 
 _FALSE_POSITIONS = 5
 """Within one pixel the distance bends by about 1e-2 of its change: each step gains two digits."""
+_POINT_STEPS = 6
+"""The window bends rays so little that each step of Newton's method leaves a hundredth of the error."""
+_POINT_MM = 0.05
+"""A point is seen if its ray meets nothing so much before it: far above the rounding of 32 bits."""
+_POINT_PX = 1e-2
+"""A point is found if the last step was no larger."""
 _TOLERANCE_MM = 5e-4
 """A root is where the surface truly passes the sheet's middle; across a depth edge the distance jumps instead."""
 
@@ -74,6 +80,28 @@ def check_scene(renderer: Renderer, scene: Scene) -> None:
             f"the sheet never meets the objects: seen from the sensor they stay between X = {low[:, 0].min():.1f} and "
             f"{high[:, 0].max():.1f} mm, the sheet is at X = 0: change the motion or the objects' position"
         )
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """A shot as taken: the image, and the mean photo-electrons of its exposure by the way that their light took.
+
+    ``image`` (H, W) holds grey values. The others are (H, W), float32, without speckle and noise: ``direct`` is the
+    laser's light straight from the lit surfaces; ``scattered_once`` what the water scattered out of the sheet into the
+    camera's rays; ``longer_ways`` what was scattered more often or went from one surface to another; ``even`` that of
+    lamp and day.
+    """
+
+    image: np.ndarray
+    exposure_ms: float
+    direct: np.ndarray
+    scattered_once: np.ndarray
+    longer_ways: np.ndarray
+    even: np.ndarray
+
+    def total(self) -> np.ndarray:
+        """All of them together (H, W)."""
+        return self.direct + self.scattered_once + self.longer_ways + self.even
 
 
 class Studio:
@@ -132,15 +160,28 @@ class Studio:
 
     def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
         """Mean photo-electrons per ms (H, W) of a shot."""
-        others = "lamp" if self._shows(shot, "lamp") else "day"
-        light = self._through_lens(self.renderer.irradiance(others, self.pose(shot), spp=spp, travel=travel))
-        if self._shows(shot, "laser"):
-            laser_light = self._laser_light(shot, spp=spp, seed=seed, travel=travel)
-            light += self._laser_shares * self._through_lens(laser_light)
-        sensor = self.sensor
-        return electrons_per_ms(light, sensor.camera, sensor.detector, wavelength_nm=sensor.laser.wavelength_nm)
+        return self._electrons_per_ms(*self._light(shot, spp=spp, seed=seed, travel=travel), shot)
 
-    def _shows(self, shot: Shot, light: Light) -> bool:
+    def _light(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None) -> tuple[np.ndarray, LaserFrame | None]:
+        """Irradiance (H, W) of lamp and day before the lens, and the laser's light, None where it is off."""
+        others, pose = "lamp" if self.shows(shot, "lamp") else "day", self.pose(shot)
+        even = self.renderer.irradiance(others, pose, spp=spp, travel=travel)
+        if not self.shows(shot, "laser"):
+            return even, None
+        return even, self.renderer.laser_frame(pose, spp=spp, seed=seed, travel=travel)
+
+    def _electrons_per_ms(self, even: np.ndarray, laser: LaserFrame | None, shot: Shot) -> np.ndarray:
+        """Mean photo-electrons per ms (H, W) of what `_light` returns, with speckle."""
+        light = self._through_lens(even)
+        if laser is not None:
+            light += self._laser_shares * self._through_lens(self._speckled(laser, shot))
+        return self._to_electrons(light)
+
+    def _to_electrons(self, irradiance: np.ndarray) -> np.ndarray:
+        sensor = self.sensor
+        return electrons_per_ms(irradiance, sensor.camera, sensor.detector, wavelength_nm=sensor.laser.wavelength_nm)
+
+    def shows(self, shot: Shot, light: Light) -> bool:
         """Whether a shot is taken with the laser or the lamp on."""
         return shot.light == light or (self.options.flaws.lamp_and_laser and shot.light != "day")
 
@@ -149,9 +190,8 @@ class Studio:
         passed, glare = irradiance * self._vignette, self.options.flaws.glare
         return veiled(passed, glare) if glare else passed
 
-    def _laser_light(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None) -> np.ndarray:
+    def _speckled(self, frame: LaserFrame, shot: Shot) -> np.ndarray:
         """Irradiance (H, W) of the laser's light in W/mm2, with its speckle."""
-        frame = self.renderer.laser_frame(self.pose(shot), spp=spp, seed=seed, travel=travel)
         if not self.options.effects.speckle:
             return frame.irradiance()
         laser = self.sensor.laser
@@ -178,13 +218,29 @@ class Studio:
 
     def image(self, shot: Shot, index: int) -> np.ndarray:
         """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
+        light = self._electrons_per_ms(*self._light_of(shot, index), shot)
+        return self._taken(light, index, exposure_ms=self.exposure_ms[shot.light])
+
+    def exposed(self, shot: Shot, index: int, *, exposure: float = 1.0) -> Exposed:
+        """The image of a shot, as `image` gives it, with its light; ``exposure`` multiplies the time of exposure."""
+        even, laser = self._light_of(shot, index)
+        exposure_ms = exposure * self.exposure_ms[shot.light]
+        nothing = np.zeros_like(even)
+        parts = [nothing] * 3 if laser is None else [laser.direct(), laser.haze, laser.scattered - laser.haze]
+        parts = [self._laser_shares * self._through_lens(part) if part.any() else nothing for part in parts]
+        parts = [exposure_ms * self._to_electrons(part) for part in (*parts, self._through_lens(even))]
+        image = self._taken(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)
+        return Exposed(image, exposure_ms, *(np.maximum(part, 0, dtype=np.float32) for part in parts))
+
+    def _light_of(self, shot: Shot, index: int) -> tuple[np.ndarray, LaserFrame | None]:
+        """The light of image number ``index`` before the lens, as `_light` returns it."""
         self._shift_points(shot, index)
-        walks = np.random.SeedSequence([self.options.seed, index])
-        exposure = self.exposure_ms[shot.light]
-        light = self.electrons_per_ms(
-            shot, spp=self.options.spp, seed=int(walks.generate_state(1)[0]), travel=self.travel(shot.light)
-        )
-        return self.detected(exposure * light, exposure_ms=exposure, noise_seed=[self.options.seed, index])
+        seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
+        return self._light(shot, spp=self.options.spp, seed=seed, travel=self.travel(shot.light))
+
+    def _taken(self, electrons_per_ms: np.ndarray, index: int, *, exposure_ms: float) -> np.ndarray:
+        noise_seed = [self.options.seed, index]
+        return self.detected(exposure_ms * electrons_per_ms, exposure_ms=exposure_ms, noise_seed=noise_seed)
 
     def detected(self, electrons: np.ndarray, *, exposure_ms: float, noise_seed: list[int]) -> np.ndarray:
         """Grey values (H, W) of mean photo-electrons (H, W), with the noise of a seed if noise is rendered."""
@@ -194,7 +250,7 @@ class Studio:
 
     def truth(self, shot: Shot) -> "FrameTruth":
         """Ground truth of every profile line of a shot."""
-        if not self._shows(shot, "laser"):
+        if not self.shows(shot, "laser"):
             return no_stripe(self.sensor.camera.lines())
         return true_stripe(self.renderer, self.pose(shot), travel=self.travel(shot.light))
 
@@ -252,19 +308,61 @@ def no_stripe(lines: int) -> FrameTruth:
     )
 
 
+@dataclass(frozen=True)
+class Crossings:
+    """Where profile lines see the middle of the sheet on a surface, K of them, lit or in the shadow.
+
+    ``line`` (K,) is the line's number, ``centre_px`` (K,) the image coordinate across the stripe, ``brightness`` (K,)
+    the laser's irradiance on the image sensor in W/mm2, 0 in the shadow. ``point_mm`` and ``normal`` (K, 3) are the
+    surface there in scene coordinates, ``thing`` (K,) is the number of the object among the scene's.
+    """
+
+    line: np.ndarray
+    centre_px: np.ndarray
+    brightness: np.ndarray
+    point_mm: np.ndarray
+    normal: np.ndarray
+    thing: np.ndarray
+
+
 def true_stripe(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Travel | None = None) -> FrameTruth:
-    """True stripe of a frame, by false position on Mitsuba's own hit points along every profile line.
+    """True stripe of a frame: of every profile line's lit crossings of the sheet the brightest.
 
     It is what chief rays see in the middle of the exposure.
     """
+    return brightest(crossings(renderer, scene_from_object, travel=travel), renderer.sensor.camera.lines())
+
+
+def brightest(found: Crossings, lines: int) -> FrameTruth:
+    """Truth of a frame of so many profile lines by its crossings."""
+    truth = no_stripe(lines)
+    dimmest_first = lit_dimmest_first(found)
+    chosen = found.line[dimmest_first]
+    np.add.at(truth.crossings, chosen, 1)
+    truth.centre_px[chosen] = found.centre_px[dimmest_first]
+    truth.point_mm[chosen] = found.point_mm[dimmest_first]
+    truth.normal[chosen] = found.normal[dimmest_first]
+    truth.status[chosen] = TruthStatus.VISIBLE
+    return truth
+
+
+def lit_dimmest_first(found: Crossings) -> np.ndarray:
+    """Numbers of the lit crossings in the order of their brightness: the last of a line is its brightest."""
+    lit = np.flatnonzero(found.brightness > 0)
+    return lit[np.argsort(found.brightness[lit], kind="stable")]
+
+
+def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Travel | None = None) -> Crossings:
+    """All crossings of a frame, by false position on Mitsuba's own hit points along every profile line."""
     camera = renderer.sensor.camera
     pose = SensorPose(scene_from_object, travel)
     along_width = camera.stripe_along == "width"
     rows, columns = renderer.lit_pixels(pose)
     line, cell = (columns, rows) if along_width else (rows, columns)
-    truth = no_stripe(camera.lines())
+    none, vectors = np.zeros(0), np.zeros((0, 3))
+    nothing = Crossings(none.astype(int), none, none, vectors, vectors, none.astype(int))
     if len(line) == 0:
-        return truth
+        return nothing
 
     def position(across: Float, at: Float) -> tuple[Float, Float]:
         return (at, across) if along_width else (across, at)
@@ -287,7 +385,7 @@ def true_stripe(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Tr
     bracketed &= np.isfinite(below) & np.isfinite(above)
     line, cell, below, above = line[bracketed], cell[bracketed], below[bracketed], above[bracketed]
     if len(line) == 0:
-        return truth
+        return nothing
     at, low, high = to_jit(mi.Float, line), to_jit(mi.Float, cell - 0.5), to_jit(mi.Float, cell + 0.5)
     below, above = to_jit(mi.Float, below), to_jit(mi.Float, above)
     for _ in range(_FALSE_POSITIONS):
@@ -303,28 +401,65 @@ def true_stripe(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Tr
     brightness = renderer.laser(pose, bundle, travelled(centre, at))
     si = renderer.objects.scene.ray_intersect(pose.ray(bundle.origin, bundle.direction, travelled(centre, at)))
     offset = distance(centre, at)
-    dr.eval(centre, brightness, si.p, si.n, offset)
-    brightness = brightness.numpy()
-    good = (np.abs(offset.numpy()) < _TOLERANCE_MM) & (brightness > 0)
-    dimmest_first = np.flatnonzero(good)[np.argsort(brightness[good], kind="stable")]
-    chosen = line[dimmest_first]
-    np.add.at(truth.crossings, chosen, 1)
-    truth.centre_px[chosen] = centre.numpy()[dimmest_first]
-    truth.point_mm[chosen] = to_numpy(si.p)[dimmest_first]
-    truth.normal[chosen] = to_numpy(si.n)[dimmest_first]
-    truth.status[chosen] = TruthStatus.VISIBLE
-    return truth
+    thing = renderer.objects.number(si.shape, si.is_valid())
+    dr.eval(centre, brightness, si.p, si.n, offset, thing)
+    good = np.abs(offset.numpy()) < _TOLERANCE_MM
+    # In the order of `Crossings`' fields.
+    arrays = line, centre.numpy(), brightness.numpy(), to_numpy(si.p), to_numpy(si.n), thing.numpy()
+    return Crossings(*(values[good] for values in arrays))
 
 
 def depth_map(renderer: Renderer, scene_from_object: np.ndarray) -> np.ndarray:
     """Camera-frame z in mm (H, W), float32, of the surface that every pixel's centre sees; NaN where there is none."""
+    return seen_surfaces(renderer, scene_from_object)[0]
+
+
+def seen_surfaces(renderer: Renderer, scene_from_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What every pixel's centre sees: its depth as `depth_map`, and its object's number (H, W), -1 for nothing."""
     camera = renderer.sensor.camera
     x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float32), np.arange(camera.height_px, dtype=np.float32))
     bundle = renderer.view.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
     ray = SensorPose(scene_from_object).ray(bundle.origin, bundle.direction)
     hit = renderer.objects.scene.ray_intersect_preliminary(ray)
     depth = renderer.view.depth_mm(mi.Point3f(bundle.origin + bundle.direction * hit.t))
-    return dr.select(hit.is_valid() & (bundle.weight > 0), depth, dr.nan).numpy().reshape(x.shape)
+    seen = hit.is_valid() & (bundle.weight > 0)
+    depth, number = dr.select(seen, depth, dr.nan), renderer.objects.number(hit.shape, seen)
+    dr.eval(depth, number)
+    return depth.numpy().reshape(x.shape), number.numpy().reshape(x.shape)
+
+
+def image_points(renderer: Renderer, scene_from_object: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
+    """Image points (N, 2) in px at which points (N, 3) of the scene are seen; NaN where one is hidden or out of view.
+
+    Newton's method on the chief rays: a ray's distance from its point is brought to zero.
+    """
+    camera, transform = renderer.sensor.camera, np.linalg.inv(scene_from_object)
+    points = points_mm @ transform[:3, :3].T + transform[:3, 3]
+    seen = points @ camera_from_object(renderer.sensor)[:3, :3].T + camera_from_object(renderer.sensor)[:3, 3]
+    size = np.array([camera.width_px, camera.height_px])
+    pixels = seen[:, :2] / seen[:, 2:] * camera.focal_lengths_px() + camera.principal_point()
+    for _ in range(_POINT_STEPS):
+        pixels = np.clip(pixels, -0.1 * size, 1.1 * size)
+        at = pixels[:, None] + [(0, 0), (1, 0), (0, 1)]
+        bundle = renderer.view.bundle(to_jit(mi.Float, at[..., 0]), to_jit(mi.Float, at[..., 1]))
+        dr.eval(bundle.origin, bundle.direction)
+        origin, direction = (
+            to_numpy(v).astype(float).reshape(at.shape[:2] + (3,)) for v in (bundle.origin, bundle.direction)
+        )
+        towards = points[:, None] - origin
+        miss = towards - np.sum(towards * direction, axis=2, keepdims=True) * direction
+        slopes = np.stack([miss[:, 1] - miss[:, 0], miss[:, 2] - miss[:, 0]], axis=2)
+        steps = np.einsum("nij,nj->ni", np.linalg.pinv(slopes), miss[:, 0])
+        pixels = pixels - steps
+    bundle = renderer.view.bundle(*(to_jit(mi.Float, axis) for axis in pixels.T))
+    hit = renderer.objects.scene.ray_intersect_preliminary(
+        SensorPose(scene_from_object).ray(bundle.origin, bundle.direction)
+    )
+    dr.eval(hit.t, bundle.origin, bundle.weight)
+    length = np.linalg.norm(points - to_numpy(bundle.origin), axis=1)
+    inside = ((pixels > -0.5) & (pixels < size - 0.5)).all(axis=1) & (bundle.weight.numpy() > 0)
+    found = inside & (np.abs(hit.t.numpy() - length) < _POINT_MM) & (np.abs(steps).max(axis=1) < _POINT_PX)
+    return np.where(found[:, None], pixels, np.nan)
 
 
 def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], *, first: Shot) -> Truth:

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import trimesh
 
-from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
+from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
 from twin.scene.description import (
     AnyObject,
     Block,
@@ -78,6 +78,11 @@ class Objects:
         """Rms height of the object hit, 0 where nothing is hit."""
         return self._fact("roughness_um", si)
 
+    def number(self, shape: mi.ShapePtr, active: Bool) -> Int32:
+        """Number of the object of a shape among the scene's objects, -1 where not ``active``."""
+        number = dr.gather(mi.Float, self._facts["number"], _registry_number(shape), active)
+        return dr.select(active, mi.Int32(number), -1)
+
     def albedo(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
         """Radiance towards the viewer from surfaces under a sky of radiance 1 all around, mirror images aside.
 
@@ -124,6 +129,7 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
         "mirror": [thing.mirror_share() if gloss else 0.0 for thing in things],
         "polarisation": [thing.polarisation() for thing in things],
         "roughness_um": [thing.rms_height_um() for thing in things],
+        "number": list(range(len(things))),
         "two_sided": [isinstance(thing, (Mesh, FreeForm)) for thing in things],
         "albedo_black": [black for black, _ in parts],
         "albedo_per_unit": [per_unit for _, per_unit in parts],

@@ -10,10 +10,11 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from twin.design.choice import Judged
-from twin.design.description import Study, Value, Variable
+from twin.design.description import Study, Variable
 from twin.design.designs import Marked
 from twin.design.figures import CLASS_NAMES, FIGURES
 from twin.design.verification import Agreement
+from twin.scene.paths import Value
 from uwlts.report.page_toolkit import Tile
 
 MISSING = "\N{EN DASH}"

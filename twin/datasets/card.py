@@ -1,0 +1,302 @@
+"""Data card of a data set: what it holds and how it was made, as JSON, as Markdown and as a page with pictures."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from markupsafe import Markup
+from pydantic import JsonValue
+
+import uwlts
+from twin.datasets.description import (
+    SPLITS,
+    Choice,
+    Constant,
+    DataSetDescription,
+    LineStatus,
+    LogUniform,
+    Mask,
+    Normal,
+    Split,
+    Uniform,
+)
+from twin.datasets.loading import CARD, CARD_FORMAT, CARD_VERSION, DataCard, DataSet, Shard
+from twin.scene.paths import Value
+from uwlts.report.page_toolkit import BLUE, new_figure, plain_text, png_data_uri, render_page, svg_of, write_page
+from uwlts.storage.files import sha256_of, written_aside
+from uwlts.storage.json_files import write_model
+
+README, PAGE = "README.md", "dataset.html"
+_SHOWN = 12
+"""Frames that the page shows."""
+_SHOWN_WIDTH_PX = 480
+_GAMMA = 0.5
+"""Exponent of the shown brightness, which makes haze visible beside the stripe."""
+_OVERLAY = {
+    Mask.HAZE: (70, 110, 200),
+    Mask.SECONDARY: (230, 150, 40),
+    Mask.STRIPE: (60, 180, 90),
+    Mask.SATURATED: (230, 40, 60),
+}
+"""Colours (red, green, blue) of the masks on the page; later ones cover earlier ones."""
+MEANINGS = {
+    "centre_px": "(lines,) float32: true centre of the stripe on each profile line, in px across it; NaN without one",
+    "status": "(lines,) uint8: " + ", ".join(f"{one.value} {one.name.lower()}" for one in LineStatus),
+    "width_px": "(lines,) float32: full width at half maximum of the stripe across it, in px",
+    "snr": "(lines,) float32: signal over noise of the stripe's brightest pixel, speckle left out",
+    "bound_px": "(lines,) float32: Cramér-Rao bound of the centre's standard deviation, in px, speckle left out",
+    "point_mm": "(lines, 3) float32: surface at the centre, in scene coordinates",
+    "normal": "(lines, 3) float32: unit normal of the surface there",
+    "object": "(lines,) int16: number of the object there, -1 for none",
+    "target_px": "(points, 2) float32: where the points of the calibration target are seen; NaN where they are not",
+    "mask": "(height, width) uint8: sum of " + ", ".join(f"{one.value} {str(one.name).lower()}" for one in Mask),
+    "light_e": "(4, height, width) float16: mean photo-electrons of light straight from the lit surface, scattered "
+    "once, on longer ways, and of lamp and day; without speckle and noise",
+    "depth_mm": "(height, width) float32: depth in the camera frame of what each pixel's middle sees; NaN for nothing",
+    "object_map": "(height, width) uint8: number of the object that each pixel's middle sees, 255 for none",
+}
+"""Meaning of the arrays of a sample, see `twin.datasets.labels`."""
+
+
+@dataclass
+class _Collected:
+    """What is counted over all frames, in memory that does not grow with the images."""
+
+    drawn: dict[str, list[Value]] = field(default_factory=dict)
+    status: Counter[int] = field(default_factory=Counter)
+    quality: dict[str, list[float]] = field(default_factory=lambda: {"width_px": [], "snr": [], "bound_px": []})
+    redrawn: set[int] = field(default_factory=set)
+    labels: list[str] = field(default_factory=list)
+
+
+def write_card(
+    folder: Path, description: DataSetDescription, shards: Sequence[tuple[Path, Split, int]], plan: dict[str, JsonValue]
+) -> DataCard:
+    """Write the card of a data set whose shards (path, split and number of frames) are complete, in all three forms."""
+    per_scene, versions = description.frames_per_scene(), plan["versions"]
+    frames = {split: sum(count for _, own, count in shards if own == split) for split in SPLITS}
+    card = DataCard(
+        title=description.title,
+        notes=description.notes,
+        licence=description.licence,
+        seed=description.seed,
+        file_format=description.format,
+        versions={str(k): str(v) for k, v in versions.items()} if isinstance(versions, dict) else {},
+        image={
+            "width_px": description.sensor.camera.width_px,
+            "height_px": description.sensor.camera.height_px,
+            "bits": description.sensor.detector.bits,
+        },
+        scenes={split: count // per_scene for split, count in frames.items()},
+        frames=frames,
+        redrawn=0,
+        labels={},
+        drawn={},
+        status={},
+        description=description.model_dump(mode="json"),
+        shards=tuple(Shard(name=path.name, split=own, frames=n, sha256=sha256_of(path)) for path, own, n in shards),
+    )
+    found = _collected(DataSet(folder, card, None, ("info", "status", *_Collected().quality)))
+    names = _stored(DataSet(folder, card, None, None))
+    card = card.model_copy(
+        update={
+            "redrawn": len(found.redrawn),
+            "labels": {name: MEANINGS[name] for name in names},
+            "drawn": {path: _summary(values) for path, values in found.drawn.items()},
+            "status": {LineStatus(number).name.lower(): count for number, count in sorted(found.status.items())},
+        }
+    )
+    with written_aside(folder / README, overwrite=True) as aside:
+        aside.write_text(_markdown(card, description), encoding="utf-8")
+    everything = DataSet(folder, card, None, ("image", "mask", "centre_px", "info"))
+    write_page(folder / PAGE, _page(card, description, found, everything), overwrite=True)
+    # The last file: with it the data set is complete.
+    write_model(folder / CARD, card, format=CARD_FORMAT, version=CARD_VERSION, overwrite=True)
+    return card
+
+
+def _stored(samples: DataSet) -> list[str]:
+    return [name for name in samples[0] if name in MEANINGS]
+
+
+def _collected(samples: DataSet) -> _Collected:
+    found = _Collected()
+    for sample in samples:
+        info = sample["info"]
+        for path, value in info["drawn"].items():
+            # What all frames of a scene share counts once.
+            if info["frame"] == 0 or path == "frame.exposure":
+                found.drawn.setdefault(path, []).append(value)
+        if info["attempt"]:
+            found.redrawn.add(info["scene"])
+        if "status" in sample:
+            numbers, counts = np.unique(sample["status"], return_counts=True)
+            found.status.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
+        for name, values in found.quality.items():
+            if name in sample and np.isfinite(sample[name]).any():
+                values.append(float(np.nanmedian(sample[name])))
+    return found
+
+
+def _summary(values: Sequence[Value]) -> dict[str, float | str]:
+    if any(isinstance(value, str | bool) for value in values):
+        return {str(value): float(count) for value, count in sorted(Counter(map(str, values)).items())}
+    numbers = np.array(values, float)
+    return {"least": float(numbers.min()), "mean": float(numbers.mean()), "most": float(numbers.max())}
+
+
+def _markdown(card: DataCard, description: DataSetDescription) -> str:
+    splits = [f"| {split} | {card.scenes[split]} | {card.frames[split]} |" for split in SPLITS]
+    varied = [f"| `{path}` | {words} | {drawn} |" for path, words, drawn in _varied(card, description)]
+    return "\n".join(
+        [
+            f"# {card.title}",
+            "",
+            *([card.notes, ""] if card.notes else []),
+            f"{sum(card.frames.values())} images of {sum(card.scenes.values())} scenes, {_size(card)}, rendered by the "
+            f"twin (uwlts {card.versions.get('uwlts')}, Mitsuba {card.versions.get('mitsuba')}). Seed {card.seed}. "
+            f"Licence: {card.licence}.",
+            "",
+            "| split | scenes | frames |",
+            "| --- | --- | --- |",
+            *splits,
+            "",
+            "All frames of a scene are in the same split.",
+            "",
+            "## What varies",
+            "",
+            "| path | distribution | drawn |",
+            "| --- | --- | --- |",
+            *varied,
+            "",
+            f"Everything else is as in `{CARD}`. {card.redrawn} scenes were drawn anew: the sensor could not see them.",
+            "",
+            "## What each sample holds",
+            "",
+            "- `image`: grey values (height, width)",
+            *(f"- `{name}`: {words}" for name, words in card.labels.items()),
+            "- `info`: scene, split, values drawn, exposure, poses, and the sensor if its label was chosen",
+            "",
+            "## Read it",
+            "",
+            "    import twin",
+            '    train = twin.load_dataset("FOLDER", split="train")',
+            '    sample = train[0]; sample["image"], sample.get("centre_px")',
+            "",
+        ]
+    )
+
+
+def _size(card: DataCard) -> str:
+    return f"{card.image['width_px']} x {card.image['height_px']} px of {card.image['bits']} bit"
+
+
+def _varied(card: DataCard, description: DataSetDescription) -> list[tuple[str, str, str]]:
+    """Path, distribution and what was drawn, of all that varies, as text."""
+    rows = []
+    for path, distribution in description.vary.items():
+        match distribution:
+            case Constant():
+                words = f"always {distribution.value}"
+            case Choice():
+                words = f"one of {', '.join(map(str, distribution.values))}"
+                words += (
+                    f", weights {', '.join(f'{w:g}' for w in distribution.weights)}" if distribution.weights else ""
+                )
+            case Uniform():
+                words = f"uniform from {distribution.least:g} to {distribution.most:g}"
+            case LogUniform():
+                words = f"log-uniform from {distribution.least:g} to {distribution.most:g}"
+            case Normal():
+                words = f"normal, mean {distribution.mean:g}, std {distribution.std:g}"
+                ends = (("least", distribution.least), ("most", distribution.most))
+                words += "".join(f", {name} {end:g}" for name, end in ends if end is not None)
+        drawn = card.drawn.get(path, {})
+        numbers = [f"{name} {value:.4g}" for name, value in drawn.items() if isinstance(value, float)]
+        rows.append((path, words, ", ".join(numbers)))
+    return rows
+
+
+# --- the page ---------------------------------------------------------------------------------------------------------
+
+
+def _page(card: DataCard, description: DataSetDescription, found: _Collected, samples: DataSet) -> str:
+    places = np.unique(np.linspace(0, len(samples) - 1, _SHOWN).astype(int))
+    status, lines = card.status, sum(card.status.values())
+    return render_page(
+        "twin.datasets",
+        "page.html.j2",
+        title=card.title,
+        introduction=[
+            ("frames", f"{sum(card.frames.values())} of {sum(card.scenes.values())} scenes"),
+            ("splits", ", ".join(f"{split} {card.frames[split]}" for split in SPLITS)),
+            ("image", _size(card)),
+            ("seed", str(card.seed)),
+            ("licence", card.licence),
+            ("made with", ", ".join(f"{name} {number}" for name, number in card.versions.items())),
+        ],
+        notes=[card.notes] if card.notes else [],
+        pictures=[_pictures(samples[int(place)], along=description.sensor.camera.stripe_along) for place in places],
+        colours=[(str(mask.name).lower(), "#" + bytes(colour).hex()) for mask, colour in _OVERLAY.items()],
+        varied=[list(row) for row in _varied(card, description)],
+        drawn=_histograms({path: values for path, values in found.drawn.items() if path in description.vary}),
+        quality=_histograms({name: values for name, values in found.quality.items() if values}),
+        status=[[name, f"{count}", f"{100 * count / lines:.1f} %"] for name, count in status.items()],
+        labels=[[name, words] for name, words in card.labels.items()],
+        shards=[[one.name, one.split, f"{one.frames}", one.sha256[:16]] for one in card.shards],
+        version=uwlts.__version__,
+    )
+
+
+def _pictures(sample: dict[str, Any], *, along: str) -> tuple[str, str, str]:
+    """The image and its labels as addresses of pictures, and words for them."""
+    image, info = sample["image"], sample["info"]
+    full = 255 if image.dtype == np.uint8 else max(int(image.max()), 1)
+    grey = (255 * (image / full) ** _GAMMA).astype(np.uint8)
+    plain = cv2.cvtColor(grey, cv2.COLOR_GRAY2RGB)
+    labelled = plain // 2
+    for mask, colour in _OVERLAY.items():
+        if "mask" in sample:
+            labelled[(sample["mask"] & mask) > 0] = colour
+    if "centre_px" in sample:
+        line = np.flatnonzero(np.isfinite(sample["centre_px"]))
+        across = np.clip(np.rint(sample["centre_px"][line]).astype(int), 0, None)
+        row, column = (across, line) if along == "width" else (line, across)
+        inside = (row < image.shape[0]) & (column < image.shape[1])
+        labelled[row[inside], column[inside]] = (255, 255, 255)
+    words = f"{sample['key']} ({info['split']}, {info['light']}, {info['exposure_ms']:.3g} ms)"
+    return _address(plain), _address(labelled), words
+
+
+def _address(picture: np.ndarray) -> str:
+    """A small copy (RGB) of a picture as an address that holds it."""
+    height = max(1, round(picture.shape[0] * _SHOWN_WIDTH_PX / picture.shape[1]))
+    small = picture
+    if picture.shape[1] > _SHOWN_WIDTH_PX:
+        small = cv2.resize(picture, (_SHOWN_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+    return png_data_uri(cv2.imencode(".png", cv2.cvtColor(small, cv2.COLOR_RGB2BGR))[1].tobytes())
+
+
+def _histograms(drawn: dict[str, list[Value]] | dict[str, list[float]]) -> Markup | None:
+    """Histograms of values, three beside each other; None if there are none."""
+    if not drawn:
+        return None
+    columns = min(3, len(drawn))
+    rows = -(-len(drawn) // columns)
+    figure, all_axes = new_figure(3.6 * columns, 2.1 * rows, rows=rows, columns=columns)
+    for axes, (name, values) in zip(all_axes, drawn.items(), strict=False):
+        axes.set_title(plain_text(name), fontsize=8)
+        if any(isinstance(value, str | bool) for value in values):
+            counts = sorted(Counter(map(str, values)).items())
+            axes.bar([plain_text(word) for word, _ in counts], [count for _, count in counts], color=BLUE)
+        else:
+            axes.hist(np.array(values, float), bins=24, color=BLUE)
+    for axes in all_axes[len(drawn) :]:
+        axes.set_visible(False)
+    return svg_of(figure)

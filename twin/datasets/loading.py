@@ -1,0 +1,134 @@
+"""Reading of data sets, sample by sample, with NumPy alone; what it returns is a map-style data set to PyTorch too."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from itertools import accumulate
+from pathlib import Path
+from typing import Any
+
+from twin.datasets.description import SPLITS, Split
+from twin.datasets.shards import SUFFIXES, Format, ShardReader
+from uwlts.model.errors import CaptureError, DescriptionError
+from uwlts.model.sensor import Description, Table
+from uwlts.storage.json_files import read_model
+
+CARD, CARD_FORMAT, CARD_VERSION = "dataset.json", "uwlts-dataset", 1
+
+
+class Shard(Description):
+    """One file of a data set, its split, its frames, and the hash of its content in hexadecimal."""
+
+    name: str
+    split: Split
+    frames: int
+    sha256: str
+
+
+class DataCard(Description):
+    """What is in a data set: the content of its ``dataset.json``.
+
+    ``description`` is all that it was made from, ``labels`` say what each stored array is, ``drawn`` the least, mean
+    and largest value of each path that varies (or how often each word was drawn), and ``status`` how many profile lines
+    of all frames show what. ``redrawn`` scenes were drawn more than once, as a sensor cannot measure all that is drawn.
+    """
+
+    title: str
+    notes: str
+    licence: str
+    seed: int
+    file_format: Format
+    versions: dict[str, str]
+    image: dict[str, int]
+    scenes: dict[Split, int]
+    frames: dict[Split, int]
+    redrawn: int
+    labels: dict[str, str]
+    drawn: dict[str, dict[str, float | str]]
+    status: dict[str, int]
+    description: Table
+    shards: tuple[Shard, ...]
+
+
+class DataSet(Sequence[dict[str, Any]]):
+    """Samples of a data set in a folder, or of one split of it, in the order of their scenes and frames.
+
+    A sample is a dict: "key" (text), "image" (H, W), uint8 or uint16, the labels' arrays by their names, and "info",
+    the table of everything else that is known of the frame. `len`, indexing and iterating are all that PyTorch's
+    DataLoader needs of it. It can be sent to other processes.
+
+    Attributes
+    ----------
+    card
+        What the data set holds (`twin.datasets.loading.DataCard`).
+    """
+
+    def __init__(self, folder: Path, card: DataCard, split: Split | None, names: tuple[str, ...] | None):
+        self.card, self._names = card, names
+        shards = [shard for shard in card.shards if split in (None, shard.split)]
+        self._readers = [ShardReader(folder / one.name, card.file_format, frames=one.frames) for one in shards]
+        self._ends = list(accumulate(one.frames for one in shards))
+
+    def __len__(self) -> int:
+        return self._ends[-1] if self._ends else 0
+
+    def __getitem__(self, index: Any) -> Any:
+        """A sample by its number, which may count from the end; a list of samples by a slice."""
+        if isinstance(index, slice):
+            return [self[number] for number in range(*index.indices(len(self)))]
+        number = index + len(self) if index < 0 else index
+        if not 0 <= number < len(self):
+            raise IndexError(f"sample {index} of {len(self)}")
+        shard = bisect_right(self._ends, number)
+        return self._readers[shard].sample(number - (self._ends[shard - 1] if shard else 0), self._names)
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        return (self[number] for number in range(len(self)))
+
+
+def load_dataset(folder: str | Path, *, split: Split | None = None, names: Sequence[str] | None = None) -> DataSet:
+    """Open a data set that `dataset` has written, to be indexed or iterated.
+
+    Parameters
+    ----------
+    folder
+        The data set's folder.
+    split
+        "train", "validation" or "test"; everything unless given.
+    names
+        Names of what is read of each sample, such as ["image", "centre_px"]; everything unless given.
+
+    Raises
+    ------
+    CaptureError
+        The folder holds no data set, or one that is not complete; or, later, a file is damaged.
+    DescriptionError
+        The split is unknown, or nothing has one of the names.
+
+    Examples
+    --------
+    >>> train = twin.load_dataset("runs/stripes", split="train")
+    >>> sample = train[0]
+    >>> sample["image"].shape, sample["centre_px"].shape
+    """
+    folder = Path(folder)
+    if split is not None and split not in SPLITS:
+        raise DescriptionError(f"unknown split '{split}'; known are {', '.join(SPLITS)}")
+    advice = (
+        "" if (folder / CARD).is_file() else f"; is {folder} a finished data set? run twin dataset again to complete it"
+    )
+    try:
+        card = read_model(
+            folder / CARD, DataCard, format=CARD_FORMAT, version=CARD_VERSION, called="card of a data set"
+        )
+    except CaptureError as error:
+        raise CaptureError(f"{error}{advice}") from error
+    for shard in card.shards:
+        # A name with a path could lead anywhere.
+        if Path(shard.name).name != shard.name or Path(shard.name).suffix != SUFFIXES[card.file_format]:
+            raise CaptureError(f"{folder / CARD} names a shard '{shard.name}', which is no file of a data set")
+    known = {"image", "info", *card.labels}
+    if names is not None and (unknown := set(names) - known):
+        raise DescriptionError(f"the data set has no {', '.join(sorted(unknown))}; it has {', '.join(sorted(known))}")
+    return DataSet(folder, card, split, None if names is None else tuple(names))

@@ -1,0 +1,190 @@
+"""Files of a data set: tar archives as the webdataset library reads them, and HDF5 files; every frame is one sample.
+
+In a tar archive the files of a sample stand together and share the name up to its first dot, ``000123-00`` for frame 0
+of scene 123: ``.png`` is the image, ``.mask.png`` and ``.object_map.png`` are pictures of 8 bit, ``.json`` holds what
+is known of the frame, and each further array is a ``.npy`` of its name. In an HDF5 file every array is a dataset of
+that name with the frames along its first axis; ``image``, ``json`` and ``key`` are further ones.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol, assert_never
+
+import cv2
+import h5py
+import numpy as np
+
+from uwlts.model.errors import CaptureError
+from uwlts.storage.files import written_aside
+
+Format = Literal["webdataset", "hdf5"]
+SUFFIXES: dict[Format, str] = {"webdataset": ".tar", "hdf5": ".h5"}
+_PICTURES = ("mask", "object_map")
+_PNG_EFFORT = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+"""Noise cannot be packed: more effort makes the files some percent smaller, in several times the time."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One frame: its key, the image (H, W), arrays by their names, and what is known of it as a table of JSON."""
+
+    key: str
+    image: np.ndarray
+    arrays: dict[str, np.ndarray]
+    info: dict[str, Any]
+
+
+class ShardWriter(Protocol):
+    """Takes the samples of one shard in their order."""
+
+    def add(self, sample: Sample) -> None:
+        """Write a sample."""
+        ...
+
+
+@contextmanager
+def written_shard(path: Path, format: Format, *, frames: int) -> Iterator[ShardWriter]:
+    """A shard of so many frames, which appears at ``path`` when the body ends without an exception."""
+    with written_aside(path, overwrite=True) as aside:
+        match format:
+            case "webdataset":
+                with tarfile.open(aside, "w", format=tarfile.USTAR_FORMAT) as archive:
+                    yield _TarWriter(archive)
+            case "hdf5":
+                with h5py.File(aside, "w", libver="latest") as file:
+                    yield _Hdf5Writer(file, frames)
+            case _:
+                assert_never(format)
+
+
+class _TarWriter:
+    def __init__(self, archive: tarfile.TarFile):
+        self._archive = archive
+
+    def add(self, sample: Sample) -> None:
+        """Write a sample."""
+        self._put(f"{sample.key}.png", _png(sample.image))
+        for name, values in sample.arrays.items():
+            if name in _PICTURES:
+                self._put(f"{sample.key}.{name}.png", _png(values))
+            else:
+                self._put(f"{sample.key}.{name}.npy", _npy(values))
+        self._put(f"{sample.key}.json", json.dumps(sample.info, allow_nan=False).encode())
+
+    def _put(self, name: str, content: bytes) -> None:
+        # Owner and time stay 0, so that equal samples make equal files.
+        member = tarfile.TarInfo(name)
+        member.size = len(content)
+        self._archive.addfile(member, io.BytesIO(content))
+
+
+class _Hdf5Writer:
+    def __init__(self, file: h5py.File, frames: int):
+        self._file, self._frames, self._done = file, frames, 0
+
+    def add(self, sample: Sample) -> None:
+        """Write a sample."""
+        for name, values in {"image": sample.image, **sample.arrays}.items():
+            if name not in self._file:
+                chunk = (1, *values.shape)
+                packed: dict[str, Any] = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
+                self._file.create_dataset(name, (self._frames, *values.shape), values.dtype, chunks=chunk, **packed)
+            self._array(name)[self._done] = values
+        for name, text in (("key", sample.key), ("json", json.dumps(sample.info, allow_nan=False))):
+            if name not in self._file:
+                self._file.create_dataset(name, (self._frames,), h5py.string_dtype())
+            self._array(name)[self._done] = text
+        self._done += 1
+
+    def _array(self, name: str) -> h5py.Dataset:
+        found = self._file[name]
+        assert isinstance(found, h5py.Dataset)
+        return found
+
+
+def _png(values: np.ndarray) -> bytes:
+    return cv2.imencode(".png", values, _PNG_EFFORT)[1].tobytes()
+
+
+def _npy(values: np.ndarray) -> bytes:
+    content = io.BytesIO()
+    np.save(content, values, allow_pickle=False)
+    return content.getvalue()
+
+
+class ShardReader:
+    """Samples of one shard in any order, read when they are asked for; the file is open only meanwhile.
+
+    CaptureError where the file is missing, damaged, or holds another number of frames than ``frames``.
+    """
+
+    def __init__(self, path: Path, format: Format, *, frames: int):
+        self.path, self.format, self.frames = path, format, frames
+        self._places: list[tuple[str, dict[str, tuple[int, int]]]] | None = None
+
+    def sample(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
+        """A sample as arrays by their names, with "key", "image" and, as "info", its table; only ``names`` if given."""
+        try:
+            match self.format:
+                case "webdataset":
+                    return self._from_tar(number, names)
+                case "hdf5":
+                    return self._from_hdf5(number, names)
+                case _:
+                    assert_never(self.format)
+        except (OSError, ValueError, KeyError, EOFError, tarfile.TarError, cv2.error) as error:
+            raise CaptureError(f"{self.path} is not a shard of this data set, or is damaged: {error}") from error
+
+    def _from_tar(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
+        if self._places is None:
+            self._places = self._found_places()
+        key, places = self._places[number]
+        sample: dict[str, Any] = {"key": key}
+        with open(self.path, "rb") as file:
+            for ending, (offset, size) in places.items():
+                name = {"png": "image", "json": "info"}.get(ending, ending.partition(".")[0])
+                if names is None or name in names:
+                    file.seek(offset)
+                    sample[name] = _decoded(ending, file.read(size))
+        return sample
+
+    def _found_places(self) -> list[tuple[str, dict[str, tuple[int, int]]]]:
+        """Key of each sample, with the offset and size of each of its files by what follows the key's dot."""
+        found: dict[str, dict[str, tuple[int, int]]] = {}
+        with tarfile.open(self.path, "r:") as archive:
+            for member in archive:
+                key, _, ending = member.name.partition(".")
+                found.setdefault(key, {})[ending] = member.offset_data, member.size
+        if len(found) != self.frames:
+            raise ValueError(f"it holds {len(found)} frames, expected {self.frames}")
+        return list(found.items())
+
+    def _from_hdf5(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
+        with h5py.File(self.path, "r") as file:
+            datasets: dict[str, Any] = {name: file[name] for name in file}
+            if len(datasets["key"]) != self.frames:
+                raise ValueError(f"it holds {len(datasets['key'])} frames, expected {self.frames}")
+            sample: dict[str, Any] = {"key": datasets.pop("key")[number].decode()}
+            text = datasets.pop("json")
+            sample |= {name: each[number] for name, each in datasets.items() if names is None or name in names}
+            if names is None or "info" in names:
+                sample["info"] = json.loads(text[number])
+            return sample
+
+
+def _decoded(ending: str, content: bytes) -> Any:
+    if ending == "json":
+        return json.loads(content)
+    if ending.endswith("png"):
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise ValueError("a picture cannot be decoded")
+        return image
+    return np.load(io.BytesIO(content), allow_pickle=False)
