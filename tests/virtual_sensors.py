@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -166,3 +167,35 @@ def gauss_legendre(low: float, high: float, count: int) -> tuple[np.ndarray, np.
     """Nodes and weights of an integral from ``low`` to ``high``."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
     return 0.5 * (high - low) * nodes + 0.5 * (high + low), 0.5 * (high - low) * weights
+
+
+def seen_at(sensor: Sensor, medium: Medium, points: np.ndarray) -> np.ndarray:
+    """Image points (N, 2) of points (N, 3) of the OCS by least time and OpenCV's lens."""
+    camera, d = sensor.camera, sensor.camera.distortion
+    fx, (cx, cy) = camera.focal_length_px(), camera.principal_point()
+    matrix = np.array([[fx, 0, cx], [0, camera.pixel_aspect * fx, cy], [0, 0, 1.0]])
+    rays = oracle_paths(sensor, medium, points)[0]
+    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array(list(d.model_dump().values())))[0][:, 0]
+
+
+def stripe_on_plate(sensor: Sensor, medium: Medium, lines: np.ndarray, z: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where profile lines see the sheet X = 0 on the plane Z = ``z``: y (N,) and the coordinate across the stripe (N,).
+
+    A secant search along the sheet for the y that appears on the line.
+    """
+    along, across = (0, 1) if sensor.camera.stripe_along == "width" else (1, 0)
+
+    def image(y: np.ndarray) -> np.ndarray:
+        return seen_at(sensor, medium, np.stack([0 * y, y, np.full_like(y, z)], axis=1))
+
+    y = np.linspace(-110, 110, len(lines))
+    slope, offset = np.polyfit(y, image(y)[:, along], 1)
+    old, new = (lines - offset) / slope, (lines - offset) / slope + 0.5
+    miss_old = image(old)[:, along] - lines
+    for _ in range(30):
+        miss = image(new)[:, along] - lines
+        if np.abs(miss).max() < 1e-9:
+            return new, image(new)[:, across]
+        change = np.where(miss == miss_old, 0.0, miss * (new - old) / np.where(miss == miss_old, 1.0, miss - miss_old))
+        old, new, miss_old = new, new - change, miss
+    raise ArithmeticError(f"the stripe was not found on every line: {np.abs(miss).max():g} px are left")

@@ -80,7 +80,7 @@ def write_card(
 ) -> DataCard:
     """Write the card of a data set whose shards (path, split and number of frames) are complete, in all three forms."""
     per_scene, versions = description.frames_per_scene(), plan["versions"]
-    frames = {split: sum(count for _, own, count in shards if own == split) for split in SPLITS}
+    frames: dict[Split, int] = {split: sum(count for _, own, count in shards if own == split) for split in SPLITS}
     card = DataCard(
         title=description.title,
         notes=description.notes,
@@ -93,7 +93,7 @@ def write_card(
             "height_px": description.sensor.camera.height_px,
             "bits": description.sensor.detector.bits,
         },
-        scenes={split: count // per_scene for split, count in frames.items()},
+        scenes={split: frames[split] // per_scene for split in SPLITS},
         frames=frames,
         redrawn=0,
         labels={},

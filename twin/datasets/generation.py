@@ -35,9 +35,11 @@ if TYPE_CHECKING:
     from twin.recording.studio import Exposed, Studio
     from twin.scene.description import Shot
 
-MOST_ATTEMPTS = 50
+MOST_ATTEMPTS = 20
 """A scene that the sensor cannot measure is drawn anew; where so many in a row are, the description is at fault."""
-_OUTPUT = re.compile(rf"({'|'.join(SPLITS)})-\d{{6}}\.(tar|h5)|{re.escape(CARD)}|{re.escape(README)}|{re.escape(PAGE)}")
+_OUTPUT = re.compile(
+    rf"({'|'.join(SPLITS)})-\d{{6}}\.(tar|h5)|{re.escape(CARD)}|{re.escape(README)}|{re.escape(PAGE)}|{re.escape(PLAN)}"
+)
 _UNFINISHED = re.compile(r"\.[0-9a-f]{16}\.(tar|h5|json|md|html)")
 
 
@@ -195,10 +197,11 @@ def _measurable(description: DataSetDescription, scene: int) -> tuple[DrawnScene
     """A scene as first drawn so that the sensor can measure it, and the sensor before it."""
     from twin.recording.studio import Studio
 
+    why = None
     for attempt in range(MOST_ATTEMPTS):
         drawn = draw_scene(description, scene, attempt=attempt)
         try:
-            return drawn, Studio(drawn.as_built, drawn.scene, drawn.options)
+            return drawn, Studio(drawn.as_built, drawn.scene, drawn.options, probe="middle")
         except DesignError as error:
             why = error
     raise DesignError(

@@ -178,13 +178,17 @@ def stripe_quality(
     with np.errstate(divide="ignore"):
         bound = np.where(information > 0, 1 / np.sqrt(information), np.nan)
     within = (place > first) & (place < last) & inside
-    values = width, signal[peak, columns] / window_noise[peak, columns], bound
-    result = [np.full(len(centre), np.nan) for _ in values]
-    for whole_row, value in zip(result, values, strict=True):
-        whole_row[lines] = value
-    is_clipped = np.zeros(len(centre), bool)
-    is_clipped[lines] = (within & clipped[row, lines] & (half > 0)).any(axis=0)
-    return StripeQuality(*result, is_clipped)
+    snr = signal[peak, columns] / window_noise[peak, columns]
+
+    def of_all_lines(values: np.ndarray, elsewhere: float | bool) -> np.ndarray:
+        everywhere = np.full(len(centre), elsewhere)
+        everywhere[lines] = values
+        return everywhere
+
+    return StripeQuality(
+        *(of_all_lines(values, np.nan) for values in (width, snr, bound)),
+        clipped=of_all_lines((within & clipped[row, lines] & (half > 0)).any(axis=0), False),
+    )
 
 
 def mask_of(taken: Exposed, noise: np.ndarray, *, saturation: int, along_width: bool) -> np.ndarray:

@@ -126,7 +126,8 @@ class ShardReader:
     """
 
     def __init__(self, path: Path, format: Format, *, frames: int):
-        self.path, self.format, self.frames = path, format, frames
+        self.path, self.frames = path, frames
+        self.format: Format = format
         self._places: list[tuple[str, dict[str, tuple[int, int]]]] | None = None
 
     def sample(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
@@ -168,7 +169,7 @@ class ShardReader:
 
     def _from_hdf5(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
         with h5py.File(self.path, "r") as file:
-            datasets: dict[str, Any] = {name: file[name] for name in file}
+            datasets: dict[str, Any] = {str(name): each for name, each in file.items()}
             if len(datasets["key"]) != self.frames:
                 raise ValueError(f"it holds {len(datasets['key'])} frames, expected {self.frames}")
             sample: dict[str, Any] = {"key": datasets.pop("key")[number].decode()}

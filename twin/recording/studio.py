@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
+from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
@@ -105,9 +106,13 @@ class Exposed:
 
 
 class Studio:
-    """A sensor before a scene, ready to take shots; exposures are settled once, before the first."""
+    """A sensor before a scene, ready to take shots; exposures are settled once, before the first.
 
-    def __init__(self, sensor: Sensor, scene: Scene, options: Options):
+    An automatic exposure follows from the first, middle and last shot of the ``scan``, or from its ``middle`` one alone
+    if that shows any light.
+    """
+
+    def __init__(self, sensor: Sensor, scene: Scene, options: Options, *, probe: Literal["scan", "middle"] = "scan"):
         flaws, mounted = options.flaws, sensor.camera.window.mounted and scene.window_mounted
         self.sensor = as_built(with_window(sensor, mounted=mounted), flaws)
         self.scene, self.options = scene, options
@@ -123,7 +128,7 @@ class Studio:
         self._pattern = None
         if options.effects.fixed_pattern:
             self._pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
-        self.exposure_ms = {light: self._exposure(light) for light in dict.fromkeys(scene.motion.lights)}
+        self.exposure_ms = {light: self._exposure(light, probe) for light in dict.fromkeys(scene.motion.lights)}
         shortest_s = max(1e-3 * max(self.exposure_ms.values()), 1 / self.sensor.detector.frame_rate_hz)
         motion = scene.motion
         # Time from one shot to the next: the stage moves or settles, and the camera exposes and reads out.
@@ -271,15 +276,17 @@ class Studio:
         in_medium = outside / self.medium.refractive_index(wavelength)
         return window.distance_mm + window.thickness_mm / window.index(wavelength) + in_medium
 
-    def _exposure(self, light: Light) -> float:
-        """Exposure in ms as described, or so that the first, middle or last shot just reaches the wanted level."""
+    def _exposure(self, light: Light, probe: Literal["scan", "middle"]) -> float:
+        """Exposure in ms as described, or so that the brightest of the shots probed just reaches the wanted level."""
         wanted = self.sensor.exposure.laser_ms if light == "laser" else self.sensor.exposure.lamp_ms
         if wanted != "auto":
             return wanted
         shots = [shot for shot in self.scene.motion.shots() if shot.light == light]
         axis = 0 if self.sensor.camera.stripe_along == "width" else 1
         brightest = 0.0
-        for shot in dict.fromkeys((shots[0], shots[len(shots) // 2], shots[-1])):
+        for shot in dict.fromkeys((shots[len(shots) // 2], shots[0], shots[-1])):
+            if probe == "middle" and brightest > 0:
+                break
             peaks = self.electrons_per_ms(shot, spp=PROBE_SPP, seed=0).max(axis=axis)
             if (peaks > 0).any():
                 brightest = max(brightest, float(np.quantile(peaks[peaks > 0.05 * peaks.max()], BRIGHT_SHARE)))
@@ -438,6 +445,7 @@ def image_points(renderer: Renderer, scene_from_object: np.ndarray, points_mm: n
     seen = points @ camera_from_object(renderer.sensor)[:3, :3].T + camera_from_object(renderer.sensor)[:3, 3]
     size = np.array([camera.width_px, camera.height_px])
     pixels = seen[:, :2] / seen[:, 2:] * camera.focal_lengths_px() + camera.principal_point()
+    steps = np.full_like(pixels, np.inf)
     for _ in range(_POINT_STEPS):
         pixels = np.clip(pixels, -0.1 * size, 1.1 * size)
         at = pixels[:, None] + [(0, 0), (1, 0), (0, 1)]

@@ -38,11 +38,16 @@ def with_values(table: dict[str, Any], changes: Mapping[str, Value]) -> dict[str
         *parents, last = path.split(".")
         place: Any = changed
         for parent in parents:
-            key, empty = (int(parent), []) if isinstance(place, list) else (parent, {})
-            below = place.get(key, empty) if isinstance(place, dict) else place[key]
-            place[key] = place = list(below) if isinstance(below, list | tuple) else dict(below)
-        place[int(last) if isinstance(place, list) else last] = value
+            key = _key(place, parent)
+            below = place[key] if isinstance(place, list) else place.get(key, {})
+            place[key] = below = list(below) if isinstance(below, list | tuple) else dict(below)
+            place = below
+        place[_key(place, last)] = value
     return changed
+
+
+def _key(place: Any, text: str) -> Any:
+    return int(text) if isinstance(place, list) else text
 
 
 def _places(found: object) -> str:

@@ -1,6 +1,5 @@
 """The twin's ground truth: stripe centres by least time, points on their surfaces, shadows where geometry puts them."""
 
-import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -17,12 +16,14 @@ from tests.virtual_sensors import (
     oracle_paths,
     plate,
     scene_of,
+    seen_at,
     sensor_at,
+    stripe_on_plate,
 )
 from twin.light.renderer import Renderer
 from twin.options import NONE
-from twin.recording.studio import FrameTruth, depth_map, true_stripe
-from uwlts.model.sensor import Medium, Sensor
+from twin.recording.studio import FrameTruth, crossings, depth_map, image_points, seen_surfaces, true_stripe
+from uwlts.model.sensor import Sensor
 from uwlts.storage.truth import TruthStatus
 
 CENTRE_PX = 1e-3
@@ -34,38 +35,6 @@ SURFACE_MM = 1e-3
 def coarse(thesis: Sensor) -> Sensor:
     """The thesis's view in 320 x 256 pixels."""
     return altered(thesis, {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2}})
-
-
-def seen_at(sensor: Sensor, medium: Medium, points: np.ndarray) -> np.ndarray:
-    """Image points (N, 2) of points (N, 3) of the OCS by least time and OpenCV's lens."""
-    camera, d = sensor.camera, sensor.camera.distortion
-    fx, (cx, cy) = camera.focal_length_px(), camera.principal_point()
-    matrix = np.array([[fx, 0, cx], [0, camera.pixel_aspect * fx, cy], [0, 0, 1.0]])
-    rays = oracle_paths(sensor, medium, points)[0]
-    return cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array(list(d.model_dump().values())))[0][:, 0]
-
-
-def stripe_on_plate(sensor: Sensor, medium: Medium, lines: np.ndarray, z: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where profile lines see the sheet X = 0 on the plane Z = ``z``: y (N,) and the coordinate across the stripe (N,).
-
-    A secant search along the sheet for the y that appears on the line.
-    """
-    along, across = (0, 1) if sensor.camera.stripe_along == "width" else (1, 0)
-
-    def image(y: np.ndarray) -> np.ndarray:
-        return seen_at(sensor, medium, np.stack([0 * y, y, np.full_like(y, z)], axis=1))
-
-    y = np.linspace(-110, 110, len(lines))
-    slope, offset = np.polyfit(y, image(y)[:, along], 1)
-    old, new = (lines - offset) / slope, (lines - offset) / slope + 0.5
-    miss_old = image(old)[:, along] - lines
-    for _ in range(30):
-        miss = image(new)[:, along] - lines
-        if np.abs(miss).max() < 1e-9:
-            return new, image(new)[:, across]
-        change = np.where(miss == miss_old, 0.0, miss * (new - old) / np.where(miss == miss_old, 1.0, miss - miss_old))
-        old, new, miss_old = new, new - change, miss
-    raise ArithmeticError(f"the stripe was not found on every line: {np.abs(miss).max():g} px are left")
 
 
 SENSORS = {
@@ -216,6 +185,35 @@ def test_the_depth_map_is_the_camera_frame_z_of_what_pixels_see(thesis):
     assert not seen[:, : int(corners[:, 0].min()) - 1].any()
 
 
+def test_points_are_seen_where_light_of_least_time_shows_them(thesis):
+    sensor, medium = altered(thesis, {"camera": SENSORS["distorted"]}), clear(0.3)
+    renderer = Renderer(sensor, medium, scene_of(plate(30.0, side=120.0), block((20.0, 20.0, 20.0), (0.0, 0.0, 10.0))))
+    x, y = (g.ravel() for g in np.meshgrid(np.linspace(-70, 70, 9), np.linspace(-70, 70, 9)))
+    points = np.stack([x, y, np.full_like(x, 30.0)], axis=1)
+    found, expected = image_points(renderer, sensor_at(), points), seen_at(sensor, medium, points)
+    known = np.isfinite(found).all(axis=1)
+    # 0.05 px are 0.01 mm: within the rounding of Newton's last step and of coordinates in 32 bits.
+    np.testing.assert_allclose(found[known], expected[known], rtol=0, atol=2 * CENTRE_PX)
+    on_plate, middle = np.maximum(np.abs(x), np.abs(y)) < 60, np.maximum(np.abs(x), np.abs(y)) < 1
+    assert known.sum() > 30
+    assert not known[~on_plate].any(), "beside the plate nothing is met at the point's depth"
+    assert not known[middle].any(), "the block hides the middle"
+
+
+def test_pixels_know_the_object_that_they_see(thesis):
+    renderer = Renderer(
+        coarse(thesis), clear(), scene_of(plate(30.0, side=120.0), block((60.0, 60.0, 20.0), (0.0, 0.0, 0.0)))
+    )
+    depth, number = seen_surfaces(renderer, sensor_at())
+    assert set(np.unique(number)) == {-1, 0, 1}
+    np.testing.assert_array_equal(number < 0, np.isnan(depth))
+    # Of both things the block is nearer wherever it is seen, by its 20 mm less what tilts by 35 deg do to depths.
+    assert depth[128, 160] < np.nanmin(depth[number == 0]) + 60.0 and number[128, 160] == 1
+    truth = crossings(renderer, sensor_at())
+    np.testing.assert_array_equal(truth.thing, np.where(truth.point_mm[:, 2] > 20.0, 0, 1))
+    assert set(truth.thing) == {0, 1}
+
+
 def intervals_overlap(start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Signed length (N,) of the parts of segments (N, 3) inside a box, as a share of them: negative if they pass by."""
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -262,6 +260,11 @@ def test_lines_whose_stripe_is_shaded_or_hidden_have_none(thesis, name):
     assert not bright[inner == 3].any()
     assert bright[inner == 0].all()
     assert truth.crossings[lines.astype(int)].max() == 1
+    # What lies in the shadow is still seen, what is hidden is not.
+    found = crossings(renderer, sensor_at())
+    on_the_plate = found.line[np.abs(found.point_mm[:, 2] - z) < 0.1]
+    seen = np.isin(lines, on_the_plate)
+    np.testing.assert_array_equal(seen[clear_cut], hidden[clear_cut] <= 0)
 
 
 def test_of_two_crossings_on_a_line_the_brighter_is_given(thesis):

@@ -1,0 +1,256 @@
+"""Data sets as files: the same for any number of workers, resumed, refused, described by their card, and read again."""
+
+import gc
+import json
+import pickle
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import webdataset
+
+import twin
+from tests.virtual_sensors import altered
+from twin.datasets.description import SPLITS, DataSetDescription
+from twin.datasets.draws import draw_scene
+from uwlts.model.errors import CaptureError, DescriptionError, DesignError, OutputError
+from uwlts.model.library import load_sensor
+from uwlts.storage.files import sha256_of
+
+SMALL = {"camera": {"width_px": 160, "height_px": 128, "pixel_size_um": 42.4}}
+LABELS = ("centre", "quality", "points", "masks", "light", "depth", "sensor")
+
+
+def small(**changes: object) -> DataSetDescription:
+    """Eight scenes of two frames each, in tiny images."""
+    table = {
+        "title": "small",
+        "licence": "CC0-1.0",
+        "sensor": altered(load_sensor("thesis"), SMALL | {"exposure": {"laser_ms": 2.0}}),
+        "scene": "spheres",
+        "motion": {"start_mm": -4.0, "step_mm": 8.0, "count": 2},
+        "scenes": 8,
+        "scenes_per_shard": 2,
+        "splits": {"train": 0.5, "validation": 0.25, "test": 0.25},
+        "spp": 4,
+        "without": ("multiple-scattering", "secondary-light"),
+        "labels": LABELS,
+        "vary": {
+            "sensor.laser.power_mw": {"kind": "uniform", "least": 5.0, "most": 9.0},
+            "scene.placements.standoff.position_mm.2": {"kind": "uniform", "least": 0.0, "most": 30.0},
+            "scene.water": {"kind": "choice", "values": ("clear", "coastal")},
+        },
+    }
+    return DataSetDescription.model_validate(table | changes)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small data set, made by one process."""
+    return twin.dataset(small(), out=tmp_path_factory.mktemp("sets") / "small", workers=1)
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    return {path.name: sha256_of(path) for path in sorted(folder.glob("*.tar"))}
+
+
+def test_files_are_the_same_for_any_number_of_workers(folder, tmp_path):
+    made = hashes(folder)
+    assert len(made) >= 4
+    assert hashes(twin.dataset(small(), out=tmp_path / "two", workers=2)) == made
+    other = hashes(twin.dataset(small(scenes=2), out=tmp_path / "seed", seed=1, workers=1))
+    assert not set(other.values()) & set(made.values())
+
+
+def test_frames_are_those_of_the_twin(folder):
+    sample = twin.load_dataset(folder)[5]
+    info = sample["info"]
+    drawn = draw_scene(small(), info["scene"])
+    again = twin.render(
+        drawn.scene,
+        sensor=drawn.sensor,
+        spp=4,
+        seed=info["seed"],
+        without=("multiple-scattering", "secondary-light"),
+        frames=[info["frame"]],
+    )
+    np.testing.assert_array_equal(sample["image"], again.images[0])
+    np.testing.assert_array_equal(sample["centre_px"], again.truth.centre_px[0].astype(np.float32))
+    assert info["exposure_ms"] == again.exposure_ms[0] == 2.0
+    assert info["as_built"]["laser"]["power_mw"] == info["drawn"]["sensor.laser.power_mw"]
+    assert info["medium"]["water"] == info["drawn"]["scene.water"]
+    # The pose leads from the sensor to the scene, as everywhere.
+    assert info["T_scene_object"][0][3] == info["stage_mm"] == (-4.0, 4.0)[info["frame"]]
+
+
+def test_an_interrupted_run_goes_on(folder, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    made, lost = hashes(copy), sorted(copy.glob("*.tar"))[1]
+    lost.unlink()
+    (copy / "dataset.json").unlink()
+    (copy / ".0123456789abcdef.tar").write_bytes(b"of a killed run")
+    (copy / "mine.txt").write_text("kept", encoding="utf-8")
+    kept = {path: path.stat().st_mtime_ns for path in copy.glob("[a-z]*.tar")}
+    with pytest.raises(CaptureError, match="run twin dataset again"):
+        twin.load_dataset(copy)
+    twin.dataset(small(), out=copy, workers=1)
+    assert hashes(copy) == made
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert not list(copy.glob(".*")) and (copy / "mine.txt").is_file()
+
+
+def test_another_data_set_is_refused_unless_it_is_to_be_replaced(folder, tmp_path):
+    place = twin.dataset(
+        small(scenes=2, splits={"train": 1, "validation": 0, "test": 0}), out=tmp_path / "x", workers=1
+    )
+    with pytest.raises(DescriptionError, match=r"holds a data set made with another .*scenes is 2 in it, 1 now"):
+        twin.dataset(small(scenes=1), out=place, workers=1)
+    (place / "mine.txt").write_text("kept", encoding="utf-8")
+    only = {"splits": {"train": 0, "validation": 0, "test": 1}, "labels": ("centre",), "scenes": 1}
+    twin.dataset(small(**only), out=place, workers=1, overwrite=True)
+    assert [path.name for path in place.glob("*.tar")] == ["test-000000.tar"]
+    assert (place / "mine.txt").is_file()
+    with pytest.raises(DescriptionError, match="workers is 0"):
+        twin.dataset(small(), out=place, workers=0)
+    with pytest.raises(OutputError, match="cannot use the folder"):
+        twin.dataset(small(), out=place / "mine.txt", workers=1)
+
+
+def test_scenes_that_the_sensor_cannot_see_are_drawn_anew(tmp_path):
+    # The measuring volume ends some 110 mm about the stand-off along the camera's axis.
+    far = {"scene.placements.standoff.position_mm.2": {"kind": "uniform", "least": 0.0, "most": 400.0}}
+    described = small(scenes=3, labels=("centre",), splits={"train": 1, "validation": 0, "test": 0}, vary=far)
+    card = twin.load_dataset(twin.dataset(described, out=tmp_path / "far", workers=1)).card
+    assert card.redrawn > 0
+    least = {"scene.placements.standoff.position_mm.2": {"kind": "uniform", "least": 300.0, "most": 400.0}}
+    with pytest.raises(DesignError, match="was drawn 20 times"):
+        twin.dataset(small(vary=least), out=tmp_path / "farther", workers=1)
+
+
+def test_splits_hold_different_scenes_and_together_all(folder):
+    scenes = {split: {each["info"]["scene"] for each in twin.load_dataset(folder, split=split)} for split in SPLITS}
+    assert sorted(scene for members in scenes.values() for scene in members) == list(range(8))
+    assert all(members for members in scenes.values())
+    for split in SPLITS:
+        assert {each["info"]["split"] for each in twin.load_dataset(folder, split=split)} == {split}
+
+
+def test_samples_are_read_in_any_way(folder):
+    everything = twin.load_dataset(folder)
+    assert len(everything) == 16 == len(list(everything))
+    assert "torch" not in sys.modules
+    keys = [sample["key"] for sample in everything]
+    assert len(set(keys)) == 16
+    assert everything[-1]["key"] == keys[-1] and [each["key"] for each in everything[3:5]] == keys[3:5]
+    with pytest.raises(IndexError):
+        everything[16]
+    again = pickle.loads(pickle.dumps(everything))
+    np.testing.assert_array_equal(again[7]["image"], everything[7]["image"])
+    sample = everything[0]
+    shapes = {name: values.shape for name, values in sample.items() if isinstance(values, np.ndarray)}
+    assert set(shapes) == {"image"} | set(everything.card.labels)
+    assert shapes["image"] == shapes["mask"] == shapes["depth_mm"] == shapes["object_map"] == (128, 160)
+    assert shapes["centre_px"] == shapes["snr"] == (160,) and shapes["point_mm"] == (160, 3)
+    assert shapes["light_e"] == (4, 128, 160)
+    few = twin.load_dataset(folder, names=["image", "centre_px"])[0]
+    assert set(few) == {"key", "image", "centre_px"}
+    with pytest.raises(DescriptionError, match="unknown split 'dev'"):
+        twin.load_dataset(folder, split="dev")
+    with pytest.raises(DescriptionError, match="has no centres; it has bound_px"):
+        twin.load_dataset(folder, names=["centres"])
+
+
+@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+def test_the_webdataset_library_reads_the_shards(folder):
+    shards = [str(path) for path in sorted(folder.glob("train-*.tar"))]
+    read = list(webdataset.WebDataset(shards, shardshuffle=False).decode("l8"))
+    gc.collect()  # the library leaves files open
+    own = twin.load_dataset(folder, split="train")
+    assert [each["__key__"] for each in read] == [each["key"] for each in own]
+    for theirs, ours in zip(read, own, strict=True):
+        np.testing.assert_array_equal(theirs["centre_px.npy"], ours["centre_px"])
+        np.testing.assert_array_equal(theirs["light_e.npy"], ours["light_e"])
+        assert theirs["json"] == ours["info"]
+        np.testing.assert_array_equal(theirs["png"], ours["image"])
+        np.testing.assert_array_equal(theirs["mask.png"], ours["mask"])
+
+
+def test_hdf5_holds_the_same(folder, tmp_path):
+    described = small(format="hdf5", scenes=4)
+    other = twin.load_dataset(twin.dataset(described, out=tmp_path / "hdf5", workers=1))
+    ours = {sample["key"]: sample for sample in twin.load_dataset(folder)}
+    assert len(other) == 8
+    for sample in other:
+        assert set(sample) == set(ours[sample["key"]])
+        for name, values in sample.items():
+            np.testing.assert_array_equal(values, ours[sample["key"]][name])
+
+
+def test_the_card_says_what_there_is(folder):
+    card = twin.load_dataset(folder).card
+    assert sum(card.frames.values()) == 16 and sum(card.scenes.values()) == 8
+    assert sum(card.status.values()) == 16 * 160
+    power = [each["info"]["drawn"]["sensor.laser.power_mw"] for each in twin.load_dataset(folder)]
+    assert card.drawn["sensor.laser.power_mw"]["least"] == min(power)
+    assert card.drawn["scene.water"] == {"clear": pytest.approx(4, abs=4), "coastal": pytest.approx(4, abs=4)}
+    assert {shard.name: shard.sha256 for shard in card.shards} == hashes(folder)
+    text = (folder / "README.md").read_text(encoding="utf-8")
+    for words in ("16 images of 8 scenes", "CC0-1.0", "uniform from 5 to 9", "one of clear, coastal", "| train |"):
+        assert words in text
+    page = (folder / "dataset.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png") == 2 * 12
+    assert not re.search(r"(src|href)=\"http", page)
+    json.loads((folder / "plan.json").read_text(encoding="utf-8"))
+
+
+def test_damaged_files_are_named(folder, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    shard = copy / twin.load_dataset(copy).card.shards[0].name
+    shard.write_bytes(shard.read_bytes()[:5000])
+    with pytest.raises(CaptureError, match=re.escape(f"{shard} is not a shard")):
+        twin.load_dataset(copy)[0]
+    shard.unlink()
+    with pytest.raises(CaptureError, match=re.escape(shard.name)):
+        twin.load_dataset(copy)[0]
+    card = copy / "dataset.json"
+    card.write_text(card.read_text(encoding="utf-8").replace(f'"{shard.name}"', '"../other.tar"'), encoding="utf-8")
+    with pytest.raises(CaptureError, match="which is no file of a data set"):
+        twin.load_dataset(copy)
+    with pytest.raises(CaptureError, match="run twin dataset again"):
+        twin.load_dataset(tmp_path)
+
+
+@pytest.mark.slow
+def test_ctrl_c_leaves_complete_shards_only(tmp_path):
+    out = tmp_path / "set"
+    line = [sys.executable, "-m", "twin.cli", "dataset", "stripe-clean", "--scenes", "40", "--out", str(out)]
+    process = subprocess.Popen([*line, "--workers", "2"], stderr=subprocess.PIPE, text=True)
+    until = time.monotonic() + 120
+    while not list(out.glob(".*.tar")) and time.monotonic() < until:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130, told
+    assert "run it again" in told and "Traceback" not in told
+    assert [path.name for path in out.iterdir() if path.suffix != ".tar"] == ["plan.json"]
+    assert not list(out.glob(".*"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["stripe-turbid", "stripe-shiny", "calibration-boards"])
+def test_presets_are_rendered(name, tmp_path):
+    samples = twin.load_dataset(twin.dataset(name, out=tmp_path / name, scenes=2, workers=1))
+    for sample in samples:
+        assert sample["image"].max() > 10 or sample["info"]["exposure_ms"] > 0
+        if sample["info"]["light"] == "laser":
+            assert np.isfinite(sample["centre_px"]).sum() > 100
+    if name == "calibration-boards":
+        assert np.isfinite(samples[0]["target_px"]).all(axis=1).sum() > 50
