@@ -61,6 +61,7 @@ PAIRS: dict[str, tuple[str, set[str], set[str]]] = {
     "twin serve": ("twin.serve", set(), set()),
     "twin demo": ("twin.demo", set(), set()),
     "twin record": ("twin.record", set(), {"show_progress"}),
+    "twin dataset": ("twin.dataset", set(), {"show_progress"}),
     "twin sweep": ("twin.sweep", set(), {"show_progress"}),
     # The evaluation is uwlts.evaluate_thesis, in a process of its own.
     "twin reproduce": ("twin.reproduce", set(), {"show_progress"}),

@@ -10,6 +10,7 @@ from pydantic import JsonValue
 
 from twin.options import CPU, Flaws, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, load_campaign, takes
+from uwlts.model.command_files import own_files
 from uwlts.model.errors import CaptureError, DescriptionError, Error, OutputError
 from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import work_through
@@ -192,7 +193,9 @@ def keep_to_plan(
     except OSError as error:
         raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
     try:
-        known = read_json(path, called="plan") if path.is_file() else None
+        # Not an input of the command, which may replace it.
+        with own_files():
+            known = read_json(path, called="plan") if path.is_file() else None
     except CaptureError:
         known = None
     if known == plan:
