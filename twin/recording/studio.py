@@ -96,7 +96,8 @@ class Studio:
         if options.effects.fixed_pattern:
             self._pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
         self.exposure_ms = {light: self._exposure(light) for light in dict.fromkeys(scene.motion.lights)}
-        shortest_s = max(1e-3 * max(self.exposure_ms.values()), 1 / self.sensor.detector.frame_rate_hz)
+        longest_ms = max(self.exposure_ms[shot.light] * shot.exposure for shot in scene.motion.shots())
+        shortest_s = max(1e-3 * longest_ms, 1 / self.sensor.detector.frame_rate_hz)
         motion = scene.motion
         # Time from one shot to the next: the stage moves or settles, and the camera exposes and reads out.
         moving = motion.speed_mm_per_s > 0
@@ -172,7 +173,7 @@ class Studio:
             image=self.image(shot, index),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
-            exposure_ms=self.exposure_ms[shot.light],
+            exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
             time_s=index * self.period_s,
         )
 
@@ -180,7 +181,7 @@ class Studio:
         """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
         self._shift_points(shot, index)
         walks = np.random.SeedSequence([self.options.seed, index])
-        exposure = self.exposure_ms[shot.light]
+        exposure = self.exposure_ms[shot.light] * shot.exposure
         light = self.electrons_per_ms(
             shot, spp=self.options.spp, seed=int(walks.generate_state(1)[0]), travel=self.travel(shot.light)
         )
