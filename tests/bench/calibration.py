@@ -1,9 +1,7 @@
 """Time of the joint calibration and of measuring with it, on the captures of a campaign of `tests.bench.light`."""
 
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,24 +11,23 @@ from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.model.calibration import Calibration
-from uwlts.model.sensor import CaptureHeader
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
 
 
-@dataclass(frozen=True)
 class _InMemory:
-    """The laser images of a capture, read beforehand."""
+    """A capture whose images were read beforehand."""
 
-    path: Path
-    header: CaptureHeader
-    images: list[tuple[int, np.ndarray]]
+    def __init__(self, capture: Capture):
+        self.path, self.header, self.laser_on, self.pose = capture.path, capture.header, capture.laser_on, capture.pose
+        self.stage_mm, self.exposure_ms = capture.stage_mm, capture.exposure_ms
+        self._images = [capture.image(number) for number in range(len(capture))]
 
-    def frames(self, *, laser_on: bool | None = None) -> Iterator[tuple[int, np.ndarray]]:
-        return iter(self.images)
+    def image(self, index: int) -> np.ndarray:
+        return self._images[index]
 
     def __len__(self) -> int:
-        return len(self.images)
+        return len(self._images)
 
 
 def joint_calibration(targets: list[Path], steps: list[Path]) -> tuple[Calibration, float, float]:
@@ -48,11 +45,11 @@ def joint_calibration(targets: list[Path], steps: list[Path]) -> tuple[Calibrati
 def measuring_rate(scan: Path, calibration: Calibration) -> float:
     """Frames per second from images in memory to points with their covariance."""
     with Capture(scan) as capture:
-        images = _InMemory(scan, capture.header, [(k, image.copy()) for k, image in capture.frames(laser_on=True)])
+        images = _InMemory(capture)
         seconds = []
         for _ in range(4):
             start = time.perf_counter()
             cloud = reconstruct_stripes(capture, find_stripes(images), calibration, with_uncertainty=True)
             assert cloud.uncertainty is not None and cloud.uncertainty.covariance_mm2().shape == (len(cloud), 3, 3)
             seconds.append(time.perf_counter() - start)
-        return len(images) / float(np.median(seconds[1:]))
+        return np.count_nonzero(images.laser_on) / float(np.median(seconds[1:]))

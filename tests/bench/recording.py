@@ -13,7 +13,7 @@ import numpy as np
 
 from twin.devices.gige_camera import GigeCamera
 from uwlts.desk.board import Board
-from uwlts.desk.recording_view import RecordingView, frames_of
+from uwlts.desk.recording_view import LOOK_S, RecordingView, frames_of
 from uwlts.hardware.camera import CameraDevice
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.replay import ReplayCamera
@@ -29,7 +29,7 @@ SERVED, SERVED_HZ = 300, 60.0
 
 @dataclass(frozen=True)
 class Recorded:
-    """Frames per second that reached the disk, and how many were lost.
+    """Frames per second that reached the disk, from the first to the last, and how many were lost.
 
     ``followed`` of them were read from the growing file, their stripe found and turned into points, by a second
     process, at ``followed_hz`` from the first to the last; it was done ``behind_s`` after the recording.
@@ -94,13 +94,13 @@ def _record(camera: CameraDevice, sensor: Sensor, out: Path, count: int) -> Reco
     with CaptureWriter(out, _header(sensor), dtype=np.uint8) as writer:
         camera.configure(frame_rate_hz=RATE_HZ)
         camera.start(faults="skip")
-        start = time.perf_counter()
+        stored_s = np.empty(count)
         for k in range(count):
             frame = camera.grab(2.0)
             writer.append(Frame(frame.image, float(k), True, 1.0, frame.time_s))
-        seconds = time.perf_counter() - start
+            stored_s[k] = time.perf_counter()
         counts = camera.counts
-    return Recorded(count / seconds, counts.dropped + counts.short)
+    return Recorded((count - 1) / float(stored_s[-1] - stored_s[0]), counts.dropped + counts.short)
 
 
 def _followed(out: Path, record: Callable[[], Recorded]) -> Recorded:
@@ -126,7 +126,7 @@ def _follow(out: Path, ready: multiprocessing.synchronize.Event, result: multipr
     ready.set()
     for seen in frames_of(out):
         if seen is None:
-            time.sleep(0.25)
+            time.sleep(LOOK_S)
             continue
         header, number, frame = seen
         view = view or RecordingView(board, header, calibration)

@@ -13,6 +13,7 @@ from tests.waiting import within
 from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import Scene, load_scene
 from uwlts.storage.capture import Capture, part_path
+from uwlts.stripe import find_stripes
 
 pytestmark = pytest.mark.slow
 
@@ -57,7 +58,8 @@ def scanned(scene: Scene, served: ServedTwin, folder: Path, out: Path) -> str:
     motion, plan = scene.motion, folder / "plan.toml"
     plan.write_text(
         f'title = "Scan"\nsensor = "sensor.toml"\nmedium = "{scene.medium}"\ncamera = "{served.camera.address}"\n'
-        f'lights = {list(motion.lights)}\n[stage]\nport = "{served.controller.port}"\n'
+        f"lights = {list(motion.lights)}\nbracket = {list(motion.bracket)}\n"
+        f'[stage]\nport = "{served.controller.port}"\n'
         f"start_mm = {served.track.start_mm}\nstep_mm = {motion.step_mm}\ncount = {motion.count}\n"
         f"direction = {list(map(float, motion.unit_direction()))}\nfeed_mm_per_min = 900.0\n",
         encoding="utf-8",
@@ -177,3 +179,18 @@ def test_the_page_is_there_while_the_scan_runs_and_ends_with_it(folder, sensor, 
     assert refused(address)
     with Capture(tmp_path / "scan.h5") as scan:
         assert len(scan) == scan.header.provenance["images"] == 12
+
+
+def test_a_bracket_multiplies_the_exposure_that_was_found(folder, sensor, tmp_path):
+    """Long exposures of a bright board are saturated on purpose: nothing is shortened, and nothing warned of."""
+    scene = load_scene("plane", placement="near")
+    motion = {"count": 3, "bracket": (1.0, 4.0, 16.0), "lights": ("lamp", "laser")}
+    scene = scene.model_copy(update={"motion": scene.motion.model_copy(update=motion)})
+    with serve(scene, sensor=sensor, spp=4, speed_up=50.0) as served:
+        assert "saturated" not in scanned(scene, served, folder, tmp_path / "scan.h5")
+    with Capture(tmp_path / "scan.h5") as scan:
+        assert scan.laser_on.tolist() == [False, True, True, True] * 3
+        lit = scan.exposure_ms[scan.laser_on].reshape(3, 3)
+        # The camera rounds to whole microseconds.
+        np.testing.assert_allclose(lit / lit[:, :1], [[1, 4, 16]] * 3, rtol=0.02)
+        assert set(find_stripes(scan).frame.tolist()) == {3, 7, 11}

@@ -91,7 +91,7 @@ class _Job:
 
     @property
     def images(self) -> int:
-        return self.take.scene.motion.count * len(self.take.scene.motion.lights)
+        return self.take.scene.motion.images()
 
     @property
     def files(self) -> tuple[Path, Path, Path]:

@@ -129,7 +129,8 @@ class Studio:
         if options.effects.fixed_pattern:
             self._pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
         self.exposure_ms = {light: self._exposure(light, probe) for light in dict.fromkeys(scene.motion.lights)}
-        shortest_s = max(1e-3 * max(self.exposure_ms.values()), 1 / self.sensor.detector.frame_rate_hz)
+        longest_ms = max(self.exposure_ms[shot.light] * shot.exposure for shot in scene.motion.shots())
+        shortest_s = max(1e-3 * longest_ms, 1 / self.sensor.detector.frame_rate_hz)
         motion = scene.motion
         # Time from one shot to the next: the stage moves or settles, and the camera exposes and reads out.
         moving = motion.speed_mm_per_s > 0
@@ -217,19 +218,19 @@ class Studio:
             image=self.image(shot, index),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
-            exposure_ms=self.exposure_ms[shot.light],
+            exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
             time_s=index * self.period_s,
         )
 
     def image(self, shot: Shot, index: int) -> np.ndarray:
         """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
         light = self._electrons_per_ms(*self._light_of(shot, index), shot)
-        return self._taken(light, index, exposure_ms=self.exposure_ms[shot.light])
+        return self._taken(light, index, exposure_ms=self.exposure_ms[shot.light] * shot.exposure)
 
     def exposed(self, shot: Shot, index: int, *, exposure: float = 1.0) -> Exposed:
         """The image of a shot, as `image` gives it, with its light; ``exposure`` multiplies the time of exposure."""
         even, laser = self._light_of(shot, index)
-        exposure_ms = exposure * self.exposure_ms[shot.light]
+        exposure_ms = exposure * self.exposure_ms[shot.light] * shot.exposure
         nothing = np.zeros_like(even)
         parts = [nothing] * 3 if laser is None else [laser.direct(), laser.haze, laser.scattered - laser.haze]
         parts = [self._laser_shares * self._through_lens(part) if part.any() else nothing for part in parts]

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, read_table, validated
-from uwlts.model.sensor import Description, NotNegative, Positive, Table, Vector
+from uwlts.model.sensor import Bracket, Description, NotNegative, Positive, Table, Vector
 from uwlts.targets import CircleTarget, Target, parse_target
 
 Kind = TypeVar("Kind", bound=Description)
@@ -340,8 +340,9 @@ class Motion(Description):
     """Stage positions of a scan: ``count`` of them from ``start_mm`` in steps of ``step_mm`` along ``direction``.
 
     ``direction`` is where the stage truly carries the sensor; the capture records ``nominal_direction``. At every
-    position the images in ``lights`` are taken in turn. ``position_errors_mm`` is how much farther than recorded the
-    stage truly stands at each position, 0 unless given. ``speed_mm_per_s`` is how fast the stage moves along
+    position the images in ``lights`` are taken in turn, those with the laser at every multiple of its exposure in
+    ``bracket``. ``position_errors_mm`` is how much farther than recorded the stage truly stands at each position, 0
+    unless given. ``speed_mm_per_s`` is how fast the stage moves along
     ``direction`` while an image is exposed; at 0 it stands still.
     """
 
@@ -352,6 +353,7 @@ class Motion(Description):
     nominal_direction: Vector | None = None
     position_errors_mm: tuple[float, ...] = ()
     lights: tuple[Literal["lamp", "laser"], ...] = ("laser",)
+    bracket: Bracket = (1.0,)
     speed_mm_per_s: NotNegative = 0.0
 
     @model_validator(mode="after")
@@ -363,8 +365,10 @@ class Motion(Description):
             raise ValueError(f"position_errors_mm has {len(self.position_errors_mm)} values for {self.count} positions")
         if not self.lights:
             raise ValueError("lights is empty: name 'lamp', 'laser' or both")
-        if self.speed_mm_per_s > 0 and len(self.lights) > 1:
-            raise ValueError("a moving stage takes one image at each position: name one light, or stop with speed 0")
+        if self.speed_mm_per_s > 0 and self.images() > self.count:
+            raise ValueError(
+                "a moving stage takes one image at each position: name one light and no bracket, or stop with speed 0"
+            )
         return self
 
     def unit_direction(self) -> np.ndarray:
@@ -383,16 +387,27 @@ class Motion(Description):
             stage_mm = self.start_mm + index * self.step_mm
             error = self.position_errors_mm[index] if self.position_errors_mm else 0.0
             for light in self.lights:
-                yield Shot(stage_mm=stage_mm, travelled_mm=stage_mm + error, light=light)
+                for exposure in self.bracket if light == "laser" else (1.0,):
+                    yield Shot(stage_mm=stage_mm, travelled_mm=stage_mm + error, light=light, exposure=exposure)
+
+    def images(self) -> int:
+        """Number of images of the scan."""
+        laser = self.lights.count("laser")
+        return self.count * (len(self.lights) + laser * (len(self.bracket) - 1))
 
 
 @dataclass(frozen=True)
 class Shot:
-    """One image to take: recorded and true position of the stage in mm, and the light that is on beside the day's."""
+    """One image to take.
+
+    Recorded and true position of the stage in mm, the light that is on beside the day's, and the multiple of its
+    exposure.
+    """
 
     stage_mm: float
     travelled_mm: float
     light: Light
+    exposure: float = 1.0
 
 
 class Scene(Description):

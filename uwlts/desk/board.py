@@ -4,6 +4,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import cv2
@@ -22,38 +23,37 @@ _FOUND, _STRIPE = (0, 140, 0), (40, 60, 255)
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """An image as a JPEG with its dark parts raised, and the share of its pixels in equal steps of grey value.
+    """An image (H, W) to be shown, with the pixels (N, 2) of the stripe and (M, 2) of a target's points marked in it.
 
-    ``saturated`` is the share of profile lines at the full scale, where that is known.
+    ``full_dn`` is the full scale, ``saturated`` the share of profile lines there, where that is known. What is shown is
+    made when somebody looks at it first: a recording has more images than a page shows.
     """
 
-    jpeg: bytes
+    image: np.ndarray
     caption: str
-    histogram: np.ndarray
+    full_dn: int
+    stripe: np.ndarray | None = None
+    points: np.ndarray | None = None
     saturated: float | None = None
 
+    @cached_property
+    def jpeg(self) -> bytes:
+        """The image as a JPEG with its dark parts raised."""
+        grey = np.minimum(255 * np.sqrt(self.image.astype(np.float32) / self.full_dn), 255).astype(np.uint8)
+        scale = min(1.0, _LONGEST_SIDE_PX / max(grey.shape))
+        size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
+        shown = cv2.cvtColor(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
+        if self.stripe is not None:
+            column, row = np.clip(np.rint(self.stripe * scale).astype(int), 0, np.array(size) - 1).T
+            shown[row, column] = _STRIPE
+        for u, v in np.rint((np.empty((0, 2)) if self.points is None else self.points) * scale).astype(int).tolist():
+            cv2.circle(shown, (u, v), 3, _FOUND, 2, cv2.LINE_AA)
+        return _encoded(shown, ".jpg")
 
-def picture_of(
-    image: np.ndarray,
-    *,
-    full_dn: int,
-    caption: str,
-    stripe: np.ndarray | None = None,
-    points: np.ndarray | None = None,
-    saturated: float | None = None,
-) -> Picture:
-    """Picture of an image (H, W) with the pixels (N, 2) of the stripe and of a target's points marked in it."""
-    grey = np.minimum(255 * np.sqrt(image.astype(np.float32) / full_dn), 255).astype(np.uint8)
-    scale = min(1.0, _LONGEST_SIDE_PX / max(grey.shape))
-    size = (max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale)))
-    shown = cv2.cvtColor(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
-    if stripe is not None:
-        column, row = np.clip(np.rint(stripe * scale).astype(int), 0, np.array(size) - 1).T
-        shown[row, column] = _STRIPE
-    for u, v in np.rint((np.empty((0, 2)) if points is None else points) * scale).astype(int).tolist():
-        cv2.circle(shown, (u, v), 3, _FOUND, 2, cv2.LINE_AA)
-    counts = np.histogram(image, _BINS, (0, full_dn + 1))[0]
-    return Picture(_encoded(shown, ".jpg"), caption, counts / image.size, saturated)
+    @cached_property
+    def histogram(self) -> np.ndarray:
+        """Shares of the pixels in equal steps of grey value."""
+        return np.histogram(self.image, _BINS, (0, self.full_dn + 1))[0] / self.image.size
 
 
 def png_of(picture: np.ndarray) -> bytes:

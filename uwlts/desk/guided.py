@@ -10,7 +10,7 @@ import numpy as np
 from nicegui import ui
 
 from uwlts.calibration.guidance.pose_advice import Coverage
-from uwlts.desk.board import Board, picture_of, png_of
+from uwlts.desk.board import Board, Picture, png_of
 from uwlts.desk.page import BoardView, laser_off_button, timed
 from uwlts.desk.server import DeskServer
 from uwlts.hardware.grbl import GrblStage
@@ -65,7 +65,7 @@ class BoardScreen:
         self, image: np.ndarray, *, full_dn: int, points: np.ndarray | None, stripe: np.ndarray | None, remark: str
     ) -> None:
         """Show an image (H, W) with the points (N, 2) of the target and the stripe's pixels (N, 2) found in it."""
-        self._board.show(picture_of(image, full_dn=full_dn, caption=remark, stripe=stripe, points=points))
+        self._board.show(Picture(image, full_dn=full_dn, caption=remark, stripe=stripe, points=points))
         if isinstance(self._stage, GrblStage):
             self._board.laser = "on" if self._stage.laser_power > 0 else "flashing"
 

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.calibration.calibrate import calibrate
-from uwlts.desk.board import Board, picture_of
+from uwlts.desk.board import Board, Picture
 from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.recording_view import RecordingView
 from uwlts.hardware.camera import CameraDevice
@@ -351,7 +351,7 @@ class Instrument:
             pixels = stripe.pixels()
             caption += f"; stripe on {len(pixels)} of {len(stripe.status)} profile lines"
         saturated = seen.saturated / max(seen.counted, 1)
-        self._board.show(picture_of(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated))
+        self._board.show(Picture(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated))
 
     def _scan(self, plan: ScanPlan, out: Path, calibration: Path | None, resume: bool, overwrite: bool) -> None:
         known: AnyCalibration | None = None if calibration is None else load_calibration(calibration)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.desk.board import Board, picture_of
+from uwlts.desk.board import Board, Picture
 from uwlts.desk.server import DeskServer
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.model.any_calibration import AnyCalibration
@@ -17,7 +17,8 @@ from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, part_path
 from uwlts.stripe import FoundStripes, extract_stripe, warm_up
 
-_LOOK_S = 0.25
+LOOK_S = 0.1
+"""Time between two looks for new images; one takes some ms."""
 _FAINT, _MANY, _FEW = 0.1, 0.05, 0.05
 """A laser image is faint below this part of the full scale, saturated with more than this part of its lines there; it
 shows hardly any stripe below this part of its lines."""
@@ -56,13 +57,13 @@ class RecordingView:
         caption = f"image {number + 1}, {light}, stage at {frame.stage_mm:.3f} mm, exposure {frame.exposure_ms:.3g} ms"
         board.position_mm = frame.stage_mm
         if not frame.laser_on:
-            board.show(picture_of(frame.image, full_dn=full, caption=caption))
+            board.show(Picture(frame.image, full_dn=full, caption=caption))
             return
         profile = _profile(frame, self._header, self._calibration)
         self._found, self._lines = self._found + len(profile.pixels), self._lines + profile.lines
         caption += f"; stripe on {self._found:,} of {self._lines:,} profile lines so far"
         board.show(
-            picture_of(frame.image, full_dn=full, caption=caption, stripe=profile.pixels, saturated=profile.saturated)
+            Picture(frame.image, full_dn=full, caption=caption, stripe=profile.pixels, saturated=profile.saturated)
         )
         if len(profile.points_mm):
             board.cloud.add(profile.points_mm, intensity=profile.intensity)
@@ -157,7 +158,7 @@ def watch(
             view, begun = None, 0
             for seen in frames_of(path):
                 if seen is None:
-                    time.sleep(_LOOK_S)
+                    time.sleep(LOOK_S)
                     continue
                 header, number, frame = seen
                 if view is None:

@@ -13,7 +13,7 @@ from uwlts.model.errors import DescriptionError, DesignError, RangeError
 from uwlts.model.input_file import is_regular_file
 from uwlts.model.library import load_sensor, read_table, validated
 from uwlts.model.placement import check_design
-from uwlts.model.sensor import Description, NotNegative, Positive, Sensor, Table, Vector
+from uwlts.model.sensor import Bracket, Description, NotNegative, Positive, Sensor, Table, Vector
 from uwlts.storage.capture import CaptureHeader
 from uwlts.targets import parse_target
 
@@ -117,17 +117,23 @@ class ScanPlan(RigPlan):
 
     At every position the images in ``lights`` are taken in turn: "laser" with the laser on, "lamp" with it off, under
     whatever other light there is. With ``background`` an image without laser is taken before every laser image and
-    subtracted from it. With ``check_steps`` an early position is visited again at the end, to see whether the stage has
-    lost steps.
+    subtracted from it. Laser images are taken at every multiple of their exposure in ``bracket``, to be fused into one
+    that shows bright and dark surfaces (`uwlts.stripe.exposures`). With ``check_steps`` an early position is visited
+    again at the end, to see whether the stage has lost steps.
     """
 
     medium: str
     stage: StagePlan
     lights: Annotated[tuple[Light, ...], Field(min_length=1)] = ("laser",)
     background: bool = False
+    bracket: Bracket = (1.0,)
     check_steps: bool = True
     target: Table | None = None
     artefact: Table | None = None
+
+    def images(self) -> list[tuple[Light, float]]:
+        """Light, and multiple of its exposure, of each image at a position."""
+        return [(light, each) for light in self.lights for each in (self.bracket if light == "laser" else (1.0,))]
 
     def header(self, name: str) -> CaptureHeader:
         """Header of the capture; DescriptionError or EvaluationError where what the plan describes is not valid."""

@@ -5,7 +5,7 @@ laser is on for its own images only; the stage's driver switches it off however 
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from itertools import product
@@ -184,8 +184,8 @@ def record_scan(
     ``recorded`` is called with every image that is in the file, and its number.
     """
     positions_mm = plan.stage.positions_mm()
-    shots = list(product(positions_mm, plan.lights))
-    images = len(positions_mm) * (len(plan.lights) + int(plan.background and "laser" in plan.lights))
+    shots = list(product(positions_mm, plan.images()))
+    images = len(shots) + (len(positions_mm) * len(plan.bracket) if plan.background and "laser" in plan.lights else 0)
     report(
         f"{len(positions_mm)} positions from {positions_mm[0]:g} to {positions_mm[-1]:g} mm, {images} images to take"
     )
@@ -202,7 +202,7 @@ def record_scan(
         images=len(shots),
         background=plan.background,
     )
-    known_ms, before_s = left_over(out) if resume else ({}, 0.0)
+    known_ms, before_s = left_over(out, [multiple for _, multiple in plan.images()]) if resume else ({}, 0.0)
     seen = ScanProgress(exposure_ms=known_ms)
     with CaptureWriter(out, header, dtype=dtype, plan=plan.recorded(), overwrite=overwrite, resume=resume) as writer:
         begun = len(writer)
@@ -214,9 +214,9 @@ def record_scan(
         taking.settle_exposures(between)
         report("recording")
         start_s = time.monotonic() - before_s
-        for done, (position_mm, light) in enumerate(shots[begun:], begun + 1):
+        for done, (position_mm, (light, multiple)) in enumerate(shots[begun:], begun + 1):
             between()
-            position, image, exposure_ms = taking.take(position_mm, light, last=done == len(shots))
+            position, image, exposure_ms = taking.take(position_mm, light, multiple, last=done == len(shots))
             image = image.astype(dtype, copy=False)
             frame = Frame(image, position, light == "laser", exposure_ms, time.monotonic() - start_s)
             writer.append(frame)
@@ -229,13 +229,17 @@ def record_scan(
         return seen
 
 
-def left_over(path: Path) -> tuple[dict[Light, float], float]:
-    """Exposures in ms that an interrupted recording of a path used last, and the time in s of its last image."""
+def left_over(path: Path, multiples: Sequence[float] = (1.0,)) -> tuple[dict[Light, float], float]:
+    """Exposures in ms that an interrupted recording of a path used last, and the time in s of its last image.
+
+    ``multiples`` of a light's exposure are taken in turn.
+    """
     if not part_path(path).exists():
         return {}, 0.0
     with Capture(part_path(path)) as capture:
         lights: list[Light] = ["laser" if on else "lamp" for on in capture.laser_on.tolist()]
-        known = dict(zip(lights, capture.exposure_ms.tolist(), strict=True))
+        single_ms = capture.exposure_ms / np.resize(multiples, len(lights))
+        known = dict(zip(lights, single_ms.tolist(), strict=True))
         return known, float(capture.time_s[-1]) if len(capture) else 0.0
 
 
@@ -302,17 +306,25 @@ class _Taking:
             self._watch.lit = LitPlace(position_mm, exposure_ms)
         exposures[light] = min(exposure_ms, exposures.get(light, exposure_ms))
 
-    def take(self, position_mm: float, light: Light, *, last: bool) -> tuple[float, np.ndarray, float]:
-        """Position read back, image (H, W) as it is stored, and its exposure in ms."""
+    def take(self, position_mm: float, light: Light, multiple: float, *, last: bool) -> tuple[float, np.ndarray, float]:
+        """Position read back, image (H, W) as it is stored, and its exposure in ms: a multiple of the light's own.
+
+        Only images at the light's own exposure are watched; longer ones of a bracket are meant to be saturated.
+        """
         rig, seen, zero_dn = self._rig, self._seen, self._plan.zero_dn(self._sensor)
         position = rig.move_to(position_mm)
-        image, exposure_ms = rig.image(light, seen.exposure_ms[light])
+        image, exposure_ms = rig.image(light, seen.exposure_ms[light] * multiple)
         bright = brightness(image, self._sensor, light)
-        if bright.overexposed and light not in self._plan.planned_ms() and self._shorten(light, position_mm):
+        if (
+            multiple == 1
+            and bright.overexposed
+            and light not in self._plan.planned_ms()
+            and self._shorten(light, position_mm)
+        ):
             image, exposure_ms = rig.image(light, seen.exposure_ms[light])
             bright = brightness(image, self._sensor, light)
         unlit = rig.image("lamp", exposure_ms)[0] if zero_dn and light == "laser" else None
-        if light == "laser":
+        if light == "laser" and multiple == 1:
             stripe, place = stripe_of(image, self._sensor, background=unlit), LitPlace(position_mm, exposure_ms)
             self._slip.see(Place(position, exposure_ms, centres_of(stripe)))
             self._watch.see(image, stripe, bright.level, place, unlit=unlit, last=last)

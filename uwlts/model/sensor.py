@@ -428,6 +428,26 @@ class Detector(Description):
         return 2.0 ** ((self.temperature_c - self.reference_temperature_c) / self.dark_current_doubling_k)
 
 
+LEAST_BRACKET_STEP = 1.5
+"""Ratio of exposures at one place from which they are a bracket; closer ones are repeats."""
+
+MOST_IN_BRACKET = 8
+"""Exposures at one place at most."""
+
+
+def _growing(factors: tuple[float, ...]) -> tuple[float, ...]:
+    if factors[0] != 1 or any(b < LEAST_BRACKET_STEP * a for a, b in pairwise(factors)):
+        raise ValueError(
+            f"bracket is {factors}; expected multiples of the exposure that begin with 1, each at least "
+            f"{LEAST_BRACKET_STEP:g} times the one before, such as [1, 4, 16]"
+        )
+    return factors
+
+
+Bracket = Annotated[tuple[Positive, ...], Field(min_length=1, max_length=MOST_IN_BRACKET), AfterValidator(_growing)]
+"""Multiples of the laser's exposure, growing from 1, at which images of one place are taken to be fused."""
+
+
 class Exposure(Description):
     """Exposure of laser and of lamp images in ms; "auto" brings the brightest light to ``auto_level`` of full scale."""
 

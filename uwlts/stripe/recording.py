@@ -1,15 +1,14 @@
 """The stripes of all laser images of a recording, and why images show none."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import cv2
 import numpy as np
 
 from uwlts.model.errors import CaptureError, ImageError
-from uwlts.model.sensor import CaptureHeader
+from uwlts.stripe.exposures import BracketImages, fused_images
 from uwlts.stripe.extract import extract_stripe
 from uwlts.stripe.result import StripeOptions, StripeSettings, StripeStatus
 
@@ -25,20 +24,6 @@ FEWEST_LINES = 20
 _CLEARLY = 3
 """A stripe runs across if so many times as many lines show it when the image is read the other way; a right one is
 seen on a fifth of as many, at its steep places."""
-
-
-class LaserImages(Protocol):
-    """A sequence of images, numbered, of which those taken with the laser on can be read; a capture is one."""
-
-    @property
-    def path(self) -> Path: ...
-
-    @property
-    def header(self) -> CaptureHeader: ...
-
-    def frames(self, *, laser_on: bool | None = None) -> Iterator[tuple[int, np.ndarray]]: ...
-
-    def __len__(self) -> int: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +51,15 @@ class FoundStripes:
 
 
 def find_stripes(
-    capture: LaserImages,
+    capture: BracketImages,
     *,
     options: StripeSettings = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> FoundStripes:
     """Find the stripe in all laser images of a recording, such as an opened `uwlts.storage.capture.Capture`.
+
+    Images of one place at several exposures are fused (`uwlts.stripe.exposures`); their stripe has the number of the
+    longest exposure, and amplitudes are in its grey levels.
 
     ``options`` are as for `StripeOptions.of`. ``progress`` is called after each image with the number of images done
     and the number in all. CaptureError where the recording holds no laser image, or none of them shows a stripe.
@@ -80,8 +68,8 @@ def find_stripes(
     chosen = StripeOptions.of(capture.header.sensor, options)
     found: list[tuple[np.ndarray, ...]] = []
     statuses = np.zeros(len(StripeStatus), int)
-    for number, image in capture.frames(laser_on=True):
-        stripe = extract_stripe(image, stripe_along=along, options=chosen, saturation=full_dn)
+    for number, image, saturation in fused_images(capture):
+        stripe = extract_stripe(image, stripe_along=along, options=chosen, saturation=saturation)
         statuses += np.bincount(stripe.status, minlength=len(StripeStatus))
         good = stripe.lines
         of_lines = (values[good] for values in (stripe.centre_px, stripe.amplitude, stripe.width_px))
@@ -93,7 +81,7 @@ def find_stripes(
         )
     by_status = {status.name.lower(): int(statuses[status]) for status in StripeStatus}
     if statuses[StripeStatus.OK] == 0:
-        lit = (image for _, image in capture.frames(laser_on=True))
+        lit = (capture.image(number) for number in np.flatnonzero(capture.laser_on).tolist())
         reason = why_no_stripe(lit, stripe_along=along, full_dn=full_dn)
         raise CaptureError(f"no stripe in any of the {len(found)} laser images of {capture.path.name}: {reason}")
     return FoundStripes(*map(np.concatenate, zip(*found, strict=True)), lines_by_status=by_status)

@@ -176,6 +176,8 @@ BAD_SCENES = {
         r"motion: direction \(0\.0, 0\.0, 0\.0\) has no length",
     ),
     "no light": ("base = 'plane'\n[motion]\nlights = []", r"motion: lights is empty"),
+    "falling bracket": ("base = 'plane'\n[motion]\nbracket = [1, 16, 4]", r"motion\.bracket: .*such as \[1, 4, 16\]"),
+    "bracket in motion": ("base = 'plane'\n[motion]\nbracket = [1, 4]\nspeed_mm_per_s = 5", r"motion: a moving stage"),
     "unknown light": ("base = 'plane'\n[motion]\nlights = ['sun']", r"motion\.lights\.0: .*'sun'"),
     "no frames": ("base = 'plane'\n[motion]\ncount = 0", r"motion\.count: .*found 0"),
     "step not a number": ("base = 'plane'\n[motion]\nstep_mm = nan", r"motion\.step_mm: .*finite"),

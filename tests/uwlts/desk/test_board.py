@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from uwlts.desk.board import KEPT_LINES, Board, picture_of, png_of
+from uwlts.desk.board import KEPT_LINES, Board, Picture, png_of
 
 FULL = 255
 
@@ -105,7 +105,7 @@ def test_another_phase_begins_anew():
 
 def shown(image: np.ndarray, **options: object) -> np.ndarray:
     """The picture as a browser decodes it (H, W, 3): blue, green, red."""
-    picture = picture_of(image, full_dn=FULL, caption="test", **options)
+    picture = Picture(image, full_dn=FULL, caption="test", **options)
     return cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_COLOR).astype(int)
 
 
@@ -119,7 +119,7 @@ def test_a_picture_raises_what_is_dark():
 @pytest.mark.parametrize("full", [255, 4095])
 def test_brighter_than_the_full_scale_is_white(full):
     image = np.full((32, 32), 60000, np.uint16)
-    picture = picture_of(image, full_dn=full, caption="test")
+    picture = Picture(image, full_dn=full, caption="test")
     assert cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE).min() == 255
 
 
@@ -165,14 +165,14 @@ def test_the_histogram_counts_shares():
     image = np.zeros((100, 100), np.uint8)
     image[:25] = 255
     image[25:50] = 128
-    picture = picture_of(image, full_dn=FULL, caption="counted", saturated=0.25)
+    picture = Picture(image, full_dn=FULL, caption="counted", saturated=0.25)
     assert (picture.caption, picture.saturated) == ("counted", 0.25)
     assert len(picture.histogram) == 64 and picture.histogram.sum() == pytest.approx(1.0)
     assert picture.histogram[[0, 32, 63]].tolist() == [0.5, 0.25, 0.25]
 
 
 def test_showing_counts_pictures():
-    board, picture = Board("test"), picture_of(np.zeros((8, 8), np.uint8), full_dn=FULL, caption="one")
+    board, picture = Board("test"), Picture(np.zeros((8, 8), np.uint8), full_dn=FULL, caption="one")
     board.show(picture)
     board.show(picture)
     assert board.picture is picture and board.pictures == 2

@@ -12,7 +12,7 @@ import numpy as np
 
 from uwlts.runtime.compiled import compiled
 from uwlts.stripe.methods import quadratic
-from uwlts.stripe.peak_window import FLANK, FWHM_PER_SIGMA, PeakWindow
+from uwlts.stripe.peak_window import FLANK, FWHM_PER_SIGMA, PeakWindow, greatest
 
 _STEPS, _FIRST_STEPS = 5, 2
 """Steps in all, and those before the contrast is taken from what the fit leaves."""
@@ -164,8 +164,8 @@ def _sum_moments(known: np.ndarray, signal: np.ndarray, squared_contrast: np.flo
     """Moments of f^2 / v up to u^4, then of (y - f) f / v up to u^2."""
     for k in range(sums.size):
         sums[k] = np.float32(0.0)
-    most = signal.size // (2 * _LANES)
-    for row in range(2 * most + 1):
+    most, reach = signal.size // (2 * _LANES), int(greatest(known[_REACH : _REACH + _LANES]))
+    for row in range(most - reach, most + reach + 1):
         y, x = signal[row * _LANES :][:_LANES], np.float32(row - most)
         for k in range(_LANES):
             u = (x - known[_CENTRE + k]) / known[_SIGMA + k]
