@@ -27,8 +27,12 @@ if TYPE_CHECKING:
 else:
     # The names of the modules in uwlts.stripe.methods, which are not imported for a command's help.
     _METHODS = Path(uwlts.__file__).parent / "stripe" / "methods"
-    MethodName = Literal[tuple(sorted(m.name.replace("_", "-") for m in pkgutil.iter_modules([str(_METHODS)])))]
-Method = Annotated[MethodName | None, Parameter(help="How the stripe's centre is found.")]
+    _NAMES = sorted(m.name.replace("_", "-") for m in pkgutil.iter_modules([str(_METHODS)]))
+    MethodName = Literal[(*_NAMES, "learned")]
+Method = Annotated[
+    MethodName | None,
+    Parameter(help="How the stripe's centre is found; learned needs --stripe model=FILE.onnx (docs: learned_stripe)."),
+]
 Index = Annotated[
     float | None, Parameter(help="Refractive index of the medium, in place of the one that follows from the captures.")
 ]

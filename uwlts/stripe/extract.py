@@ -10,10 +10,11 @@ import numpy as np
 
 from uwlts.model.errors import ImageError
 from uwlts.stripe.candidates import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
-from uwlts.stripe.methods import place_centre
+from uwlts.stripe.learned import find_learned
+from uwlts.stripe.methods import amplitudes, place_centre
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
-from uwlts.stripe.result import Stripe, StripeOptions, StripeStatus
-from uwlts.stripe.search import MARGIN, search
+from uwlts.stripe.result import LEARNED, Stripe, StripeOptions, StripeStatus
+from uwlts.stripe.search import MARGIN, look_at, search
 
 _LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
 
@@ -24,8 +25,8 @@ _MANY = 0.25
 """Lines with a stripe that is too wide, over those with one that is measured, from which a wider window is tried."""
 
 # NumPy compares with its own integers several times as fast as with an enumeration.
-_OK, _NO_STRIPE, _SATURATED, _END = (
-    np.uint8(status) for status in (StripeStatus.OK, StripeStatus.NO_STRIPE, StripeStatus.SATURATED, StripeStatus.END)
+_OK, _NO_STRIPE, _AMBIGUOUS, _SATURATED, _END = (
+    np.uint8(StripeStatus[name]) for name in ("OK", "NO_STRIPE", "AMBIGUOUS", "SATURATED", "END")
 )
 
 
@@ -121,8 +122,24 @@ def warm_up(dtype: np.dtype | type = np.uint8, options: StripeOptions = StripeOp
         extract_stripe(lines, stripe_along="height", options=replace(options, method=method))
 
 
+def _found_by_model(profiles: np.ndarray, options: StripeOptions, clip: float) -> _Lines:
+    """The stripe on each of the profiles (N, L) as a trained network sees it; height and width are measured there."""
+    status, centre = find_learned(profiles, options.model, clip=clip)
+    lines = np.flatnonzero(status == _OK)
+    peak = look_at(profiles, lines, centre[lines], options)
+    amplitude, width = np.full((2, len(status)), np.nan, np.float32)
+    amplitude[lines] = amplitudes(peak, (centre[lines] - peak.start).astype(np.float32))
+    width[lines] = peak.sigma * FWHM_PER_SIGMA
+    nothing = np.zeros(len(status), bool)
+    found = _Lines(centre, amplitude, width, status, nothing, nothing)
+    found.discard(lines[~((peak.height > 0) & (amplitude[lines] > 0))], _AMBIGUOUS)
+    return found
+
+
 def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> _Lines:
     """The stripe on each of the profiles (N, L), sought with one size of window."""
+    if options.method == LEARNED:
+        return _found_by_model(profiles, options, clip if math.isfinite(clip) else max(float(profiles.max()), 1.0))
     block = options.half_window_px // 2
     high, low = block_extremes(profiles, block)
     # Blocks more at either end of the lines, so that what one window covers can be crossed out without a check.

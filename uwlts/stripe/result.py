@@ -13,6 +13,9 @@ from uwlts.model.errors import DescriptionError, RangeError
 from uwlts.model.sensor import Sensor
 from uwlts.stripe.methods import method_names
 
+LEARNED = "learned"
+"""The method of a trained network."""
+
 
 class PeakRule(StrEnum):
     """Which of several stripes on one line counts. First and last are in the order of growing pixel index."""
@@ -45,7 +48,10 @@ class StripeOptions:
     Attributes
     ----------
     method : str
-        How the centre is placed once the stripe is found: one of `uwlts.stripe.method_names`.
+        How the centre is placed once the stripe is found: one of `uwlts.stripe.method_names`; or "learned": the network
+        in ``model`` both finds it and places it.
+    model : str
+        ONNX file of the method "learned" (`uwlts.stripe.learned`).
     peak : PeakRule
         Which of several stripes on a line counts.
     half_window_px : int
@@ -77,6 +83,7 @@ class StripeOptions:
     """
 
     method: str = "profile-fit"
+    model: str = ""
     peak: PeakRule = PeakRule.STRONGEST
     half_window_px: int = 16
     widest_window_px: int = 64
@@ -89,11 +96,16 @@ class StripeOptions:
     end_lines: int = 2
 
     def __post_init__(self) -> None:
-        for name, known in (("method", method_names()), ("peak", tuple(PeakRule))):
+        for name, known in (("method", (*method_names(), LEARNED)), ("peak", tuple(PeakRule))):
             value = getattr(self, name)
             if value not in known:
                 raise RangeError(f"{name} is {value!r}; use one of {', '.join(repr(str(k)) for k in known)}")
         object.__setattr__(self, "peak", PeakRule(self.peak))
+        if not isinstance(self.model, str) or bool(self.model) != (self.method == LEARNED):
+            raise RangeError(
+                f"method is {self.method!r} and model {self.model!r}; the method {LEARNED!r}, and no other, needs the "
+                "ONNX file of its model"
+            )
         for name in ("half_window_px", "widest_window_px", "smoothing_lines", "end_lines"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int | np.integer):

@@ -56,8 +56,37 @@ def search(
     Returns the status (L,) of each line, whether something bright was too wide to be measured (L,), and the windows of
     the lines with a stripe, in their order.
     """
-    half, lines = options.half_window_px, profiles.shape[1]
-    rules = SearchRules(
+    lines, rules = profiles.shape[1], _rules(options, coarse=coarse, fine=fine, clip=clip)
+    peaks = PeakWindow.empty(lines, 2 * rules.half + rules.block, options.smoothing_px)
+    status, wide = np.full(lines, _NO_STRIPE, np.uint8), np.zeros(lines, np.bool_)
+    kernel = low_pass(options.smoothing_px)
+    # Numba compiles longest for arrays that compiled code makes itself.
+    smooth = np.empty(peaks.window.shape[1], np.float32)
+    pixels = np.empty(smooth.size + kernel.size - 1, np.float32)
+    _search_lines(profiles, board, kernel, pixels, smooth, rules, status, wide, peaks)
+    good = status == _OK
+    return status, wide, peaks if good.all() else peaks.keep(good)
+
+
+def look_at(profiles: np.ndarray, lines: np.ndarray, centre: np.ndarray, options: StripeOptions) -> PeakWindow:
+    """Windows about stripes whose centres (M,) on M lines of the profiles (N, L) are known from elsewhere.
+
+    Their height is 0 where nothing stands out there.
+    """
+    rules = _rules(options, coarse=0.0, fine=0.0, clip=np.inf)
+    peaks = PeakWindow.empty(len(lines), 2 * rules.half + rules.block, options.smoothing_px)
+    peaks.start[:] = np.rint(centre).astype(np.intp) - rules.half - rules.block // 2
+    kernel = low_pass(options.smoothing_px)
+    smooth = np.empty(peaks.window.shape[1], np.float32)
+    pixels = np.empty(smooth.size + kernel.size - 1, np.float32)
+    _look_at_lines(profiles, lines, kernel, pixels, smooth, rules, peaks)
+    return peaks
+
+
+def _rules(options: StripeOptions, *, coarse: float, fine: float, clip: float) -> SearchRules:
+    """Rules of the search; parameters as of `search`."""
+    half = options.half_window_px
+    return SearchRules(
         half=half,
         block=half // 2,
         smoothing=options.smoothing_px,
@@ -69,15 +98,30 @@ def search(
         fine=fine,
         bright=max(fine, _BRIGHT * clip),
     )
-    peaks = PeakWindow.empty(lines, 2 * half + rules.block, options.smoothing_px)
-    status, wide = np.full(lines, _NO_STRIPE, np.uint8), np.zeros(lines, np.bool_)
-    kernel = low_pass(options.smoothing_px)
-    # Numba compiles longest for arrays that compiled code makes itself.
-    smooth = np.empty(peaks.window.shape[1], np.float32)
-    pixels = np.empty(smooth.size + kernel.size - 1, np.float32)
-    _search_lines(profiles, board, kernel, pixels, smooth, rules, status, wide, peaks)
-    good = status == _OK
-    return status, wide, peaks if good.all() else peaks.keep(good)
+
+
+@compiled
+def _look_at_lines(
+    profiles: np.ndarray,
+    lines: np.ndarray,
+    kernel: np.ndarray,
+    pixels: np.ndarray,
+    smooth: np.ndarray,
+    rules: SearchRules,
+    peaks: PeakWindow,
+) -> None:
+    """Fill the windows that begin at ``peaks.start``."""
+    size, border = smooth.size, kernel.size // 2
+    for m in range(lines.size):
+        window = pixels[border : border + size]
+        cut(profiles, lines[m], peaks.start[m], window)
+        filtered(pixels, kernel, smooth)
+        peak = measured(smooth, peaks.start[m], profiles.shape[0], rules)
+        peaks.middle[m], peaks.sigma[m], peaks.reach[m] = peak.middle, peak.sigma, peak.reach
+        peaks.base[m], peaks.slope[m] = peak.base, peak.slope
+        peaks.height[m] = peak.height if peak.closed else np.float32(0.0)
+        for k in range(size):
+            peaks.window[m, k] = window[k]
 
 
 @compiled

@@ -25,17 +25,19 @@ def method_names() -> tuple[str, ...]:
 
 
 def place_centre(method: str, peak: PeakWindow) -> tuple[np.ndarray, np.ndarray]:
-    """Centre (M,) float32 of the peak in each window, px from its first pixel, and amplitude (M,) float32.
-
-    The amplitude is the height, in grey levels, of the best-fitting Gaussian of the peak's sigma at the centre.
-    """
+    """Centre (M,) float32 of the peak in each window, px from its first pixel, and amplitude as of `amplitudes`."""
     centre = _method(method)(peak)
+    return centre, amplitudes(peak, centre)
+
+
+def amplitudes(peak: PeakWindow, centre: np.ndarray) -> np.ndarray:
+    """Height (M,) float32, in grey levels, of the best-fitting Gaussian of each peak's sigma at the centre (M,)."""
     sigma, kernel = np.maximum(peak.sigma, np.float32(0.3)), peak.kernel_sigma()
     moments = np.empty((centre.size, 3), np.float32)
     gaussian_moments(peak, centre, kernel, moments)
     # The sum of the product of two Gaussians over the pixels, solved for the height of the first.
     joint = 0.5 / math.pi * (1 / (sigma * sigma) + 1 / (kernel * kernel))
-    return centre, moments[:, 0] * np.sqrt(joint)
+    return moments[:, 0] * np.sqrt(joint)
 
 
 @lru_cache

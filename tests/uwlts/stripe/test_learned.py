@@ -1,0 +1,116 @@
+"""The method of a trained network, with a model whose answers are known: the centroid of what is bright."""
+
+import sys
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from uwlts.model.errors import CaptureError, DescriptionError, RangeError, SetupError
+from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
+
+LINES, LENGTH = 300, 170
+DARK, DOUBTFUL = slice(0, 20), slice(20, 40)
+
+
+def centroid_model(path, *, name="lines"):
+    """Centroid of the pixels above a tenth of the full scale; visible is their sum: faint lines are not sure."""
+    held = [
+        numpy_helper.from_array(np.float32(0.1), "level"),
+        numpy_helper.from_array(np.float32(1e-9), "tiny"),
+        numpy_helper.from_array(np.array([1], np.int64), "axis"),
+        numpy_helper.from_array(np.arange(176, dtype=np.float32), "place"),
+    ]
+    nodes = [
+        helper.make_node("Relu", ["above"], ["light"]),
+        helper.make_node("ReduceSum", ["light", "axis"], ["visible"], keepdims=0),
+        helper.make_node("Mul", ["light", "place"], ["weighted"]),
+        helper.make_node("ReduceSum", ["weighted", "axis"], ["moment"], keepdims=0),
+        helper.make_node("Add", ["visible", "tiny"], ["mass"]),
+        helper.make_node("Div", ["moment", "mass"], ["centre_px"]),
+    ]
+    nodes.insert(0, helper.make_node("Sub", [name, "level"], ["above"]))
+    outputs = [helper.make_tensor_value_info(each, TensorProto.FLOAT, ["n"]) for each in ("centre_px", "visible")]
+    given = helper.make_tensor_value_info(name, TensorProto.FLOAT, ["n", "p"])
+    graph = helper.make_graph(nodes, "centroid", [given], outputs, held)
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), str(path))
+    return path
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    return centroid_model(tmp_path_factory.mktemp("model") / "centroid.onnx")
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Centres (L,) and an image whose first lines are dark and whose next ones are faint."""
+    centre = 80 + 20 * np.sin(np.arange(LINES) / 40)
+    height = np.full(LINES, 200.0)
+    height[DARK], height[DOUBTFUL] = 0.0, 34.0
+    light = height[:, None] * np.exp(-0.5 * ((np.arange(LENGTH) - centre[:, None]) / 1.5) ** 2)
+    return centre, np.round(light + 2).astype(np.uint8)
+
+
+@pytest.mark.parametrize("along", ["height", "width"])
+def test_centres_and_what_is_visible_are_the_models(model, drawn, along):
+    centre, image = drawn
+    options = StripeOptions(method="learned", model=str(model), end_lines=0)
+    found = extract_stripe(image if along == "height" else image.T.copy(), stripe_along=along, options=options)
+    assert (found.status[DARK] == StripeStatus.NO_STRIPE).all()
+    assert (found.status[DOUBTFUL] == StripeStatus.AMBIGUOUS).all()
+    assert (found.status[40:] == StripeStatus.OK).all()
+    np.testing.assert_allclose(found.centre_px[40:], centre[40:], atol=0.02)
+    # Measured in the image, not by the model.
+    np.testing.assert_allclose(found.amplitude[40:], 200, rtol=0.05)
+    np.testing.assert_allclose(found.width_px[40:], 3.53, rtol=0.05)
+    assert np.isnan(found.centre_px[:40]).all() and np.isnan(found.amplitude[:40]).all()
+
+
+def test_ends_are_left_out_as_with_other_methods(model, drawn):
+    _, image = drawn
+    found = extract_stripe(image, stripe_along="height", options=StripeOptions(method="learned", model=str(model)))
+    assert (found.status[40:42] == StripeStatus.END).all() and found.status[42] == StripeStatus.OK
+
+
+def test_deeper_images_are_shares_of_their_full_scale(model, drawn):
+    centre, image = drawn
+    options = StripeOptions(method="learned", model=str(model), end_lines=0)
+    found = extract_stripe(image.astype(np.uint16) * 16, stripe_along="height", options=options, saturation=4095)
+    np.testing.assert_allclose(found.centre_px[40:], centre[40:], atol=0.02)
+
+
+def test_a_place_where_nothing_stands_out_is_no_stripe(model):
+    image = np.full((40, LENGTH), 100, np.uint8)
+    options = StripeOptions(method="learned", model=str(model))
+    assert not (extract_stripe(image, stripe_along="height", options=options).status == StripeStatus.OK).any()
+
+
+@pytest.mark.parametrize(
+    "settings", [{"method": "learned"}, {"model": "stripe.onnx"}, {"method": "learned", "model": 3}]
+)
+def test_method_and_model_go_together(settings):
+    with pytest.raises(RangeError, match="needs the ONNX file of its model"):
+        StripeOptions(**settings)
+
+
+def test_other_files_are_refused(tmp_path, drawn):
+    _, image = drawn
+    foreign, text = centroid_model(tmp_path / "foreign.onnx", name="photo"), tmp_path / "text.onnx"
+    text.write_text("not a model")
+    cases = (
+        (foreign, DescriptionError, r"has the inputs \['photo'\]"),
+        (text, DescriptionError, "no ONNX model"),
+        (tmp_path / "absent.onnx", CaptureError, "absent.onnx"),
+    )
+    for path, error, message in cases:
+        with pytest.raises(error, match=message):
+            extract_stripe(image, stripe_along="height", options=StripeOptions(method="learned", model=str(path)))
+
+
+def test_without_onnx_runtime_the_extra_is_named(tmp_path, drawn, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    path = centroid_model(tmp_path / "again.onnx")
+    with pytest.raises(SetupError, match=r"uwlts\[learn\]"):
+        extract_stripe(drawn[1], stripe_along="height", options=StripeOptions(method="learned", model=str(path)))
