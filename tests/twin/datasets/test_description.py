@@ -12,7 +12,7 @@ from twin.datasets.draws import draw_scene, split_of
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import names
 
-TINY = {"title": "tiny", "scene": "plane", "sensor": "thesis-binned"}
+TINY = {"title": "tiny", "scene": "plane", "sensor": "thesis-small"}
 POWER = "sensor.laser.power_mw"
 
 
