@@ -291,9 +291,9 @@ class Studio:
         for shot in dict.fromkeys((shots[len(shots) // 2], shots[0], shots[-1])):
             if probe == "middle" and brightest > 0:
                 break
-            light = self._light(shot, spp=PROBE_SPP, seed=0, travel=None)
+            even, laser = self._light(shot, spp=PROBE_SPP, seed=0, travel=None)
             # Where one shot is enough, its grain need not be known either, which takes as long as all else.
-            peaks = self._electrons_per_ms(*light, shot, speckle=probe == "scan").max(axis=axis)
+            peaks = self._electrons_per_ms(even, laser, shot, speckle=probe == "scan").max(axis=axis)
             if (peaks > 0).any():
                 brightest = max(brightest, float(np.quantile(peaks[peaks > 0.05 * peaks.max()], BRIGHT_SHARE)))
         longest = self.sensor.exposure.longest_ms
