@@ -16,13 +16,13 @@ from pydantic import JsonValue
 import uwlts
 from twin.datasets.description import (
     SPLITS,
-    OneOf,
     Constant,
     DataSetDescription,
     LineStatus,
     LogUniform,
     Mask,
     Normal,
+    OneOf,
     Split,
     Uniform,
 )

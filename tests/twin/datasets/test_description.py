@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.datasets.description import SPLITS, OneOf, DataSetDescription, LogUniform, Normal, Uniform, load_description
+from twin.datasets.description import SPLITS, DataSetDescription, LogUniform, Normal, OneOf, Uniform, load_description
 from twin.datasets.draws import draw_scene, split_of
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import names
