@@ -218,6 +218,13 @@ def studies() -> list[Row]:
     ]
 
 
+def datasets() -> list[Row]:
+    """Frames of a data set per second, single scattering, 640 x 512 pixels, from the light to the labelled files."""
+    from tests.bench.dataset import rate_hz
+
+    return [at_least("data set stripe-clean, two workers", rate_hz(), "frames/s", 10)]
+
+
 def hardware() -> list[Row]:
     """Frames per second from a camera to the disk, alone and with stripe and points found meanwhile."""
     from tests.bench.recording import RATE_HZ, SERVED, TAKEN, following_rate, gige_recording, recording
@@ -262,7 +269,7 @@ def commands() -> list[Row]:
     ]
 
 
-_ALL = (demo, reproduction, rendering, light, campaign, pipeline, studies, hardware, commands)
+_ALL = (demo, reproduction, rendering, light, campaign, pipeline, studies, datasets, hardware, commands)
 SECTIONS = {section.__name__: section for section in _ALL}
 
 

@@ -16,13 +16,13 @@ from pydantic import JsonValue
 import uwlts
 from twin.datasets.description import (
     SPLITS,
-    Choice,
     Constant,
     DataSetDescription,
     LineStatus,
     LogUniform,
     Mask,
     Normal,
+    OneOf,
     Split,
     Uniform,
 )
@@ -204,7 +204,7 @@ def _varied(card: DataCard, description: DataSetDescription) -> list[tuple[str, 
         match distribution:
             case Constant():
                 words = f"always {distribution.value}"
-            case Choice():
+            case OneOf():
                 words = f"one of {', '.join(map(str, distribution.values))}"
                 words += (
                     f", weights {', '.join(f'{w:g}' for w in distribution.weights)}" if distribution.weights else ""

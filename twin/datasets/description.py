@@ -84,7 +84,7 @@ class Constant(Distribution):
         return self.value
 
 
-class Choice(Distribution):
+class OneOf(Distribution):
     """One of some values, each as probable as its weight says, all equally unless given."""
 
     kind: Literal["choice"]
@@ -108,7 +108,7 @@ class Choice(Distribution):
         return self.values[-1]
 
 
-class Range(Distribution):
+class Between(Distribution):
     """Base of distributions between two ends."""
 
     least: float
@@ -121,7 +121,7 @@ class Range(Distribution):
         return self
 
 
-class Uniform(Range):
+class Uniform(Between):
     """Every number of a range equally probable."""
 
     kind: Literal["uniform"]
@@ -131,7 +131,7 @@ class Uniform(Range):
         return self.least + share * (self.most - self.least)
 
 
-class LogUniform(Range):
+class LogUniform(Between):
     """Every factor of a range equally probable: the logarithm is uniform."""
 
     kind: Literal["log_uniform"]
@@ -179,7 +179,7 @@ class Normal(Distribution):
         return low, high
 
 
-AnyDistribution = Annotated[Constant | Choice | Uniform | LogUniform | Normal, Field(discriminator="kind")]
+AnyDistribution = Annotated[Constant | OneOf | Uniform | LogUniform | Normal, Field(discriminator="kind")]
 
 
 class Splits(Description):

@@ -122,7 +122,7 @@ def noise_std_e(taken: Exposed, detector: Detector) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class StripeQuality:
+class LineQuality:
     """Of the stripe on L profile lines: width, signal to noise, least standard deviation of its centre, all (L,).
 
     ``clipped`` (L,) says whether pixels within its full width at half maximum are saturated. NaN where no stripe is.
@@ -136,7 +136,7 @@ class StripeQuality:
 
 def stripe_quality(
     direct: np.ndarray, noise: np.ndarray, centre: np.ndarray, *, informative: np.ndarray, clipped: np.ndarray
-) -> StripeQuality:
+) -> LineQuality:
     """Quality of the stripe about true centres (L,), from images of its own light and of the noise, in electrons.
 
     Images are (A, L), A being the pixels across the stripe. The stripe is the run of lit pixels that holds the centre.
@@ -185,7 +185,7 @@ def stripe_quality(
         everywhere[lines] = values
         return everywhere
 
-    return StripeQuality(
+    return LineQuality(
         *(of_all_lines(values, np.nan) for values in (width, snr, bound)),
         clipped=of_all_lines((within & clipped[row, lines] & (half > 0)).any(axis=0), False),
     )

@@ -108,8 +108,8 @@ class Exposed:
 class Studio:
     """A sensor before a scene, ready to take shots; exposures are settled once, before the first.
 
-    An automatic exposure follows from the first, middle and last shot of the ``scan``, or from its ``middle`` one alone
-    if that shows any light.
+    An automatic exposure follows from the first, middle and last shot of the ``scan``, or from its ``middle`` one
+    alone, without speckle, if that shows any light.
     """
 
     def __init__(self, sensor: Sensor, scene: Scene, options: Options, *, probe: Literal["scan", "middle"] = "scan"):
@@ -176,11 +176,15 @@ class Studio:
             return even, None
         return even, self.renderer.laser_frame(pose, spp=spp, seed=seed, travel=travel)
 
-    def _electrons_per_ms(self, even: np.ndarray, laser: LaserFrame | None, shot: Shot) -> np.ndarray:
-        """Mean photo-electrons per ms (H, W) of what `_light` returns, with speckle."""
+    def _electrons_per_ms(
+        self, even: np.ndarray, laser: LaserFrame | None, shot: Shot, *, speckle: bool = True
+    ) -> np.ndarray:
+        """Mean photo-electrons per ms (H, W) of what `_light` returns, with ``speckle`` if that is rendered."""
         light = self._through_lens(even)
         if laser is not None:
-            light += self._laser_shares * self._through_lens(self._speckled(laser, shot))
+            light += self._laser_shares * self._through_lens(
+                self._speckled(laser, shot) if speckle else laser.irradiance()
+            )
         return self._to_electrons(light)
 
     def _to_electrons(self, irradiance: np.ndarray) -> np.ndarray:
@@ -288,7 +292,9 @@ class Studio:
         for shot in dict.fromkeys((shots[len(shots) // 2], shots[0], shots[-1])):
             if probe == "middle" and brightest > 0:
                 break
-            peaks = self.electrons_per_ms(shot, spp=PROBE_SPP, seed=0).max(axis=axis)
+            even, laser = self._light(shot, spp=PROBE_SPP, seed=0, travel=None)
+            # Where one shot is enough, its grain need not be known either, which takes as long as all else.
+            peaks = self._electrons_per_ms(even, laser, shot, speckle=probe == "scan").max(axis=axis)
             if (peaks > 0).any():
                 brightest = max(brightest, float(np.quantile(peaks[peaks > 0.05 * peaks.max()], BRIGHT_SHARE)))
         longest = self.sensor.exposure.longest_ms

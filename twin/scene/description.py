@@ -223,6 +223,37 @@ class Weld(FreeForm):
         return self
 
 
+class PittedPipe(FreeForm):
+    """The outside of a corroded pipe, not quite round; its axis is its own x axis, its middle its origin.
+
+    The diameter along z is the largest, that square to it the smallest: ``ovality`` is their difference over
+    ``diameter_mm``, their mean. ``pits`` pits of ``pit_diameter_mm`` and ``pit_depth_mm`` lie within 60 deg of -z;
+    ``seed`` chooses where (`twin.scene.shapes.pit_places`).
+    """
+
+    kind: Literal["pitted_pipe"]
+    diameter_mm: Positive = 100.0
+    length_mm: Positive = 120.0
+    ovality: Annotated[float, Field(ge=0, le=0.2)] = 0.0
+    pits: Annotated[int, Field(ge=0, le=1000)] = 12
+    pit_diameter_mm: Positive = 10.0
+    pit_depth_mm: NotNegative = 2.0
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _has_room_for_pits(self) -> Self:
+        if self.pit_diameter_mm > min(self.length_mm, self.diameter_mm / 2):
+            raise ValueError(
+                f"pit_diameter_mm {self.pit_diameter_mm:g} is more than length_mm {self.length_mm:g}, or than half of "
+                f"diameter_mm {self.diameter_mm:g}"
+            )
+        if self.pit_depth_mm > self.diameter_mm / 4:
+            raise ValueError(
+                f"pit_depth_mm {self.pit_depth_mm:g} is more than a quarter of diameter_mm {self.diameter_mm:g}"
+            )
+        return self
+
+
 class Printed(Placed, ABC):
     """Base of calibration targets on a flat plate that faces -z; its own frame is the target's.
 
@@ -332,7 +363,8 @@ class TargetPlate(Printed):
 
 
 AnyObject = Annotated[
-    Sphere | Plate | Block | Pipe | Mesh | Head | Weld | CirclePlate | TargetPlate, Field(discriminator="kind")
+    Sphere | Plate | Block | Pipe | Mesh | Head | Weld | PittedPipe | CirclePlate | TargetPlate,
+    Field(discriminator="kind"),
 ]
 
 

@@ -20,6 +20,7 @@ from twin.scene.description import (
     Head,
     Mesh,
     Pipe,
+    PittedPipe,
     Plate,
     Scene,
     Sphere,
@@ -27,7 +28,7 @@ from twin.scene.description import (
     Weld,
 )
 from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, square_on
-from twin.scene.shapes import bowed_plate, head_surface, weld_surface
+from twin.scene.shapes import bowed_plate, head_surface, pitted_surface, weld_surface
 from uwlts.model.errors import DescriptionError
 from uwlts.model.input_file import require_regular_file
 
@@ -181,7 +182,7 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
             matrix = _FACING_SENSOR @ _scaled(*(last - first) / 2, 1)
             matrix[:2, 3] = (first + last) / 2
             matrix, kind = pose @ matrix, "rectangle"
-        case Mesh() | Head() | Weld():
+        case Mesh() | Head() | Weld() | PittedPipe():
             return _mesh(thing, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}))
         case Plate():
             matrix, kind = pose @ _FACING_SENSOR @ _scaled(thing.width_mm / 2, thing.height_mm / 2, 1), "rectangle"
@@ -190,7 +191,9 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
     return mi.load_dict({"type": kind, "to_world": scalar_transform(matrix), "bsdf": bsdf})
 
 
-def _mesh(thing: Mesh | Head | Weld | CirclePlate | TargetPlate, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
+def _mesh(
+    thing: Mesh | Head | Weld | PittedPipe | CirclePlate | TargetPlate, pose: np.ndarray, bsdf: mi.BSDF
+) -> mi.Mesh:
     """A surface of triangles with its vertices already in scene coordinates."""
     vertices, faces, uv = _surface(thing)
     vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
@@ -206,7 +209,9 @@ def _mesh(thing: Mesh | Head | Weld | CirclePlate | TargetPlate, pose: np.ndarra
     return mesh
 
 
-def _surface(thing: Mesh | Head | Weld | CirclePlate | TargetPlate) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _surface(
+    thing: Mesh | Head | Weld | PittedPipe | CirclePlate | TargetPlate,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Vertices (V, 3) in the object's own frame, faces (F, 3) and, if it has them, texture coordinates (V, 2)."""
     match thing:
         case Head():
@@ -214,6 +219,8 @@ def _surface(thing: Mesh | Head | Weld | CirclePlate | TargetPlate) -> tuple[np.
         case Weld():
             # Frozen models are hashable, which type checkers do not see.
             return *weld_surface(cast(Hashable, thing)), None
+        case PittedPipe():
+            return *pitted_surface(cast(Hashable, thing)), None
         case CirclePlate() | TargetPlate():
             return bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm)
         case Mesh():
@@ -281,7 +288,7 @@ def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:
         case Plate():
             half = np.array([thing.width_mm, thing.height_mm]) / 2
             yield MirrorFace(pose @ _FACING_SENSOR, half, thing.mirror_share())
-        case Sphere() | Pipe() | Mesh() | Head() | Weld() | CirclePlate() | TargetPlate():
+        case Sphere() | Pipe() | Mesh() | Head() | Weld() | PittedPipe() | CirclePlate() | TargetPlate():
             raise NotImplementedError(f"a {thing.kind} has no flat face that could be a mirror")
         case _:
             assert_never(thing)

@@ -1,7 +1,7 @@
-"""Free-form objects as fine triangle meshes of smooth functions: a dummy head, and weld beads on a plate.
+"""Free-form objects as fine triangle meshes of smooth functions: a dummy head, weld beads on a plate, a pitted pipe.
 
-Both face -z, towards the sensor. Where a ray along z meets their front is known in closed form (`head_depth`,
-`weld_height`), and the vertices lie on it; between them, facets cut corners by some micrometres.
+All face -z, towards the sensor. Their front is known in closed form (`head_depth`, `weld_height`, `pitted_radius`), and
+the vertices lie on it; between them, facets cut corners by some micrometres.
 """
 
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from twin.scene.description import Weld
+from twin.scene.description import PittedPipe, Weld
 from uwlts.model.errors import DescriptionError
 
 # Unit of the head's tables is its height, from the neck's cut at y = -0.5 to the crown at 0.5.
@@ -47,6 +47,10 @@ _TRAIL = 1 / 3
 _SAG_MM = 0.004
 """Largest distance of a weld's facets from its surface."""
 _MOST_VERTICES = 4_000_000
+_PIT_SAG_MM = 0.01
+"""Largest distance of a pitted pipe's facets from its surface."""
+_PITTED_DEG = 60.0
+"""Pits lie within this angle of the side that faces the sensor."""
 
 
 def head_depth(x: np.ndarray, y: np.ndarray, *, height_mm: float) -> np.ndarray:
@@ -149,6 +153,59 @@ def weld_surface(weld: Weld) -> tuple[np.ndarray, np.ndarray]:
         )
     x, y = np.meshgrid(*((along, across) if weld.along == "x" else (across, along)), indexing="ij")
     return _locked(np.stack([x, y, -weld_height(weld, x, y)], axis=-1).reshape(-1, 3), _grid_faces(x.shape))
+
+
+def pit_places(pipe: PittedPipe) -> np.ndarray:
+    """Places (pits, 2) of the middles of a pipe's pits: x in mm, and the angle in rad from -z towards y."""
+    most = 0.5 * (pipe.length_mm - pipe.pit_diameter_mm), np.radians(_PITTED_DEG)
+    return np.random.default_rng(pipe.seed).uniform(-1, 1, (pipe.pits, 2)) * most
+
+
+def pitted_radius(pipe: PittedPipe, x: np.ndarray, angle: np.ndarray) -> np.ndarray:
+    """Distance of a pitted pipe's surface from its axis at ``x`` in mm and angles in rad from -z towards y.
+
+    R (1 + ovality / 2 cos(2 angle)), less the depth of the deepest pit there: `pit_depth_mm` (1 - t^2)^2, with t from 0
+    in a pit's middle to 1 at its rim, measured along the surface of the round pipe.
+    """
+    round_mm, pit_mm = pipe.diameter_mm / 2, pipe.pit_diameter_mm / 2
+    depth = np.zeros(np.broadcast(x, angle).shape)
+    for at_x, at_angle in pit_places(pipe):
+        squared = (np.square(x - at_x) + np.square(round_mm * (angle - at_angle))) / pit_mm**2
+        depth = np.maximum(depth, pipe.pit_depth_mm * np.square(np.maximum(1 - squared, 0)))
+    return round_mm * (1 + 0.5 * pipe.ovality * np.cos(2 * angle)) - depth
+
+
+@lru_cache(maxsize=4)
+def pitted_surface(pipe: PittedPipe) -> tuple[np.ndarray, np.ndarray]:
+    """A pitted pipe: vertices (V, 3) in mm and faces (F, 3) of a tube that is open at its ends.
+
+    Facets deviate from `pitted_radius` by `_PIT_SAG_MM`, by up to ten times that at creases between overlapping pits.
+    DescriptionError where pits so small and deep on so large a pipe need too many vertices.
+    """
+    # As of a weld: chords of the round pipe, and of pits, whose second derivative is largest at the rim.
+    radius = pipe.diameter_mm / 2
+    step = np.sqrt(8 * _PIT_SAG_MM / (1 / radius + 8 * pipe.pit_depth_mm / (0.5 * pipe.pit_diameter_mm) ** 2))
+    plain = np.sqrt(8 * _PIT_SAG_MM * radius)
+    reach = np.radians(_PITTED_DEG) + 0.5 * pipe.pit_diameter_mm / radius if pipe.pits else 0.0
+    front = np.linspace(-reach, reach, int(np.ceil(2 * reach * radius / step)) + 1)
+    back = np.linspace(reach, 2 * np.pi - reach, int(np.ceil(2 * (np.pi - reach) * radius / plain)) + 1)
+    angle = np.concatenate([front, back[1:-1]])
+    x = (
+        np.linspace(-0.5, 0.5, int(np.ceil(pipe.length_mm / (step if pipe.pits else pipe.length_mm))) + 1)
+        * pipe.length_mm
+    )
+    if len(x) * len(angle) > _MOST_VERTICES:
+        raise DescriptionError(
+            f"a pitted pipe in steps of {step:.3g} mm needs {len(x) * len(angle)} vertices, more than {_MOST_VERTICES}"
+            ": make its pits wider or flatter, or the pipe smaller"
+        )
+    along, around = np.meshgrid(x, angle, indexing="ij")
+    # Behind, angles run beyond pi, where no pit is.
+    distance = pitted_radius(pipe, along, np.where(around > np.pi, around - 2 * np.pi, around))
+    vertices = np.stack([along, distance * np.sin(around), -distance * np.cos(around)], axis=-1).reshape(-1, 3)
+    corner = np.arange(len(x) * len(angle)).reshape(len(x), len(angle))
+    beside = np.roll(corner, -1, axis=1)
+    return _locked(vertices, _quads(*(part.ravel() for part in (corner[:-1], beside[:-1], beside[1:], corner[1:]))))
 
 
 def _bead_middles(weld: Weld) -> np.ndarray:

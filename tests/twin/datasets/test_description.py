@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.datasets.description import SPLITS, Choice, DataSetDescription, LogUniform, Normal, Uniform, load_description
+from twin.datasets.description import SPLITS, DataSetDescription, LogUniform, Normal, OneOf, Uniform, load_description
 from twin.datasets.draws import draw_scene, split_of
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import names
 
-TINY = {"title": "tiny", "scene": "plane", "sensor": "thesis-binned"}
+TINY = {"title": "tiny", "scene": "plane", "sensor": "thesis-small"}
 POWER = "sensor.laser.power_mw"
 
 
@@ -38,10 +38,10 @@ def test_distributions_are_the_inverse_of_scipys(name):
 
 
 def test_choices_come_as_often_as_their_weights_say():
-    choice = Choice(kind="choice", values=("a", "b", "c"), weights=(1.0, 2.0, 1.0))
+    choice = OneOf(kind="choice", values=("a", "b", "c"), weights=(1.0, 2.0, 1.0))
     drawn = [choice.at(share) for share in (np.arange(400) + 0.5) / 400]
     assert [drawn.count(value) for value in "abc"] == [100, 200, 100]
-    assert Choice(kind="choice", values=(1, 2)).at(0.5) == 2
+    assert OneOf(kind="choice", values=(1, 2)).at(0.5) == 2
 
 
 def test_every_path_of_every_scene_has_numbers_of_its_own():
@@ -170,7 +170,7 @@ def test_presets_draw_valid_scenes_over_all_of_their_ranges(name):
     assert {each.scene.title for each in drawn} == {preset.scene.title}
     assert len({str(each.values) for each in drawn}) == 12
     for path, distribution in preset.vary.items():
-        if not isinstance(distribution, Choice):
+        if not isinstance(distribution, OneOf):
             ends = [preset.drawn(path, share) for share in (0.001, 0.5, 0.999)]
             assert all(isinstance(end, str) or math.isfinite(end) for end in ends)
             assert all(a <= b for a, b in pairwise(ends)), path

@@ -245,7 +245,7 @@ def test_ctrl_c_leaves_complete_shards_only(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["stripe-turbid", "stripe-shiny", "calibration-boards"])
+@pytest.mark.parametrize("name", ["stripe-turbid", "stripe-shiny", "pipe-inspection", "calibration-boards"])
 def test_presets_are_rendered(name, tmp_path):
     samples = twin.load_dataset(twin.dataset(name, out=tmp_path / name, scenes=2, workers=1))
     for sample in samples:

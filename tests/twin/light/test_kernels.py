@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
+from twin.datasets.description import DataSetDescription, load_description
+from twin.datasets.draws import draw_scene
+from twin.datasets.labels import labelled
 from twin.light.pose import SensorPose
 from twin.light.renderer import Renderer
-from twin.recording.studio import true_stripe
+from twin.recording.studio import Studio, true_stripe
 from twin.scene.description import load_scene
 from uwlts.model.sensor import Medium, Sensor
 
@@ -110,3 +113,22 @@ def test_another_sensor_in_other_water_compiles_nothing(thesis, new_kernels):
     # An effect that is absent does compile anew: the count can tell.
     frames(altered(thesis, SMALL), clear(0.3), sphere(), spp=4)
     assert new_kernels()[1] > 0
+
+
+def test_scenes_of_a_data_set_share_their_kernels(thesis, new_kernels):
+    table = load_description("stripe-clean").model_dump() | {"sensor": altered(thesis, SMALL), "spp": 4}
+    described = DataSetDescription.model_validate(table)
+
+    def scene(number: int) -> None:
+        drawn = draw_scene(described, number)
+        studio = Studio(drawn.as_built, drawn.scene, drawn.options, probe="middle")
+        for index, shot in enumerate(drawn.scene.motion.shots()):
+            labelled(studio, shot, studio.exposed(shot, index), described.labels)
+
+    scene(0)
+    assert new_kernels()[1] >= 4
+    for number in range(1, 4):
+        scene(number)
+    launched, new = new_kernels()
+    assert launched > 50
+    assert new == 0

@@ -5,8 +5,16 @@ import pytest
 import trimesh
 from scipy.signal import argrelmin
 
-from twin.scene.description import Weld
-from twin.scene.shapes import head_depth, head_surface, weld_height, weld_surface
+from twin.scene.description import PittedPipe, Weld
+from twin.scene.shapes import (
+    head_depth,
+    head_surface,
+    pit_places,
+    pitted_radius,
+    pitted_surface,
+    weld_height,
+    weld_surface,
+)
 from uwlts.model.errors import DescriptionError
 
 HEIGHT = 160.0
@@ -157,3 +165,48 @@ def test_surfaces_are_the_same_every_time_and_kept_unharmed():
 def test_a_weld_too_fine_to_be_meshed_is_refused():
     with pytest.raises(DescriptionError, match=r"a weld in steps of 0\.0\d+ mm needs \d+ vertices"):
         weld_surface(Weld(kind="weld", ripple_pitch_mm=0.2))
+
+
+PITTED = PittedPipe(kind="pitted_pipe", ovality=0.04, pits=5, seed=1)
+
+
+def test_a_pitted_pipe_has_the_diameters_and_pits_that_were_asked_for():
+    mesh = mesh_of(pitted_surface(PITTED))
+    assert mesh.is_winding_consistent
+    axial = np.stack([mesh.triangles_center[:, 0], *np.zeros((2, len(mesh.faces)))], axis=1)
+    outwards = np.sum((mesh.triangles_center - axial) * mesh.face_normals, axis=1)
+    assert outwards.min() > 0
+    # Behind there are no pits: the smallest diameter lies across, the largest along z.
+    end = mesh.vertices[np.isclose(mesh.vertices[:, 0], -60.0)]
+    assert 2 * end[:, 2].max() == pytest.approx(102.0, abs=0.02)
+    assert np.ptp(end[:, 1]) == pytest.approx(98.0, abs=0.02)
+    places = pit_places(PITTED)
+    assert places.shape == (5, 2) and np.abs(places[:, 1]).max() < np.radians(60)
+    x, y, z = np.moveaxis(mesh.vertices, -1, 0)
+    angle, radius = np.arctan2(y, -z), np.hypot(y, z)
+    missing = 50.0 * (1 + 0.02 * np.cos(2 * angle)) - radius
+    assert missing.max() == pytest.approx(2.0, abs=0.02)
+    near = np.min([np.hypot(x - px, 50 * (angle - pa)) for px, pa in places], axis=0)
+    assert missing[near > 5.0].max() < 1e-9
+    # A quarter of the depth is left where t^2 is one half.
+    assert missing[(near > 3.4) & (near < 3.6)] == pytest.approx(2.0 * (1 - 0.49) ** 2, abs=0.06)
+    assert missing[near < 0.5].min() > 1.95
+
+
+def test_a_pitted_pipes_facets_follow_its_smooth_surface():
+    mesh = mesh_of(pitted_surface(PITTED))
+    x, y, z = np.moveaxis(inner_points(mesh), -1, 0)
+    away = np.abs(pitted_radius(PITTED, x, np.arctan2(y, -z)) - np.hypot(y, z))
+    # Chords deviate by 0.01 mm along each side, the middles of faces by up to twice that.
+    assert away.max() < 0.03
+    assert np.quantile(away, 0.99) < 0.015
+
+
+def test_a_pipe_without_pits_is_a_plain_one_and_too_many_vertices_are_refused():
+    plain = mesh_of(pitted_surface(PittedPipe(kind="pitted_pipe", pits=0)))
+    assert len(plain.vertices) < 500
+    np.testing.assert_allclose(np.hypot(*plain.vertices.T[1:]), 50.0, rtol=1e-12)
+    with pytest.raises(DescriptionError, match="make its pits wider or flatter"):
+        pitted_surface(
+            PittedPipe(kind="pitted_pipe", diameter_mm=400, length_mm=600, pit_diameter_mm=2, pit_depth_mm=5)
+        )

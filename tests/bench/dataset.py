@@ -1,0 +1,24 @@
+"""Speed of making data sets."""
+
+import tempfile
+import time
+from pathlib import Path
+
+import twin
+
+FEW, MANY = 32, 96
+"""Scenes of two runs: the difference leaves out the start of the processes."""
+
+
+def rate_hz() -> float:
+    """Frames per second of the preset `stripe-clean` with two workers."""
+    with tempfile.TemporaryDirectory() as name:
+        seconds, frames = zip(*(_made(Path(name, str(scenes)), scenes) for scenes in (FEW, MANY)), strict=True)
+    return (frames[1] - frames[0]) / (seconds[1] - seconds[0])
+
+
+def _made(folder: Path, scenes: int) -> tuple[float, int]:
+    """Seconds that so many scenes take, and their frames."""
+    start = time.perf_counter()
+    twin.dataset("stripe-clean", out=folder, scenes=scenes, workers=2)
+    return time.perf_counter() - start, len(twin.load_dataset(folder))
