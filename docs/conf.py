@@ -16,7 +16,7 @@ release = version = version_of("uwlts")
 
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
 source_suffix = {".md": "myst-nb"}
-exclude_patterns = ["_build", "studies", "pictures"]
+exclude_patterns = ["_build", "studies", "examples", "pictures"]
 html_theme = "pydata_sphinx_theme"
 html_title = "uwlts"
 html_theme_options = {
