@@ -84,7 +84,10 @@ class DataSet(Sequence[dict[str, Any]]):
         return self._readers[shard].sample(number - (self._ends[shard - 1] if shard else 0), self._names)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        return (self[number] for number in range(len(self)))
+        for reader in self._readers:
+            # Of its own, whose table of contents is gone after it.
+            own = ShardReader(reader.path, reader.format, frames=reader.frames)
+            yield from (own.sample(number, self._names) for number in range(own.frames))
 
 
 def load_dataset(folder: str | Path, *, split: Split | None = None, names: Sequence[str] | None = None) -> DataSet:

@@ -181,7 +181,8 @@ class Weld(FreeForm):
     The beads run along the plate's x or y axis (``along``), side by side, ``spacing_mm`` from middle to middle;
     ``length_mm``, ``width_mm`` and ``height_mm`` are those of one bead, ``ripple_height_mm`` is that from trough to
     crest. ``irregularity`` is how much width and height change on the way, as a share of them, and how far the path
-    and the ripples' places wander, in widths and pitches; ``seed`` chooses how.
+    and the ripples' places wander, in widths and pitches; ``seed`` chooses how. Grooves of ``undercut_depth_mm`` and
+    ``undercut_width_mm`` run along both toes of each bead.
     """
 
     kind: Literal["weld"]
@@ -195,11 +196,14 @@ class Weld(FreeForm):
     ripple_pitch_mm: Positive = 3.0
     ripple_height_mm: NotNegative = 0.25
     irregularity: Annotated[float, Field(ge=0, le=0.3)] = 0.06
+    undercut_depth_mm: NotNegative = 0.0
+    undercut_width_mm: Positive = 1.5
     seed: Annotated[int, Field(ge=0)] = 0
 
     def bead_reach_mm(self) -> float:
         """Largest distance that a bead reaches sideways from its straight middle line, irregularities included."""
-        return self.width_mm * (0.5 + 1.5 * self.irregularity)
+        groove = 0.5 * self.undercut_width_mm if self.undercut_depth_mm else 0.0
+        return self.width_mm * (0.5 + 1.5 * self.irregularity) + groove
 
     @model_validator(mode="after")
     def _beads_have_room(self) -> "Weld":

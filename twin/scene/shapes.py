@@ -116,7 +116,8 @@ def weld_height(weld: Weld, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Height of the beads of a weld above its plate, towards -z, at places ``x``, ``y`` (N,), all in mm.
 
     A bead is `height_mm` (1 - t^2)^2, with t from 0 in its middle to 1 at its toes and round ends, and cosine ripples
-    on it: crescents that trail at the sides.
+    on it: crescents that trail at the sides. An undercut is a groove of `undercut_depth_mm` (1 - u^2)^2 about each toe,
+    with u from 0 in its middle to 1 at its rims, which ends with the straight part of the bead.
     """
     along, across = (x, y) if weld.along == "x" else (y, x)
     height = np.zeros(np.broadcast(x, y).shape)
@@ -129,6 +130,10 @@ def weld_height(weld: Weld, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         crests = (along + _TRAIL * weld.width_mm * np.square(sideways)) / weld.ripple_pitch_mm + hurry
         ripple = 0.5 * weld.ripple_height_mm * np.cos(2 * np.pi * crests)
         height += envelope * (weld.height_mm * (1 + thickness) + ripple)
+        if weld.undercut_depth_mm:
+            from_toe = (np.abs(sideways) - 1) * weld.width_mm * (1 + swell) / weld.undercut_width_mm
+            ends = np.square(np.maximum(1 - np.square(beyond), 0))
+            height -= weld.undercut_depth_mm * ends * np.square(np.maximum(1 - np.square(from_toe), 0))
     return height
 
 
@@ -142,7 +147,8 @@ def weld_surface(weld: Weld) -> tuple[np.ndarray, np.ndarray]:
     # A chord over a step h of a curve of second derivative c deviates from it by c h^2 / 8.
     ripple = 0.5 * weld.ripple_height_mm * (2 * np.pi / weld.ripple_pitch_mm) ** 2
     toe = 8 * weld.height_mm / (0.5 * weld.width_mm) ** 2
-    step = np.sqrt(8 * _SAG_MM / (1.3 * ripple + toe))
+    undercut = 8 * weld.undercut_depth_mm / (0.5 * weld.undercut_width_mm) ** 2
+    step = np.sqrt(8 * _SAG_MM / (1.3 * ripple + toe + undercut))
     plate = weld.plate_mm if weld.along == "x" else weld.plate_mm[::-1]
     along = _nodes([0.0], 0.5 * weld.length_mm, step=step, length=plate[0])
     across = _nodes(_bead_middles(weld), weld.bead_reach_mm(), step=step, length=plate[1])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from pydantic import ValidationError
 from scipy.signal import argrelmin
 
 from twin.scene.description import PittedPipe, Weld
@@ -165,6 +166,23 @@ def test_surfaces_are_the_same_every_time_and_kept_unharmed():
 def test_a_weld_too_fine_to_be_meshed_is_refused():
     with pytest.raises(DescriptionError, match=r"a weld in steps of 0\.0\d+ mm needs \d+ vertices"):
         weld_surface(Weld(kind="weld", ripple_pitch_mm=0.2))
+
+
+def test_an_undercut_runs_along_both_toes_of_a_bead():
+    straight = {"kind": "weld", "beads": 1, "irregularity": 0.0, "ripple_height_mm": 0.0}
+    plain, cut = (Weld(**straight, undercut_depth_mm=depth, undercut_width_mm=2.0) for depth in (0.0, 0.6))
+    across = np.linspace(-10, 10, 2001)
+    lost = weld_height(plain, np.zeros_like(across), across) - weld_height(cut, np.zeros_like(across), across)
+    # A bead 10 mm wide has its toes 5 mm beside its middle.
+    assert lost.max() == pytest.approx(0.6, abs=1e-4)
+    np.testing.assert_allclose(np.abs(across[lost > 0.599]), 5.0, atol=0.03)
+    np.testing.assert_allclose([np.abs(across[lost > 0]).min(), np.abs(across[lost > 0]).max()], [4.0, 6.0], atol=0.02)
+    assert weld_height(cut, np.array([29.0]), np.array([5.0])) == 0, "it ends with the bead"
+    mesh = mesh_of(weld_surface(cut))
+    x, y, z = np.moveaxis(inner_points(mesh), -1, 0)
+    assert np.abs(weld_height(cut, x, y) + z).max() < 0.015
+    with pytest.raises(ValidationError, match="do not fit on plate_mm"):
+        Weld(**straight, plate_mm=(80.0, 11.0), undercut_depth_mm=0.5)
 
 
 PITTED = PittedPipe(kind="pitted_pipe", ovality=0.04, pits=5, seed=1)
