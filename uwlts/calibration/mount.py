@@ -9,15 +9,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, t
 
+from uwlts.calibration.mount_board import mount_by_board
 from uwlts.calibration.mount_model import Motion, MountState, Problem, Scatter
-from uwlts.calibration.mount_next_pose import next_pose
+from uwlts.calibration.mount_next_pose import axis_words, missing_turns, next_pose
 from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLine, find_arc, find_line
 from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere
-from uwlts.model.errors import CalibrationError
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound
 from uwlts.model.trajectory import Trajectory
+from uwlts.storage.calibration_file import loaded_calibration
+from uwlts.storage.capture import Capture
 from uwlts.storage.mount_files import MountEvidence, read_mount_evidence
-from uwlts.storage.pose_files import PoseFormat, Unit
+from uwlts.storage.pose_files import PoseFormat, Unit, read_poses
 
 _FEWEST_POSES = {"sphere": 5, "plane": 8}
 """Poses whose profiles have more numbers (three each, or two) than there are unknowns (nine or ten), with some over."""
@@ -34,8 +38,6 @@ _OPEN_MM, _OPEN_RAD = 5.0, np.radians(1.0)
 """Standard uncertainties from which a mount counts as not determined; a ruler and a protractor do better."""
 _WEAK = 5.0
 """Times the best determined direction: so much worse is worth a further pose."""
-_LEAST_TURN_RAD = np.radians(5.0)
-"""Root mean square of turns about an axis below which a note says that there are too few."""
 
 
 def calibrate_mount(
@@ -44,6 +46,7 @@ def calibrate_mount(
     *,
     artefact: Literal["sphere", "plane"] = "sphere",
     radius_mm: float | None = None,
+    calibration: Calibration | str | Path | None = None,
     pose_format: PoseFormat = "matrix",
     profile_unit: Unit = "mm",
     pose_unit: Unit = "mm",
@@ -65,11 +68,13 @@ def calibrate_mount(
         One array for each pose: (N, 2) with x along the profile and z, or (N, 3) with x, y, z in the sensor's frame, in
         the order along the profile, mm, NaN where nothing was seen. Or a file or folder: a description (.toml) of
         everything, a folder of CSV files, or one CSV file with a column ``pose``, or a cloud of `uwlts.reconstruct`
-        whose frames are the poses.
+        whose frames are the poses. Or, with a ``calibration``, a capture whose images with the laser off show a target.
     poses
-        ``T_base_platform`` (P, 4, 4), mm, or a CSV file with one pose a line.
+        ``T_base_platform`` (P, 4, 4), mm, or a CSV file with one pose a line; not needed for a capture that holds them.
     artefact, radius_mm
         What is seen; the radius of the sphere where it is known.
+    calibration
+        Of the sensor whose images of a target give the mount (`uwlts.calibration.mount_board`), held fixed.
     pose_format, profile_unit, pose_unit
         How files are to be read; see `uwlts.storage.pose_files.read_poses`.
     scale
@@ -92,6 +97,19 @@ def calibrate_mount(
     >>> mount = uwlts.calibrate_mount("profiles", "poses.csv", pose_format="quaternion-wxyz", radius_mm=19.05)
     >>> mount.transform(), mount.std()
     """
+    if calibration is not None:
+        if not isinstance(profiles, str | Path) or radius_mm is not None or scale or time:
+            raise DescriptionError(
+                "a calibration goes with a capture that shows a target: give the capture's path, and no radius, scale "
+                "or time"
+            )
+        known = loaded_calibration(calibration)
+        if not isinstance(known, Calibration):
+            raise DescriptionError("a calibration by polynomials does not place a target: give one with a camera")
+        path = isinstance(poses, str | Path)
+        table = read_poses(poses, pose_format=pose_format, unit=pose_unit)[0] if path else poses
+        with Capture(profiles) as capture:
+            return mount_by_board([capture], known, table)
     evidence = read_mount_evidence(
         profiles,
         poses,
@@ -422,14 +440,6 @@ def _left_out_excess(problem: Problem, state: MountState, scatter: Scatter) -> n
     return np.array(excess)
 
 
-def axis_words(direction: np.ndarray) -> str:
-    """A direction of the platform in words."""
-    place = int(np.argmax(np.abs(direction)))
-    if abs(direction[place]) > 0.94:  # within 20 deg
-        return f"the platform's {'xyz'[place]} axis"
-    return f"the platform's direction ({', '.join(f'{each:.2f}' for each in direction)})"
-
-
 def _coverage_factor(problem: Problem, state: MountState, scatter: Scatter, covariance: np.ndarray) -> float:
     """Student's factor for 95 %, with degrees of freedom by Welch and Satterthwaite (GUM, G.4).
 
@@ -458,17 +468,7 @@ def _weaknesses(problem: Problem, state: MountState, covariance: np.ndarray) -> 
                 f"the turn about {axis_words(axis)} is {_known(np.degrees(std), np.degrees(_OPEN_RAD), 'deg')}: the "
                 "artefact stays at nearly the same place of the profile"
             )
-    every = Rotation.from_matrix(problem.motion(state.offset_s)[0])
-    vectors = (every.mean().inv() * every).as_rotvec()
-    # Turns about two axes are enough: those about one leave the shift along it open.
-    if np.linalg.eigvalsh(vectors.T @ vectors / len(vectors))[1] < _LEAST_TURN_RAD**2:
-        rms = np.sqrt(np.mean(vectors**2, axis=0))
-        lines += [
-            f"insufficient rotation about {axis_words(axis)} ({np.degrees(size):.1f} deg rms)"
-            for size, axis in zip(rms, np.eye(3), strict=True)
-            if size < _LEAST_TURN_RAD
-        ]
-    return lines
+    return lines + missing_turns(Rotation.from_matrix(problem.motion(state.offset_s)[0]))
 
 
 def _known(std: float, limit: float, unit: str) -> str:

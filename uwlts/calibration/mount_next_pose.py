@@ -1,4 +1,4 @@
-"""The further pose that would lower the uncertainty of a mount most, by the information that its profile would hold."""
+"""The motions that a mount calibration lacks, and the further pose that would lower its uncertainty most."""
 
 from dataclasses import replace
 from itertools import product
@@ -11,6 +11,8 @@ from uwlts.model.mount import NextPose
 
 _TURN_RAD = np.radians(30)
 """A robot turns so far easily with the artefact in view."""
+_LEAST_TURN_RAD = np.radians(5.0)
+"""Root mean square of turns about an axis below which a note says that there are too few."""
 _POINTS = 100
 _UNKNOWN_MM, _UNKNOWN_RAD = 100.0, 0.5
 """Standard uncertainty of a mount of which nothing is known, so that open directions can be compared."""
@@ -122,3 +124,27 @@ def _on_plane(
     if abs(steep) < 0.5:  # 60 deg
         return None
     return points - np.outer((points - seen) @ inside / steep, down)
+
+
+def axis_words(direction: np.ndarray) -> str:
+    """A direction of the platform in words."""
+    place = int(np.argmax(np.abs(direction)))
+    if abs(direction[place]) > 0.94:  # within 20 deg
+        return f"the platform's {'xyz'[place]} axis"
+    return f"the platform's direction ({', '.join(f'{each:.2f}' for each in direction)})"
+
+
+def missing_turns(rotations: Rotation, *, least_rad: float = _LEAST_TURN_RAD) -> list[str]:
+    """Axes of the platform about which its rotations hardly turn, in words; none where they turn about two axes.
+
+    Turns about one axis alone leave the shift along it open. ``least_rad`` is the root mean square of what counts as a
+    turn.
+    """
+    vectors = (rotations.mean().inv() * rotations).as_rotvec()
+    if np.linalg.eigvalsh(vectors.T @ vectors / len(vectors))[1] >= least_rad**2:
+        return []
+    return [
+        f"insufficient rotation about {axis_words(axis)} ({np.degrees(size):.1f} deg rms)"
+        for size, axis in zip(np.sqrt(np.mean(vectors**2, axis=0)), np.eye(3), strict=True)
+        if size < least_rad
+    ]

@@ -197,6 +197,7 @@ def mount(
     out: Path,
     artefact: Literal["sphere", "plane"] = "sphere",
     radius_mm: float | None = None,
+    calibration: Path | None = None,
     pose_format: str = "matrix",
     profile_unit: Literal["mm", "m"] = "mm",
     pose_unit: Literal["mm", "m"] = "mm",
@@ -204,7 +205,8 @@ def mount(
     time: Flag = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Calibrate the mount of any laser profiler on a robot or stage, from its profiles of a sphere or plane.
+    """Calibrate the mount of any laser profiler on a robot or stage, from its profiles of a sphere or plane; or that of
+    a calibrated sensor, from its images of a target.
 
     The artefact stands still at an unknown place. Prints the transform from the sensor to the platform with its
     uncertainty, the poses that were left out, what the motions determine badly, and the pose to add next.
@@ -213,11 +215,14 @@ def mount(
 
     Args:
         profiles: Folder with one CSV file (columns x and z) for each pose, one CSV file with a column pose, a cloud
-            whose frames are the poses, or a description of everything (.toml; docs/how-to/calibrate-a-mount.md).
-        poses: CSV file with the pose of the platform in the base frame for each profile.
+            whose frames are the poses, or a description of everything (.toml; docs/how-to/calibrate-a-mount.md). With
+            a calibration, a capture whose images with the laser off show a target.
+        poses: CSV file with the pose of the platform in the base frame for each profile, or image of the target;
+            those of the capture unless given.
         out: Mount to write (JSON).
         artefact: What the profiles show.
         radius_mm: Radius of the sphere; estimated unless given.
+        calibration: Calibration of the sensor whose images of a target give the mount.
         pose_format: matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about the moved
             axes), euler-zyx-deg (about the fixed axes) or another order, -rad for radians.
         profile_unit: Unit of the profiles.
@@ -233,6 +238,7 @@ def mount(
         poses,
         artefact=artefact,
         radius_mm=radius_mm,
+        calibration=calibration,
         pose_format=pose_format,
         profile_unit=profile_unit,
         pose_unit=pose_unit,

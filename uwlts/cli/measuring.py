@@ -164,10 +164,11 @@ def reconstruct(
             joint calibration its uncertainty.
         mount: Where the sensor is on its platform (uwlts mount). Poses are the platform's then, and points are given in
             the frame of the poses.
-        trajectory: CSV file with times and poses of the platform (of the sensor without a mount), which replace poses
-            in the capture and the stage.
-        pose_format: Format of the trajectory: tum, matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg,
-            euler-ZYX-deg (about the moved axes), euler-zyx-deg (about the fixed axes) or another order, -rad.
+        trajectory: CSV file or ROS bag with times and poses of the platform (of the sensor without a mount), which
+            replace poses in the capture and the stage.
+        pose_format: Format of the trajectory: matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg,
+            euler-ZYX-deg (about the moved axes), euler-zyx-deg (about the fixed axes) or another order, -rad; tum; or
+            of a ROS bag ros, ros:/TOPIC, ros:PARENT>CHILD (frames).
         pose_unit: Unit of the trajectory's positions.
         clock_offset_s: What to add to the times of the images for those of the trajectory; as the mount says unless
             given.

@@ -12,10 +12,11 @@ Rows = tuple[tuple[float, ...], ...]
 
 
 class MountPose(Description):
-    """One pose of the platform and what its profile says.
+    """One pose of the platform and what its profile or image says.
 
-    ``rms_mm`` is the root mean square distance of its points from the artefact, ``held_out_mm`` the same where the
-    mount was calculated without this pose. A pose that was not used has a ``reason``.
+    ``rms_mm`` is the root mean square distance of its points from the artefact (of a target's middle from its common
+    place), ``held_out_mm`` the same where the mount was calculated without this pose. A pose that was not used has a
+    ``reason``.
     """
 
     name: str
@@ -55,6 +56,13 @@ class PlaneFound(Description):
     distance_mm: float
 
 
+class BoardFound(Description):
+    """The target: ``T_base_target`` (4, 4), mm."""
+
+    kind: Literal["board"] = "board"
+    T_base_target: Rows
+
+
 class Mount(Description):
     """Transform from the sensor to the platform that carries it, with its uncertainty and the evidence.
 
@@ -69,7 +77,7 @@ class Mount(Description):
     T_platform_sensor: Rows
     covariance: Rows
     coverage_factor: Positive
-    artefact: Annotated[SphereFound | PlaneFound, Field(discriminator="kind")]
+    artefact: Annotated[SphereFound | PlaneFound | BoardFound, Field(discriminator="kind")]
     robot_scale: Positive | None = None
     robot_scale_std: NotNegative | None = None
     time_offset_s: float | None = None

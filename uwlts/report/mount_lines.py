@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.model.mount import Mount, SphereFound
+from uwlts.model.mount import BoardFound, Mount, SphereFound
 
 
 def mount_lines(mount: Mount) -> list[str]:
@@ -21,7 +21,10 @@ def mount_lines(mount: Mount) -> list[str]:
         f"rotation, 95 % deg        {' '.join(f'+-{value:.4f}' for value in np.degrees(half[3:]))}",
     ]
     found = mount.artefact
-    if isinstance(found, SphereFound):
+    if isinstance(found, BoardFound):
+        x, y, z = (row[3] for row in found.T_base_target[:3])
+        lines.append(f"target, mm                origin at {_vector((x, y, z))}")
+    elif isinstance(found, SphereFound):
         known = "given" if found.radius_std_mm is None else f"+-{mount.coverage_factor * found.radius_std_mm:.3f}"
         lines.append(f"sphere, mm                at {_vector(found.centre_mm)}, radius {found.radius_mm:.3f} ({known})")
     else:

@@ -15,6 +15,7 @@ from uwlts.model.errors import DescriptionError
 from uwlts.model.input_file import read_bytes
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.files import sha256_of
+from uwlts.storage.ros_bags import read_bag_poses
 
 Unit = Literal["mm", "m"]
 PoseFormat = str
@@ -107,10 +108,15 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
     """The path of a platform from a file as for `read_poses` with a column ``time_s``.
 
     With the format ``tum`` each line is the time in s, the position in m and the quaternion x y z w, separated by
-    blanks and without names, as the RGB-D benchmark of TU Munich has them. DescriptionError as `read_poses` and
-    `Trajectory`, and where there are no times.
+    blanks and without names, as the RGB-D benchmark of TU Munich has them. With the format ``ros`` the file is a bag of
+    ROS 1 or ROS 2; ``ros:/TOPIC`` or ``ros:PARENT>CHILD`` names the poses or transforms in it
+    (`uwlts.storage.ros_bags`). DescriptionError as `read_poses` and `Trajectory`, and where there are no times;
+    SetupError where the library for bags is not installed.
     """
     path = Path(path)
+    if pose_format == "ros" or pose_format.startswith("ros:"):
+        times, rows = read_bag_poses(path, pose_format.removeprefix("ros").removeprefix(":"))
+        return _trajectory(path, times, scaled(matrices_of(rows, "quaternion-xyzw", path), "m"))
     rows, times = pose_rows(path, {})
     if pose_format == "tum":
         if rows.shape[1] != 8:
@@ -118,7 +124,10 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
         times, rows, pose_format, unit = rows[:, 0], rows[:, 1:], "quaternion-xyzw", "m"
     if times is None:
         raise DescriptionError(f"{path} has no column time_s: a trajectory needs the time of each pose")
-    poses = scaled(matrices_of(rows, pose_format, path), unit)
+    return _trajectory(path, times, scaled(matrices_of(rows, pose_format, path), unit))
+
+
+def _trajectory(path: Path, times: np.ndarray, poses: np.ndarray) -> Trajectory:
     try:
         return Trajectory(times, poses)
     except DescriptionError as error:

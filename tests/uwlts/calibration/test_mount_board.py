@@ -1,0 +1,141 @@
+"""Mounts from images of a target: simulated images with stated errors, and rendered ones through a window in water."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import uwlts
+from tests.virtual_sensors import scene_of
+from twin import render
+from uwlts.calibration.mount_board import BoardImage, _Problem
+from uwlts.model.errors import CalibrationError, DescriptionError
+from uwlts.model.mount import BoardFound
+from uwlts.optics.nominal import nominal
+from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+
+MIDDLE = np.array([60.0, 40.0, 0.0])
+
+
+def pose(turn_deg, shift_mm):
+    result = np.eye(4)
+    result[:3, :3] = Rotation.from_rotvec(turn_deg, degrees=True).as_matrix()
+    result[:3, 3] = shift_mm
+    return result
+
+
+MOUNT = pose((10.0, -35.0, 80.0), (40.0, -25.0, 110.0))
+TARGET = pose((170.0, 5.0, -10.0), (700.0, 100.0, 50.0))
+CAMERA = pose((0.0, 22.0, 0.0), (-30.0, 0.0, 280.0))
+
+
+def views(count, rng):
+    """True ``T_sensor_target`` of targets 250 to 400 mm away, tilted by up to 35 deg and turned at will."""
+    for _ in range(count):
+        tilt = rng.uniform(-35, 35, 2)
+        turn = Rotation.from_euler("ZYX", [rng.uniform(-180, 180), *tilt], degrees=True)
+        seen = np.eye(4)
+        seen[:3, :3] = turn.as_matrix()
+        seen[:3, 3] = (*rng.uniform(-40, 40, 2), rng.uniform(-60, 60)) - turn.apply(MIDDLE)
+        yield seen
+
+
+def simulated(rng, *, count=12, position_mm=0.05, turn_rad=3e-4, wrong=()):
+    """Images whose poses err by their covariance, of a platform whose positions and turns scatter."""
+    images = []
+    std = np.array([0.02, 0.02, 0.15, 2e-3, 2e-3, 2e-4])
+    for number, seen in enumerate(views(count, rng)):
+        step = std * rng.normal(size=6)
+        in_camera = CAMERA @ seen
+        turn = Rotation.from_rotvec(step[3:]).as_matrix() @ in_camera[:3, :3]
+        place = in_camera[:3, :3] @ MIDDLE + in_camera[:3, 3] + step[:3]
+        found = np.eye(4)
+        found[:3, :3], found[:3, 3] = turn, place - turn @ MIDDLE
+        platform = TARGET @ np.linalg.inv(seen) @ np.linalg.inv(MOUNT)
+        platform[:3, 3] += position_mm * rng.normal(size=3)
+        platform[:3, :3] = Rotation.from_rotvec(turn_rad * rng.normal(size=3)).as_matrix() @ platform[:3, :3]
+        if number in wrong:
+            platform[:3, 3] += 4.0
+        images.append(BoardImage(f"image {number}", found, np.diag(std**2), 50, 0.1, platform))
+    return images
+
+
+def errors_of(mount):
+    """Shift (3,) in mm and turn (3,) in rad, of the mount's estimate from the truth."""
+    turn = Rotation.from_matrix(mount[:3, :3] @ MOUNT[:3, :3].T).as_rotvec()
+    return np.concatenate([mount[:3, 3] - MOUNT[:3, 3], turn])
+
+
+def test_the_covariance_is_that_of_the_errors():
+    rng = np.random.default_rng(5)
+    inside, ratios = [], []
+    for _ in range(20):
+        problem = _Problem(simulated(rng), CAMERA, MIDDLE)
+        used, state, scatter = problem.robust()
+        std = np.sqrt(np.diag(np.linalg.inv(used.information(state, scatter)))[:6])
+        error = errors_of(state[0])
+        inside.append(np.abs(error) < 2.0 * std)
+        ratios.append(error / std)
+    # 120 of them, correlated within a run: six standard deviations of the share are 10 %.
+    assert 0.86 < np.mean(inside) <= 1.0
+    assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.35
+
+
+def test_wrong_poses_are_left_out():
+    problem = _Problem(simulated(np.random.default_rng(1), wrong=(3, 7)), CAMERA, MIDDLE)
+    used, state, _ = problem.robust()
+    assert {image.name for image in problem.images} - {image.name for image in used.images} == {"image 3", "image 7"}
+    assert np.linalg.norm(errors_of(state[0])[:3]) < 0.3
+
+
+@pytest.fixture(scope="module")
+def capture_path(thesis, tmp_path_factory):
+    """A chessboard in water behind the window, rendered in seven turns; poses are those of an ideal robot."""
+    frames, header = [], None
+    board = {"kind": "chessboard", "columns": 10, "rows": 7, "square_mm": 10.0}
+    for k, turn in enumerate([(0, 0), (20, 0), (-18, 8), (0, 20), (8, -20), (-12, -12), (15, 15)]):
+        turned = Rotation.from_euler("xyz", (*turn, 12.0 * k), degrees=True)
+        place = (0.0, 2.0 * k, -4.0 * k) - turned.apply((40.0, 25.0, 0.0))
+        plate = {"kind": "target_plate", "position_mm": tuple(place), "rotation_deg": (*map(float, turn), 12.0 * k)}
+        scene = scene_of(plate | {"reflectance": 0.8}, target=board, motion={"lights": ["lamp"], "count": 1})
+        recording = render(scene, sensor=thesis, spp=4)
+        seen = recording.scene.object_poses()[0]
+        platform = TARGET @ np.linalg.inv(seen) @ np.linalg.inv(MOUNT)
+        frames.append(Frame(recording.images[0], 0.0, False, 20.0, float(k), platform))
+        header = CaptureHeader(
+            name="board",
+            sensor=recording.sensor,
+            medium_name="water",
+            medium=recording.medium,
+            stage_direction=(1.0, 0.0, 0.0),
+            saturation_dn=255,
+            target=recording.scene.target,
+        )
+    path = tmp_path_factory.mktemp("board") / "board.h5"
+    with CaptureWriter(path, header, dtype=np.uint8) as writer:
+        for frame in frames:
+            writer.append(frame)
+    return path
+
+
+def test_a_target_in_water_gives_the_mount(thesis, capture_path, tmp_path):
+    mount = uwlts.calibrate_mount(capture_path, calibration=nominal(thesis, medium="water"))
+    assert not [each.reason for each in mount.poses if each.reason] and isinstance(mount.artefact, BoardFound)
+    error = errors_of(mount.transform())
+    assert np.linalg.norm(error[:3]) < 0.3 and np.degrees(np.linalg.norm(error[3:])) < 0.05
+    assert (np.abs(error) < 4 * mount.std()).all()
+    uwlts.write_mount(tmp_path / "mount.json", mount)
+    assert uwlts.read_mount(tmp_path / "mount.json") == mount
+
+
+def test_wrong_evidence_is_refused(thesis, capture_path):
+    calibration = nominal(thesis, medium="water")
+    with Capture(capture_path) as capture:
+        poses = capture.pose[:]
+    with pytest.raises(DescriptionError, match="there are 6 poses for 7 images"):
+        uwlts.calibrate_mount(capture_path, poses[:6], calibration=calibration)
+    with pytest.raises(CalibrationError, match="T_base_platform"):
+        uwlts.calibrate_mount(capture_path, np.linalg.inv(poses), calibration=calibration)
+    with pytest.raises(CalibrationError, match="insufficient rotation|T_base_platform"):
+        uwlts.calibrate_mount(capture_path, np.tile(poses[0], (7, 1, 1)), calibration=calibration)
+    with pytest.raises(DescriptionError, match="give the capture's path"):
+        uwlts.calibrate_mount(capture_path, calibration=calibration, radius_mm=3.0)

@@ -1,0 +1,110 @@
+"""Poses in ROS recordings: bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or their folder), without ROS installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from uwlts.model.errors import DescriptionError, SetupError
+from uwlts.model.input_file import require_regular_file
+
+_POSES = {
+    "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
+    "geometry_msgs/msg/PoseStamped": lambda message: message.pose,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
+    "geometry_msgs/msg/TransformStamped": lambda message: message.transform,
+}
+_TRANSFORMS = "tf2_msgs/msg/TFMessage"
+
+
+def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray]:
+    """Times (N,) in s, as the messages' headers have them, and N poses (N, 7): x, y, z in m and a quaternion x y z w.
+
+    Parameters
+    ----------
+    path : Path
+        The bag.
+    wanted : str
+        Topic of messages Odometry, PoseStamped, PoseWithCovarianceStamped or TransformStamped; or ``PARENT>CHILD`` for
+        the transforms of frame CHILD in frame PARENT among all messages of type TFMessage. Not needed in a bag with one
+        such topic, or without any and with the transforms of one pair of frames.
+
+    Raises
+    ------
+    DescriptionError
+        The path is no bag, or does not hold what is wanted: the message names what it holds.
+    SetupError
+        The library for bags is not installed.
+    """
+    highlevel, typesys = _rosbags()
+    if not path.is_dir():
+        require_regular_file(path, error=DescriptionError, called="bag")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    try:
+        with highlevel.AnyReader([path], default_typestore=store) as bag:
+            return _poses(bag, path, wanted)
+    except DescriptionError:
+        raise
+    except Exception as error:
+        # The library raises errors of the formats, of compression, of SQLite and of the system.
+        raise DescriptionError(
+            f"{path} is no ROS bag (.bag, .mcap, .db3 or a bag's folder), or damaged: {error}"
+        ) from error
+
+
+def _poses(bag: Any, path: Path, wanted: str) -> tuple[np.ndarray, np.ndarray]:
+    topics = {connection.topic: connection.msgtype for connection in bag.connections if connection.msgtype in _POSES}
+    parent, is_transform, child = wanted.partition(">")
+    if is_transform or not (topics or wanted):
+        rows = [row for pair, row in _transforms(bag) if not is_transform or pair == (parent.strip(), child.strip())]
+        pairs = {pair for pair, _ in _transforms(bag)} if not (rows and is_transform) else {(parent, child)}
+        if not rows or len(pairs) > 1:
+            held = ", ".join(sorted(f"{above}>{below}" for above, below in pairs)) or "none"
+            raise DescriptionError(f"{path} has transforms {held}; found {len(rows)} of '{wanted}': name one of them")
+    else:
+        topic = wanted or (next(iter(topics)) if len(topics) == 1 else "")
+        if topic not in topics:
+            held = ", ".join(f"{name} ({kind.split('/')[-1]})" for name, kind in sorted(topics.items())) or "none"
+            raise DescriptionError(
+                f"{path} has the topics with poses {held}; found none called '{wanted}': name one of them, or the "
+                "frames of a transform as PARENT>CHILD"
+            )
+        rows = [
+            _row(message.header.stamp, _POSES[connection.msgtype](message))
+            for connection, message in _messages(bag, lambda connection: connection.topic == topic)
+        ]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
+    return table[:, 0], table[:, 1:]
+
+
+def _messages(bag: Any, chosen: Any) -> Any:
+    connections = [connection for connection in bag.connections if chosen(connection)]
+    for connection, _, data in bag.messages(connections=connections) if connections else ():
+        yield connection, bag.deserialize(data, connection.msgtype)
+
+
+def _transforms(bag: Any) -> Any:
+    """Frames, parent and child, and row of every transform of the bag."""
+    for _, message in _messages(bag, lambda connection: connection.msgtype == _TRANSFORMS):
+        for each in message.transforms:
+            frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
+            yield frames, _row(each.header.stamp, each.transform)
+
+
+def _row(stamp: Any, pose: Any) -> tuple[float, ...]:
+    """Time and pose of a message; a pose has a position and an orientation, a transform translation and rotation."""
+    place, turn = (pose.position, pose.orientation) if hasattr(pose, "position") else (pose.translation, pose.rotation)
+    return stamp.sec + 1e-9 * stamp.nanosec, place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w
+
+
+def _rosbags() -> tuple[ModuleType, ModuleType]:
+    try:
+        from rosbags import highlevel, typesys
+    except ImportError as error:
+        raise SetupError(
+            "ROS bags need the library rosbags, which is not installed: pip install 'uwlts[ros]'"
+        ) from error
+    return highlevel, typesys
