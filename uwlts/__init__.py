@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from uwlts.measurement.evaluation import Evaluation, evaluate, write_evaluation
     from uwlts.measurement.reconstruction import ScanCloud, reconstruct
     from uwlts.measurement.verification import Verification, verify
+    from uwlts.metrology.change import SurfaceChange, compare_clouds
     from uwlts.model.calibration import Calibration
     from uwlts.model.errors import Error
     from uwlts.model.library import load_sensor
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     from uwlts.report.campaign_page import Report, write_report
     from uwlts.report.certificate import check_certificate
     from uwlts.report.certificate_page import write_certificate
+    from uwlts.report.change_page import write_change
     from uwlts.report.inventory import describe, design
     from uwlts.report.model_comparison import write_models
     from uwlts.storage.calibration_file import load_calibration, write_calibration
@@ -70,6 +72,7 @@ __all__ = [
     "ScanCloud",
     "Sensor",
     "StripeOptions",
+    "SurfaceChange",
     "ThesisReport",
     "Trajectory",
     "Truth",
@@ -79,6 +82,7 @@ __all__ = [
     "calibrate_mount",
     "calibrate_polynomials",
     "check_certificate",
+    "compare_clouds",
     "compare_models",
     "describe",
     "design",
@@ -107,6 +111,7 @@ __all__ = [
     "write_camera",
     "write_camera_page",
     "write_certificate",
+    "write_change",
     "write_cloud",
     "write_evaluation",
     "write_models",
@@ -134,6 +139,7 @@ _MODULES = {
     "ScanCloud": "uwlts.measurement.reconstruction",
     "Sensor": "uwlts.model.sensor",
     "StripeOptions": "uwlts.stripe",
+    "SurfaceChange": "uwlts.metrology.change",
     "ThesisReport": "uwlts.thesis.report",
     "Trajectory": "uwlts.model.trajectory",
     "Truth": "uwlts.storage.truth",
@@ -143,6 +149,7 @@ _MODULES = {
     "calibrate_mount": "uwlts.calibration.mount",
     "calibrate_polynomials": "uwlts.calibration.polynomial",
     "check_certificate": "uwlts.report.certificate",
+    "compare_clouds": "uwlts.metrology.change",
     "compare_models": "uwlts.calibration.model_comparison.comparison",
     "describe": "uwlts.report.inventory",
     "design": "uwlts.report.inventory",
@@ -171,6 +178,7 @@ _MODULES = {
     "write_camera": "uwlts.calibration.photographs",
     "write_camera_page": "uwlts.report.camera_page",
     "write_certificate": "uwlts.report.certificate_page",
+    "write_change": "uwlts.report.change_page",
     "write_cloud": "uwlts.storage.cloud",
     "write_evaluation": "uwlts.measurement.evaluation",
     "write_models": "uwlts.report.model_comparison",

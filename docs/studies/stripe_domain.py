@@ -103,11 +103,12 @@ def main() -> None:
             cells.append(", ".join(f"{x:.3g}" for x in np.quantile(values, [0.05, 0.5, 0.95])) if len(values) else "-")
         print(f"| {words} | " + " | ".join(cells) + " |")
     if given.out:
-        figure, axes = plt.subplots(1, len(FIGURES), figsize=(3 * len(FIGURES), 3.6), layout="constrained")
-        for axis, (name, words) in zip(axes, FIGURES.items(), strict=True):
+        figure, axes = plt.subplots(4, 2, figsize=(11, 11), layout="constrained")
+        axes.flat[-1].set_axis_off()
+        for axis, (name, words) in zip(axes.flat, FIGURES.items(), strict=False):
             values = [figures[name] if len(figures[name]) else [np.nan] for figures in sets.values()]
             axis.boxplot(values, whis=(5, 95), showfliers=False, orientation="horizontal")
-            axis.set_yticks(range(1, len(sets) + 1), list(sets) if name == "width" else [""] * len(sets))
+            axis.set_yticks(range(1, len(sets) + 1), list(sets))
             axis.set_xlabel(words)
         figure.savefig(given.out)
 

@@ -237,6 +237,45 @@ def evaluate(
 
 
 @app.command
+def compare(
+    cloud: Path,
+    reference: Path,
+    *,
+    out: Path,
+    coloured: Path | None = None,
+    register: Flag = False,
+    disc_mm: float | None = None,
+    deep_mm: float | None = None,
+    unit: Literal["mm", "m"] = "mm",
+    overwrite: Overwrite = False,
+) -> None:
+    """Find where a surface differs from an earlier cloud or a mesh by more than the uncertainty.
+
+    Example: uwlts compare after.ply before.ply --out change.html
+
+    Args:
+        cloud: Cloud of the surface (.ply or .h5).
+        reference: Earlier cloud, or a mesh (.stl, .obj, .off, or .ply with faces).
+        out: Page to write, with the figures as JSON beside it.
+        coloured: Also write the places with distance, level of detection and significance to this PLY file.
+        register: Move the cloud onto the reference first; else both have one frame.
+        disc_mm: Diameter over which points are averaged; about 30 points unless given.
+        deep_mm: Largest distance that is looked for; three diameters unless given.
+        unit: Unit of the reference.
+    """
+    from uwlts.report.page_toolkit import refuse_unsuitable_page
+
+    refuse_unsuitable_page(out, example="change.html", overwrite=overwrite)
+    if coloured:
+        refuse_unsuitable(coloured, overwrite=overwrite)
+    change = uwlts.compare_clouds(cloud, reference, register=register, disc_mm=disc_mm, deep_mm=deep_mm, unit=unit)
+    show(change.lines())
+    title = f"{cloud.name} against {reference.name}"
+    uwlts.write_change(out, change, title=title, coloured=coloured, overwrite=overwrite)
+    print(f"wrote {out} and {out.with_suffix('.json').name}")
+
+
+@app.command
 def report(
     folder: Path,
     *,

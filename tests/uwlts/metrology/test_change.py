@@ -1,0 +1,187 @@
+"""Change between clouds: what is claimed where nothing changed, what is found, and what a registration leaves open."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
+
+import uwlts
+from uwlts.cli import app
+from uwlts.metrology.registration import register_to_surface
+from uwlts.model.errors import CaptureError, EvaluationError, OutputError
+from uwlts.storage.cloud import PointCloud, PointUncertainty
+
+NOISE_MM, SHIFT_MM, TILT, STAGE_MM = 0.03, 0.04, 1e-3, 0.02
+SIDE_MM, STEP_MM = 60.0, 0.5
+
+
+def height(x, y):
+    """A surface that no movement leaves as it is."""
+    return 2.0 * np.sin(x / 9.0) + 1.5 * np.cos(y / 7.0) + 0.01 * x * y / 5
+
+
+def dent(x, y):
+    return 0.5 * (np.hypot(x - 10, y - 5) < 5)
+
+
+def scanned(rng, *, change=None, common=True, surface=height):
+    """A cloud taken in lines by a stage, whose errors are those that it states."""
+    x, y = np.meshgrid(np.arange(-SIDE_MM / 2, SIDE_MM / 2, STEP_MM), np.arange(-SIDE_MM / 2, SIDE_MM / 2, STEP_MM))
+    image = np.repeat(np.arange(x.shape[1])[None], x.shape[0], axis=0).ravel()
+    x, y = (each.ravel() + rng.uniform(-0.2, 0.2, x.size) for each in (x, y))
+    points = np.column_stack([x, y, surface(x, y) + (0.0 if change is None else change(x, y))])
+    count = len(points)
+    patterns = np.zeros((2, count, 3), np.float32)
+    patterns[0, :, 2], patterns[1, :, 2] = SHIFT_MM, TILT * y
+    if not common:
+        patterns[:] = 0
+    position = np.zeros((count, 3), np.float32)
+    position[:, 2] = STAGE_MM
+    random = np.zeros((count, 6), np.float32)
+    random[:, 5] = NOISE_MM**2
+    seen = points.copy()
+    seen[:, 2] += NOISE_MM * rng.normal(size=count) + STAGE_MM * rng.normal(size=image.max() + 1)[image]
+    seen[:, 2] += np.tensordot(rng.normal(size=2), patterns[:, :, 2], axes=1)
+    line = np.zeros(count, int)
+    return PointCloud(seen, np.ones(count), image, line, uncertainty=PointUncertainty(random, position, patterns))
+
+
+def test_nothing_is_claimed_where_nothing_changed():
+    rng = np.random.default_rng(2)
+    shares = []
+    for _ in range(8):
+        change = uwlts.compare_clouds(scanned(rng), scanned(rng))
+        assert change.compared.mean() > 0.95
+        shares.append(change.significant[change.compared].mean())
+    # What is common to all points makes the shares of single pairs scatter widely about 5 %.
+    assert np.mean(shares) < 0.12
+    quiet = [uwlts.compare_clouds(scanned(rng, common=False), scanned(rng, common=False)) for _ in range(3)]
+    share = np.mean([each.significant[each.compared].mean() for each in quiet])
+    assert 0.005 < share < 0.08
+
+
+def test_the_level_is_that_of_the_distances():
+    """Over many pairs distances scatter by the level over 1.96, common errors included."""
+    rng = np.random.default_rng(3)
+    ratios = []
+    for _ in range(8):
+        change = uwlts.compare_clouds(scanned(rng), scanned(rng), disc_mm=6.0)
+        ratios.append(1.96 * change.distance_mm[change.compared] / change.level_mm[change.compared])
+    assert 0.6 < np.sqrt(np.mean(np.square(np.concatenate(ratios)))) < 1.5
+
+
+def test_a_dent_is_found():
+    rng = np.random.default_rng(4)
+    change = uwlts.compare_clouds(scanned(rng, change=dent), scanned(rng))
+    x, y, _ = change.points_mm.T
+    inside = np.hypot(x - 10, y - 5) < 3
+    assert change.significant[inside].mean() > 0.95
+    # Positive towards the sensor, so that a loss is negative.
+    assert np.median(change.distance_mm[inside]) == pytest.approx(-0.5, abs=0.2)
+    assert change.record()["largest_loss_mm"] < -0.4
+
+
+def test_a_moved_cloud_is_registered():
+    rng = np.random.default_rng(5)
+    before, after = scanned(rng, common=False), scanned(rng, common=False, change=dent)
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.4], degrees=True).as_matrix()
+    moved = PointCloud(after.points_mm @ turn.T + [0.4, -0.3, 0.2], after.intensity, after.frame, after.line)
+    change = uwlts.compare_clouds(moved, before, register=True)
+    found = change.registration
+    assert found.open_directions == ()
+    back = found.transform @ np.block([[turn, np.array([[0.4], [-0.3], [0.2]])], [np.zeros((1, 3)), np.ones((1, 1))]])
+    assert np.linalg.norm(back[:3, 3]) < 0.1 and Rotation.from_matrix(back[:3, :3]).magnitude() < np.radians(0.1)
+    x, y, _ = change.points_mm.T
+    assert change.significant[np.hypot(x - 10, y - 5) < 3].mean() > 0.9
+    assert change.significant[change.compared & (np.hypot(x - 10, y - 5) > 8)].mean() < 0.12
+
+
+@pytest.mark.parametrize(
+    ("surface", "open_words"),
+    [
+        (lambda x, y: 0 * x, ("shift along x", "shift along y", "turn about z")),
+        (lambda x, y: np.sqrt(150.0**2 - x**2) - 150.0, ("shift along y",)),
+    ],
+    ids=["plane", "pipe"],
+)
+def test_what_a_shape_does_not_tell_is_left_as_it_was(surface, open_words):
+    rng = np.random.default_rng(6)
+    before, after = scanned(rng, common=False, surface=surface), scanned(rng, common=False, surface=surface)
+    shifted = PointCloud(after.points_mm + [0.0, 0.6, 0.2], after.intensity, after.frame, after.line)
+    found = uwlts.compare_clouds(shifted, before, register=True).registration
+    assert set(open_words) <= {name for words in found.open_directions for name in words.split(" with ")}
+    assert abs(found.transform[1, 3]) < 0.05 and found.transform[2, 3] == pytest.approx(-0.2, abs=0.05)
+
+
+def test_too_far_apart_is_refused():
+    points = np.random.default_rng(0).uniform(0, 10, (200, 3)) * [1, 1, 0]
+    with pytest.raises(EvaluationError, match="same frame and unit"):
+        register_to_surface(
+            points + [0, 0, 50], points, np.tile([0, 0, 1.0], (200, 1)), reach_mm=2, std_mm=np.ones(200)
+        )
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    """A sphere of 50 mm diameter as an STL file, and a cloud of its side before the sensor with a 0.3 mm bump."""
+    path = tmp_path_factory.mktemp("mesh") / "ball.stl"
+    trimesh.creation.icosphere(subdivisions=6, radius=25.0).export(path)
+    rng = np.random.default_rng(7)
+    direction = rng.normal(size=(40000, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = direction[direction[:, 2] < -0.5]
+    bump = 0.3 * (np.degrees(np.arccos(-direction[:, 2])) < 8)
+    radius = 25.0 + bump + 0.02 * rng.normal(size=len(direction))
+    count = len(direction)
+    cloud = PointCloud(direction * radius[:, None], np.ones(count), np.zeros(count, int), np.arange(count))
+    return path, cloud
+
+
+def test_a_mesh_is_a_reference(ball):
+    path, cloud = ball
+    change = uwlts.compare_clouds(cloud, path)
+    angle = np.degrees(np.arccos(-change.points_mm[:, 2] / np.linalg.norm(change.points_mm, axis=1)))
+    assert np.median(change.distance_mm[angle < 5]) == pytest.approx(0.3, abs=0.03)
+    assert change.significant[angle < 5].mean() > 0.95
+    far = change.compared & (angle > 14) & (angle < 50)
+    assert abs(np.median(change.distance_mm[far])) < 0.01 and change.significant[far].mean() < 0.15
+
+
+def test_wrong_references_are_refused(ball, tmp_path):
+    path, cloud = ball
+    small = tmp_path / "metres.stl"
+    trimesh.load(path).apply_scale(0.001).export(small)
+    with pytest.raises(EvaluationError, match="--unit m"):
+        uwlts.compare_clouds(cloud, small)
+    assert uwlts.compare_clouds(cloud, small, unit="m").compared.any()
+    (tmp_path / "text.stl").write_text("no mesh")
+    with pytest.raises(CaptureError, match="text.stl"):
+        uwlts.compare_clouds(cloud, tmp_path / "text.stl")
+    away = PointCloud(cloud.points_mm + [0, 0, 200], cloud.intensity, cloud.frame, cloud.line)
+    with pytest.raises(EvaluationError, match="do not overlap"):
+        uwlts.compare_clouds(away, path)
+    with pytest.raises(EvaluationError, match="disc_mm is -1"):
+        uwlts.compare_clouds(cloud, path, disc_mm=-1.0)
+    few = PointCloud(cloud.points_mm[:9], cloud.intensity[:9], cloud.frame[:9], cloud.line[:9])
+    with pytest.raises(EvaluationError, match="the cloud has 9 points"):
+        uwlts.compare_clouds(few, path)
+
+
+def test_the_command_writes_page_figures_and_cloud(ball, tmp_path, monkeypatch):
+    path, cloud = ball
+    uwlts.write_cloud(tmp_path / "ball.ply", cloud)
+    monkeypatch.chdir(tmp_path)
+    words = ["compare", "ball.ply", str(path), "--out", "change.html", "--coloured", "change.ply"]
+    app(words, result_action="return_value")
+    record = json.loads((tmp_path / "change.json").read_text())
+    assert record["largest_rise_mm"] == pytest.approx(0.3, abs=0.05) and record["registration"] is None
+    places = PlyData.read(tmp_path / "change.ply")["vertex"].data
+    assert set(places.dtype.names) >= {"x", "y", "z", "distance", "level", "significant"}
+    assert places["significant"].mean() == pytest.approx(record["significant_share"], abs=0.2)
+    page = (tmp_path / "change.html").read_text()
+    assert "level of detection" in page and "ball.ply against ball.stl" in page
+    with pytest.raises(OutputError, match="exists already"):
+        uwlts.write_change("change.html", uwlts.compare_clouds(cloud, path))

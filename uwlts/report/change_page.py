@@ -1,0 +1,98 @@
+"""Page of a surface's change: a map of the distances, their histogram and the figures; and the places as a cloud."""
+
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+from plyfile import PlyData, PlyElement
+
+import uwlts
+from uwlts.metrology.change import SurfaceChange
+from uwlts.model.errors import OutputError
+from uwlts.report.page_toolkit import BLUE, RED, new_figure, png_data_uri, render_page, svg_of, write_page
+from uwlts.storage.files import written_aside
+from uwlts.storage.json_files import json_text
+
+_NOT_SIGNIFICANT = "#cccccc"
+_INK = 60_000
+"""Area of all dots together, square points: they nearly touch."""
+_CLIPPED = 0.995
+"""Share of the places within the colours' range."""
+
+
+def write_change(
+    path: str | Path,
+    change: SurfaceChange,
+    *,
+    title: str = "Change of a surface",
+    coloured: str | Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write the page of a change, its figures as JSON beside it, and with ``coloured`` its places as a PLY cloud.
+
+    The cloud's vertices have x, y, z, nx, ny, nz, distance, level (mm; NaN where not compared) and significant (0, 1).
+    OutputError if a file exists and ``overwrite`` is not given, or cannot be written.
+    """
+    text = render_page(
+        "uwlts.report",
+        "change.html.j2",
+        title=title,
+        software=f"uwlts {uwlts.__version__}",
+        summary=change.lines(),
+        map=_map(change),
+        histogram=_histogram(change),
+    )
+    if coloured is not None:
+        _write_places(Path(coloured), change, overwrite=overwrite)
+    write_page(path, text, beside=json_text(change.record()), overwrite=overwrite)
+
+
+def _write_places(path: Path, change: SurfaceChange, *, overwrite: bool) -> None:
+    if path.suffix.lower() != ".ply":
+        raise OutputError(f"{path}: the places are written as PLY; give a name like change.ply")
+    columns = dict(zip(("x", "y", "z"), change.points_mm.T, strict=True))
+    columns |= dict(zip(("nx", "ny", "nz"), change.normals.T.astype(np.float32), strict=True))
+    columns |= {"distance": change.distance_mm.astype(np.float32), "level": change.level_mm.astype(np.float32)}
+    columns["significant"] = change.significant.astype(np.uint8)
+    vertices = np.empty(len(change.points_mm), [(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        vertices[name] = values
+    with written_aside(path, overwrite=overwrite) as aside:
+        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(aside))
+
+
+def _map(change: SurfaceChange) -> str:
+    """The places from above, across the two longest of their extents, coloured where the change is significant."""
+    first, second = np.sort(np.argsort(np.ptp(change.points_mm, axis=0))[1:])
+    shown, changed = change.compared, change.significant
+    limit = float(np.quantile(np.abs(change.distance_mm[shown]), _CLIPPED))
+    figure, (axes,) = new_figure(9.0, 6.0)
+    u, v = change.points_mm[:, first], change.points_mm[:, second]
+    size = float(np.clip(_INK / len(u), 2, 60))
+    axes.scatter(u[shown & ~changed], v[shown & ~changed], s=size, color=_NOT_SIGNIFICANT, linewidths=0)
+    colours = axes.scatter(
+        u[changed],
+        v[changed],
+        s=size,
+        c=change.distance_mm[changed],
+        cmap="RdBu",
+        vmin=-limit,
+        vmax=limit,
+        linewidths=0,
+    )
+    figure.colorbar(colours, ax=axes, label="distance / mm (grey: within its level of detection)")
+    axes.set(xlabel=f"{'XYZ'[first]} / mm", ylabel=f"{'XYZ'[second]} / mm", aspect="equal")
+    return png_data_uri(axes, dpi=130)
+
+
+def _histogram(change: SurfaceChange) -> Markup:
+    distance, level = change.distance_mm[change.compared], change.level_mm[change.compared]
+    limit = float(np.quantile(np.abs(distance), _CLIPPED)) or 1.0
+    figure, (axes,) = new_figure(9.0, 3.2)
+    axes.hist(np.clip(distance, -limit, limit), bins=81, color=BLUE)
+    for side in (-1, 1):
+        label = "level of detection (median)" if side > 0 else None
+        axes.axvline(side * float(np.median(level)), color=RED, linewidth=1, label=label)
+    axes.set(xlabel="distance / mm", ylabel="places")
+    axes.legend(frameon=False)
+    return svg_of(figure)
