@@ -23,7 +23,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from tests.waiting import within
 from uwlts.desk.access import PageAccess
-from uwlts.desk.board import Board, picture_of
+from uwlts.desk.board import Board, Picture
 from uwlts.desk.guided import BoardScreen, answer_buttons
 from uwlts.desk.page import BoardView, laser_off_button, timed
 from uwlts.desk.server import DeskServer
@@ -322,7 +322,7 @@ def test_the_latest_image_and_the_cloud_are_fetched_anew(page):
     empty = asked(page, "/picture.jpg")
     assert (empty.status, empty.body) == (204, b"")
     image = np.full((64, 80), 100, np.uint8)
-    page.board.show(picture_of(image, full_dn=255, caption="grey"))
+    page.board.show(Picture(image, full_dn=255, caption="grey"))
     shown = asked(page, "/picture.jpg?1")
     assert shown.status == 200 and shown.body == page.board.picture.jpeg
     assert shown.headers["content-type"] == "image/jpeg" and shown.headers["cache-control"] == "no-store"
