@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from uwlts.measurement.reconstruction import ScanCloud, reconstruct
     from uwlts.measurement.verification import Verification, verify
     from uwlts.metrology.change import SurfaceChange, compare_clouds
+    from uwlts.metrology.gauge import GaugeStudy, gauge_study
     from uwlts.model.calibration import Calibration
     from uwlts.model.errors import Error
     from uwlts.model.library import load_sensor
@@ -61,6 +62,7 @@ __all__ = [
     "Evaluation",
     "Finding",
     "Frame",
+    "GaugeStudy",
     "GuidedRecording",
     "Imported",
     "Mount",
@@ -90,6 +92,7 @@ __all__ = [
     "evaluate_thesis",
     "examine",
     "export",
+    "gauge_study",
     "import_images",
     "load_calibration",
     "load_sensor",
@@ -128,6 +131,7 @@ _MODULES = {
     "Evaluation": "uwlts.measurement.evaluation",
     "Finding": "uwlts.doctor",
     "Frame": "uwlts.storage.capture",
+    "GaugeStudy": "uwlts.metrology.gauge",
     "GuidedRecording": "uwlts.hardware.guided.recording",
     "Imported": "uwlts.storage.import_",
     "Mount": "uwlts.model.mount",
@@ -157,6 +161,7 @@ _MODULES = {
     "evaluate_thesis": "uwlts.thesis.report",
     "examine": "uwlts.doctor",
     "export": "uwlts.storage.export_",
+    "gauge_study": "uwlts.metrology.gauge",
     "import_images": "uwlts.storage.import_",
     "load_calibration": "uwlts.storage.calibration_file",
     "load_sensor": "uwlts.model.library",

@@ -20,7 +20,7 @@ from uwlts.cli.options import (
     warn,
 )
 from uwlts.runtime.console import progress_bar
-from uwlts.storage.files import refuse_unsuitable
+from uwlts.storage.files import refuse_unsuitable, written_aside
 
 
 @app.command
@@ -273,6 +273,37 @@ def compare(
     title = f"{cloud.name} against {reference.name}"
     uwlts.write_change(out, change, title=title, coloured=coloured, overwrite=overwrite)
     print(f"wrote {out} and {out.with_suffix('.json').name}")
+
+
+@app.command
+def gauge(
+    table: Path,
+    *,
+    out: Path | None = None,
+    tolerance: float | None = None,
+    reference: float | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Judge the gauge by repeated measurements of a figure: repeatability, reproducibility, share of a tolerance.
+
+    Example: uwlts gauge diameters.csv --tolerance 0.2 --out gauge.json
+
+    Args:
+        table: CSV file with the columns part, operator and value, one measurement a line.
+        out: Study to write (JSON).
+        tolerance: Width of the tolerance.
+        reference: True value of the only part: a type-1 study with Cg and Cgk.
+    """
+    from uwlts.storage.json_files import json_text
+
+    if out:
+        refuse_unsuitable(out, overwrite=overwrite)
+    study = uwlts.gauge_study(table, tolerance=tolerance, reference=reference)
+    show(study.lines())
+    if out:
+        with written_aside(out, overwrite=overwrite) as aside:
+            aside.write_text(json_text(study.record(), indent=1), encoding="utf-8")
+        print(f"wrote {out}")
 
 
 @app.command
