@@ -6,9 +6,10 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from uwlts.metrology.registration import Registration, register_to_surface
@@ -246,7 +247,7 @@ def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
         if b"element face" not in header or b"element face 0" in header:
             return None
     try:
-        loaded = trimesh.load(path, force="mesh", process=False)
+        loaded: Any = trimesh.load(path, force="mesh", process=False)
     except Exception as error:
         # Trimesh raises whatever its parsers do.
         raise CaptureError(f"{path} is no mesh (.stl, .obj, .off, .ply) and no cloud: {error}") from error
@@ -296,7 +297,7 @@ def _require_same_unit(cloud: np.ndarray, reference: np.ndarray) -> None:
 def _disc_of(points: np.ndarray) -> float:
     """Diameter of discs that hold some thirty points, from the usual distance of the sixth neighbour."""
     sample = points[:: max(1, len(points) // 2000)]
-    seventh = cKDTree(points).query(sample, k=7)[0][:, 6]
+    seventh = KDTree(points).query(sample, k=7)[0][:, 6]
     # A disc of radius r about a point holds six neighbours more: the area for thirty is five times as large.
     return float(2 * np.median(seventh) * np.sqrt(_POINTS_PER_DISC / 6.0))
 
@@ -313,11 +314,11 @@ def _normals(places: np.ndarray, surface: np.ndarray, disc: float, *, given: np.
 
     Those of clouds look towards the sensor, to -Z. Points within one disc's diameter are taken, at least eight.
     """
-    tree = cKDTree(surface)
+    tree = KDTree(surface)
     if given is not None:
         return given[tree.query(places, workers=-1)[1]]
     result = np.empty_like(places)
-    nearest = tree.query(places, k=min(2 * _POINTS_PER_DISC, len(surface)), workers=-1)
+    nearest: Any = tree.query(places, k=min(2 * _POINTS_PER_DISC, len(surface)), workers=-1)
     for number, (away, neighbours) in enumerate(zip(*nearest, strict=True)):
         kept = neighbours[(away <= max(disc, away[7])) | (np.arange(len(away)) < 8)]
         about = surface[kept] - surface[kept].mean(axis=0)
@@ -325,7 +326,7 @@ def _normals(places: np.ndarray, surface: np.ndarray, disc: float, *, given: np.
     return np.where(result[:, 2:] > 0, -result, result)
 
 
-def _neighbours(tree: cKDTree, places: np.ndarray, radius: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _neighbours(tree: KDTree, places: np.ndarray, radius: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Numbers of places and of the points near them, pair by pair, some places at a time."""
     counts = tree.query_ball_point(places, radius, return_length=True, workers=-1)
     part = np.cumsum(counts) // _PAIRS_AT_A_TIME
@@ -350,7 +351,7 @@ def _side(
     """Mean (P,) of the points of one side along the normals from the places, and its variance (P,)."""
     count, mean, variance = (np.zeros(len(places)) for _ in range(3))
     radius = float(np.hypot(disc / 2, deep))
-    for place, point in _neighbours(cKDTree(points), places, radius):
+    for place, point in _neighbours(KDTree(points), places, radius):
         away = points[point] - places[place]
         along = np.einsum("ni,ni->n", away, normals[place])
         across = np.einsum("ni,ni->n", away, away) - along**2

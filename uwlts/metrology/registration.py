@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from uwlts.metrology.least_squares import MAD_TO_STD
@@ -73,13 +74,15 @@ def register_to_surface(
     """
     every = slice(None, None, max(1, len(points_mm) // _MOST_POINTS))
     moved, std = points_mm[every].astype(np.float64), np.maximum(std_mm[every], 1e-6)
-    tree, transform, middle = cKDTree(surface_mm), np.eye(4), points_mm.mean(axis=0)
+    tree, transform, middle = KDTree(surface_mm), np.eye(4), points_mm.mean(axis=0)
     size = max(float(np.sqrt(np.mean(np.sum((moved - middle) ** 2, axis=1)))), 1e-9)
     # Turns in units of the shift that they give to the usual point.
     units = np.array([1.0] * 3 + [1 / size] * 3)
+    fit = _NO_FIT
     for _ in range(_ROUNDS):
         middle = (transform @ np.append(points_mm.mean(axis=0), 1.0))[:3]
-        away, nearest = tree.query(moved, distance_upper_bound=reach_mm, workers=-1)
+        found: Any = tree.query(moved, distance_upper_bound=reach_mm, workers=-1)
+        away, nearest = found
         near = np.isfinite(away)
         if np.count_nonzero(near) < _FEWEST:
             raise EvaluationError(
@@ -88,31 +91,47 @@ def register_to_surface(
             )
         normal = normals[nearest[near]]
         left = np.einsum("ni,ni->n", moved[near] - surface_mm[nearest[near]], normal)
-        relative = left / std[near]
-        spread = max(MAD_TO_STD * float(np.median(np.abs(relative))), 1.0)
-        u = np.clip(relative / (_TUKEY * spread), -1, 1)
-        weight = (1 - u * u) ** 2 / (std[near] * spread) ** 2
-        by = np.hstack([normal, np.cross(moved[near] - middle, normal)]) * units
-        information = by.T @ (weight[:, None] * by)
-        values, vectors = np.linalg.eigh(information)
-        known = values > _OPEN_SHARE * values[-1]
-        inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
-        step = -units * (inverse @ (by.T @ (weight * left)))
+        fit = _fitted(np.hstack([normal, np.cross(moved[near] - middle, normal)]) * units, left, std[near])
+        step = units * fit.step
         change = np.eye(4)
         change[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix()
         change[:3, 3] = middle + step[:3] - change[:3, :3] @ middle
         transform, moved = change @ transform, moved @ change[:3, :3].T + change[:3, 3]
-        if np.abs(step / units).max() < _STILL_MM:
+        if np.abs(fit.step).max() < _STILL_MM:
             break
-    counted = np.abs(u) < 1
     return Registration(
         transform,
-        units[:, None] * inverse * units,
+        units[:, None] * fit.covariance * units,
         (transform @ np.append(points_mm.mean(axis=0), 1.0))[:3],
-        tuple(_words(vector) for vector in vectors[:, ~known].T),
-        float(np.sqrt(np.mean(left[counted] ** 2))),
-        int(np.count_nonzero(counted)),
+        tuple(_words(vector) for vector in fit.open_directions),
+        float(np.sqrt(np.mean(fit.counted_mm**2))),
+        len(fit.counted_mm),
     )
+
+
+class _Fit(NamedTuple):
+    """A step (6,) of the movement, its covariance (6, 6), open directions (K, 6), and the distances that count."""
+
+    step: np.ndarray
+    covariance: np.ndarray
+    open_directions: np.ndarray
+    counted_mm: np.ndarray
+
+
+_NO_FIT = _Fit(*(np.empty(0) for _ in range(4)))
+
+
+def _fitted(by: np.ndarray, left: np.ndarray, std: np.ndarray) -> _Fit:
+    """Weighted step against distances (N,) with derivatives (N, 6), along the directions that are determined."""
+    relative = left / std
+    spread = max(MAD_TO_STD * float(np.median(np.abs(relative))), 1.0)
+    u = np.clip(relative / (_TUKEY * spread), -1, 1)
+    weight = (1 - u * u) ** 2 / (std * spread) ** 2
+    values, vectors = np.linalg.eigh(by.T @ (weight[:, None] * by))
+    known = values > _OPEN_SHARE * values[-1]
+    inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
+    step = -inverse @ (by.T @ (weight * left))
+    return _Fit(step, inverse, vectors[:, np.logical_not(known)].T, left[np.abs(u) < 1])
 
 
 def _words(direction: np.ndarray) -> str:
