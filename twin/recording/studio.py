@@ -219,7 +219,7 @@ class Studio:
     def frame(self, shot: Shot, index: int) -> Frame:
         """Image number ``index`` of the scan with what a capture records of it."""
         return Frame(
-            image=self.image(shot, index),
+            self.image(shot, index),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
             exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
