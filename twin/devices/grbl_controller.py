@@ -96,6 +96,10 @@ class GrblController:
             speed = self._firmware.axis.at(self._now())[1]
             return StageState(self._firmware.stage_mm, speed != 0, power > 0, power, self._port_open)
 
+    def steps(self) -> int:
+        """Count of an encoder on the axis, a step each."""
+        return round(self.state().position_mm / self._firmware.step_mm)
+
     def disconnect(self) -> None:
         """Pull the cable out: the line is gone and, with it, the controller's power."""
         with self._lock:

@@ -298,6 +298,7 @@ def serve(
         Named place of the objects, such as near, standoff or far.
     effects
         Effects of real images to add, as for `simulate`, but for lamp-and-laser: the controller switches the laser.
+        With camera-3d the camera's pixel format is Coord3D_C16 until a program sets Mono8.
     without
         Effects to leave out, as for `simulate`; a moving stage does not blur the image in any case.
     ideal
@@ -366,7 +367,10 @@ def serve(
         inject(number + 1, ahead=True)
         return image
 
-    camera = GigeCamera(frame, width_px=built.camera.width_px, height_px=built.camera.height_px)
+    size = {"width_px": built.camera.width_px, "height_px": built.camera.height_px}
+    if studio.peak_finder is not None and built.camera.stripe_along != "width":
+        raise DesignError("a 3D camera's profile lines are its columns: take a sensor with stripe_along = 'width'")
+    camera = GigeCamera(frame, **size, scan3d=studio.peak_finder, encoder=controller.steps)
     inject(1, ahead=True)
     with controller, camera:
         yield ServedTwin(controller, camera, track, studio.exposure_ms, lambda: bench.rates)
