@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from ctypes import c_char_p, c_double, c_int, c_size_t, c_uint32, c_uint64, c_void_p
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Literal, Protocol, Self
@@ -131,6 +132,18 @@ _Shot = tuple[np.ndarray, int, int | None]
 """An image or profile, the time in ns at which its exposure began, and the encoder's count in its middle."""
 
 
+@dataclass(frozen=True)
+class Exposed:
+    """An exposure: its middle in s of the monotonic clock, the encoder's count then, and what makes its image.
+
+    ``image(exposure_ms)`` returns the whole image (H, W) of uint8.
+    """
+
+    middle_s: float
+    encoder: int | None
+    image: Callable[[float], np.ndarray]
+
+
 class Scan3d(Protocol):
     """A peak finder inside the camera."""
 
@@ -154,6 +167,10 @@ class GigeCamera:
     With ``scan3d`` it is a 3D camera: its pixel format is Coord3D_C16 until a program asks for Mono8, and each frame
     holds the profile that is found in the image, with 0 for no stripe. ``encoder()`` is the count of an encoder that is
     wired to the camera, sent as chunk data where a program asks for it.
+
+    With ``expose`` a free-running camera exposes at its frame rate with true time stamps, however long its images take:
+    it is called in the middle of each exposure, and frames wait in the camera's memory, as in one that is faster than
+    its cable. They are lost at the end of the acquisition.
     """
 
     def __init__(
@@ -166,11 +183,12 @@ class GigeCamera:
         first_number: int = 1,
         scan3d: Scan3d | None = None,
         encoder: Callable[[], int] | None = None,
+        expose: Callable[[], Exposed] | None = None,
     ):
         if not serial.isascii() or not 0 < len(serial) < _SERIAL_BYTES:
             raise HardwareError(f"serial is '{serial}': it must have 1 to {_SERIAL_BYTES - 1} ASCII characters")
         self.failure: BaseException | None = None
-        self._frame, self._scan3d, self._encoder = frame, scan3d, encoder
+        self._frame, self._scan3d, self._encoder, self._expose = frame, scan3d, encoder, expose
         self._size = (height_px, width_px)
         self._serial = serial.encode()
         self._library = _functions()
@@ -302,9 +320,27 @@ class GigeCamera:
 
     def _fill(self, _buffer: int, _data: None, exposure_us: int, _gain: int, _pixel_format: int) -> None:
         """Called by the library when a frame is due; what it sends itself is lost."""
-        shot = self._due(1e-3 * exposure_us)
-        if shot is None:
+        if self._expose is not None and not self._library.arv_fake_camera_is_in_software_trigger_mode(self._camera):
+            self._stopping.wait(0.5e-6 * exposure_us)
+            self._maker_thread.submit(self._develop, self._expose(), 1e-3 * exposure_us)
             return
+        shot = self._due(1e-3 * exposure_us)
+        if shot is not None:
+            self._send(shot)
+
+    def _develop(self, exposed: Exposed, exposure_ms: float) -> None:
+        """Make the image of an exposure in memory and send it; called in the second thread, in turn."""
+        with self._lock:
+            if self._server is None or not self._read(_Register.ACQUISITION):
+                return
+        try:
+            seen = self._seen(exposed.image(exposure_ms))
+        except BaseException as error:
+            self.failure = error
+            raise
+        self._send((seen, round(1e9 * exposed.middle_s - 0.5e6 * exposure_ms), exposed.encoder))
+
+    def _send(self, shot: _Shot) -> None:
         with self._lock:
             if self._server is None:
                 return
@@ -374,9 +410,13 @@ class GigeCamera:
         if image.shape != self._size or image.dtype != np.uint8:
             raise ImageError(f"the camera shows {self._size} uint8, the image is {image.shape} {image.dtype}")
         count = None if self._encoder is None else self._encoder()
+        return self._seen(image), began_ns, count
+
+    def _seen(self, image: np.ndarray) -> np.ndarray:
+        """The image, or the profile (1, L) that a 3D camera finds in it."""
         if self._scan3d is not None and self._read(_Register.PIXEL_FORMAT) == _COORD3D_C16:
-            return self._scan3d.numbers(image)[None], began_ns, count
-        return image, began_ns, count
+            return self._scan3d.numbers(image)[None]
+        return image
 
     def _read(self, register: int) -> int:
         number = c_uint32()

@@ -155,16 +155,24 @@ class Studio:
         transform[:3, 3] = shot.travelled_mm * self.scene.motion.unit_direction()
         return transform
 
+    def speed_mm_per_s(self) -> float:
+        """Speed of the stage along its positions while an image is exposed."""
+        motion = self.scene.motion
+        return motion.speed_mm_per_s * (1 if motion.step_mm >= 0 else -1)
+
     def travel(self, light: Light) -> Travel | None:
         """Movement of the sensor during an exposure; None if it stands still."""
-        motion, detector = self.scene.motion, self.sensor.detector
-        if motion.speed_mm_per_s == 0 or not self.options.effects.motion:
+        return self.travel_at(self.speed_mm_per_s(), exposure_ms=self.exposure_ms.get(light, 0.0))
+
+    def travel_at(self, speed: float, *, exposure_ms: float) -> Travel | None:
+        """Movement of the sensor during an exposure at a speed in mm/s; None if it stands still."""
+        detector = self.sensor.detector
+        if speed == 0 or not self.options.effects.motion:
             return None
-        speed = motion.speed_mm_per_s * (1 if motion.step_mm >= 0 else -1)
         row_s = 1e-6 * detector.line_time_us if detector.shutter == "rolling" else 0.0
         return Travel(
-            direction=motion.unit_direction(),
-            exposure_mm=speed * 1e-3 * self.exposure_ms.get(light, 0.0),
+            direction=self.scene.motion.unit_direction(),
+            exposure_mm=speed * 1e-3 * exposure_ms,
             row_mm=speed * row_s,
             middle_row=(self.sensor.camera.height_px - 1) / 2,
         )
@@ -229,6 +237,7 @@ class Studio:
             laser_on=shot.light == "laser",
             exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
             time_s=index * self.period_s,
+            speed_mm_per_s=self.speed_mm_per_s(),
         )
 
     def seen(self, shot: Shot, index: int) -> Seen:
@@ -550,8 +559,9 @@ def record_scene(
         "spp": studio.options.spp,
     }
     lines = studio.peak_finder is not None
+    kinds = {"centre_lines": lines, "moving": studio.speed_mm_per_s() != 0}
     files = {"overwrite": overwrite, "resume": resume}
-    with CaptureWriter(path, header, dtype=dtype, centre_lines=lines, plan=plan, **files) as writer:
+    with CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer:
         done = len(writer)
         for index, shot in enumerate(shots):
             truths.append(studio.truth(shot))

@@ -15,6 +15,7 @@ import numpy as np
 
 from uwlts.hardware.camera import CameraDevice
 from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.continuous import record_continuously, ways_of
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.page_beside import PageBeside
 from uwlts.hardware.replay import ReplayCamera
@@ -205,6 +206,34 @@ def record_scan(
         images=len(shots),
         background=plan.background,
     )
+    if plan.continuous is not None:
+        if resume:
+            raise DescriptionError("a continuous scan cannot be resumed: give --overwrite to scan again")
+        ways_of(plan, plan.continuous, stage)
+        rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
+        seen = ScanProgress()
+        taking = _Taking(plan, sensor, rig, seen, warn)
+        report("finding the exposures")
+        taking.settle_exposures(between)
+        report("recording")
+        placed = record_continuously(
+            plan,
+            plan.continuous,
+            out,
+            sensor=sensor,
+            camera=camera,
+            stage=stage,
+            header=header,
+            exposure_ms=seen.exposure_ms["laser"],
+            overwrite=overwrite,
+            progress=progress,
+            report=report,
+            warn=warn,
+            recorded=recorded,
+            counted=taking.count_stripe,
+        )
+        report(f"{placed}")
+        return seen
     known_ms, before_s = left_over(out, [multiple for _, multiple in plan.images()]) if resume else ({}, 0.0)
     seen = ScanProgress(exposure_ms=known_ms)
     files = {"overwrite": overwrite, "resume": resume}
@@ -396,10 +425,14 @@ class _Taking:
         )
         return True
 
+    def count_stripe(self, stripe: Stripe) -> None:
+        """Count the profile lines with a stripe."""
+        self._seen.lines += len(stripe.status)
+        self._seen.found += int((stripe.status == StripeStatus.OK).sum())
+
     def _count(self, stripe: Stripe, bright: Brightness) -> None:
         seen = self._seen
-        seen.lines += len(stripe.status)
-        seen.found += int((stripe.status == StripeStatus.OK).sum())
+        self.count_stripe(stripe)
         if bright.overexposed:
             seen.saturated += 1
             if seen.saturated == 1:

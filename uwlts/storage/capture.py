@@ -10,6 +10,9 @@ the rows centre, amplitude, width and status of a `Stripe`, ``has_image (N,)`` s
 same, such as those of a target, and ``encoder (N,)`` is the count of an encoder at each frame, NaN where there is none.
 A part of ``frames`` or ``centre_lines`` that a frame does not have takes no space.
 
+Frames of a stage that moves have its ``speed_mm_per_s (N,)`` (version 2 too), positive where positions grow, and the
+capture holds what the stage reported meanwhile: ``stage_reports (M, 2)``, time in s of the frames' clock and position.
+
 While it is being recorded the file is called ``NAME.part`` and every frame is flushed in HDF5's single-writer mode, so
 an interrupted recording keeps all its complete frames; closing it gives it its name.
 """
@@ -51,9 +54,10 @@ from uwlts.storage.one_writer import one_writer
 
 FORMAT = "uwlts-capture"
 VERSION = 2
-"""Of captures with centre lines; those of images alone have version 1."""
+"""Of captures with centre lines or a moving stage; those of images at rest have version 1."""
 _PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (), "time_s": ()}
-_WITH_LINES = {"has_image": bool, "encoder": float}
+_MORE = {"has_image": bool, "encoder": float, "speed_mm_per_s": float}
+"""Columns of version 2."""
 # What h5py raises on a damaged file depends on where the damage is.
 _DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 POSE_ROUNDED = 1e-4
@@ -85,7 +89,8 @@ def picture_of(seen: Seen, camera: Camera) -> np.ndarray:
 class Frame:
     """What was seen, with its stage position, light, exposure, time, and pose ``T_scene_object`` (4, 4) if known.
 
-    ``encoder`` is the count of an encoder at that moment, where there is one.
+    ``encoder`` is the count of an encoder at that moment, where there is one. Of a stage that moves, position and time
+    are those in the middle of the exposure, of an image's middle row where the shutter is rolling.
     """
 
     seen: Seen
@@ -95,6 +100,7 @@ class Frame:
     time_s: float
     pose: np.ndarray | None = None
     encoder: float | None = None
+    speed_mm_per_s: float = 0.0
 
     @property
     def image(self) -> np.ndarray:
@@ -106,8 +112,8 @@ class Frame:
 class FrameTable:
     """What is known of each image of a recording besides its pixels, as of a `Capture`.
 
-    ``stage_mm`` and ``exposure_ms`` are (N,), ``pose`` is (N, 4, 4), NaN where an image has none; ``path`` is what the
-    recording is called.
+    ``stage_mm``, ``exposure_ms`` and ``speed_mm_per_s`` are (N,), ``pose`` is (N, 4, 4), NaN where an image has none;
+    ``path`` is what the recording is called.
     """
 
     header: CaptureHeader
@@ -115,6 +121,7 @@ class FrameTable:
     stage_mm: np.ndarray
     exposure_ms: np.ndarray
     pose: np.ndarray
+    speed_mm_per_s: np.ndarray
 
     @classmethod
     def of(cls, header: CaptureHeader, frames: Sequence[Frame]) -> "FrameTable":
@@ -126,6 +133,7 @@ class FrameTable:
             np.array([frame.stage_mm for frame in frames]),
             np.array([frame.exposure_ms for frame in frames]),
             np.array([none if frame.pose is None else frame.pose for frame in frames]).reshape(-1, 4, 4),
+            np.array([frame.speed_mm_per_s for frame in frames]),
         )
 
 
@@ -139,15 +147,15 @@ def _cut_to_used(path: Path) -> None:
     h5py.File(path, "r+", locking=False).close()
 
 
-def _recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None, *, lines: bool) -> Table:
+def _recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None, *, lines: bool, moving: bool) -> Table:
     """What a recording is to hold, as JSON."""
-    held = f"{dtype} and centre lines" if lines else str(dtype)
+    held = f"{dtype}{' and centre lines' if lines else ''}{', moving' if moving else ''}"
     return {"plan": plan, "images": held, "header": header.model_dump(mode="json")}
 
 
 def _arrays(file: h5py.File) -> dict[str, h5py.Dataset]:
     """A capture's datasets by their names, in a file of this program's."""
-    names = ("frames", "centre_lines", *_WITH_LINES, *_PER_FRAME)
+    names = ("frames", "centre_lines", "stage_reports", *_MORE, *_PER_FRAME)
     return {name: cast(h5py.Dataset, file[name]) for name in names if name in file}
 
 
@@ -161,11 +169,12 @@ def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
 class CaptureWriter(AbstractContextManager["CaptureWriter"]):
     """Records a capture. A context manager: leaving it normally finishes the file, an exception keeps the part.
 
-    ``dtype`` is that of images; with ``centre_lines`` laser frames are centre lines. ``plan`` says, as JSON, what is to
-    be recorded beyond what the header states; it is kept in the part and not in the
-    finished capture. OutputError where the file exists (give ``overwrite``), is an input of the running command or is
-    being written by another process, a part is left over (give ``resume`` or ``overwrite``), or storage fails;
-    CaptureError for ``resume`` of a part that is damaged, or of another header or plan.
+    ``dtype`` is that of images; with ``centre_lines`` laser frames are centre lines, with ``moving`` frames have a
+    speed, and the stage's reports are added by `place`. ``plan`` says, as JSON, what is to be recorded beyond what the
+    header states; it is kept in the part and not in the finished capture. OutputError where the file exists (give
+    ``overwrite``), is an input of the running command or is being written by another process, a part is left over (give
+    ``resume`` or ``overwrite``), or storage fails; CaptureError for ``resume`` of a part that is damaged, or of another
+    header or plan.
     """
 
     def __init__(
@@ -175,6 +184,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         *,
         dtype: np.dtype,
         centre_lines: bool = False,
+        moving: bool = False,
         plan: Table | None = None,
         overwrite: bool = False,
         resume: bool = False,
@@ -184,7 +194,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         self._part = part_path(self.path)
         camera = header.sensor.camera
         self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
-        self._lines = camera.lines() if centre_lines else 0
+        self._lines, self._moving = camera.lines() if centre_lines else 0, moving
         if self._dtype not in (np.uint8, np.uint16):
             raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
         with self._storage(), ExitStack() as claimed:
@@ -211,8 +221,9 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         except CaptureError as error:
             raise CaptureError(f"cannot resume: {error}; give --overwrite to start afresh") from error
         held = unfinished.header, unfinished.dtype, unfinished.plan()
-        there = _recording_table(*held, lines=unfinished.holds_lines)
-        wanted = _recording_table(self.header, self._dtype, self._plan, lines=bool(self._lines))
+        there = _recording_table(*held, lines=unfinished.holds_lines, moving=unfinished.moving)
+        kinds = {"lines": bool(self._lines), "moving": self._moving}
+        wanted = _recording_table(self.header, self._dtype, self._plan, **kinds)
         if others := differences(there, wanted):
             unfinished.close()
             raise CaptureError(
@@ -231,7 +242,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         try:
             with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
                 self._claim_space()
-                write_label(self._file, format=FORMAT, version=VERSION if self._lines else 1, header=self.header)
+                write_label(self._file, format=FORMAT, version=self._version(), header=self.header)
                 if self._plan is not None:
                     write_plan(self._file, self._plan)
                 # The checksum finds damage that the compression would decode to a different picture.
@@ -248,9 +259,11 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                         fletcher32=True,
                         **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
                     )
-                columns = _PER_FRAME | (dict.fromkeys(_WITH_LINES, ()) if self._lines else {})
+                columns = _PER_FRAME | (dict.fromkeys(_MORE, ()) if self._version() > 1 else {})
+                if self._moving:
+                    self._file.create_dataset("stage_reports", (0, 2), float, maxshape=(None, 2), chunks=(256, 2))
                 for name, shape in columns.items():
-                    kind, chunks = _WITH_LINES.get(name, bool if name == "laser_on" else float), (256, *shape)
+                    kind, chunks = _MORE.get(name, bool if name == "laser_on" else float), (256, *shape)
                     # No checksum: a kill while 256 rows are rewritten would then lose them all, not only the last one.
                     self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=chunks)
                 self._arrays = _arrays(self._file)
@@ -260,6 +273,9 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             os.replace(fresh, self._part)
         finally:
             fresh.unlink(missing_ok=True)
+
+    def _version(self) -> int:
+        return VERSION if self._lines or self._moving else 1
 
     def __len__(self) -> int:
         """Number of complete frames written."""
@@ -274,6 +290,8 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         is no rotation with a shift (4, 4); OutputError where storage fails, the frames before being kept.
         """
         self._require_fitting(frame)
+        if frame.speed_mm_per_s and not self._moving:
+            raise CaptureError(f"a frame moves by {frame.speed_mm_per_s:g} mm/s in a capture of a stage at rest")
         if not np.isfinite([frame.stage_mm, frame.exposure_ms, frame.time_s]).all() or frame.exposure_ms < 0:
             raise CaptureError(
                 f"a frame at stage position {frame.stage_mm} mm, exposure {frame.exposure_ms} ms and time "
@@ -290,6 +308,19 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         with self._storage():
             self._store(frame)
 
+    def place(self, stage_mm: np.ndarray, speed_mm_per_s: np.ndarray, reports: np.ndarray) -> None:
+        """Correct positions and speeds (N,) of the frames, once the stage's ``reports`` (M, 2) are complete."""
+        with self._storage():
+            for name, values in (
+                ("stage_mm", stage_mm),
+                ("speed_mm_per_s", speed_mm_per_s),
+                ("stage_reports", reports),
+            ):
+                dataset = self._arrays[name]
+                dataset.resize(len(values), axis=0)
+                dataset[...] = values
+                dataset.flush()
+
     def _require_fitting(self, frame: Frame) -> None:
         seen = frame.seen
         if isinstance(seen, Stripe):
@@ -305,9 +336,10 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         self._claim_space()
         pose = np.full((4, 4), np.nan) if frame.pose is None else frame.pose
         values: dict[str, object] = {"stage_mm": frame.stage_mm, "pose": pose, "laser_on": frame.laser_on}
-        if self._lines:
+        if self._version() > 1:
             encoder = np.nan if frame.encoder is None else frame.encoder
             values |= {"has_image": not isinstance(frame.seen, Stripe), "encoder": encoder}
+            values |= {"speed_mm_per_s": frame.speed_mm_per_s}
         if isinstance(frame.seen, Stripe):
             kept, seen = "centre_lines", rows_of(frame.seen)
         else:
@@ -394,6 +426,10 @@ class Capture(AbstractContextManager["Capture"]):
         Whether a frame is an image, rather than a centre line.
     encoder : (N,) float64
         Count of an encoder at each frame; NaN where there is none.
+    speed_mm_per_s : (N,) float64
+        Speed of the stage at each frame, positive where positions grow; 0 at rest.
+    stage_reports : (M, 2) float64
+        What a stage reported while it moved: time in s, as of ``time_s``, and position in mm.
 
     Raises
     ------
@@ -431,17 +467,33 @@ class Capture(AbstractContextManager["Capture"]):
             require_small_chunks(dataset, name, path=self.path)
         self._images, self.dtype = images, images.dtype
         self.holds_lines = "centre_lines" in self.file
-        counted = [images, *columns.values()]
+        self.moving = "stage_reports" in self.file
+        more = {
+            name: self._dataset(name, (), "b" if kind is bool else "f")
+            for name, kind in _MORE.items()
+            if name in self.file
+        }
+        counted = [images, *columns.values(), *more.values()]
         if self.holds_lines:
             self._lines = self._dataset("centre_lines", (len(ROWS), camera.lines()), "f")
             if self._lines.chunks != (1, *self._lines.shape[1:]):
                 raise CaptureError(f"{self.path} is damaged: centre lines are in chunks of {self._lines.chunks}")
-            marked, encoder = self._dataset("has_image", (), "b"), self._dataset("encoder", (), "f")
-            counted += [self._lines, marked, encoder]
+            counted.append(self._lines)
         self._count = min(map(len, counted))
-        self.has_image, self.encoder = np.ones(self._count, bool), np.full(self._count, np.nan)
+        for dataset, name in zip(more.values(), more, strict=True):
+            require_small_chunks(dataset, name, path=self.path)
+        known = {name: dataset[: self._count] for name, dataset in more.items()}
+        self.has_image = known.get("has_image", np.ones(self._count, bool))
+        self.encoder = known.get("encoder", np.full(self._count, np.nan))
+        self.speed_mm_per_s = known.get("speed_mm_per_s", np.zeros(self._count))
+        self.stage_reports = np.empty((0, 2))
+        if self.moving:
+            reports = self._dataset("stage_reports", (2,), "f")
+            require_small_chunks(reports, "stage_reports", path=self.path)
+            self.stage_reports = reports[:]
+        if not (np.isfinite(self.speed_mm_per_s).all() and np.isfinite(self.stage_reports).all()):
+            raise CaptureError(f"{self.path} holds speeds or reports of the stage that are not finite")
         if self.holds_lines:
-            self.has_image, self.encoder = marked[: self._count], encoder[: self._count]
             self._require_stored(self._lines, int(np.count_nonzero(~self.has_image)), "centre lines")
         self._require_stored(images, int(np.count_nonzero(self.has_image)), "images")
         self.stage_mm, self.pose, self.laser_on, self.exposure_ms, self.time_s = (
@@ -459,7 +511,7 @@ class Capture(AbstractContextManager["Capture"]):
         if unfinished and self._count > 1 and self.time_s[-1] < self.time_s[-2]:
             # The writer was killed between making room for its last frame and storing it.
             self._count -= 1
-            for name in (*_PER_FRAME, *_WITH_LINES):
+            for name in (*_PER_FRAME, *_MORE):
                 setattr(self, name, getattr(self, name)[: self._count])
         if (np.diff(self.time_s) < 0).any():
             raise CaptureError(f"{self.path} holds times that run backwards")
@@ -527,7 +579,8 @@ class Capture(AbstractContextManager["Capture"]):
         columns = (self.stage_mm, self.laser_on, self.exposure_ms, self.time_s)
         pose = self.pose[index] if np.isfinite(self.pose[index]).all() else None
         encoder = self.encoder[index].item() if np.isfinite(self.encoder[index]) else None
-        return Frame(seen, *(column[index].item() for column in columns), pose=pose, encoder=encoder)
+        known = {"pose": pose, "encoder": encoder, "speed_mm_per_s": self.speed_mm_per_s[index].item()}
+        return Frame(seen, *(column[index].item() for column in columns), **known)
 
     def frames(self, *, laser_on: bool | None = None) -> Iterator[tuple[int, np.ndarray]]:
         """Index and image of all frames, or only of those with the laser on or off; ImageError at a centre line."""
