@@ -8,7 +8,7 @@ import pytest
 
 import uwlts
 from tests.system.drawn_hardware import HEIGHT_PX, WIDTH_PX, write_plan
-from twin.devices.gige_camera import Exposed, GigeCamera
+from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
 from uwlts.hardware import continuous
 from uwlts.measurement.latency import measure_latency
@@ -41,10 +41,10 @@ class Hill:
             expose=self._expose,
         )
 
-    def _expose(self) -> Exposed:
+    def _expose(self) -> ExposedFrame:
         state = self.controller.state()
         self.states.append(state)
-        return Exposed(state.time_s, self.controller.steps(state), lambda exposure_ms: self._drawn(state))
+        return ExposedFrame(state.time_s, self.controller.steps(state), lambda exposure_ms: self._drawn(state))
 
     def _drawn(self, state: StageState) -> np.ndarray:
         image = self._rng.normal(6.0, 1.0, (HEIGHT_PX, WIDTH_PX))

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from twin.devices.gige_camera import Exposed, GigeCamera
+from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
 from twin.options import CPU, Options, Variant, use_variant
 from twin.recording.recording import AnyScene, AnySensor, choose_scene, choose_sensors
@@ -384,11 +384,10 @@ def serve(
         inject(number + 1, ahead=True)
         return image
 
-    size = {"width_px": built.camera.width_px, "height_px": built.camera.height_px}
     if studio.peak_finder is not None and built.camera.stripe_along != "width":
         raise DesignError("a 3D camera's profile lines are its columns: take a sensor with stripe_along = 'width'")
 
-    def expose() -> Exposed:
+    def expose() -> ExposedFrame:
         state = controller.state()
 
         def image(exposure_ms: float) -> np.ndarray:
@@ -396,9 +395,16 @@ def serve(
             inject(number, ahead=False)
             return bench.frame(exposure_ms, state)
 
-        return Exposed(state.time_s, controller.steps(state), image)
+        return ExposedFrame(state.time_s, controller.steps(state), image)
 
-    camera = GigeCamera(frame, **size, scan3d=studio.peak_finder, encoder=controller.steps, expose=expose)
+    camera = GigeCamera(
+        frame,
+        width_px=built.camera.width_px,
+        height_px=built.camera.height_px,
+        scan3d=studio.peak_finder,
+        encoder=controller.steps,
+        expose=expose,
+    )
     inject(1, ahead=True)
     with controller, camera:
         yield ServedTwin(controller, camera, track, studio.exposure_ms, lambda: bench.rates)

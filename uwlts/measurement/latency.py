@@ -62,6 +62,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
     if not np.isfinite(costs).any():
         raise EvaluationError("the passes there and back hardly see the same lines: was the surface in view both ways?")
     shift = float(ways[np.nanargmin(costs)])
+    away = slope = np.empty(0)
     for _ in range(_ROUNDS):
         away, slope = surface.at(position - shift, seen)
         scatter = MAD_TO_STD * np.median(np.abs(away - np.median(away))) if len(away) else 0.0

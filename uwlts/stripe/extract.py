@@ -114,9 +114,20 @@ def extract_stripe(
 def stripe_in(
     seen: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions = StripeOptions(), saturation: float | None
 ) -> Stripe:
-    """The stripe of what a camera saw: that of an image as by `extract_stripe`, that of a 3D camera as it is."""
+    """The stripe of what a camera saw: that of an image as by `extract_stripe`, that of a 3D camera without its ends.
+
+    Of the ``options`` a 3D camera's stripe takes `StripeOptions.end_lines` alone.
+    """
     if isinstance(seen, Stripe):
-        return seen
+        if not options.end_lines:
+            return seen
+        good, jump_px = seen.status == _OK, options.half_window_px / 2
+        ends = _half_lit(good, seen.centre_px, lines=options.end_lines, jump_px=jump_px)
+        centre, amplitude, width, status = (
+            each.copy() for each in (seen.centre_px, seen.amplitude, seen.width_px, seen.status)
+        )
+        centre[ends], amplitude[ends], width[ends], status[ends] = np.nan, np.nan, np.nan, _END
+        return Stripe(centre, amplitude, width, status, seen.stripe_along)
     return extract_stripe(seen, stripe_along=stripe_along, options=options, saturation=saturation)
 
 

@@ -60,7 +60,7 @@ def find_stripes(
 ) -> FoundStripes:
     """Find the stripe in all laser images of a recording, such as an opened `uwlts.storage.capture.Capture`.
 
-    Centre lines of a 3D camera are taken as they are.
+    Centre lines of a 3D camera are taken as they are, less the lines at their ends (`StripeOptions.end_lines`).
 
     Images of one place at several exposures are fused (`uwlts.stripe.exposures`); their stripe has the number of the
     longest exposure, and amplitudes are in its grey levels.
