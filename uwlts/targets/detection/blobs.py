@@ -128,30 +128,27 @@ def _ellipse_like(mask, *, bright):
     """Blobs of a 0/1 mask whose outline encloses the area of the ellipse with the same moments."""
     height, width = mask.shape
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    centres, shapes = [], []
     is_outline = hierarchy.reshape(-1, 4)[:, 3] < 0 if contours else ()
+    found = []
     # The outline of the largest circle that fits into the image has less than four times its shorter side.
     for contour, outline in zip(contours, is_outline, strict=True):
-        if not outline or not 8 <= len(contour) <= 4 * min(height, width):
-            continue
-        u, v, du, dv = cv2.boundingRect(contour)
-        if u <= 1 or v <= 1 or u + du >= width - 1 or v + dv >= height - 1:
-            continue
-        moments = cv2.moments(contour)
-        area = moments["m00"]
-        # The outline runs through pixel centres: it leaves out half a pixel all around, and all of a line of pixels.
-        if area <= 0 or area + len(contour) / 2 < MIN_AREA_PX:
-            continue
-        covariance = np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]]) / area
-        determinant = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
-        # The uniform disc of radius r has the variance r^2 / 4, so an ellipse has area 4 pi sqrt(det covariance).
-        if determinant <= 0 or abs(area / (4 * np.pi * np.sqrt(determinant)) - 1) > 0.12:
-            continue
-        centres.append((moments["m10"] / area, moments["m01"] / area))
-        shapes.append(covariance)
-    values, vectors = np.linalg.eigh(np.array(shapes).reshape(-1, 2, 2))
+        if outline and 8 <= (length := len(contour)) <= 4 * min(height, width):
+            u, v, du, dv = cv2.boundingRect(contour)
+            if u > 1 and v > 1 and u + du < width - 1 and v + dv < height - 1:
+                moments = cv2.moments(contour)
+                found.append((length, *(moments[name] for name in ("m00", "m10", "m01", "mu20", "mu11", "mu02"))))
+    found = np.array(found).reshape(-1, 7)
+    # The outline runs through pixel centres: it leaves out half a pixel all around, and all of a line of pixels.
+    found = found[(found[:, 1] > 0) & (found[:, 1] + found[:, 0] / 2 >= MIN_AREA_PX)]
+    area, covariances = found[:, 1], found[:, 4:] / found[:, 1:2]
+    determinant = covariances[:, 0] * covariances[:, 2] - covariances[:, 1] ** 2
+    # The uniform disc of radius r has the variance r^2 / 4, so an ellipse has area 4 pi sqrt(det covariance).
+    expected = 4 * np.pi * np.sqrt(np.maximum(determinant, 0))
+    like = np.abs(area - expected) <= 0.12 * expected
+    centres, shapes = found[like, 2:4] / area[like, None], covariances[like][:, [0, 1, 1, 2]]
+    values, vectors = np.linalg.eigh(shapes.reshape(-1, 2, 2))
     semi_axes = 2 * np.sqrt(values) + 0.5
-    return Blobs(np.array(centres).reshape(-1, 2), (vectors * semi_axes[:, None, :]) @ vectors.swapaxes(1, 2), bright)
+    return Blobs(centres, (vectors * semi_axes[:, None, :]) @ vectors.swapaxes(1, 2), bright)
 
 
 def _largest_family(radii):

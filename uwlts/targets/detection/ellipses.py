@@ -240,9 +240,8 @@ def _moved(grey, ellipses, longest, noise):
     """Ellipses moved to the edges around them by least squares, and whether (N,) the edges are whole."""
     rim, normals = _rims(ellipses.shapes)
     reach = np.minimum(longest, REACH_OVER_MINOR_AXIS * np.linalg.eigvalsh(ellipses.shapes)[:, 0])
-    steps = reach[:, None] * np.linspace(-1, 1, SAMPLES)
-    along = normals[:, :, None] * steps[:, None, :, None]
-    profiles = sample(grey, (ellipses.centres[:, None] + rim)[:, :, None] + along)
+    profiles = np.empty((len(ellipses), PROFILES, SAMPLES), np.float32)
+    _sample_profiles(grey, ellipses.centres[:, None] + rim, normals, reach, profiles)
     if not ellipses.bright:
         profiles = -profiles
     inner, outer = profiles[:, :, :2].mean(2), profiles[:, :, -2:].mean(2)
@@ -291,14 +290,31 @@ def sample(grey, points):
 
 
 @compiled
+def _sample_profiles(grey, middles, normals, reach, profiles):
+    """Grey values (N, P, S) from minus to plus ``reach`` (N,) along normals (N, P, 2) about middles (N, P, 2)."""
+    count, around, samples = profiles.shape
+    for n in range(count):
+        for p in range(around):
+            for s in range(samples):
+                step = reach[n] * (2 * s / (samples - 1) - 1)
+                u, v = middles[n, p, 0] + step * normals[n, p, 0], middles[n, p, 1] + step * normals[n, p, 1]
+                profiles[n, p, s] = _bilinear(grey, u, v)
+
+
+@compiled
 def _interpolate(grey, points, values):
-    height, width = grey.shape
     for n in range(len(points)):
-        u, v = min(max(int(points[n, 0]), 0), width - 2), min(max(int(points[n, 1]), 0), height - 2)
-        du, dv = np.float32(points[n, 0] - u), np.float32(points[n, 1] - v)
-        top = grey[v, u] * (1 - du) + grey[v, u + 1] * du
-        bottom = grey[v + 1, u] * (1 - du) + grey[v + 1, u + 1] * du
-        values[n] = top * (1 - dv) + bottom * dv
+        values[n] = _bilinear(grey, points[n, 0], points[n, 1])
+
+
+@compiled
+def _bilinear(grey, u, v):
+    height, width = grey.shape
+    left, top = min(max(int(u), 0), width - 2), min(max(int(v), 0), height - 2)
+    du, dv = np.float32(u - left), np.float32(v - top)
+    upper = grey[top, left] * (1 - du) + grey[top, left + 1] * du
+    lower = grey[top + 1, left] * (1 - du) + grey[top + 1, left + 1] * du
+    return upper * (1 - dv) + lower * dv
 
 
 def find_circles(image):
