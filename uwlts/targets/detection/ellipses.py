@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from uwlts.runtime.compiled import compiled
-from uwlts.targets.detection.blobs import Blobs, find_blobs, noise_level
+from uwlts.targets.detection.blobs import Blobs, checked_grey, find_blobs, noise_level
 
 PASSES = 2
 # The edge of Gaussian blur s has the slope 0.4 / s over its contrast; 1.2 / slope is therefore three s.
@@ -184,7 +184,7 @@ class Ellipses(Blobs):
         return Ellipses(**{name: value if name == "bright" else value[select] for name, value in own})
 
 
-def fit_ellipses(image, blobs):
+def fit_ellipses(grey, blobs, noise):
     """Fit ellipses to the edges of blobs and keep those that are ellipses.
 
     The edge is where the grey level passes half-way between inside and outside, sampled along normals of the current
@@ -194,10 +194,8 @@ def fit_ellipses(image, blobs):
     an uneven contrast and are left out; nothing is downweighted. Where the image is out of focus, the edge is sampled
     over a longer distance.
 
-    The image is (H, W) of uint8 or uint16; possibly no ellipse is accepted.
+    ``grey`` is the image (H, W) in float32, ``noise`` that of a pixel; possibly no ellipse is accepted.
     """
-    grey = image.astype(np.float32)
-    noise = max(noise_level(grey), 0.5)
     best = _fitted(grey, blobs, REACHES_PX[0], noise)
     for reach in REACHES_PX[1:]:
         if len(best) >= (1 - MISSED_SHARE) * len(blobs):
@@ -326,8 +324,11 @@ def find_circles(image):
     The image is (H, W) of uint8 or uint16, ImageError for others. Centres are centroids of the covered area, in px
     (u, v); possibly none are found.
     """
-    ellipses = fit_ellipses(image, find_blobs(image))
-    centres, agree = area_centroids(image.astype(np.float32), ellipses)
+    grey = checked_grey(image).astype(np.float32)
+    # Half a grey level covers an image without noise, whose only disturbance is its rounding.
+    noise = max(noise_level(grey), 0.5)
+    ellipses = fit_ellipses(grey, find_blobs(grey, noise), noise)
+    centres, agree = area_centroids(grey, ellipses)
     return replace(ellipses, centres=centres)[agree]
 
 
