@@ -34,7 +34,7 @@ _PATIENCE_S = 3.0
 """Longest wait for a frame beyond its exposure."""
 _SLOW_REPORT = 2.0
 """Reports that took so many times as long as the fastest say less exactly when they were made."""
-_FEWEST_REPORTS = 3
+_FEWEST_REPORTS = 4
 _OUTLIER = 5.0
 _BUSY = 0.9
 """Share of the time between frames that an exposure may take."""
@@ -319,13 +319,15 @@ class _Line:
 
 def _line_through(reports: list[StageReport]) -> _Line:
     """The line through reports of a pass at constant speed, late ones left out; HardwareError where it is not."""
-    quick = min((each.answered_s - each.asked_s for each in reports), default=0.0)
-    used = [each for each in reports if each.answered_s - each.asked_s <= _SLOW_REPORT * quick + 1e-3]
-    if len(used) < _FEWEST_REPORTS:
+    if len(reports) < _FEWEST_REPORTS:
         raise HardwareError(
-            f"the stage reported {len(used)} positions within a pass, {_FEWEST_REPORTS} are needed: travel more "
-            "slowly, or scan a longer way"
+            f"the stage reported {len(reports)} positions at constant speed within a pass, {_FEWEST_REPORTS} are needed: "
+            "travel more slowly, or scan a longer way"
         )
+    # The fastest half counts in any case.
+    took = np.sort([each.answered_s - each.asked_s for each in reports])
+    longest = max(_SLOW_REPORT * took[0], took[max(len(reports) // 2, _FEWEST_REPORTS - 1)])
+    used = [each for each in reports if each.answered_s - each.asked_s <= longest]
     times, places = np.array([_time_of(each) for each in used]), np.array([each.position_mm for each in used])
     middle, kept = times.mean(), np.ones(len(used), bool)
 
@@ -338,4 +340,6 @@ def _line_through(reports: list[StageReport]) -> _Line:
         scatter = max(MAD_TO_STD * float(np.median(np.abs(away))), 1e-6)
         kept = np.abs(away) <= _OUTLIER * scatter
         speed, start, away = fitted()
-    return _Line(float(middle), start, speed, float(np.std(away[kept])) / abs(speed))
+    # Two of the degrees of freedom are the line's.
+    scatter = float(np.sqrt((away[kept] ** 2).sum() / max(np.count_nonzero(kept) - 2, 1)))
+    return _Line(float(middle), start, speed, scatter / abs(speed))
