@@ -321,8 +321,8 @@ def _line_through(reports: list[StageReport]) -> _Line:
     """The line through reports of a pass at constant speed, late ones left out; HardwareError where it is not."""
     if len(reports) < _FEWEST_REPORTS:
         raise HardwareError(
-            f"the stage reported {len(reports)} positions at constant speed within a pass, {_FEWEST_REPORTS} are needed: "
-            "travel more slowly, or scan a longer way"
+            f"the stage reported {len(reports)} positions at constant speed within a pass, {_FEWEST_REPORTS} are "
+            "needed: travel more slowly, or scan a longer way"
         )
     # The fastest half counts in any case.
     took = np.sort([each.answered_s - each.asked_s for each in reports])
