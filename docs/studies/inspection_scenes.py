@@ -74,7 +74,8 @@ def pipe_mesh(pits: Pits, *, half_length: float, half_arc: float | None) -> trim
     plain = np.sqrt(8 * SAG_MM * DIAMETER_MM / 2)
     step = plain
     if len(pits.depth):
-        step = min(plain, float(np.sqrt(8 * SAG_MM / np.max(8 * pits.depth / (pits.diameter / 2) ** 2))), 0.2)
+        bend = float(np.max(8 * pits.depth / (pits.diameter / 2) ** 2))
+        step = float(np.clip(np.sqrt(8 * SAG_MM / bend), 0.1, 0.2))
     half_angle = np.pi if half_arc is None else 2 * half_arc / DIAMETER_MM
     angle = np.linspace(-half_angle, half_angle, int(np.ceil(half_angle * DIAMETER_MM / step)) + 1)
     x = np.linspace(-half_length, half_length, int(np.ceil(2 * half_length / step)) + 1 if len(pits.depth) else 2)
@@ -100,8 +101,8 @@ def scenes(folder: Path) -> dict[str, dict[str, Any]]:
 
     for name, pits, half_length, half_arc in (
         ("pipe-before", NO_PITS, 60.0, None),
-        ("pipe-after", small_pits(), 38.0, 110.0),
-        ("pipe-corroded", large_pits(), 40.0, 110.0),
+        ("pipe-after", small_pits(), 36.0, 105.0),
+        ("pipe-corroded", large_pits(), 36.0, 105.0),
     ):
         pipe_mesh(pits, half_length=half_length, half_arc=half_arc).export(folder / f"{name}.ply")
     found = {

@@ -16,7 +16,7 @@ from uwlts.metrology.registration import Registration, register_to_surface
 from uwlts.model.errors import CaptureError, EvaluationError
 from uwlts.model.input_file import require_regular_file
 from uwlts.model.sensor import Table
-from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty, read_cloud
+from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty, read_cloud, variance_along
 from uwlts.storage.pose_files import MM_PER_UNIT, Unit, checked_unit
 
 _POINTS_PER_DISC = 30
@@ -381,10 +381,7 @@ def _variance(
 ) -> np.ndarray:
     """Variance (P,) of the mean of each place's points along the normal: single points, images, and what all share."""
     size, normal, many = len(number), normals[place], np.maximum(number, 1)
-    pairs = known.random_mm2[point]
-    single = sum(
-        (1 if i == j else 2) * pairs[:, column] * normal[:, i] * normal[:, j] for column, (i, j) in enumerate(PAIRS)
-    )
+    single = variance_along(known.random_mm2[point], normal)
     result = np.maximum(rough, np.bincount(place, single, minlength=size) / many**2)
     moved = np.einsum("ni,ni->n", known.position_mm[point], normal)
     image = np.arange(len(point)) if frame is None else frame[point].astype(np.int64)
