@@ -168,7 +168,12 @@ def pipe_features(cloud: PointCloud, form: PipeForm, *, section_mm: float | None
 
 
 def _values(
-    kind: FeatureKind, form: PipeForm, errors: NormalErrors, weights: np.ndarray, coefficients: np.ndarray, diameter: float
+    kind: FeatureKind,
+    form: PipeForm,
+    errors: NormalErrors,
+    weights: np.ndarray,
+    coefficients: np.ndarray,
+    diameter: float,
 ) -> tuple[FeatureValue, ...]:
     used = np.flatnonzero(form.used)
     random, common = errors.covariances(weights, form.distance_mm[used], _groups(form, used))

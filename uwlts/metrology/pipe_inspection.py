@@ -114,9 +114,7 @@ def _blemish_features(
     errors = normal_errors(cloud, chosen, form.outwards[chosen])
     measured: list[tuple[Blemish, float]] = []
     for indication in search.indications:
-        blemish = measure_blemish(
-            surface, search, indication, errors, diameter_mm=2 * form.radius_mm, wall_mm=wall_mm
-        )
+        blemish = measure_blemish(surface, search, indication, errors, diameter_mm=2 * form.radius_mm, wall_mm=wall_mm)
         if blemish is not None:
             measured.append((blemish, indication.false_alarm))
     measured.sort(key=lambda each: each[0].extent_mm[2], reverse=True)
