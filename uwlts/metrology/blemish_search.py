@@ -31,7 +31,7 @@ _LEAST_INFORMATION = 0.4
 _BLOCK = 24.0
 """Side of the squares in which the local scatter is taken, in radii: some 180 independent places."""
 _MAD_EFFICIENCY = 0.37
-"""Efficiency of the median absolute deviation at the normal distribution (Huber, Robust Statistics, 1981, section 5.1)."""
+"""Efficiency of the median absolute deviation at the normal distribution (Huber, Robust Statistics, 1981, 5.1)."""
 _LARGEST_SHARE = 1 / 6
 """Of the area's shorter side: larger bells leave no surroundings."""
 _MOST_CELLS = 4_000_000
@@ -281,7 +281,7 @@ def _moment(z: np.ndarray, axis: int, cell: float) -> float:
 
 
 def _threshold(maps: Sequence[_Map], false_alarm: float) -> float:
-    """The level that noise exceeds with a probability anywhere at any size: the sum over the sizes is an upper bound."""
+    """The level that noise exceeds with a probability anywhere at any size: the sizes' sum is an upper bound."""
     return float(optimize.brentq(lambda z: sum(m.false_alarms(z) for m in maps) - false_alarm, 1.0, 40.0))
 
 

@@ -125,7 +125,7 @@ def _noise_of(surface: Surface, search: BlemishSearch, near: np.ndarray, indicat
 class _Field:
     """Depths on a grid (G, 2) of shape ``shape`` as sums over the points ``near`` (n,), by ``rows`` (G, n).
 
-    ``region`` (G,) are the cells of the blemish, ``narrow`` (n,) the row of the deepest place with a narrower quadratic,
+    ``region`` (G,) are the cells of the blemish, ``narrow`` (n,) the row of the deepest place by a narrower quadratic,
     ``richardson`` the factor of the difference that leads to none at all, ``stride`` half a bandwidth in cells.
     """
 

@@ -38,6 +38,8 @@ class Definition:
 
 
 _GAUSSIAN = "ISO 14405-1 (GG), least squares"
+_OUT_OF_ROUND = "DNV-ST-F101, out of roundness"
+_UNDERCUT = "ISO 5817, 5011"
 _B31G = "ASME B31G"
 _BLEMISH = {
     "depth": Definition("mm", "greatest depth below the undamaged surface, interpolated from around it", _B31G + ", d"),
@@ -56,7 +58,7 @@ _BLEMISH = {
 DEFINITIONS: dict[FeatureKind, dict[str, Definition]] = {
     FeatureKind.PIPE: {
         "diameter": Definition("mm", "mean diameter of the sections", _GAUSSIAN),
-        "ovality": Definition("mm", "largest less smallest diameter of the elliptic part", "DNV-ST-F101, out of roundness"),
+        "ovality": Definition("mm", "largest less smallest diameter of the elliptic part", _OUT_OF_ROUND),
         "ovality share": Definition("%", "ovality over the diameter", "DNV-ST-F101, f0"),
         "straightness": Definition(
             "mm", "largest distance of two sections' centres across their line, by the axis's bow", "ISO 12780-1, STRt"
@@ -68,7 +70,7 @@ DEFINITIONS: dict[FeatureKind, dict[str, Definition]] = {
     },
     FeatureKind.SECTION: {
         "diameter": Definition("mm", "mean diameter of the section", _GAUSSIAN),
-        "ovality": Definition("mm", "largest less smallest diameter of the elliptic part", "DNV-ST-F101, out of roundness"),
+        "ovality": Definition("mm", "largest less smallest diameter of the elliptic part", _OUT_OF_ROUND),
         "ovality angle": Definition("deg", "direction of the largest diameter, from the first axis", "this project"),
     },
     FeatureKind.PIT: _BLEMISH,
@@ -78,37 +80,40 @@ DEFINITIONS: dict[FeatureKind, dict[str, Definition]] = {
         **{name: _BLEMISH[name] for name in ("edge depth", "length", "width", "area")},
     },
     FeatureKind.WELD: {
-        "height": Definition("mm", "greatest height above the line through both plates, mean of the sections", "ISO 5817, 502"),
+        "height": Definition(
+            "mm", "greatest height above the line between both plates, mean of the sections", "ISO 5817, 502"
+        ),
         "largest height": Definition("mm", "the same in the highest section", "ISO 5817, 502"),
-        "width": Definition("mm", "distance of the toes, mean of the sections", "ISO 5817, 502, b"),
-        "undercut left": Definition("mm", "depth of the groove at the left toe, mean of the sections", "ISO 5817, 5011"),
-        "undercut right": Definition("mm", "depth of the groove at the right toe, mean of the sections", "ISO 5817, 5011"),
-        "largest undercut": Definition("mm", "depth of the groove in the deepest section", "ISO 5817, 5011/5012"),
-        "toe angle left": Definition("deg", "180 deg less the slope of the flank from 10 to 50 % of its height", "ISO 5817, 505"),
+        "width": Definition("mm", "distance of the toes, median of the sections", "ISO 5817, 502, b"),
+        "undercut left": Definition("mm", "depth of the groove at the left toe, mean along the weld", _UNDERCUT),
+        "undercut right": Definition("mm", "depth of the groove at the right toe, mean along the weld", _UNDERCUT),
+        "largest undercut": Definition("mm", "depth of the groove where it is deepest", "ISO 5817, 5012"),
+        "toe angle left": Definition(
+            "deg", "180 deg less the slope of the flank from 10 to 50 % height, median", "ISO 5817, 505"
+        ),
         "toe angle right": Definition("deg", "the same at the right toe", "ISO 5817, 505"),
         "misalignment": Definition("mm", "offset of the plates in the middle of the weld", "ISO 5817, 507"),
     },
     FeatureKind.STEP: {
-        "height": Definition("mm", "mean distance of the upper face from the plane of the lower one", "ISO 5436-1, type A"),
+        "height": Definition("mm", "distance of the upper face from the lower one's plane", "ISO 5436-1, type A"),
         "parallelism": Definition("deg", "angle between both faces", "ISO 1101"),
     },
     FeatureKind.FLANGE: {
         "flatness": Definition("mm", "range of the smoothed face about its least-squares plane", "ISO 12781-1, FLTt"),
-        "bolt circle": Definition("mm", "diameter of the circle through the holes' centres", "ASME B16.5, ISO 14405-1 (GG)"),
-        "outer diameter": Definition("mm", "diameter of the face's outer edge", "ASME B16.5, ISO 14405-1 (GG)"),
-        "bore": Definition("mm", "diameter of the face's inner edge", "ASME B16.5, ISO 14405-1 (GG)"),
+        "bolt circle": Definition("mm", "diameter of the circle through the holes' centres", "ASME B16.5"),
+        "bore": Definition("mm", "diameter of the face's inner edge", "ASME B16.5"),
         "parallelism": Definition("deg", "angle between the face and the datum that was given", "ISO 1101"),
     },
     FeatureKind.HOLE: {
         "diameter": Definition("mm", "diameter of the circle through the edge", _GAUSSIAN),
-        "position": Definition("mm", "distance of the centre from its place on an evenly divided bolt circle", "ISO 5458"),
+        "position": Definition("mm", "distance of the centre from its place on an even bolt circle", "ISO 5458"),
     },
     FeatureKind.GAP: {
         "width": Definition("mm", "mean distance of the two edges", "VDA gap and flush"),
         "parallelism": Definition("deg", "angle between the two edges", "ISO 1101"),
         "flush": Definition("mm", "offset of the two faces in the middle of the gap", "VDA gap and flush"),
     },
-}  # fmt: skip
+}
 """Definitions of all values by kind of feature and name."""
 
 
@@ -160,8 +165,8 @@ class Feature:
     place_mm : (3,) float64
         Its middle, in the cloud's frame; of a pit the deepest place.
     axes : (3, 3) float64
-        Unit directions in rows, in the cloud's frame: along its length, its width, and outwards. Of a pipe and a section
-        two directions across the axis, then the axis.
+        Unit directions in rows, in the cloud's frame: along its length, its width, and outwards. Of a pipe and a
+        section two directions across the axis, then the axis.
     extent_mm : (3,) float64
         Its size along these.
     points : (K,) int

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -77,7 +78,7 @@ def fit_pipe(cloud: PointCloud, *, left_out: np.ndarray | None = None) -> PipeFo
     """Form of the pipe that most points of a cloud lie on; ``left_out`` (N,) bool are damaged places.
 
     A cylinder by orthogonal distances, then harmonics of the radial distance around (out of roundness) and along (bow,
-    taper), all at once by iterated weights (Tukey's biweight). EvaluationError where the points do not determine a pipe.
+    taper), all at once by iterated weights (Tukey's biweight). EvaluationError where the points determine no pipe.
     """
     points = cloud.points_mm
     keep = np.ones(len(points), bool) if left_out is None else ~left_out
@@ -147,7 +148,7 @@ def pipe_features(cloud: PointCloud, form: PipeForm, *, section_mm: float | None
     terms = _section_terms(form)
     raw = form.distance_mm + _design(form.along_mm, form.angle, form.scale_mm, form.terms) @ form.coefficients
     number = 0
-    for start, end in zip(edges[:-1], edges[1:], strict=True):
+    for start, end in pairwise(edges):
         inside = (along >= start) & ((along < end) | (end == edges[-1]))
         own = used[inside]
         if len(own) < _FEWEST_OF_SECTION or _arc(form.angle[own]) < min(form.arc, _LEAST_ARC) * 0.8:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -14,18 +13,14 @@ from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.metrology.pipe_form import PipeForm, fit_pipe, pipe_features
 from uwlts.metrology.propagation import normal_errors
 from uwlts.model.errors import EvaluationError
-from uwlts.storage.cloud import PointCloud, read_cloud
+from uwlts.storage.cloud import PointCloud
 
 _FEWEST = 500
 """Points from which a pipe's surface can be searched."""
 
 
 def inspect_pipe(
-    cloud: PointCloud | str | os.PathLike[str],
-    *,
-    section_mm: float | None = None,
-    wall_mm: float | None = None,
-    false_alarm: float = 0.05,
+    cloud: PointCloud, *, section_mm: float | None = None, wall_mm: float | None = None, false_alarm: float = 0.05
 ) -> Inspection:
     """Measure a pipe's form and find the blemishes of its outside.
 
@@ -38,7 +33,7 @@ def inspect_pipe(
     Parameters
     ----------
     cloud
-        Cloud of the pipe's outside, or its file.
+        Cloud of the pipe's outside.
     section_mm
         Length of a section; up to twelve sections unless given.
     wall_mm
@@ -60,24 +55,23 @@ def inspect_pipe(
     """
     if wall_mm is not None and not 0 < wall_mm < np.inf:
         raise EvaluationError(f"wall_mm is {wall_mm:g}; expected a positive thickness in mm")
-    measured = cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
-    if len(measured) < _FEWEST:
-        raise EvaluationError(f"the cloud has {len(measured)} points; at least {_FEWEST} are needed for a pipe")
-    form = fit_pipe(measured)
-    surface, chosen = _unrolled(measured, form)
+    if len(cloud) < _FEWEST:
+        raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST} are needed for a pipe")
+    form = fit_pipe(cloud)
+    surface, chosen = _unrolled(cloud, form)
     search = search_blemishes(surface, false_alarm=false_alarm)
     if search.indications:
         # Once more without what was found, which pulls the form towards it.
-        damaged = np.ones(len(measured), bool)
+        damaged = np.ones(len(cloud), bool)
         damaged[chosen[search.plain]] = False
-        form = fit_pipe(measured, left_out=damaged)
+        form = fit_pipe(cloud, left_out=damaged)
         surface = replace(surface, heights=form.distance_mm[chosen])
-    features = pipe_features(measured, form, section_mm=section_mm)
-    features += _blemish_features(measured, form, surface, search, chosen, wall_mm)
-    deviation, level = np.full(len(measured), np.nan), np.full(len(measured), np.nan)
+    features = pipe_features(cloud, form, section_mm=section_mm)
+    features += _blemish_features(cloud, form, surface, search, chosen, wall_mm)
+    deviation, level = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
     deviation[chosen[~search.outliers]] = form.distance_mm[chosen[~search.outliers]]
     level[chosen] = search.level_mm
-    return Inspection("pipe", tuple(features), deviation, level, _notes(measured, form, search, false_alarm))
+    return Inspection("pipe", tuple(features), deviation, level, _notes(cloud, form, search, false_alarm))
 
 
 def _unrolled(cloud: PointCloud, form: PipeForm) -> tuple[Surface, np.ndarray]:

@@ -2,7 +2,7 @@
 
 To first order the values of a fitted shape are sums of the points' distances from it along the normals, each with a
 weight (GUM, JCGM 100:2008, Eq. 13). Noise counts at least as much as the residuals show in groups of neighbours
-(the sandwich estimator of Liang and Zeger, Biometrika 73, 1986, Eq. 5): neighbours err together, and roughness is noise.
+(the sandwich estimator of Liang and Zeger, Biometrika 73, 1986): neighbours err together, and roughness is noise.
 """
 
 from __future__ import annotations
