@@ -92,8 +92,6 @@ def search_blemishes(surface: Surface, *, false_alarm: float) -> BlemishSearch:
     ``false_alarm`` is the probability that anything is found, inwards or outwards, where nothing is. The most
     significant are taken first and their points left out of all that follows, until nothing is left.
     """
-    if not 0 < false_alarm < 1:
-        raise EvaluationError(f"false_alarm is {false_alarm:g}; expected a probability between 0 and 1")
     places, tree = surface.places, KDTree(surface.places)
     if len(places) < 20 * _POINTS_IN_SMALLEST:
         raise EvaluationError(f"{len(places)} points are too few to search for blemishes")

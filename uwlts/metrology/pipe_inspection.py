@@ -55,6 +55,8 @@ def inspect_pipe(
     """
     if wall_mm is not None and not 0 < wall_mm < np.inf:
         raise EvaluationError(f"wall_mm is {wall_mm:g}; expected a positive thickness in mm")
+    if not 0 < false_alarm < 1:
+        raise EvaluationError(f"false_alarm is {false_alarm:g}; expected a probability between 0 and 1")
     if len(cloud) < _FEWEST:
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST} are needed for a pipe")
     form = fit_pipe(cloud)

@@ -244,10 +244,10 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
         moves += rng.standard_normal(errors.image.max() + 1)[errors.image] * errors.image_mm
         drawn.append(_figures(bead, bead.raw_mm + moves, toes)[0] - seen)
     random, bias = np.nanstd(drawn, axis=0), np.zeros(len(seen))
-    # The deepest of a noisy groove is too deep, by about as much as it deepens with as much noise again.
-    grooves = ["undercut" in name for name in _NAMES]
-    bias[grooves] = np.maximum(np.nanmean(drawn, axis=0)[grooves], 0)
-    plain, random = np.where(grooves, np.maximum(seen - bias, 0), seen), np.hypot(random, bias)
+    # The extreme of a noisy profile is too far out, by about as much as with as much noise again.
+    extremes = ["undercut" in name or "height" in name for name in _NAMES]
+    bias[extremes] = np.maximum(np.nanmean(drawn, axis=0)[extremes], 0)
+    plain, random = np.where(extremes, np.maximum(seen - bias, 0), seen), np.hypot(random, bias)
     common = None
     if errors.patterns_mm is not None:
         moved = [_figures(bead, bead.raw_mm + pattern, toes)[0] - seen for pattern in errors.patterns_mm]

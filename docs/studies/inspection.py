@@ -1,0 +1,319 @@
+"""What inspections find in rendered scans, and how right their figures are.
+
+    python docs/studies/inspection_scenes.py runs/inspection      # and render, as it says
+    cd runs/inspection/calibration && uwlts calibrate --air target-bare.h5 target-air.h5 --water target-water.h5 \
+        --step step-near-water.h5 step-standoff-water.h5 step-far-water.h5 --out calibration.json
+    python docs/studies/inspection.py runs/inspection docs/pictures
+
+Prints the tables of the documentation: the probability of detection of pits by their depth (hit or miss, logistic in
+the logarithm of the depth, with the bound of its likelihood ratio: MIL-HDBK-1823A, appendix G), errors and coverage of
+all values against the closed form, and what is claimed to have changed where nothing has.
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from inspection_scenes import AXIS_Z_MM, DIAMETER_MM, OVALITY, SIDES_DEG, WATERS, Pits, large_pits, small_pits
+from scipy import optimize
+from scipy.spatial.transform import Rotation
+from stripe_tables import table
+
+import uwlts
+from twin.scene.description import Weld, load_scene
+from twin.scene.shapes import weld_height
+from uwlts.metrology.features import Feature, FeatureKind, Inspection
+from uwlts.storage.capture import CaptureWriter
+
+BLEMISHES = FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION
+
+
+def cloud_of(folder: Path, water: str, name: str) -> uwlts.PointCloud:
+    """The cloud of a recording, reconstructed once."""
+    path = folder / water / f"{name}.cloud.h5"
+    if not path.exists():
+        cloud = uwlts.reconstruct(folder / water / f"{name}.h5", folder / "calibration" / "calibration.json")
+        uwlts.write_cloud(path, cloud)
+    return uwlts.read_cloud(path)
+
+
+def around(folder: Path, water: str) -> uwlts.PointCloud:
+    """The pipe from six sides as one scan with known poses, in the pipe's frame."""
+    joined = folder / water / "pipe-around.h5"
+    if not joined.exists():
+        with uwlts.open_capture(folder / water / f"pipe-side-{SIDES_DEG[0]}.h5") as first:
+            header, kind = first.header, first.dtype
+        time_s = 0.0
+        with CaptureWriter(joined, header, dtype=kind) as writer:
+            for side in SIDES_DEG:
+                with uwlts.open_capture(folder / water / f"pipe-side-{side}.h5") as capture:
+                    for frame in capture:
+                        pose = np.eye(4)
+                        pose[:3, :3] = Rotation.from_euler("x", -side, degrees=True).as_matrix()
+                        at = frame.stage_mm * np.array(capture.header.stage_direction) - [0.0, 0.0, AXIS_Z_MM]
+                        pose[:3, 3] = pose[:3, :3] @ at
+                        time_s += 1.0
+                        writer.append(replace(frame, pose=pose, time_s=time_s))
+    return cloud_of(folder, water, "pipe-around")
+
+
+def matched(found: Inspection, pits: Pits) -> list[Feature | None]:
+    """The feature that lies on each pit, the deepest of several."""
+    result: list[Feature | None] = [None] * len(pits.depth)
+    for feature in reversed(found.of(*BLEMISHES)):
+        x, y, z = feature.place_mm
+        away = np.hypot(pits.along - x, pits.around - DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z))
+        nearest = int(np.argmin(away / pits.diameter))
+        if away[nearest] < pits.diameter[nearest] / 2 + 0.5:
+            result[nearest] = feature
+    return result
+
+
+def false_ones(found: Inspection, pits: Pits) -> int:
+    """Features that lie on no pit."""
+    count = 0
+    for feature in found.of(*BLEMISHES):
+        x, y, z = feature.place_mm
+        away = np.hypot(pits.along - x, pits.around - DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z))
+        count += bool(np.all(away > pits.diameter / 2 + 0.5)) if len(pits.depth) else 1
+    return count
+
+
+def detection(depth: np.ndarray, hit: np.ndarray) -> tuple[float, float, np.ndarray]:
+    """Depths a90 and a90/95 and the logistic's parameters (2,): depth of 90 % and slope in the logarithm.
+
+    The bound is that of the profile likelihood at 95 %, one-sided, which also exists where hits and misses do not mix.
+    """
+    x = np.log(depth)
+
+    def loss(at_90: float, slope: float) -> float:
+        logit = np.log(9.0) + slope * (x - at_90)
+        return float(np.sum(np.logaddexp(0, np.where(hit, -logit, logit))))
+
+    def profile(at_90: float) -> float:
+        best = optimize.minimize_scalar(lambda s: loss(at_90, np.exp(s)), bounds=(-1, 5), method="bounded")
+        return float(best.fun)
+
+    grid = np.linspace(x.min() - 1, x.max() + 1, 600)
+    losses = np.array([profile(at) for at in grid])
+    best = int(np.argmin(losses))
+    slope = float(
+        np.exp(optimize.minimize_scalar(lambda s: loss(grid[best], np.exp(s)), bounds=(-1, 5), method="bounded").x)
+    )
+    # Half of chi-square's 90 % quantile with one degree of freedom.
+    within = losses <= losses[best] + 1.3528
+    return float(np.exp(grid[best])), float(np.exp(grid[within].max())), np.array([grid[best], slope])
+
+
+def true_values(diameter: float, depth: float, edge: float) -> dict[str, float]:
+    """Values of a pit depth (1 - t^2)^2 within the contour of an edge's depth."""
+    t = np.sqrt(1 - np.sqrt(min(edge / depth, 1.0)))
+    radius = diameter / 2
+    lost = 2 * depth * radius * (t - 2 * t**3 / 3 + t**5 / 5)
+    return {
+        "depth": depth,
+        "length": 2 * radius * t,
+        "width": 2 * radius * t,
+        "area": np.pi * (radius * t) ** 2,
+        "lost area": lost,
+    }
+
+
+def figure_rows(name: str, pairs: list[tuple[Feature, dict[str, float]]]) -> list[list[str]]:
+    """Rows of a table of errors: value, number, bias, spread, mean standard uncertainty, coverage."""
+    rows = []
+    for value in pairs[0][1] if pairs else ():
+        known = [(feature[value], truth[value]) for feature, truth in pairs if value in feature]
+        error = np.array([each.value - truth for each, truth in known])
+        inside = np.mean([each.low <= truth <= each.high for each, truth in known])
+        stated = np.mean([each.uncertainty for each, _ in known])
+        rows.append(
+            [
+                name,
+                value,
+                f"{len(known)}",
+                f"{error.mean():+.4f}",
+                f"{error.std():.4f}",
+                f"{stated:.4f}",
+                f"{100 * inside:.0f} %",
+            ]
+        )
+    return rows
+
+
+def true_weld(weld: Weld) -> dict[str, float]:
+    """Values of a weld by their definitions, from its closed form on a fine grid."""
+    x, y = np.arange(-24.5, 24.6, 0.25), np.arange(-15, 15, 0.005)
+    sections = np.array([weld_height(weld, np.full(len(y), at), y) for at in x])
+    toes, angles = [], []
+    for section in sections:
+        top, peak = section.max(), int(np.argmax(section))
+        ends, slopes = [], []
+        for half, sign in ((np.arange(peak, -1, -1), -1), (np.arange(peak, len(y)), 1)):
+            at = [y[half[int(np.argmax(section[half] < share * top))]] for share in (0.5, 0.1)]
+            slope = 0.4 * top / abs(at[1] - at[0])
+            ends.append(at[1] + sign * 0.1 * top / slope)
+            slopes.append(180 - np.degrees(np.arctan(slope)))
+        toes.append(ends[1] - ends[0])
+        angles.append(slopes)
+    left, right = np.median(angles, axis=0)
+    tops, depth = sections.max(axis=1), weld.undercut_depth_mm
+    return {"height": tops.mean(), "width": float(np.median(toes)), "undercut left": depth, "undercut right": depth,
+            "largest undercut": depth, "toe angle left": left, "toe angle right": right, "misalignment": 0.0}  # fmt: skip
+
+
+def main(folder: Path, pictures: Path) -> None:
+    """Print all tables and draw the pictures."""
+    seen, figures, whole = [], [], []
+    curves = {}
+    for water in WATERS:
+        pits = small_pits()
+        after = uwlts.inspect(cloud_of(folder, water, "pipe-after"))
+        found = matched(after, pits)
+        hit = np.array([each is not None for each in found])
+        for diameter in np.unique(pits.diameter):
+            own = pits.diameter == diameter
+            a90, bound, fitted = detection(pits.depth[own], hit[own])
+            curves[water, diameter] = pits.depth[own], hit[own], fitted, bound
+            seen.append([water, f"{diameter:g}", f"{np.sum(hit[own])} of {np.sum(own)}", f"{a90:.3f}", f"{bound:.3f}"])
+        before_cloud = cloud_of(folder, water, "pipe-before")
+        before = uwlts.inspect(before_cloud)
+        print(
+            f"{water}: false indications, with pits and without: {false_ones(after, pits)}, {len(before.of(*BLEMISHES))}"
+        )
+        pairs = [
+            (each, true_values(pits.diameter[k], pits.depth[k], each["edge depth"].value))
+            for k, each in enumerate(found) if each is not None and each.kind != FeatureKind.PROTRUSION
+        ]  # fmt: skip
+        for diameter in np.unique(pits.diameter):
+            of_size = [
+                pair
+                for k, pair in zip(np.flatnonzero(hit), pairs, strict=True)
+                if pits.diameter[k] == diameter and pits.depth[k] > 0.1
+            ]
+            figures += figure_rows(f"{water}, {diameter:g} mm, 0.1 to 0.4 mm deep", of_size)
+        pits = large_pits()
+        corroded_cloud = cloud_of(folder, water, "pipe-corroded")
+        corroded = uwlts.inspect(corroded_cloud, wall_mm=9.5)
+        found = matched(corroded, pits)
+        print(
+            f"{water}: large pits found: {sum(each is not None for each in found)} of {len(found)}, false: {false_ones(corroded, pits)}"
+        )
+        pairs = [
+            (each, true_values(pits.diameter[k], pits.depth[k], each["edge depth"].value))
+            for k, each in enumerate(found)
+            if each is not None and pits.diameter[k] >= 10
+        ]
+        figures += figure_rows(f"{water}, 10 to 24 mm, 0.5 to 5 mm deep", pairs)
+        for k, each in enumerate(found):
+            if each is not None:
+                print(f"  {pits.diameter[k]:g} mm, {pits.depth[k]:g} mm deep: {each['depth'].text()}")
+        pipe = uwlts.inspect(around(folder, water))
+        truth = {
+            "diameter": DIAMETER_MM,
+            "ovality": DIAMETER_MM * OVALITY,
+            "ovality share": 100 * OVALITY,
+            "straightness": 0.0,
+        }
+        whole += figure_rows(f"{water}, pipe", [(pipe.features[0], truth)])
+        of_section = {name: truth[name] for name in ("diameter", "ovality")}
+        whole += figure_rows(f"{water}, sections", [(each, of_section) for each in pipe.of(FeatureKind.SECTION)])
+        weld = load_scene(str(folder / f"weld-{water}.toml")).objects[0]
+        assert isinstance(weld, Weld)
+        bead = uwlts.inspect(cloud_of(folder, water, "weld"), "weld").features[0]
+        whole += figure_rows(f"{water}, weld", [(bead, true_weld(weld))])
+        for name, cloud, pits in (
+            ("small pits", cloud_of(folder, water, "pipe-after"), small_pits()),
+            ("large pits", corroded_cloud, large_pits()),
+        ):
+            change = uwlts.compare_clouds(cloud, before_cloud)
+            x, y, z = change.points_mm.T
+            away = np.hypot(
+                pits.along - x[:, None], pits.around - DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z)[:, None]
+            )
+            clear = change.compared & np.all(away > pits.diameter / 2 + change.disc_mm / 2, axis=1)
+            print(
+                f"{water}, {name}: significant change claimed on {100 * change.significant[clear].mean():.2f} % of {clear.sum()} places where nothing changed"
+            )
+    print(table(["water", "diameter mm", "found", "a90 mm", "a90/95 mm"], seen))
+    head = ["of", "value", "number", "bias", "spread", "stated std", "truth within the 95 % interval"]
+    print(table(head, figures))
+    print(table(head, whole))
+    draw_curves(curves, pictures / "inspection-detection.svg")
+    draw_map(folder, pictures / "inspection-pits.png")
+
+
+def draw_curves(curves: dict, path: Path) -> None:
+    """Probability of detection against depth: hits, misses, the logistic and the depth of 90 % at 95 % confidence."""
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True, layout="constrained")
+    for ax, water in zip(axes, WATERS, strict=True):
+        for diameter, colour in ((2.0, "#d1495b"), (3.0, "#2152ac"), (5.0, "#3b8d5a")):
+            depth, hit, (at_90, slope), bound = curves[water, diameter]
+            x = np.geomspace(0.006, 0.4, 200)
+            ax.semilogx(
+                x,
+                1 / (1 + np.exp(-np.log(9) - slope * (np.log(x) - at_90))),
+                color=colour,
+                label=f"{diameter:g} mm wide",
+            )
+            ax.plot(depth, np.where(hit, 1.0, 0.0) + 0.01 * (diameter - 3), "|", color=colour, markersize=5)
+            ax.plot([bound], [0.9], "o", color=colour, markersize=4)
+        ax.axhline(0.9, color="#999999", linewidth=0.7)
+        ax.set(title=f"{water} water", xlabel="depth of the pit / mm")
+    axes[0].set(ylabel="probability of detection")
+    axes[1].legend(frameon=False, title="dots: a90/95")
+    figure.savefig(path)
+
+
+def draw_map(folder: Path, path: Path) -> None:
+    """The corroded pipe unrolled, with the pits that were found and their depths."""
+    cloud = cloud_of(folder, "coastal", "pipe-corroded")
+    found = uwlts.inspect(cloud, wall_mm=9.5)
+    x, y, z = cloud.points_mm[::2].T
+    figure, ax = plt.subplots(figsize=(9, 4.4), layout="constrained")
+    colours = ax.scatter(
+        DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z),
+        x,
+        c=found.deviation_mm[::2],
+        s=1,
+        cmap="magma",
+        vmin=-3,
+        vmax=0.2,
+        linewidths=0,
+    )
+    for feature in found.of(*BLEMISHES):
+        x, y, z = feature.place_mm
+        depth = feature["depth"]
+        text = f"{depth.value:.2f} ± {0.5 * (depth.high - depth.low):.2f}"
+        at = DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z), x
+        ax.annotate(
+            text,
+            at,
+            (at[0], at[1] + 0.55 * feature.extent_mm[0] + 1),
+            ha="center",
+            color="#1d6fb8",
+            fontsize=8,
+            fontweight="bold",
+        )
+        ax.add_patch(
+            plt.Rectangle(
+                (at[0] - feature.extent_mm[1] / 2, at[1] - feature.extent_mm[0] / 2),
+                *feature.extent_mm[[1, 0]],
+                fill=False,
+                color="#1d6fb8",
+            )
+        )
+    figure.colorbar(colours, label="distance from the undamaged pipe / mm")
+    ax.set(
+        xlabel="around the pipe / mm",
+        ylabel="along the pipe / mm",
+        aspect="equal",
+        title="Pits found in coastal water, depth and half its 95 % interval / mm",
+    )
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
