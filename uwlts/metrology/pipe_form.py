@@ -16,7 +16,9 @@ from uwlts.storage.cloud import PointCloud
 
 _TO_START = 6000
 """Points for the first cylinder; more add nothing to a start."""
-_ROUNDS = 12
+_MOST_POINTS = 150_000
+"""Points for the form; with more what remains is common to all of them."""
+_ROUNDS, _STILL_MM = 12, 1e-6
 _TUKEY = 4.685
 """Of Tukey's biweight, in standard deviations: 95 % efficient for normal noise."""
 _SECTORS = 72
@@ -27,9 +29,7 @@ _WHOLE_ARC = np.radians(300.0)
 """Arc from which the third and fourth harmonics are fitted too, so that they do not pass for others."""
 _FEWEST_OF_SECTION = 60
 _MOST_SECTIONS = 12
-_OFF = 8.0
-"""Distance in robust standard deviations from which a point is not the pipe's; what is nearer may be a blemish."""
-_MOST_OFF_SHARE = 0.06
+MOST_OFF_SHARE = 0.06
 """Of the radius: the deepest blemish or ovality that still counts as the pipe's surface."""
 
 
@@ -39,8 +39,8 @@ class PipeForm:
 
     ``point_mm`` (3,) lies on the axis in the middle of the points, ``axes`` (3, 3) are two directions across and the
     axis. ``along_mm``, ``angle``, ``distance_mm`` (N,) are places of all points along the axis from there, around it in
-    rad from the first direction, and their distances from the form, positive outwards. ``used`` (N,) are the points
-    that determine it, ``weights`` (K, N) those of the points in its ``coefficients`` (K,)
+    rad from the first direction, and their distances from the form, positive outwards. ``used`` (U,) are the points
+    that determine it, ``weights`` (K, U) those of the points in its ``coefficients`` (K,)
     called ``terms``; places along the axis count in units of ``scale_mm``.
     """
 
@@ -80,53 +80,72 @@ def fit_pipe(cloud: PointCloud, *, left_out: np.ndarray | None = None) -> PipeFo
     A cylinder by orthogonal distances, then harmonics of the radial distance around (out of roundness) and along (bow,
     taper), all at once by iterated weights (Tukey's biweight). EvaluationError where the points determine no pipe.
     """
-    points = cloud.points_mm
-    keep = np.ones(len(points), bool) if left_out is None else ~left_out
-    start = fit_robustly(fit_cylinder, evenly_thinned(points[keep], _TO_START)).fit
+    whole = np.arange(len(cloud)) if left_out is None else np.flatnonzero(~left_out)
+    fitted = evenly_thinned(whole, _MOST_POINTS)
+    if len(fitted) < _FEWEST_OF_SECTION:
+        raise EvaluationError(f"only {len(fitted)} of {len(cloud)} points are left for a pipe")
+    points = cloud.points_mm[fitted]
+    start = fit_robustly(fit_cylinder, evenly_thinned(points, _TO_START)).fit
     point, radius = start.point_mm, start.radius_mm
     axes = np.array([*start.across, start.axis])
-    scale = _scale_of((points[keep] - point) @ axes[2])
+    scale = max(0.5 * float(np.ptp((points - point) @ axes[2])), 1e-9)
+    arc, terms, coefficients, weight, design = 0.0, (), np.zeros(0), np.zeros(0), np.zeros((0, 0))
     for number in range(_ROUNDS):
         point = point + axes[2] * np.median((points - point) @ axes[2])
-        local = (points - point) @ axes.T
-        along, angle = local[:, 2], np.arctan2(local[:, 1], local[:, 0])
-        off = np.hypot(local[:, 0], local[:, 1]) - radius
-        near = keep & (np.abs(off - np.median(off[keep])) < _MOST_OFF_SHARE * radius)
+        along, angle, off = _cylindrical(points, point, axes, radius)
+        near = np.abs(off - np.median(off)) < MOST_OFF_SHARE * radius
         arc = _arc(angle[near])
         terms = _terms(arc)
         design = _design(along, angle, scale, terms)
-        weight = near.astype(float)
-        coefficients, spread = np.zeros(len(terms)), 0.0
-        for _ in range(_ROUNDS):
-            coefficients = _solved(design, weight, off)
-            left = off - design @ coefficients
-            spread = max(MAD_TO_STD * float(np.median(np.abs(left[near]))), 1e-9)
-            weight = near * np.square(np.clip(1 - np.square(left / (_TUKEY * spread)), 0, None))
+        coefficients, weight = _biweight(design, off, near)
         known = dict(zip(terms, coefficients, strict=True))
         # Offset and tilt go into the axis, so that the distances stay linear in them.
         shift = known["cos"] * axes[0] + known["sin"] * axes[1]
         slope = (known["along cos"] * axes[0] + known["along sin"] * axes[1]) / scale
         point, radius = point + shift, radius + known["1"]
-        third = axes[2] + slope
-        third /= np.linalg.norm(third)
-        first = axes[0] - (axes[0] @ third) * third
-        first /= np.linalg.norm(first)
-        axes = np.array([first, np.cross(third, first), third])
-        if number and np.linalg.norm(shift) + abs(known["1"]) + scale * np.linalg.norm(slope) < 1e-6:
+        axes = _turned_to(axes, axes[2] + slope)
+        if number and np.linalg.norm(shift) + abs(known["1"]) + scale * np.linalg.norm(slope) < _STILL_MM:
             break
-    used = weight > 0
+    counted = weight > 0
+    if np.count_nonzero(counted) < 3 * len(terms):
+        raise EvaluationError(f"only {np.count_nonzero(counted)} of {len(cloud)} points lie on one pipe")
     normal = (design * weight[:, None]).T @ design
-    weights = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ (design * weight[:, None]).T
+    weights = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ (design[counted] * weight[counted, None]).T
     # What moved into the axis is no part of the form any more.
     moved = np.array([term in ("1", "cos", "sin", "along cos", "along sin") for term in terms])
     coefficients = np.where(moved, 0.0, coefficients)
-    local = (points - point) @ axes.T
-    along, angle = local[:, 2], np.arctan2(local[:, 1], local[:, 0])
-    distance = np.hypot(local[:, 0], local[:, 1]) - radius
-    distance = distance - _design(along, angle, scale, terms) @ coefficients
-    if np.count_nonzero(used) < 3 * len(terms):
-        raise EvaluationError(f"only {np.count_nonzero(used)} of {len(points)} points lie on one pipe")
+    along, angle, off = _cylindrical(cloud.points_mm, point, axes, radius)
+    distance = off - _design(along, angle, scale, terms) @ coefficients
+    used = fitted[counted]
     return PipeForm(point, axes, radius, along, angle, distance, used, arc, terms, coefficients, weights, scale)
+
+
+def _cylindrical(
+    points: np.ndarray, point: np.ndarray, axes: np.ndarray, radius: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places (N,) along and angles around the axis of points, and their distances from a cylinder."""
+    local = (points - point) @ axes.T
+    return local[:, 2], np.arctan2(local[:, 1], local[:, 0]), np.hypot(local[:, 0], local[:, 1]) - radius
+
+
+def _turned_to(axes: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """The axes (3, 3) with the third along another direction."""
+    third = axis / np.linalg.norm(axis)
+    first = axes[0] - (axes[0] @ third) * third
+    first /= np.linalg.norm(first)
+    return np.array([first, np.cross(third, first), third])
+
+
+def _biweight(design: np.ndarray, values: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (K,) by Tukey's biweight and the weights (N,); points that are not near have none."""
+    weight, coefficients = near.astype(float), np.zeros(design.shape[1])
+    for _ in range(_ROUNDS):
+        loaded = (design * weight[:, None]).T
+        coefficients = np.linalg.lstsq(loaded @ design, loaded @ values, rcond=1e-12)[0]
+        left = values - design @ coefficients
+        spread = max(MAD_TO_STD * float(np.median(np.abs(left[near]))), 1e-9)
+        weight = near * np.square(np.clip(1 - np.square(left / (_TUKEY * spread)), 0, None))
+    return coefficients, weight
 
 
 def pipe_features(cloud: PointCloud, form: PipeForm, *, section_mm: float | None = None) -> list[Feature]:
@@ -134,9 +153,9 @@ def pipe_features(cloud: PointCloud, form: PipeForm, *, section_mm: float | None
 
     Without a ``section_mm`` the length is divided into up to twelve sections of at least 60 points.
     """
-    used = np.flatnonzero(form.used)
+    used = form.used
     errors = normal_errors(cloud, used, form.outwards[used])
-    whole = _values(FeatureKind.PIPE, form, errors, form.weights[:, used], form.coefficients, 2 * form.radius_mm)
+    whole = _values(form, errors)
     extent = np.array([2 * form.radius_mm, 2 * form.radius_mm, np.ptp(form.along_mm[used])])
     features = [Feature(FeatureKind.PIPE, "pipe", whole, form.point_mm, form.axes, extent, used)]
     along = form.along_mm[used]
@@ -168,16 +187,9 @@ def pipe_features(cloud: PointCloud, form: PipeForm, *, section_mm: float | None
     return features
 
 
-def _values(
-    kind: FeatureKind,
-    form: PipeForm,
-    errors: NormalErrors,
-    weights: np.ndarray,
-    coefficients: np.ndarray,
-    diameter: float,
-) -> tuple[FeatureValue, ...]:
-    used = np.flatnonzero(form.used)
-    random, common = errors.covariances(weights, form.distance_mm[used], _groups(form, used))
+def _values(form: PipeForm, errors: NormalErrors) -> tuple[FeatureValue, ...]:
+    kind, used, coefficients, diameter = FeatureKind.PIPE, form.used, form.coefficients, 2 * form.radius_mm
+    random, common = errors.covariances(form.weights, form.distance_mm[used], _groups(form, used))
     place = {term: k for k, term in enumerate(form.terms)}
 
     def covariances(*terms: str, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray | None]:
@@ -286,16 +298,6 @@ def _design(along_mm: np.ndarray, angle: np.ndarray, scale: float, terms: tuple[
             case _:
                 columns.append(np.broadcast_to(power, np.shape(angle)))
     return np.stack(columns, axis=1)
-
-
-def _scale_of(along: np.ndarray) -> float:
-    return max(0.5 * float(np.ptp(along)), 1e-9)
-
-
-def _solved(design: np.ndarray, weight: np.ndarray, values: np.ndarray) -> np.ndarray:
-    normal = (design * weight[:, None]).T @ design
-    right = (design * weight[:, None]).T @ values
-    return np.linalg.lstsq(normal, right, rcond=1e-12)[0]
 
 
 def _arc(angle: np.ndarray) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,11 +10,13 @@ from uwlts.metrology.blemish_search import BlemishSearch, Surface, search_blemis
 from uwlts.metrology.blemishes import Blemish, measure_blemish
 from uwlts.metrology.features import Feature, FeatureKind, Inspection
 from uwlts.metrology.least_squares import MAD_TO_STD
-from uwlts.metrology.pipe_form import PipeForm, fit_pipe, pipe_features
+from uwlts.metrology.pipe_form import MOST_OFF_SHARE, PipeForm, fit_pipe, pipe_features
 from uwlts.metrology.propagation import normal_errors
 from uwlts.model.errors import EvaluationError
 from uwlts.storage.cloud import PointCloud
 
+_OPEN, _OVERLAP = 0.05, 0.3
+"""Radians without a point that part the two sides of a pipe, and by which they overlap where nothing parts them."""
 _FEWEST = 500
 """Points from which a pipe's surface can be searched."""
 
@@ -60,69 +62,85 @@ def inspect_pipe(
     if len(cloud) < _FEWEST:
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST} are needed for a pipe")
     form = fit_pipe(cloud)
-    surface, chosen = _unrolled(cloud, form)
+    # Farther off lies what is not the pipe.
+    seam = _cut_open(form, np.flatnonzero(np.abs(form.distance_mm) < MOST_OFF_SHARE * form.radius_mm))
+    chosen, surface = seam.points, _unrolled(cloud, form, seam)
     search = search_blemishes(surface, false_alarm=false_alarm)
     if search.indications:
         # Once more without what was found, which pulls the form towards it.
         damaged = np.ones(len(cloud), bool)
         damaged[chosen[search.plain]] = False
         form = fit_pipe(cloud, left_out=damaged)
-        surface = replace(surface, heights=form.distance_mm[chosen])
+        surface = _unrolled(cloud, form, seam)
     features = pipe_features(cloud, form, section_mm=section_mm)
-    features += _blemish_features(cloud, form, surface, search, chosen, wall_mm)
+    features += _blemish_features(cloud, form, surface, search, seam, wall_mm)
     deviation, level = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
     deviation[chosen[~search.outliers]] = form.distance_mm[chosen[~search.outliers]]
     level[chosen] = search.level_mm
     return Inspection("pipe", tuple(features), deviation, level, _notes(cloud, form, search, false_alarm))
 
 
-def _unrolled(cloud: PointCloud, form: PipeForm) -> tuple[Surface, np.ndarray]:
-    """The surface about the middle of what was seen, and the indices of its points."""
-    chosen = np.flatnonzero(np.abs(form.distance_mm) < 0.06 * form.radius_mm)
-    # Cut where there is nothing, or opposite the middle of what was seen.
-    angle = form.angle[chosen]
-    cut = _gap(angle)
-    around = form.radius_mm * (np.mod(angle - cut, 2 * np.pi))
-    errors = normal_errors(cloud, chosen, form.outwards[chosen])
-    heights = form.distance_mm[chosen]
-    spread = max(MAD_TO_STD * float(np.median(np.abs(heights - np.median(heights)))), 1e-9)
-    std = errors.single_mm if np.all(errors.single_mm > 0) else np.full(len(chosen), spread)
-    return Surface(np.column_stack([form.along_mm[chosen], around]), heights, std), chosen
+@dataclass(frozen=True, eq=False)
+class _Seam:
+    """Where the pipe is cut open: an angle, and the points (M,) with their angles from there.
+
+    Of a pipe that was seen all around, those near the cut appear on both sides; ``end`` is the angle from which they
+    are the second ones.
+    """
+
+    cut: float
+    points: np.ndarray
+    angle: np.ndarray
+    end: float
 
 
-def _gap(angle: np.ndarray) -> float:
-    """Middle of the widest range of angles without a point."""
-    inside = np.sort(np.unique(np.round(angle, 3)))
+def _cut_open(form: PipeForm, chosen: np.ndarray) -> _Seam:
+    """Cut in the middle of the widest range of angles without a point, or anywhere with both sides overlapping."""
+    inside = np.sort(np.unique(np.round(form.angle[chosen], 3)))
     gaps = np.diff(np.append(inside, inside[0] + 2 * np.pi))
     widest = int(np.argmax(gaps))
-    return float(inside[widest] + 0.5 * gaps[widest])
+    cut = float(inside[widest] + 0.5 * gaps[widest])
+    angle = np.mod(form.angle[chosen] - cut, 2 * np.pi)
+    if gaps[widest] > _OPEN:
+        return _Seam(cut, chosen, angle, 2 * np.pi)
+    first, last = angle < _OVERLAP, angle > 2 * np.pi - _OVERLAP
+    points = np.concatenate([chosen, chosen[first], chosen[last]])
+    angle = np.concatenate([angle, angle[first] + 2 * np.pi, angle[last] - 2 * np.pi])
+    return _Seam(cut, points, angle, 2 * np.pi)
+
+
+def _unrolled(cloud: PointCloud, form: PipeForm, seam: _Seam) -> Surface:
+    """The surface of the points of a seam."""
+    angle = form.angle[seam.points] - seam.cut
+    # The form may have moved a little since it was cut open.
+    angle = angle + 2 * np.pi * np.round((seam.angle - angle) / (2 * np.pi))
+    errors = normal_errors(cloud, seam.points, form.outwards[seam.points])
+    heights = form.distance_mm[seam.points]
+    spread = max(MAD_TO_STD * float(np.median(np.abs(heights - np.median(heights)))), 1e-9)
+    std = errors.single_mm if np.all(errors.single_mm > 0) else np.full(len(heights), spread)
+    return Surface(np.column_stack([form.along_mm[seam.points], form.radius_mm * angle]), heights, std)
 
 
 def _blemish_features(
-    cloud: PointCloud,
-    form: PipeForm,
-    surface: Surface,
-    search: BlemishSearch,
-    chosen: np.ndarray,
-    wall_mm: float | None,
+    cloud: PointCloud, form: PipeForm, surface: Surface, search: BlemishSearch, seam: _Seam, wall_mm: float | None
 ) -> list[Feature]:
-    cut = _gap(form.angle[chosen])
+    chosen = seam.points
     errors = normal_errors(cloud, chosen, form.outwards[chosen])
     measured: list[tuple[Blemish, float]] = []
     for indication in search.indications:
         blemish = measure_blemish(surface, search, indication, errors, diameter_mm=2 * form.radius_mm, wall_mm=wall_mm)
-        if blemish is not None:
+        if blemish is not None and 0 <= blemish.place[1] / form.radius_mm < seam.end:
             measured.append((blemish, indication.false_alarm))
     measured.sort(key=lambda each: each[0].extent_mm[2], reverse=True)
     features, numbers = [], dict.fromkeys(FeatureKind, 0)
     for blemish, chance in measured:
         numbers[blemish.kind] += 1
-        angle = np.array([blemish.place[1] / form.radius_mm + cut])
+        angle = np.array([blemish.place[1] / form.radius_mm + seam.cut])
         place = form.at(blemish.place[:1], angle)[0]
         out = np.cos(angle) * form.axes[0] + np.sin(angle) * form.axes[1]
         axes = np.array([form.axes[2], np.cross(out, form.axes[2]), out])
         name = f"{blemish.kind} {numbers[blemish.kind]}"
-        points = chosen[blemish.points]
+        points = np.unique(chosen[blemish.points])
         features.append(Feature(blemish.kind, name, blemish.values, place, axes, blemish.extent_mm, points, chance))
     return features
 

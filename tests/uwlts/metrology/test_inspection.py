@@ -164,6 +164,23 @@ def test_pits_are_found_and_measured():
     assert np.hypot(deepest[0], deepest[1] - 5) < 3
 
 
+def test_a_pit_where_a_whole_pipe_is_cut_open_is_found_once():
+    """Pits at eight angles around, so that wherever the cut is one lies near it."""
+    turns = np.linspace(-np.pi, np.pi, 8, endpoint=False)
+
+    def radius(x, angle):
+        away = [np.mod(angle - turn + np.pi, 2 * np.pi) - np.pi for turn in turns]
+        return RADIUS_MM + sum(bell(x, RADIUS_MM * each, (0.0, 0.0), 20.0, 1.0) for each in away)
+
+    cloud = pipe_scan(np.random.default_rng(13), radius=radius, along=(-30, 30.5, 1.5), around_mm=1.5)
+    pits = uwlts.inspect(cloud).of(FeatureKind.PIT)
+    angles = np.sort([np.arctan2(pit.place_mm[1], -pit.place_mm[2]) for pit in pits])
+    assert len(pits) == 8
+    assert np.diff(angles) == pytest.approx(np.full(7, np.pi / 4), abs=0.02)
+    for pit in pits:
+        within(pit, {"depth": 1.0})
+
+
 @pytest.mark.slow
 def test_depths_are_within_their_intervals():
     """36 pits of 1 mm depth; fewer than 27 of 36 intervals of 95 % hold the truth once in 100,000 times."""
