@@ -22,8 +22,9 @@ from scipy.spatial.transform import Rotation
 from stripe_tables import table
 
 import uwlts
-from twin.scene.description import Weld, load_scene
-from twin.scene.shapes import weld_height
+from twin.scene.description import load_scene
+from twin.scene.forms import Flange, Weld
+from twin.scene.forms.weld import weld_height
 from uwlts.metrology.features import Feature, FeatureKind, Inspection
 from uwlts.storage.capture import CaptureWriter
 
@@ -243,6 +244,16 @@ def main(folder: Path, pictures: Path) -> None:
     print(table(head, whole))
     draw_curves(curves, pictures / "inspection-detection.svg")
     draw_map(folder, pictures / "inspection-pits.png")
+    flanges = []
+    for water in WATERS:
+        scene = load_scene(str(folder / f"flange-{water}.toml")).objects[0]
+        assert isinstance(scene, Flange)
+        found = uwlts.inspect(cloud_of(folder, "flanges", f"flange-{water}"), "flange")
+        truth = {"flatness": scene.flatness_mm, "bore": scene.bore_diameter_mm, "bolt circle": scene.bolt_circle_mm}
+        flanges += figure_rows(f"{water}, flange", [(found.features[0], truth)])
+        holes = [(hole, {"diameter": scene.hole_diameter_mm}) for hole in found.of(FeatureKind.HOLE)]
+        flanges += figure_rows(f"{water}, its holes", holes)
+    print(table(head, flanges))
 
 
 def draw_curves(curves: dict, path: Path) -> None:

@@ -4,6 +4,7 @@
     twin record runs/inspection/calibration.toml --out runs/inspection/calibration
     twin record runs/inspection/clear.toml --out runs/inspection/clear
     twin record runs/inspection/coastal.toml --out runs/inspection/coastal
+    twin record runs/inspection/flanges.toml --out runs/inspection/flanges
 
 A pipe of 300 mm diameter and 0.5 % ovality: smooth, with a grid of small pits for the probability of detection, and
 with large pits; and one seen from six sides. All surfaces are known in closed form (`radius_mm`).
@@ -129,6 +130,20 @@ def main(folder: Path) -> None:
         recordings = [{"name": name, "scene": f"{name}-{water}.toml"} for name in names]
         campaign = {"base": "thesis", "title": f"inspection, {water}", "recordings": recordings}
         (folder / f"{water}.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
+    flange = {
+        "kind": "flange",
+        "outer_diameter_mm": 150.0,
+        "bore_diameter_mm": 60.0,
+        "bolt_circle_mm": 110.0,
+        "holes": 6,
+    }
+    flange |= {"hole_diameter_mm": 14.0, "first_hole_deg": 10.0, "flatness_mm": 0.1, "reflectance": 0.4}
+    scene = _scene("Flange", flange, {"start_mm": -75.0, "step_mm": 1.5, "count": 101})
+    for water in WATERS:
+        (folder / f"flange-{water}.toml").write_text(tomli_w.dumps({"water": water} | scene), encoding="utf-8")
+    recordings = [{"name": f"flange-{water}", "scene": f"flange-{water}.toml"} for water in WATERS]
+    campaign = {"base": "thesis", "title": "inspection, flanges", "recordings": recordings}
+    (folder / "flanges.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
     axial = {"direction": [0.0, 0.0, 1.0], "start_mm": -126.0, "step_mm": 17.6, "count": 12}
     calibration = [
         {"name": "target-bare", "scene": "target", "motion": {"step_mm": 18.0, "count": 16}},

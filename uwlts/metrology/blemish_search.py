@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import fft, ndimage, optimize, stats
@@ -42,6 +43,10 @@ _NEIGHBOURS, _OUTLIER = 9, 6.0
 """Nearest points with which each is compared, and robust standard deviations from their median that make an outlier."""
 _EDGE_SHARE = 0.1
 """Of a blemish's depth, where its region ends."""
+_GROWN, _GROWTH = 3, 1.7
+"""Times that the window about a peak grows, where its region reaches the edge, and by how much."""
+_CORE = 0.8
+"""Of the bell's radius: points that belong to the peak in any case."""
 _EDGE_STD = 3.0
 """Standard deviations of a cell's mean from which it belongs to a blemish that holds its neighbour."""
 
@@ -128,7 +133,8 @@ def search_blemishes(surface: Surface, *, false_alarm: float) -> BlemishSearch:
 
 def _isolated(surface: Surface, tree: KDTree) -> np.ndarray:
     """Points (N,) bool that stand alone off their neighbours, on slopes measured by how these scatter."""
-    nearest = tree.query(surface.places, k=_NEIGHBOURS + 1)[1][:, 1:]
+    found: Any = tree.query(surface.places, k=_NEIGHBOURS + 1)
+    nearest = found[1][:, 1:]
     beside = surface.heights[nearest]
     middle = np.median(beside, axis=1)
     spread = MAD_TO_STD * np.median(np.abs(beside - middle[:, None]), axis=1)
@@ -193,11 +199,11 @@ def _matched(surface: Surface, plain: np.ndarray, radius: float) -> _Map:
     bell = np.square(np.maximum(1 - u**2 - v**2, 0))
     padded = [fft.next_fast_len(length + 2 * reach, real=True) for length in shape]
     base = [window, window * u, window * v, bell]
-    spectra = [fft.rfft2(each, padded) for each in (mass, load)]
+    spectra: list[Any] = [fft.rfft2(each, padded) for each in (mass, load)]
 
-    def correlated(spectrum: np.ndarray, kernel: np.ndarray) -> np.ndarray:
-        turned = fft.rfft2(kernel[::-1, ::-1], padded)
-        return fft.irfft2(spectrum * turned, padded)[reach : reach + shape[0], reach : reach + shape[1]]
+    def correlated(spectrum: Any, kernel: np.ndarray) -> np.ndarray:
+        whole: Any = fft.irfft2(spectrum * fft.rfft2(kernel[::-1, ::-1], padded), padded)
+        return whole[reach : reach + shape[0], reach : reach + shape[1]]
 
     normal = np.empty((*shape, 4, 4))
     pairs = {(i, j): base[i] * base[j] for i in range(4) for j in range(i, 4)}
@@ -243,7 +249,7 @@ def _standardised(values: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarra
     if not known.any():
         return np.full(values.shape, np.nan), np.full(values.shape, np.nan)
     if not known.all():
-        nearest = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+        nearest: Any = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
         middle, spread, freedom = (each[tuple(nearest)] for each in (middle, spread, freedom))
     at = [
         np.interp(np.arange(length) + 0.5, 0.5 * (edge[:-1] + edge[1:]), np.arange(count))
@@ -280,7 +286,8 @@ def _moment(z: np.ndarray, axis: int, cell: float) -> float:
 
 def _threshold(maps: Sequence[_Map], false_alarm: float) -> float:
     """The level that noise exceeds with a probability anywhere at any size: the sizes' sum is an upper bound."""
-    return float(optimize.brentq(lambda z: sum(m.false_alarms(z) for m in maps) - false_alarm, 1.0, 40.0))
+    level: Any = optimize.brentq(lambda z: sum(m.false_alarms(z) for m in maps) - false_alarm, 1.0, 40.0)
+    return float(level)
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,43 +340,50 @@ def _indication(
     surface: Surface, plain: np.ndarray, tree: KDTree, maps: Sequence[_Map], peak: _Peak, smallest: float
 ) -> Indication | None:
     """A peak with its region: cells about it that depart from the surroundings in the same direction."""
-    place, sign, reach = peak.place, np.sign(peak.height), 3.0 * peak.radius
-    noise = float(maps[0].noise_at(place[None])[0])
-    step = max(smallest, peak.radius / 4)
-    for _ in range(3):
-        near = np.array(tree.query_ball_point(place, reach))
+    noise, reach, points = float(maps[0].noise_at(peak.place[None])[0]), 3.0 * peak.radius, np.zeros(0, int)
+    for _ in range(_GROWN):
+        near = np.array(tree.query_ball_point(peak.place, reach), int)
         near = near[plain[near]]
-        away = surface.places[near] - place
-        ring = np.hypot(*away.T) > 0.5 * reach
-        if np.count_nonzero(ring) < 12:
+        places, heights = surface.places[near] - peak.place, surface.heights[near]
+        found = _region(places, heights, peak, noise=noise, reach=reach, step=max(smallest, peak.radius / 4))
+        if found is None:
             return None
-        base = np.column_stack([np.ones(len(near)), away])
-        left = surface.heights[near] - base @ _robust_plane(base[ring], surface.heights[near][ring])
-        cells = np.floor((away + reach) / step).astype(int)
-        side = int(np.ceil(2 * reach / step)) + 1
-        flat = cells[:, 0] * side + cells[:, 1]
-        count = ndimage.uniform_filter(np.bincount(flat, minlength=side**2).reshape(side, side) * 1.0, 3) * 9
-        total = ndimage.uniform_filter(np.bincount(flat, left, side**2).reshape(side, side), 3) * 9
-        mean = np.divide(total, count, out=np.zeros_like(total), where=count > 0.5)
-        top = float(np.max(sign * mean[count > 0.5])) if (count > 0.5).any() else 0.0
-        inside = (count > 0.5) & (
-            sign * mean > np.maximum(_EDGE_SHARE * top, _EDGE_STD * noise / np.sqrt(np.maximum(count, 1)))
-        )
-        labels = np.asarray(ndimage.label(inside)[0])
-        middle = np.floor((np.zeros(2) + reach) / step).astype(int)
-        own = labels[middle[0] - 1 : middle[0] + 2, middle[1] - 1 : middle[1] + 2]
-        own = own[own > 0]
-        region = np.isin(labels, own) if len(own) else np.zeros_like(inside)
-        edge = region[[0, 1, -2, -1], :].any() or region[:, [0, 1, -2, -1]].any()
-        if not edge:
+        points, cut = near[found[0]], found[1]
+        if not cut:
             break
-        reach *= 1.7
-    wide = ndimage.binary_dilation(region, iterations=1)
-    chosen = wide[cells[:, 0], cells[:, 1]] | (np.hypot(*away.T) < 0.8 * peak.radius)
-    if np.count_nonzero(chosen) < _FEWEST:
+        reach *= _GROWTH
+    if len(points) < _FEWEST:
         return None
     chance = min(1.0, sum(each.false_alarms(peak.z) for each in maps))
-    return Indication(place, peak.radius, peak.height, peak.z, chance, noise, near[chosen])
+    return Indication(peak.place, peak.radius, peak.height, peak.z, chance, noise, points)
+
+
+def _region(
+    places: np.ndarray, heights: np.ndarray, peak: _Peak, *, noise: float, reach: float, step: float
+) -> tuple[np.ndarray, bool] | None:
+    """Points (n,) bool of a peak at the origin, and whether its region reaches the window's edge; None for too few."""
+    away = np.hypot(*places.T)
+    ring = away > 0.5 * reach
+    if np.count_nonzero(ring) < 2 * _FEWEST:
+        return None
+    base = np.column_stack([np.ones(len(places)), places])
+    left = heights - base @ _robust_plane(base[ring], heights[ring])
+    side = int(np.ceil(2 * reach / step)) + 1
+    cells = np.floor((places + reach) / step).astype(int)
+    flat = cells[:, 0] * side + cells[:, 1]
+    # Sums over three by three cells.
+    count = 9 * ndimage.uniform_filter(np.bincount(flat, minlength=side**2).reshape(side, side) * 1.0, 3)
+    total = 9 * ndimage.uniform_filter(np.bincount(flat, left, side**2).reshape(side, side), 3)
+    filled = count > 0.5
+    mean = np.where(filled, np.sign(peak.height) * total / np.maximum(count, 0.5), -np.inf)
+    level = np.maximum(_EDGE_SHARE * float(mean.max()), _EDGE_STD * noise / np.sqrt(np.maximum(count, 1)))
+    labelled: Any = ndimage.label(mean > level)
+    middle = int(reach / step)
+    own = labelled[0][middle - 1 : middle + 2, middle - 1 : middle + 2]
+    region = np.isin(labelled[0], own[own > 0])
+    wide = ndimage.binary_dilation(region)
+    cut = bool(region[[0, 1, -2, -1], :].any() or region[:, [0, 1, -2, -1]].any())
+    return wide[cells[:, 0], cells[:, 1]] | (away < _CORE * peak.radius), cut
 
 
 def _robust_plane(base: np.ndarray, heights: np.ndarray) -> np.ndarray:

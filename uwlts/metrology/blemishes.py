@@ -8,6 +8,7 @@ each pattern that all points share, and by noise drawn anew (GUM Supplement 1, J
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage, sparse
@@ -68,7 +69,8 @@ def measure_blemish(
     depths = sign * field.depths(heights)
     deepest = int(np.argmax(np.where(field.region, depths, -np.inf)))
     depth = float(depths[deepest])
-    noise = _noise_of(surface, search, field.near, indication)
+    # Single points that, were they independent, would scatter local means as these do.
+    noise = indication.noise_mm * surface.std[field.near] / float(np.median(surface.std))
     by_noise = np.sqrt(np.asarray(field.rows.power(2) @ noise**2).ravel())
     edge = max(_EDGE_SHARE * depth, _EDGE_STD * float(np.median(by_noise)))
     plain = field.figures(depths, edge, deepest)
@@ -113,12 +115,6 @@ def _draws(rng: np.random.Generator, noise: np.ndarray, images: np.ndarray, own:
         rng.standard_normal(len(noise)) * noise + rng.standard_normal(images.max() + 1)[images] * own.image_mm
         for _ in range(_DRAWS)
     ]
-
-
-def _noise_of(surface: Surface, search: BlemishSearch, near: np.ndarray, indication: Indication) -> np.ndarray:
-    """Standard deviation (n,) of points that, were they independent, would scatter local means as they do."""
-    relative = surface.std[near] / float(np.median(surface.std))
-    return indication.noise_mm * relative
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +201,8 @@ class _Field:
         """
         inside = (np.where(self.region, depths, -np.inf) > edge).reshape(self.shape)
         top = int(np.argmax(np.where(self.region, depths, -np.inf))) if deepest is None else deepest
-        labels = np.asarray(ndimage.label(inside, structure=np.ones((3, 3)))[0])
+        labelled: Any = ndimage.label(inside, structure=np.ones((3, 3)))
+        labels = labelled[0]
         label, depth = labels[np.unravel_index(top, self.shape)], self.vertex(depths, top)
         if label == 0:
             return np.array([depth, 0.0, 0.0, 0.0, 0.0])
@@ -258,8 +255,8 @@ def _quadratic_rows(grid: np.ndarray, places: np.ndarray, tree: KDTree, bandwidt
     Weights are Epanechnikov's; where fewer than nine points are near, the mean of the three nearest is taken.
     """
     columns, values, starts = [], [], [0]
-    nearest = tree.query(grid, k=3)[1]
-    for place, close, fallback in zip(grid, tree.query_ball_point(grid, bandwidth), nearest, strict=True):
+    nearest: Any = tree.query(grid, k=3)
+    for place, close, fallback in zip(grid, tree.query_ball_point(grid, bandwidth), nearest[1], strict=True):
         chosen = np.asarray(close, np.intp)
         away = (places[chosen] - place) / bandwidth if len(chosen) >= 9 else np.zeros((0, 2))
         row = None

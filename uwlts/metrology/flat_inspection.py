@@ -7,6 +7,7 @@ without one, so that each is known to half a point's spacing on either side.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -40,9 +41,12 @@ _HOLE_ARC = 200.0
 """Degrees of a hole's edge that have to be seen."""
 _SAME_SHARE = 0.2
 """By which the diameters of bolt holes may differ."""
+_REFINED = 4
 _FLAT_CELLS = 24
 """Across the face; the means of cells are its smoothed form."""
 _DRAWS, _SEED = 48, 635
+
+_facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
 
 
 def inspect_step(cloud: PointCloud) -> Inspection:
@@ -75,7 +79,7 @@ def inspect_step(cloud: PointCloud) -> Inspection:
     points = cloud.points_mm[used]
     extent = np.append(np.ptp((points - base.point_mm) @ base.axes[:2].T, axis=0), height)
     feature = Feature(FeatureKind.STEP, "step", values, points.mean(axis=0), base.axes, extent, used)
-    return _inspection("step", cloud, (feature,), {tuple(lower): base, tuple(upper): other})
+    return _inspection("step", cloud, (feature,), [(lower, base), (upper, other)])
 
 
 def inspect_flange(cloud: PointCloud, *, datum: PointCloud | None = None) -> Inspection:
@@ -111,7 +115,7 @@ def inspect_flange(cloud: PointCloud, *, datum: PointCloud | None = None) -> Ins
         values.append(_parallelism(cloud, face, used, datum))
     extent = np.append(np.ptp((cloud.points_mm[used] - face.point_mm) @ face.axes[:2].T, axis=0), values[0].value)
     whole = Feature(FeatureKind.FLANGE, "flange", tuple(values), face.point_mm, face.axes, extent, used)
-    return _inspection("flange", cloud, (whole, *features), {tuple(used): face})
+    return _inspection("flange", cloud, (whole, *features), [(used, face)])
 
 
 def inspect_gap(cloud: PointCloud) -> Inspection:
@@ -171,7 +175,7 @@ def inspect_gap(cloud: PointCloud) -> Inspection:
     axes = np.vstack([turn @ face.axes[:2], face.axes[2]])
     extent = np.array([float(np.ptp((edges.places - middle) @ along)), abs(float(width)), values[-1].value])
     feature = Feature(kind, "gap", tuple(values), place, axes, extent, edges.points)
-    return _inspection("gap", cloud, (feature,), {})
+    return _inspection("gap", cloud, (feature,), [])
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,14 +230,15 @@ def _largest_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     near = np.abs(thinned @ normals.T - levels) < _NEAR_SHARE * size
     best = int(np.argmax(near.sum(axis=0)))
     inside = np.abs(points @ normals[best] - levels[best]) < _NEAR_SHARE * size
-    for _ in range(4):
-        robust = fit_robustly(lambda p: fit_plane(p, towards=TOWARDS_SENSOR), points[inside])
-        distance = robust.fit.distances_mm(points)
+    normal = normals[best]
+    for _ in range(_REFINED):
+        fit = fit_robustly(_facing_plane, points[inside]).fit
+        normal, distance = fit.normal, fit.distances_mm(points)
         spread = MAD_TO_STD * float(np.median(np.abs(distance[inside])))
         inside = np.abs(distance) < _OFF_FACE * max(spread, 1e-9)
     if np.count_nonzero(inside) < _FEWEST:
         raise EvaluationError(f"the largest flat face holds {np.count_nonzero(inside)} points; {_FEWEST} are needed")
-    return robust.fit.normal, np.flatnonzero(inside)
+    return normal, np.flatnonzero(inside)
 
 
 def _height_between(levels: np.ndarray) -> float:
@@ -279,11 +284,11 @@ def _angle(kind: FeatureKind, slopes: np.ndarray, random: np.ndarray, common: np
 
 
 def _inspection(
-    kind: str, cloud: PointCloud, features: tuple[Feature, ...], faces: dict[tuple[int, ...], _Face]
+    kind: str, cloud: PointCloud, features: tuple[Feature, ...], faces: list[tuple[np.ndarray, _Face]]
 ) -> Inspection:
     deviation = np.full(len(cloud), np.nan)
-    for own, face in faces.items():
-        deviation[np.array(own)] = face.residuals_mm
+    for own, face in faces:
+        deviation[own] = face.residuals_mm
     notes = ()
     if cloud.uncertainty is None:
         notes = ("the cloud states no uncertainty: intervals are of the scatter of its points alone",)

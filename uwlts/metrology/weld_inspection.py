@@ -8,6 +8,7 @@ by noise drawn anew (GUM Supplement 1, JCGM 101:2008).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage, sparse
@@ -173,7 +174,8 @@ def _found(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarra
     across = crown @ axes[1]
     count, edges = np.histogram(across, bins=max(10, int(np.sqrt(len(crown)))))
     filled = count > 0.05 * count.max()
-    labels = np.asarray(ndimage.label(filled)[0])
+    labelled: Any = ndimage.label(filled)
+    labels = labelled[0]
     best = int(np.argmax(np.bincount(labels, count * (labels > 0))))
     low, high = edges[:-1][labels == best].min(), edges[1:][labels == best].max()
     crown = crown[(across >= low) & (across <= high)]
