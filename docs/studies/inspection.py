@@ -28,7 +28,8 @@ from twin.scene.forms.weld import weld_height
 from uwlts.metrology.features import Feature, FeatureKind, Inspection
 from uwlts.storage.capture import CaptureWriter
 
-BLEMISHES = FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION
+HOLLOWS = FeatureKind.PIT, FeatureKind.DENT
+BLEMISHES = *HOLLOWS, FeatureKind.PROTRUSION
 
 
 def cloud_of(folder: Path, water: str, name: str) -> uwlts.PointCloud:
@@ -60,12 +61,17 @@ def around(folder: Path, water: str) -> uwlts.PointCloud:
     return cloud_of(folder, water, "pipe-around")
 
 
+def distances(pits: Pits, places: np.ndarray) -> np.ndarray:
+    """Distances (..., P) of places (..., 3) in the scene from the pits' middles, along the surface, in mm."""
+    x, y, z = np.moveaxis(places, -1, 0)[..., None]
+    return np.hypot(pits.along - x, pits.around - DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z))
+
+
 def matched(found: Inspection, pits: Pits) -> list[Feature | None]:
     """The feature that lies on each pit, the deepest of several."""
     result: list[Feature | None] = [None] * len(pits.depth)
-    for feature in reversed(found.of(*BLEMISHES)):
-        x, y, z = feature.place_mm
-        away = np.hypot(pits.along - x, pits.around - DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z))
+    for feature in reversed(found.of(*HOLLOWS)):
+        away = distances(pits, feature.place_mm)
         nearest = int(np.argmin(away / pits.diameter))
         if away[nearest] < pits.diameter[nearest] / 2 + 0.5:
             result[nearest] = feature
@@ -74,12 +80,7 @@ def matched(found: Inspection, pits: Pits) -> list[Feature | None]:
 
 def false_ones(found: Inspection, pits: Pits) -> int:
     """Features that lie on no pit."""
-    count = 0
-    for feature in found.of(*BLEMISHES):
-        x, y, z = feature.place_mm
-        away = np.hypot(pits.along - x, pits.around - DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z))
-        count += bool(np.all(away > pits.diameter / 2 + 0.5)) if len(pits.depth) else 1
-    return count
+    return sum(bool(np.all(distances(pits, each.place_mm) > pits.diameter / 2 + 0.5)) for each in found.of(*BLEMISHES))
 
 
 def detection(depth: np.ndarray, hit: np.ndarray) -> tuple[float, float, np.ndarray]:
@@ -160,100 +161,102 @@ def true_weld(weld: Weld) -> dict[str, float]:
         toes.append(ends[1] - ends[0])
         angles.append(slopes)
     left, right = np.median(angles, axis=0)
-    tops, depth = sections.max(axis=1), weld.undercut_depth_mm
-    return {"height": tops.mean(), "width": float(np.median(toes)), "undercut left": depth, "undercut right": depth,
-            "largest undercut": depth, "toe angle left": left, "toe angle right": right, "misalignment": 0.0}  # fmt: skip
+    undercuts = dict.fromkeys(("undercut left", "undercut right", "largest undercut"), weld.undercut_depth_mm)
+    sizes = {"height": float(sections.max(axis=1).mean()), "width": float(np.median(toes))} | undercuts
+    return sizes | {"toe angle left": left, "toe angle right": right, "misalignment": 0.0}
+
+
+def pit_pairs(found: list[Feature | None], pits: Pits, chosen: np.ndarray) -> list[tuple[Feature, dict[str, float]]]:
+    """Features and true values of those chosen (P,) bool of the pits that were found."""
+    return [
+        (each, true_values(diameter, depth, each["edge depth"].value))
+        for each, diameter, depth, one in zip(found, pits.diameter, pits.depth, chosen, strict=True)
+        if each is not None and one
+    ]
+
+
+def small_pits_in(folder: Path, water: str) -> tuple[list[list[str]], list[list[str]], dict]:
+    """Rows of detection and of figures, and what a curve of each diameter is drawn from."""
+    pits, inspected = small_pits(), uwlts.inspect(cloud_of(folder, water, "pipe-after"))
+    found = matched(inspected, pits)
+    hit = np.array([each is not None for each in found])
+    plain = uwlts.inspect(cloud_of(folder, water, "pipe-before"))
+    false = false_ones(inspected, pits), len(plain.of(*BLEMISHES))
+    print(f"{water}: indications that are no pit: {false[0]} with pits, {false[1]} without; {inspected.notes[-1]}")
+    seen, figures, curves = [], [], {}
+    for diameter in np.unique(pits.diameter):
+        own = pits.diameter == diameter
+        a90, bound, fitted = detection(pits.depth[own], hit[own])
+        curves[water, float(diameter)] = pits.depth[own], hit[own], fitted, bound
+        seen.append([water, f"{diameter:g}", f"{np.sum(hit[own])} of {np.sum(own)}", f"{a90:.3f}", f"{bound:.3f}"])
+        deep = pit_pairs(found, pits, own & (pits.depth > 0.1))
+        figures += figure_rows(f"{water}, {diameter:g} mm, 0.1 to 0.4 mm deep", deep)
+    return seen, figures, curves
+
+
+def large_pits_in(folder: Path, water: str) -> list[list[str]]:
+    """Rows of the figures of large pits; each is printed."""
+    pits, inspected = large_pits(), uwlts.inspect(cloud_of(folder, water, "pipe-corroded"), wall_mm=9.5)
+    found = matched(inspected, pits)
+    print(f"{water}: large pits found: {sum(each is not None for each in found)}, false: {false_ones(inspected, pits)}")
+    for k, each in enumerate(found):
+        if each is not None:
+            print(f"  {pits.diameter[k]:g} mm, {pits.depth[k]:g} mm deep: {each['depth'].text()}")
+    return figure_rows(f"{water}, 10 to 24 mm, 0.5 to 5 mm deep", pit_pairs(found, pits, pits.diameter >= 10))
+
+
+def wholes_in(folder: Path, water: str) -> list[list[str]]:
+    """Rows of the figures of the pipe from six sides and of the weld."""
+    pipe = uwlts.inspect(around(folder, water))
+    truth = {"diameter": DIAMETER_MM, "ovality": DIAMETER_MM * OVALITY, "ovality share": 100 * OVALITY}
+    rows = figure_rows(f"{water}, pipe", [(pipe.features[0], truth | {"straightness": 0.0})])
+    sections = pipe.of(FeatureKind.SECTION)
+    rows += figure_rows(f"{water}, sections", [(each, {"ovality": truth["ovality"]}) for each in sections])
+    print(f"{water}: blemishes on the smooth pipe from six sides: {len(pipe.of(*BLEMISHES))}")
+    weld = load_scene(str(folder / f"weld-{water}.toml")).objects[0]
+    assert isinstance(weld, Weld)
+    bead = uwlts.inspect(cloud_of(folder, water, "weld"), "weld").features[0]
+    return rows + figure_rows(f"{water}, weld", [(bead, true_weld(weld))])
+
+
+def unchanged_in(folder: Path, water: str) -> None:
+    """Print where change is claimed beside the pits, which is where nothing changed."""
+    before = cloud_of(folder, water, "pipe-before")
+    for name, pits in (("pipe-after", small_pits()), ("pipe-corroded", large_pits())):
+        change = uwlts.compare_clouds(cloud_of(folder, water, name), before)
+        reach = pits.diameter / 2 + change.disc_mm / 2
+        clear = change.compared & np.all(distances(pits, change.points_mm) > reach, axis=1)
+        share = 100 * float(change.significant[clear].mean())
+        print(f"{water}, {name}: change is claimed on {share:.2f} % of {clear.sum()} places where nothing changed")
+
+
+def flanges_in(folder: Path, water: str) -> list[list[str]]:
+    """Rows of the figures of a flange and its holes."""
+    scene = load_scene(str(folder / f"flange-{water}.toml")).objects[0]
+    assert isinstance(scene, Flange)
+    found = uwlts.inspect(cloud_of(folder, "flanges", f"flange-{water}"), "flange")
+    truth = {"flatness": scene.flatness_mm, "bore": scene.bore_diameter_mm, "bolt circle": scene.bolt_circle_mm}
+    holes = [(hole, {"diameter": scene.hole_diameter_mm, "position": 0.0}) for hole in found.of(FeatureKind.HOLE)]
+    rows = figure_rows(f"{water}, flange", [(found.features[0], truth)])
+    return rows + figure_rows(f"{water}, holes of the flange", holes)
 
 
 def main(folder: Path, pictures: Path) -> None:
     """Print all tables and draw the pictures."""
-    seen, figures, whole = [], [], []
-    curves = {}
-    for water in WATERS:
-        pits = small_pits()
-        after = uwlts.inspect(cloud_of(folder, water, "pipe-after"))
-        found = matched(after, pits)
-        hit = np.array([each is not None for each in found])
-        for diameter in np.unique(pits.diameter):
-            own = pits.diameter == diameter
-            a90, bound, fitted = detection(pits.depth[own], hit[own])
-            curves[water, diameter] = pits.depth[own], hit[own], fitted, bound
-            seen.append([water, f"{diameter:g}", f"{np.sum(hit[own])} of {np.sum(own)}", f"{a90:.3f}", f"{bound:.3f}"])
-        before_cloud = cloud_of(folder, water, "pipe-before")
-        before = uwlts.inspect(before_cloud)
-        print(
-            f"{water}: false indications, with pits and without: {false_ones(after, pits)}, {len(before.of(*BLEMISHES))}"
-        )
-        pairs = [
-            (each, true_values(pits.diameter[k], pits.depth[k], each["edge depth"].value))
-            for k, each in enumerate(found) if each is not None and each.kind != FeatureKind.PROTRUSION
-        ]  # fmt: skip
-        for diameter in np.unique(pits.diameter):
-            of_size = [
-                pair
-                for k, pair in zip(np.flatnonzero(hit), pairs, strict=True)
-                if pits.diameter[k] == diameter and pits.depth[k] > 0.1
-            ]
-            figures += figure_rows(f"{water}, {diameter:g} mm, 0.1 to 0.4 mm deep", of_size)
-        pits = large_pits()
-        corroded_cloud = cloud_of(folder, water, "pipe-corroded")
-        corroded = uwlts.inspect(corroded_cloud, wall_mm=9.5)
-        found = matched(corroded, pits)
-        print(
-            f"{water}: large pits found: {sum(each is not None for each in found)} of {len(found)}, false: {false_ones(corroded, pits)}"
-        )
-        pairs = [
-            (each, true_values(pits.diameter[k], pits.depth[k], each["edge depth"].value))
-            for k, each in enumerate(found)
-            if each is not None and pits.diameter[k] >= 10
-        ]
-        figures += figure_rows(f"{water}, 10 to 24 mm, 0.5 to 5 mm deep", pairs)
-        for k, each in enumerate(found):
-            if each is not None:
-                print(f"  {pits.diameter[k]:g} mm, {pits.depth[k]:g} mm deep: {each['depth'].text()}")
-        pipe = uwlts.inspect(around(folder, water))
-        truth = {
-            "diameter": DIAMETER_MM,
-            "ovality": DIAMETER_MM * OVALITY,
-            "ovality share": 100 * OVALITY,
-            "straightness": 0.0,
-        }
-        whole += figure_rows(f"{water}, pipe", [(pipe.features[0], truth)])
-        of_section = {name: truth[name] for name in ("diameter", "ovality")}
-        whole += figure_rows(f"{water}, sections", [(each, of_section) for each in pipe.of(FeatureKind.SECTION)])
-        weld = load_scene(str(folder / f"weld-{water}.toml")).objects[0]
-        assert isinstance(weld, Weld)
-        bead = uwlts.inspect(cloud_of(folder, water, "weld"), "weld").features[0]
-        whole += figure_rows(f"{water}, weld", [(bead, true_weld(weld))])
-        for name, cloud, pits in (
-            ("small pits", cloud_of(folder, water, "pipe-after"), small_pits()),
-            ("large pits", corroded_cloud, large_pits()),
-        ):
-            change = uwlts.compare_clouds(cloud, before_cloud)
-            x, y, z = change.points_mm.T
-            away = np.hypot(
-                pits.along - x[:, None], pits.around - DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z)[:, None]
-            )
-            clear = change.compared & np.all(away > pits.diameter / 2 + change.disc_mm / 2, axis=1)
-            print(
-                f"{water}, {name}: significant change claimed on {100 * change.significant[clear].mean():.2f} % of {clear.sum()} places where nothing changed"
-            )
-    print(table(["water", "diameter mm", "found", "a90 mm", "a90/95 mm"], seen))
     head = ["of", "value", "number", "bias", "spread", "stated std", "truth within the 95 % interval"]
+    seen, figures, curves = [], [], {}
+    for water in WATERS:
+        detected, rows, drawn = small_pits_in(folder, water)
+        seen, figures, curves = seen + detected, figures + rows, curves | drawn
+        figures += large_pits_in(folder, water)
+        unchanged_in(folder, water)
+        print(table(head, wholes_in(folder, water)))
+    print(table(["water", "diameter mm", "found", "a90 mm", "a90/95 mm"], seen))
     print(table(head, figures))
-    print(table(head, whole))
     draw_curves(curves, pictures / "inspection-detection.svg")
     draw_map(folder, pictures / "inspection-pits.png")
-    flanges = []
     for water in WATERS:
-        scene = load_scene(str(folder / f"flange-{water}.toml")).objects[0]
-        assert isinstance(scene, Flange)
-        found = uwlts.inspect(cloud_of(folder, "flanges", f"flange-{water}"), "flange")
-        truth = {"flatness": scene.flatness_mm, "bore": scene.bore_diameter_mm, "bolt circle": scene.bolt_circle_mm}
-        flanges += figure_rows(f"{water}, flange", [(found.features[0], truth)])
-        holes = [(hole, {"diameter": scene.hole_diameter_mm}) for hole in found.of(FeatureKind.HOLE)]
-        flanges += figure_rows(f"{water}, its holes", holes)
-    print(table(head, flanges))
+        print(table(head, flanges_in(folder, water)))
 
 
 def draw_curves(curves: dict, path: Path) -> None:
