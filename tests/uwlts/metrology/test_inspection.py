@@ -6,6 +6,7 @@ their probability of a false alarm.
 
 import json
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -320,6 +321,13 @@ def test_every_value_has_a_definition_with_a_source():
     for values in DEFINITIONS.values():
         for definition in values.values():
             assert definition.text and definition.source and definition.unit in ("mm", "mm2", "deg", "%")
+
+
+def test_the_guide_has_all_definitions():
+    page = (Path(__file__).resolve().parents[3] / "docs" / "how-to" / "inspect-a-pipe.md").read_text(encoding="utf-8")
+    for kind, values in DEFINITIONS.items():
+        for name, definition in values.items():
+            assert f"| {kind} | {name} | {definition.unit} | {definition.text} | {definition.source} |" in page
 
 
 def test_wrong_input_is_refused():
