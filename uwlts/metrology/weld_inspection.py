@@ -208,12 +208,13 @@ def _profile_rows(
     for k in range(count):
         own = order[starts[k] : starts[k + 1]]
         place = across[own]
+        nothing = own[:1] if len(own) else order[:1]
         first, last = np.searchsorted(place, grid - bandwidth), np.searchsorted(place, grid + bandwidth)
         for middle, a, b in zip(grid, first, last, strict=True):
             u = (place[a:b] - middle) / bandwidth
             row = _quadratic_row(u)
-            columns.append(own[a:b] if row is not None else own[:1])
-            values.append(row if row is not None else np.full(len(own[:1]), np.nan))
+            columns.append(own[a:b] if row is not None else nothing)
+            values.append(row if row is not None else np.array([np.nan]))
             lengths.append(lengths[-1] + len(values[-1]))
     parts = np.concatenate(values), np.concatenate(columns), np.array(lengths)
     return sparse.csr_array(parts, shape=(count * len(grid), len(across)))
@@ -237,14 +238,19 @@ _NAMES = (
 
 
 def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...], np.ndarray]:
-    seen, toes = _figures(bead, bead.raw_mm)
+    profiles = bead.profiles.of(bead.raw_mm)
+    tops = _tops(bead, profiles)
+    high = tops > _WHOLE_SHARE * float(np.median(tops[np.isfinite(tops)]))
+    whole = np.flatnonzero(high & np.isfinite(tops))
+    toes = _toes_and_slopes(bead, profiles, whole)[:, :2]
+    seen = _figures(bead, bead.raw_mm, whole, toes)
     rng = np.random.default_rng(_SEED)
     noise = np.maximum(bead.noise_mm, errors.single_mm)
     drawn = []
     for _ in range(_DRAWS):
         moves = rng.standard_normal(len(noise)) * noise
         moves += rng.standard_normal(errors.image.max() + 1)[errors.image] * errors.image_mm
-        drawn.append(_figures(bead, bead.raw_mm + moves, toes)[0] - seen)
+        drawn.append(_figures(bead, bead.raw_mm + moves, whole, toes) - seen)
     random, bias = np.nanstd(drawn, axis=0), np.zeros(len(seen))
     # The extreme of a noisy profile is too far out, by about as much as with as much noise again.
     extremes = ["undercut" in name or "height" in name for name in _NAMES]
@@ -252,7 +258,7 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
     plain, random = np.where(extremes, np.maximum(seen - bias, 0), seen), np.hypot(random, bias)
     common = None
     if errors.patterns_mm is not None:
-        moved = [_figures(bead, bead.raw_mm + pattern, toes)[0] - seen for pattern in errors.patterns_mm]
+        moved = [_figures(bead, bead.raw_mm + pattern, whole, toes) - seen for pattern in errors.patterns_mm]
         common = np.sqrt(np.nansum(np.square(moved), axis=0))
     values = tuple(
         plain_value(
@@ -264,26 +270,30 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
     return values, np.array([bead.length_mm, float(plain[2]), float(plain[1])])
 
 
-def _figures(bead: _Bead, raw: np.ndarray, toes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Values in the order of `_NAMES` for heights (n,) of the points, and the toes (S, 2) of the sections.
+def _tops(bead: _Bead, profiles: np.ndarray) -> np.ndarray:
+    """Greatest height (S,) of each profile between the toes; -inf where there is none."""
+    inside = np.isfinite(profiles) & (np.abs(bead.profiles.across_mm) < bead.half_mm)
+    return np.max(np.where(inside, profiles, -np.inf), axis=1)
 
-    With ``toes`` given undercuts are looked for beyond these.
+
+def _toes_and_slopes(bead: _Bead, profiles: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Toes left and right, and the flanks' slopes there (W, 4), of some sections."""
+    tops = _tops(bead, profiles)
+    return np.array([_flanks(bead.profiles.across_mm, profiles[k], float(tops[k])) for k in whole])
+
+
+def _figures(bead: _Bead, raw: np.ndarray, whole: np.ndarray, toes: np.ndarray) -> np.ndarray:
+    """Values in the order of `_NAMES` for heights (n,) of the points.
+
+    Of the sections ``whole`` (W,); undercuts are looked for beyond the ``toes`` (W, 2).
     """
     profiles, grid = bead.profiles.of(raw), bead.profiles.across_mm
-    inside = np.abs(grid) < bead.half_mm
-    tops = np.nanmax(np.where(inside, profiles, np.nan), axis=1)
-    usual = float(np.nanmedian(tops))
-    whole = np.flatnonzero(tops > _WHOLE_SHARE * usual)
-    if not len(whole):
-        raise EvaluationError("no section shows the bead: give longer sections")
-    flanks = np.array([_flanks(grid, profiles[k], float(tops[k])) for k in whole])
-    own_toes, slopes = flanks[:, :2], flanks[:, 2:]
-    at = own_toes if toes is None else toes
-    width = float(np.nanmedian(own_toes[:, 1] - own_toes[:, 0]))
-    angles = 180 - np.degrees(np.arctan(np.nanmedian(slopes, axis=0)))
+    tops, flanks = _tops(bead, profiles), _toes_and_slopes(bead, profiles, whole)
+    width = float(np.nanmedian(flanks[:, 1] - flanks[:, 0]))
+    angles = 180 - np.degrees(np.arctan(np.nanmedian(flanks[:, 2:], axis=0)))
     depths = np.full((2, len(whole)), np.nan)
     for side, sign in ((0, -1.0), (1, 1.0)):
-        beyond = sign * (grid - at[:, side, None]) / (2 * bead.half_mm)
+        beyond = sign * (grid - toes[:, side, None]) / (2 * bead.half_mm)
         groove = np.where((beyond > -_INSIDE_SHARE) & (beyond < _BEYOND_SHARE), profiles[whole], np.nan)
         lowest = np.argmin(np.where(np.isfinite(groove), groove, np.inf), axis=1)
         # Where the lines beside the deepest one were lost, that is not the groove's bottom.
@@ -305,7 +315,7 @@ def _figures(bead: _Bead, raw: np.ndarray, toes: np.ndarray | None = None) -> tu
         *(float(angle) for angle in angles),
         abs(middle[1] - middle[0]),
     ]
-    return np.array(values), own_toes
+    return np.array(values)
 
 
 def _largest_mean(values: np.ndarray, count: int) -> float:
