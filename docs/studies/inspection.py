@@ -291,7 +291,7 @@ def draw_map(folder: Path, path: Path) -> None:
         DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z),
         x,
         c=found.deviation_mm[::2],
-        s=1,
+        s=5,
         cmap="magma",
         vmin=-3,
         vmax=0.2,
