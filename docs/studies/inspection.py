@@ -277,7 +277,7 @@ def draw_curves(curves: dict, path: Path) -> None:
         ax.axhline(0.9, color="#999999", linewidth=0.7)
         ax.set(title=f"{water} water", xlabel="depth of the pit / mm")
     axes[0].set(ylabel="probability of detection")
-    axes[1].legend(frameon=False, title="dots: a90/95")
+    axes[1].legend(frameon=False, title="dots: a90/95", loc="center left")
     figure.savefig(path)
 
 
