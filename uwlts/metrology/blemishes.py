@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.spatial import KDTree
 
-from uwlts.metrology.blemish_search import BlemishSearch, Indication, Surface
+from uwlts.metrology.blemish_search import BlemishSearch, Indication, UnrolledSurface
 from uwlts.metrology.features import FeatureKind, FeatureValue
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.metrology.propagation import NormalErrors, plain_value
@@ -51,7 +51,7 @@ class Blemish:
 
 
 def measure_blemish(
-    surface: Surface,
+    surface: UnrolledSurface,
     search: BlemishSearch,
     indication: Indication,
     errors: NormalErrors,
@@ -143,7 +143,7 @@ class _Field:
     region: np.ndarray
 
     @classmethod
-    def about(cls, surface: Surface, search: BlemishSearch, indication: Indication) -> _Field:
+    def about(cls, surface: UnrolledSurface, search: BlemishSearch, indication: Indication) -> _Field:
         own = surface.places[indication.points]
         low, high = own.min(axis=0), own.max(axis=0)
         radius = 0.25 * float(np.sum(high - low))
