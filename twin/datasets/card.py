@@ -41,6 +41,7 @@ _GAMMA = 0.5
 _OVERLAY = {
     Mask.HAZE: (70, 110, 200),
     Mask.SECONDARY: (230, 150, 40),
+    Mask.PARTICLES: (200, 90, 210),
     Mask.STRIPE: (60, 180, 90),
     Mask.SATURATED: (230, 40, 60),
 }
@@ -56,8 +57,8 @@ MEANINGS = {
     "object": "(lines,) int16: number of the object there, -1 for none",
     "target_px": "(points, 2) float32: where the points of the calibration target are seen; NaN where they are not",
     "mask": "(height, width) uint8: sum of " + ", ".join(f"{one.value} {str(one.name).lower()}" for one in Mask),
-    "light_e": "(4, height, width) float16: mean photo-electrons of light straight from the lit surface, scattered "
-    "once, on longer ways, and of lamp and day; without speckle and noise",
+    "light_e": "(5, height, width) float16: mean photo-electrons of light straight from the lit surface, scattered "
+    "once, on longer ways, by grains and bubbles, and of lamp and day; without speckle and noise",
     "depth_mm": "(height, width) float32: depth in the camera frame of what each pixel's middle sees; NaN for nothing",
     "object_map": "(height, width) uint8: number of the object that each pixel's middle sees, 255 for none",
 }
