@@ -14,6 +14,7 @@ from markupsafe import Markup
 from pydantic import JsonValue
 
 import uwlts
+from twin.datasets.coco import write_coco
 from twin.datasets.description import (
     SPLITS,
     Constant,
@@ -79,7 +80,10 @@ class _Collected:
 def write_card(
     folder: Path, description: DataSetDescription, shards: Sequence[tuple[Path, Split, int]], plan: dict[str, JsonValue]
 ) -> DataCard:
-    """Write the card of a data set whose shards (path, split and number of frames) are complete, in all three forms."""
+    """Write the card of a data set whose shards (path, split and number of frames) are complete, in all three forms.
+
+    Masks are written as COCO annotations too.
+    """
     per_scene, versions = description.frames_per_scene(), plan["versions"]
     frames: dict[Split, int] = {split: sum(count for _, own, count in shards if own == split) for split in SPLITS}
     card = DataCard(
@@ -117,6 +121,8 @@ def write_card(
         aside.write_text(_markdown(card, description), encoding="utf-8")
     everything = DataSet(folder, card, None, ("image", "mask", "centre_px", "info"))
     write_page(folder / PAGE, _page(card, description, found, everything), overwrite=True)
+    if "mask" in names:
+        write_coco(folder, card)
     # The last file: with it the data set is complete.
     write_model(folder / CARD, card, format=CARD_FORMAT, version=CARD_VERSION, overwrite=True)
     return card
