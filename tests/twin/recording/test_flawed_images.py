@@ -29,6 +29,7 @@ TYPICAL = [
     "rolling-shutter=10",
     "jpeg=90",
     "colour-filter",
+    "camera-3d=16",
 ]
 NAMES = [text.partition("=")[0] for text in TYPICAL]
 
@@ -90,7 +91,7 @@ def test_what_is_no_flaw_is_refused(text, message):
         Flaws.of("glare", text)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("rolling-shutter", "caustics")])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("rolling-shutter", "caustics", "camera-3d")])
 def test_each_flaw_alone_changes_an_image(sensor, plain, name):
     changed = images(studio(sensor, name))
     assert max(np.abs(a - b).max() for a, b in zip(plain, changed, strict=True)) >= 1
