@@ -1,9 +1,9 @@
 """Wrong and lost points on scenes with mirrors and inside corners: the brightest peak, and the direct stripe.
 
 ``python docs/studies/stripe_reflections.py`` prints the table of docs/explanation/stripe-methods.md and draws its
-picture. A point is wrong that lies more than 3 px from every place of the image where the laser lights a surface, and
-lost is a lit profile line without a right one. The scenes above the line were looked at while the rules were made; those
-below it were not.
+picture. A point is wrong that lies more than 3 px from every place of the image where the laser lights a surface; a lit
+profile line without a right point is lost. The scenes of the first half were looked at while the rules were made, those
+of the second were not.
 """
 
 from collections.abc import Iterator
