@@ -172,8 +172,7 @@ def reconstruct(
         pose_unit: Unit of the trajectory's positions.
         clock_offset_s: What to add to the times of the images for those of the trajectory; as the mount says unless
             given.
-        peak: Which of several stripes on a line counts; the direct one, no reflection, or as the sensor's table [stripe]
-            says.
+        peak: Which of several stripes on a line counts; the direct one, or as the sensor's table [stripe] says.
     """
     refuse_unsuitable(out, overwrite=overwrite)
     known = uwlts.load_calibration(calibration)

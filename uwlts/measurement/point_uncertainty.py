@@ -23,7 +23,7 @@ from uwlts.optics.brightness import BLUR_STD, beside_std
 from uwlts.optics.line_table import LineTable
 from uwlts.runtime.compiled import compiled
 from uwlts.storage.capture import Capture, CaptureHeader, FrameTable
-from uwlts.storage.cloud import PAIRS, PointUncertainty
+from uwlts.storage.cloud import PointUncertainty
 from uwlts.storage.files import sha256_of
 from uwlts.stripe.result import pixels_of
 
@@ -43,8 +43,10 @@ def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) 
     smooth; edges and outliers do not count, as half the lines would have to hold some. Images with few lines take the
     value of all.
     """
-    order = np.lexsort((line, frame))
-    f, at, c = frame[order], line[order], centre_px[order].astype(np.float64)
+    f, at, c = frame, line, centre_px.astype(np.float64)
+    if np.any((f[1:] < f[:-1]) | ((f[1:] == f[:-1]) & (at[1:] < at[:-1]))):
+        order = np.lexsort((line, frame))
+        f, at, c = frame[order], line[order], c[order]
     beside = (f[2:] == f[:-2]) & (at[2:] - at[:-2] == 2)
     off, image = np.abs(c[1:-1] - 0.5 * (c[2:] + c[:-2]))[beside], f[1:-1][beside]
     if len(off) < _FEWEST_NEIGHBOURS:
@@ -134,10 +136,11 @@ def _add_parts(
     beside: np.ndarray,
     random: np.ndarray,
 ) -> None:
-    """Add to ``parts`` (N, 3, 2 + R) what stage, blur and the brightness beside the sheet do, and fill ``random`` (N, 6).
+    """Add to ``parts`` (N, 3, 2 + R) what stage, blur and brightness beside the sheet do; fill ``random`` (N, 6).
 
     The first two parts, derivatives by the pixel across the stripe and room, become those of blur and brightness.
     """
+    # In the order of `PAIRS`.
     for n in range(parts.shape[0]):
         x, y, z = parts[n, 0, 0] * noise[n], parts[n, 1, 0] * noise[n], parts[n, 2, 0] * noise[n]
         random[n, 0], random[n, 1], random[n, 2] = x * x, x * y, x * z

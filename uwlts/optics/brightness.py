@@ -192,7 +192,7 @@ def _fit_planes(
     by_position: np.ndarray,
     by_column: np.ndarray,
 ) -> None:
-    """Slopes (F, L) of planes through the values z (F, L) that are there, at positions s (F,), 0 where they do not show.
+    """Slopes (F, L) of planes through the values z (F, L) that are there, at positions s (F,), 0 where unknown.
 
     The sums over the window are running ones, first along a row and then from row to row.
     """

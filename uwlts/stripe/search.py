@@ -200,7 +200,14 @@ def _search_lines(
             if there < _CLEAR * rules.fine and _is_spike(near, there, rules.fine):
                 blocks[chosen] = 0
                 continue
-            start, peak = _looked_at(profiles, line, start, kernel, pixels, smooth, rules)
+            filtered(pixels, kernel, smooth)
+            peak = measured(smooth, start, profiles.shape[0], rules)
+            offset = _offset(peak, size, rules)
+            if offset != 0:
+                start += offset
+                cut(profiles, line, start, window)
+                filtered(pixels, kernel, smooth)
+                peak = measured(smooth, start, profiles.shape[0], rules)
             verdict = _judged(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE:
                 if (not peak.closed or peak.sigma > rules.widest) and peak.height >= rules.bright:
@@ -275,7 +282,14 @@ def _search_all(
             near = window[rules.half - 1 : rules.half + rules.block + 1]
             if there < _CLEAR * rules.fine and _is_spike(near, np.float32(there), rules.fine):
                 continue
-            start, peak = _looked_at(profiles, line, start, kernel, pixels, smooth, rules)
+            filtered(pixels, kernel, smooth)
+            peak = measured(smooth, start, profiles.shape[0], rules)
+            offset = _offset(peak, size, rules)
+            if offset != 0:
+                start += offset
+                cut(profiles, line, start, window)
+                filtered(pixels, kernel, smooth)
+                peak = measured(smooth, start, profiles.shape[0], rules)
             if _judged(peak, start, profiles.shape[0], rules) != _OK:
                 continue
             place, known = start + peak.middle, False
@@ -291,31 +305,14 @@ def _search_all(
 
 
 @compiled
-def _looked_at(
-    profiles: np.ndarray,
-    line: int,
-    start: int,
-    kernel: np.ndarray,
-    pixels: np.ndarray,
-    smooth: np.ndarray,
-    rules: SearchRules,
-) -> tuple[int, Peak]:
-    """What stands in the window cut out at `start`, and where the window begins that it was measured in at last.
-
-    The window follows a peak of which a half-height crossing or a flank lies outside it.
-    """
-    size, border = smooth.size, kernel.size // 2
-    filtered(pixels, kernel, smooth)
-    peak = measured(smooth, start, profiles.shape[0], rules)
+def _offset(peak: Peak, size: int, rules: SearchRules) -> int:
+    """How far a window is to follow a peak of which a half-height crossing or a flank lies outside it."""
     to_end = np.float32(0.5 * (size - 1))
     offset = peak.middle - to_end
     outside = abs(offset) + peak.reach > to_end - FLANK + np.float32(0.5)
     if (outside or not peak.closed) and peak.height >= rules.fine:
-        start += int(np.rint(offset))
-        cut(profiles, line, start, pixels[border : border + size])
-        filtered(pixels, kernel, smooth)
-        peak = measured(smooth, start, profiles.shape[0], rules)
-    return start, peak
+        return int(np.rint(offset))
+    return 0
 
 
 @compiled
