@@ -132,6 +132,11 @@ class Rendered:
 
 
 class _Capture(SimpleNamespace):
+    has_image = True
+
+    def seen(self, index: int) -> np.ndarray:
+        return self.images[index]
+
     def image(self, index: int) -> np.ndarray:
         return self.images[index]
 

@@ -16,12 +16,12 @@ import numpy as np
 from uwlts.model.calibration import Calibration
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Laser, Sensor, Uncertainty, Vector
+from uwlts.model.stripe import pixels_of
 from uwlts.optics.line_table import LineTable
 from uwlts.optics.reconstruction import reconstruct_pixels
 from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 from uwlts.stripe.recording import FoundStripes
-from uwlts.stripe.result import pixels_of
 
 BLUR_STD = 1.0 / math.sqrt(3.0)
 """Standard uncertainty of what blur moves centres by, over the largest possible: that is left as it is, and anything
@@ -94,7 +94,8 @@ def beside_sheet(
     in_camera = on_sheet @ frame[:3, :3].T + frame[:3, 3]
     away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
     sigma = sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
-    thickest = np.median(width_px) / FWHM_PER_SIGMA * np.abs(per_px[:, 2] / per_mm[:, 2])
+    known = width_px[np.isfinite(width_px)]
+    thickest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA * np.abs(per_px[:, 2] / per_mm[:, 2])
     return per_mm * (slopes / across * np.minimum(sigma, thickest) ** 2)[:, None]
 
 
@@ -103,10 +104,14 @@ def slopes_of_brightness(
 ) -> np.ndarray:
     """Slope (N,) per mm of the stage of the logarithm of a scan's stripe amplitudes; 0 where it is unknown.
 
+    It is unknown everywhere if a 3D camera does not give all amplitudes.
+
     A plane is fitted to the logarithms of all neighbours, so that noise and speckle of the single ones hardly count.
     ``amplitude`` (N,) is positive, ``stage_mm`` and ``exposure_ms`` (F,) are those of every image, in any order; where
     an exposure is not known, all are taken as equal.
     """
+    if not np.isfinite(amplitude).all():
+        return np.zeros(len(frame))
     order = np.argsort(stage_mm, kind="stable")
     used, row = np.unique(np.argsort(order)[frame], return_inverse=True)
     position = stage_mm[order][used]
@@ -155,9 +160,14 @@ def moved_by_blur_px(
 
 
 def sharp_lines(stripes: FoundStripes) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (M,) of the stripe centres that blur hardly moves, and by how much it may, px."""
+    """Numbers (M,) of the stripe centres that blur hardly moves, and by how much it may, px.
+
+    All of them, and 0, if a 3D camera does not give all amplitudes and widths, by which it is known.
+    """
     if len(stripes.line) == 0:
         return np.empty(0, np.intp), np.empty(0)
+    if not (np.isfinite(stripes.amplitude).all() and np.isfinite(stripes.width_px).all()):
+        return np.arange(len(stripes.line)), np.zeros(len(stripes.line))
     moved = moved_by_blur_px(stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude, stripes.width_px)
     sharp = np.flatnonzero(np.abs(moved) < _MOST_BLUR_PX)
     return sharp, moved[sharp]

@@ -7,10 +7,11 @@ gives the statuses. `direct` tells the laser's own stripe from its reflections, 
 and says why there is no stripe.
 """
 
-from uwlts.stripe.extract import extract_candidates, extract_stripe, warm_up
+from uwlts.model.stripe import Stripe, StripeStatus
+from uwlts.stripe.extract import extract_candidates, extract_stripe, stripe_in, warm_up
 from uwlts.stripe.methods import method_names
 from uwlts.stripe.recording import FoundStripes, find_stripes, why_no_stripe
-from uwlts.stripe.result import PeakRule, Stripe, StripeCandidates, StripeOptions, StripeSettings, StripeStatus
+from uwlts.stripe.result import PeakRule, StripeCandidates, StripeOptions, StripeSettings
 
 __all__ = [
     "FoundStripes",
@@ -24,6 +25,7 @@ __all__ = [
     "extract_stripe",
     "find_stripes",
     "method_names",
+    "stripe_in",
     "warm_up",
     "why_no_stripe",
 ]

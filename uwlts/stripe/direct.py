@@ -17,9 +17,10 @@ import numpy as np
 
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
+from uwlts.model.stripe import Stripe, StripeStatus
 from uwlts.runtime.compiled import compiled
 from uwlts.stripe.ends import leave_ends_out
-from uwlts.stripe.result import Stripe, StripeCandidates, StripeStatus
+from uwlts.stripe.result import StripeCandidates
 
 _GAP = 12
 """Lines that a dim stripe may be lost for and go on."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from uwlts.stripe.result import Stripe, StripeStatus
+from uwlts.model.stripe import Stripe, StripeStatus
 
 _SHORT_GAP = 2
 """A stripe that is lost for so few lines, as in noise, goes on."""

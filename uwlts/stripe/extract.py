@@ -9,13 +9,14 @@ import cv2
 import numpy as np
 
 from uwlts.model.errors import ImageError
+from uwlts.model.stripe import Stripe, StripeStatus
 from uwlts.stripe.candidates import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
 from uwlts.stripe.direct import SeenStripes
 from uwlts.stripe.ends import leave_ends_out
 from uwlts.stripe.learned import find_learned
 from uwlts.stripe.methods import amplitudes, place_centre
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
-from uwlts.stripe.result import LEARNED, PeakRule, Stripe, StripeCandidates, StripeOptions, StripeStatus
+from uwlts.stripe.result import LEARNED, PeakRule, StripeCandidates, StripeOptions
 from uwlts.stripe.search import MARGIN, look_at, search, search_all, with_rivals
 
 _LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
@@ -82,9 +83,15 @@ def extract_candidates(
     return found.candidates(np.arange(len(found.stripe.status)))
 
 
-def see_stripes(image: np.ndarray, *, stripe_along: str, options: StripeOptions, saturation: float) -> SeenStripes:
-    """The stripe as of `extract_stripe`, its ends included, and, under the rule `PeakRule.DIRECT`, the candidates on
-    lines that hold more than one stripe."""
+def see_stripes(
+    image: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions, saturation: float
+) -> SeenStripes:
+    """The stripe as of `extract_stripe`, its ends included, and the candidates on lines that hold more than one.
+
+    These only under the rule `PeakRule.DIRECT`. The stripe of a 3D camera is taken as it is.
+    """
+    if isinstance(image, Stripe):
+        return SeenStripes(image, None, options.threshold_floor, options.half_window_px / 2, 0)
     found = _extracted(image, stripe_along, options, None, saturation)
     seen, jump_px = found.detection, found.options.half_window_px / 2
     if seen is None or options.peak is not PeakRule.DIRECT:
@@ -154,6 +161,15 @@ def _extracted(
         found.status[none & white] = _SATURATED
     stripe = Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
     return _Extracted(stripe, several, profiles, options, detection)
+
+
+def stripe_in(
+    seen: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions = StripeOptions(), saturation: float | None
+) -> Stripe:
+    """The stripe of what a camera saw: that of an image as by `extract_stripe`, that of a 3D camera as it is."""
+    if isinstance(seen, Stripe):
+        return seen
+    return extract_stripe(seen, stripe_along=stripe_along, options=options, saturation=saturation)
 
 
 def warm_up(dtype: np.dtype | type = np.uint8, options: StripeOptions = StripeOptions()) -> None:

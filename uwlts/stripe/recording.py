@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 
 from uwlts.model.errors import CaptureError, ImageError
+from uwlts.model.stripe import StripeStatus
 from uwlts.stripe.direct import SeenStripes, direct_stripes, farther
 from uwlts.stripe.exposures import BracketImages, fused_images
 from uwlts.stripe.extract import extract_stripe, see_stripes
-from uwlts.stripe.result import StripeOptions, StripeSettings, StripeStatus
+from uwlts.stripe.result import StripeOptions, StripeSettings
 
 BLACK = 0.02
 """Share of the full scale that no pixel of a black image reaches: above offset and noise of a covered lens."""
@@ -34,7 +35,8 @@ class FoundStripes:
     Attributes
     ----------
     frame, line : (N,) int; image and profile line of each centre
-    centre_px, amplitude, width_px : (N,); place on the line, height in grey levels and full width at half maximum
+    centre_px, amplitude, width_px : (N,); place on the line, height in grey levels and full width at half maximum; the
+        latter two are NaN where a 3D camera does not give them
     lines_by_status : numbers of the profile lines of all images by the names of `StripeStatus`
     """
 
@@ -59,6 +61,8 @@ def find_stripes(
 ) -> FoundStripes:
     """Find the stripe in all laser images of a recording, such as an opened `uwlts.storage.capture.Capture`.
 
+    Centre lines of a 3D camera are taken as they are.
+
     Images of one place at several exposures are fused (`uwlts.stripe.exposures`); their stripe has the number of the
     longest exposure, and amplitudes are in its grey levels. Under the rule `PeakRule.DIRECT`, the default, reflections
     are left out (`uwlts.stripe.direct`).
@@ -73,9 +77,9 @@ def find_stripes(
     numbers: list[int] = []
 
     def images() -> Iterator[SeenStripes]:
-        for number, image, saturation in fused_images(capture):
+        for number, seen, saturation in fused_images(capture):
             numbers.append(number)
-            yield see_stripes(image, stripe_along=along, options=chosen, saturation=saturation)
+            yield see_stripes(seen, stripe_along=along, options=chosen, saturation=saturation)
             progress(number + 1, len(capture))
 
     for count, stripe in enumerate(direct_stripes(images(), farther=farther(capture.header.sensor))):
@@ -89,6 +93,11 @@ def find_stripes(
         )
     by_status = {status.name.lower(): int(statuses[status]) for status in StripeStatus}
     if statuses[StripeStatus.OK] == 0:
+        if not capture.has_image[capture.laser_on].all():
+            raise CaptureError(
+                f"no stripe in any of the {len(found)} centre lines of {capture.path.name}: is the laser on, the "
+                "camera's threshold low enough, the object in view?"
+            )
         lit = (capture.image(number) for number in np.flatnonzero(capture.laser_on).tolist())
         reason = why_no_stripe(lit, stripe_along=along, full_dn=full_dn)
         raise CaptureError(f"no stripe in any of the {len(found)} laser images of {capture.path.name}: {reason}")
