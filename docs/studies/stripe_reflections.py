@@ -127,13 +127,16 @@ class Rendered:
         """What `find_stripes` needs of a capture."""
         count, sensor = len(self.images), load_sensor("thesis")
         about = {"header": SimpleNamespace(sensor=sensor, saturation_dn=255), "path": Path("rendered.h5")}
-        about |= {"laser_on": np.ones(count, bool), "stage_mm": np.arange(count), "exposure_ms": np.ones(count)}
+        about |= {
+            "has_image": np.ones(count, bool),
+            "laser_on": np.ones(count, bool),
+            "stage_mm": np.arange(count),
+            "exposure_ms": np.ones(count),
+        }
         return _Capture(images=self.images, pose=np.full((count, 4, 4), np.nan), **about)
 
 
 class _Capture(SimpleNamespace):
-    has_image = True
-
     def seen(self, index: int) -> np.ndarray:
         return self.images[index]
 

@@ -31,6 +31,10 @@ _SLACK_PX = 2.0
 _TURN = 0.3
 """Share of a new step in the slope with which a stripe is expected to go on."""
 
+_SMOOTH_PX, _ROUGH, _ROUGHEST = 1.5, 0.03, 0.15
+"""Departure from the straight way that noise explains, cost in jumps of each px beyond it, and the highest: stripes are
+smooth, and chains of speckles are not."""
+
 _SKIPPED, _LOST = 0.1, 0.005
 """Cost, in jumps, of a line whose candidates the path passes by: of a clear stripe, and of a faint one, which noise may
 hide."""
@@ -61,8 +65,9 @@ _BESIDE, _AS_BRIGHT, _LONGEST_CROSSING = 4.0, 0.5, 24
 """Distance, in jumps' lengths, within which stripes may run into each other; share of the brightness from which the
 other one matters; and most lines of a crossing."""
 
-_SPOT_LINES, _FEWEST_BESIDE = 12, 3
-"""Lines on either side among which a stripe shows on so many others, at least."""
+_GRAIN, _FEWEST_BESIDE, _STRAIGHT_PX, _STEEPEST = 3, 4, 2.5, 6.0
+"""A stripe shows within `_GAP` lines on so many others, at least, those next to it aside, over which a grain of speckle
+may reach too, within so many px of a straight line of no more than so many px per line."""
 
 _TAKEN, _OPEN, _REFUSED = 1, 0, -1
 """States of a candidate."""
@@ -145,7 +150,7 @@ class _Paths:
         line, centre, amplitude, width = line[order], *columns
         # Spots of a few lines are no stripe, unless nothing else is there.
         kept = np.zeros(len(line), np.bool_)
-        _keep_stripes(line, centre, amplitude, jump_px, kept)
+        _keep_stripes(line, centre, amplitude, kept)
         line, centre, amplitude, width = (values[kept] for values in (line, centre, amplitude, width))
         single = np.bincount(line)[line] == 1
         state = np.full(len(line), _OPEN, np.int8)
@@ -256,8 +261,10 @@ def _least_cost(
             if apart == 0:
                 break
             moved, allowed = centre[k] - centre[j], jump_px + _SLACK_PX * (apart - 1)
-            if min(abs(moved), abs(moved - slope[j] * apart)) <= allowed:
+            off = min(abs(moved), abs(moved - slope[j] * apart))
+            if off <= allowed:
                 way = result[j] + min(skipped[j], skipped[k]) * (lines_before[k] - lines_before[j] - 1.0)
+                way += min(max(off - _SMOOTH_PX, 0.0) * _ROUGH, _ROUGHEST)
                 if way < best:
                     best, slope[k] = way, slope[j] + _TURN * (moved / apart - slope[j])
         result[k] = best + cost[k]
@@ -265,19 +272,26 @@ def _least_cost(
 
 
 @compiled
-def _keep_stripes(
-    line: np.ndarray, centre: np.ndarray, amplitude: np.ndarray, jump_px: float, kept: np.ndarray
-) -> None:
-    """Mark the candidates that go on over neighbouring lines, and of lines without any such the brightest one."""
+def _keep_stripes(line: np.ndarray, centre: np.ndarray, amplitude: np.ndarray, kept: np.ndarray) -> None:
+    """Mark candidates that go on straight over neighbouring lines, and the brightest ones of lines without any such."""
+    slopes = int(4.0 * _STEEPEST) + 1
     for k in range(line.size):
-        beside = 0
-        for side in (-1, 1):
-            j, last = k + side, line[k]
-            while 0 <= j < line.size and abs(line[j] - line[k]) <= _SPOT_LINES:
-                if line[j] != last and _linked(line, centre, k, j, jump_px):
-                    beside, last = beside + 1, line[j]
-                j += side
-        kept[k] = beside >= _FEWEST_BESIDE
+        for number in range(slopes):
+            slope, beside = _STEEPEST * (2.0 * number / (slopes - 1) - 1.0), 0
+            for side in (-1, 1):
+                j, last = k + side, line[k]
+                while 0 <= j < line.size and abs(line[j] - line[k]) <= _GAP:
+                    away = line[j] - line[k]
+                    if (
+                        abs(away) > _GRAIN
+                        and line[j] != last
+                        and abs(centre[j] - centre[k] - slope * away) <= _STRAIGHT_PX
+                    ):
+                        beside, last = beside + 1, line[j]
+                    j += side
+            if beside >= _FEWEST_BESIDE:
+                kept[k] = True
+                break
     first = 0
     while first < line.size:
         last, best, some = first, first, False
@@ -285,8 +299,8 @@ def _keep_stripes(
             some |= kept[last]
             best = last if amplitude[last] > amplitude[best] else best
             last += 1
-        if not some:
-            kept[best] = True
+        for k in range(first, last):
+            kept[k] |= not some and amplitude[k] >= _AS_BRIGHT * amplitude[best]
         first = last
 
 
