@@ -148,9 +148,9 @@ def _extracted(
     wider, widest = options, min(options.widest_window_px, length // 4)
     while found.too_wide() and 2 * wider.half_window_px <= widest:
         wider = wider.doubled()
-        measured, *others = _found(profiles, wider, clip)
+        measured, seen_several, seen = _found(profiles, wider, clip)
         if not measured.too_wide():
-            found, options, (several, detection) = measured, wider, others
+            found, options, several, detection = measured, wider, seen_several, seen
 
     none = found.status == _NO_STRIPE
     if none.any():
@@ -258,10 +258,11 @@ class _Extracted:
     def candidates(self, lines: np.ndarray, *, least: int = 1) -> StripeCandidates:
         """All stripes on those of some lines (M,) that have at least so many."""
         stripe, seen, options = self.stripe, self.detection, self.options
+        count, along = len(stripe.status), stripe.stripe_along
         if seen is None:
             lines = np.intersect1d(lines, stripe.lines)
-            values = (each[lines] for each in (stripe.centre_px, stripe.amplitude, stripe.width_px))
-            return StripeCandidates(lines, *values, np.zeros(len(lines)), len(stripe.status), stripe.stripe_along)
+            centre, amplitude, width = (each[lines] for each in (stripe.centre_px, stripe.amplitude, stripe.width_px))
+            return StripeCandidates(lines, centre, amplitude, width, np.zeros(len(lines)), count, along)
         line, peak = np.empty(0, np.intp), None
         if len(lines):
             board, heights = cv2.transpose(seen.board), {"coarse": seen.coarse, "fine": seen.fine}
@@ -270,19 +271,15 @@ class _Extracted:
                 enough = np.bincount(line)[line] >= least
                 line, peak = line[enough], peak.keep(enough)
         if peak is None or len(line) == 0:
-            empty = np.empty((3, 0), np.float32)
-            return StripeCandidates(
-                line, empty[0].astype(float), *empty[1:], np.empty(0), len(stripe.status), stripe.stripe_along
-            )
+            amplitude, width = np.empty((2, 0), np.float32)
+            return StripeCandidates(line, np.empty(0), amplitude, width, np.empty(0), count, along)
         centre, amplitude = place_centre(options.method, peak)
         place = peak.start + centre.astype(np.float64)
-        order = np.lexsort((place, line))
         # A matched filter: the squared height over the noise, summed over the profile of a Gaussian.
         certainty = 0.5 * math.sqrt(math.pi) * peak.kernel_sigma() * (amplitude / max(seen.noise, _LEAST_NOISE)) ** 2
-        values = place, amplitude, peak.sigma * np.float32(FWHM_PER_SIGMA), certainty.astype(np.float64)
-        return StripeCandidates(
-            line[order], *(value[order] for value in values), len(stripe.status), stripe.stripe_along
-        )
+        width, order = peak.sigma * np.float32(FWHM_PER_SIGMA), np.lexsort((place, line))
+        place, amplitude, width, certainty = (values[order] for values in (place, amplitude, width, certainty))
+        return StripeCandidates(line[order], place, amplitude, width, certainty.astype(np.float64), count, along)
 
 
 @dataclass(frozen=True)

@@ -183,12 +183,10 @@ class StripeCandidates:
         first = np.searchsorted(self.line, lines)
         found = []
         for number in range(sheets):
-            columns = []
-            for values in (self.centre_px, self.amplitude, self.width_px):
-                column = np.full(self.count, np.nan, values.dtype)
+            centre, amplitude, width = np.full(self.count, np.nan), *np.full((2, self.count), np.nan, np.float32)
+            for column, values in ((centre, self.centre_px), (amplitude, self.amplitude), (width, self.width_px)):
                 column[lines] = values[first + number]
-                columns.append(column)
-            found.append(Stripe(*columns, status.copy(), self.stripe_along))
+            found.append(Stripe(centre, amplitude, width, status.copy(), self.stripe_along))
         return found
 
     def pixels(self) -> np.ndarray:
