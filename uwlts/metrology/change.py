@@ -16,7 +16,7 @@ from uwlts.metrology.registration import Registration, register_to_surface
 from uwlts.model.errors import CaptureError, EvaluationError
 from uwlts.model.input_file import require_regular_file
 from uwlts.model.sensor import Table
-from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty, read_cloud
+from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty, read_cloud, variance_along
 from uwlts.storage.pose_files import MM_PER_UNIT, Unit, checked_unit
 
 _POINTS_PER_DISC = 30
@@ -28,6 +28,8 @@ _DEEP = 3.0
 """Times the disc's diameter: how far along the normal the other surface is looked for unless that is given."""
 _TWO_SIDED = 1.96
 """Standard normal quantile of 97.5 %."""
+_WITHOUT_EDGES = 0.8
+"""Share of the places from which the noise that neighbours share is taken: the others scatter more than noise does."""
 _PAIRS_AT_A_TIME = 2_000_000
 _SAMPLES_PER_DISC = 60
 _MOST_SAMPLES = 3_000_000
@@ -318,7 +320,9 @@ def _normals(places: np.ndarray, surface: np.ndarray, disc: float, *, given: np.
     if given is not None:
         return given[tree.query(places, workers=-1)[1]]
     result = np.empty_like(places)
-    nearest: Any = tree.query(places, k=min(2 * _POINTS_PER_DISC, len(surface)), workers=-1)
+    # About the nearest point: of a place beside the surface the nearest points would lie on a line, its border.
+    middles = surface[tree.query(places, workers=-1)[1]]
+    nearest: Any = tree.query(middles, k=min(2 * _POINTS_PER_DISC, len(surface)), workers=-1)
     for number, (away, neighbours) in enumerate(zip(*nearest, strict=True)):
         kept = neighbours[(away <= max(disc, away[7])) | (np.arange(len(away)) < 8)]
         about = surface[kept] - surface[kept].mean(axis=0)
@@ -349,7 +353,8 @@ def _side(
     deep: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean (P,) of the points of one side along the normals from the places, and its variance (P,)."""
-    count, mean, variance = (np.zeros(len(places)) for _ in range(3))
+    count, mean, rough, stated, other = (np.zeros(len(places)) for _ in range(5))
+    together, alone = np.zeros(len(places)), np.zeros(len(places))
     radius = float(np.hypot(disc / 2, deep))
     for place, point in _neighbours(KDTree(points), places, radius):
         away = points[point] - places[place]
@@ -359,15 +364,47 @@ def _side(
         place, point, along = place[inside], point[inside], along[inside]
         here = np.unique(place)
         number = np.bincount(place, minlength=len(places))
-        total = np.bincount(place, along, minlength=len(places))
-        centre = total / np.maximum(number, 1)
-        scatter = np.bincount(place, (along - centre[place]) ** 2, minlength=len(places)) / np.maximum(number - 1, 1)
+        centre = np.bincount(place, along, minlength=len(places)) / np.maximum(number, 1)
+        off = along - centre[place]
+        scatter = np.bincount(place, off**2, minlength=len(places)) / np.maximum(number - 1, 1)
         count[here], mean[here] = number[here], centre[here]
-        variance[here] = (scatter / np.maximum(number, 1))[here]
+        rough[here] = (scatter / np.maximum(number, 1))[here]
+        if frame is not None:
+            sums, expected = _of_images(place, frame[point], off, scatter, number)
+            together[here], alone[here] = sums[here], expected[here]
         if known is not None:
-            variance[here] = _variance(place, point, normals, known, frame, number, variance)[here]
+            single, shared = _variance(place, point, normals, known, frame, number)
+            stated[here], other[here] = single[here], shared[here]
+    variance = _neighbours_share(together, alone, count) * np.maximum(rough, stated) + other
     mean[count < _FEWEST] = np.nan
     return mean, variance
+
+
+def _of_images(
+    place: np.ndarray, image: np.ndarray, off: np.ndarray, scatter: np.ndarray, number: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Squares of the sums (P,) of each image's points off their place's mean, and what independent points would give.
+
+    The sums of all images of a place add up to zero, which takes the squares of the images' shares off.
+    """
+    group, owner = np.unique(np.column_stack([place, image]), axis=0, return_inverse=True)
+    sums, counts = np.bincount(owner.ravel(), off), np.bincount(owner.ravel())
+    size = len(number)
+    squares = np.bincount(group[:, 0], sums**2, minlength=size)
+    shares = np.bincount(group[:, 0], counts.astype(float) ** 2, minlength=size) / np.maximum(number, 1)
+    return squares, scatter * np.maximum(number - shares, 0)
+
+
+def _neighbours_share(together: np.ndarray, alone: np.ndarray, count: np.ndarray) -> float:
+    """Factor (1 or more) on the variance of means because neighbours in an image err together.
+
+    Of all places at once, as each has few images; those that scatter most, which hold edges, do not count.
+    """
+    full = (count >= _FEWEST) & (alone > 0)
+    if not full.any():
+        return 1.0
+    usual = full & (alone <= np.quantile(alone[full], _WITHOUT_EDGES))
+    return max(1.0, float(together[usual].sum() / alone[usual].sum()))
 
 
 def _variance(
@@ -377,25 +414,20 @@ def _variance(
     known: PointUncertainty,
     frame: np.ndarray | None,
     number: np.ndarray,
-    rough: np.ndarray,
-) -> np.ndarray:
-    """Variance (P,) of the mean of each place's points along the normal: single points, images, and what all share."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Variances (P,) of the mean of each place's points along the normal: of single points; of images and patterns."""
     size, normal, many = len(number), normals[place], np.maximum(number, 1)
-    pairs = known.random_mm2[point]
-    single = sum(
-        (1 if i == j else 2) * pairs[:, column] * normal[:, i] * normal[:, j] for column, (i, j) in enumerate(PAIRS)
-    )
-    result = np.maximum(rough, np.bincount(place, single, minlength=size) / many**2)
+    single = np.bincount(place, variance_along(known.random_mm2[point], normal), minlength=size) / many**2
     moved = np.einsum("ni,ni->n", known.position_mm[point], normal)
     image = np.arange(len(point)) if frame is None else frame[point].astype(np.int64)
     # Points of one image move together, those of different images do not.
     group, owner = np.unique(np.column_stack([place, image]), axis=0, return_inverse=True)
     together = np.bincount(owner.ravel(), moved / many[place])
-    result += np.bincount(group[:, 0], together**2, minlength=size)
+    result = np.bincount(group[:, 0], together**2, minlength=size)
     for pattern in known.patterns_mm:
         along = np.einsum("ni,ni->n", pattern[point], normal)
         result += (np.bincount(place, along, minlength=size) / many) ** 2
-    return result
+    return single, result
 
 
 def _matrices(pairs: np.ndarray) -> np.ndarray:
