@@ -239,26 +239,29 @@ def evaluate(
 @app.command
 def compare(
     cloud: Path,
-    reference: Path,
+    reference: str,
     *,
     out: Path,
     coloured: Path | None = None,
     register: Flag = False,
+    datums: Path | None = None,
     disc_mm: float | None = None,
     deep_mm: float | None = None,
     unit: Literal["mm", "m"] = "mm",
     overwrite: Overwrite = False,
 ) -> None:
-    """Find where a surface differs from an earlier cloud or a mesh by more than the uncertainty.
+    """Find where a surface differs from an earlier cloud, a mesh or an ideal shape by more than the uncertainty.
 
     Example: uwlts compare after.ply before.ply --out change.html
 
     Args:
         cloud: Cloud of the surface (.ply or .h5).
-        reference: Earlier cloud, or a mesh (.stl, .obj, .off, or .ply with faces).
+        reference: Earlier cloud; a mesh (.stl, .obj, .off, or .ply with faces); or an ideal shape: plane, sphere or
+            cylinder to fit one, or a TOML file with its kind and what is known of it (docs/how-to/compare-scans.md).
         out: Page to write, with the figures as JSON beside it.
-        coloured: Also write the places with distance, level of detection and significance to this PLY file.
+        coloured: Also write the places with distance, level of detection and significance to this PLY or LAZ file.
         register: Move the cloud onto the reference first; else both have one frame.
+        datums: TOML file with spheres that hold what has not changed; only points in them count for the registration.
         disc_mm: Diameter over which points are averaged; about 30 points unless given.
         deep_mm: Largest distance that is looked for; three diameters unless given.
         unit: Unit of the reference.
@@ -268,9 +271,11 @@ def compare(
     refuse_unsuitable_page(out, example="change.html", overwrite=overwrite)
     if coloured:
         refuse_unsuitable(coloured, overwrite=overwrite)
-    change = uwlts.compare_clouds(cloud, reference, register=register, disc_mm=disc_mm, deep_mm=deep_mm, unit=unit)
+    change = uwlts.compare_clouds(
+        cloud, reference, register=register, datums=datums, disc_mm=disc_mm, deep_mm=deep_mm, unit=unit
+    )
     show(change.lines())
-    title = f"{cloud.name} against {reference.name}"
+    title = f"{cloud.name} against {Path(reference).name}"
     uwlts.write_change(out, change, title=title, coloured=coloured, overwrite=overwrite)
     print(f"wrote {out} and {out.with_suffix('.json').name}")
 

@@ -83,6 +83,12 @@ class PointUncertainty:
         return np.sqrt(np.einsum("nii->ni", self.covariance_mm2()))
 
 
+def variance_along(pairs: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Variance (N,) along unit directions (N, 3) by covariances (N, 6) in the order of `PAIRS`."""
+    parts = [(1 if i == j else 2) * directions[:, i] * directions[:, j] for i, j in PAIRS]
+    return np.einsum("ni,in->n", pairs, np.stack(parts))
+
+
 @dataclass(frozen=True, eq=False)
 class PointCloud:
     """Points in the object coordinate system (OCS) and what is known of each.

@@ -160,15 +160,19 @@ def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> N
                 file.write("//X Y Z Intensity\n")
                 file.writelines(f"{x!r} {y!r} {z!r} {intensity!s}\n" for x, y, z, intensity in rows)
         elif suffix == ".laz":
-            aside.write_bytes(_laz(cloud))
+            fields = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
+            if cloud.deviation_mm is not None:
+                fields["deviation_mm"] = cloud.deviation_mm
+            aside.write_bytes(laz_content(cloud.points_mm, cloud.intensity, fields))
         else:
             _write_e57(cloud, aside, path)
 
 
-def _laz(cloud: PointCloud) -> bytes:
+def laz_content(points_mm: np.ndarray, intensity: np.ndarray, fields: dict[str, np.ndarray]) -> bytes:
+    """Content of a LAZ file of points (N, 3), their intensity (N,), and fields (N,) by name; see `export_cloud`."""
     laspy = _library("laspy", "LAZ")
     _library("lazrs", "LAZ")
-    points = 1e-3 * cloud.points_mm
+    points = 1e-3 * points_mm
     middle = np.round((points.min(axis=0) + points.max(axis=0)) / 2, 3)
     reach = np.abs(points - middle).max()
     if not reach <= _REACH_M:
@@ -178,14 +182,11 @@ def _laz(cloud: PointCloud) -> bytes:
         )
     header = laspy.LasHeader(version="1.4", point_format=6)
     header.offsets, header.scales = middle, np.full(3, LAZ_STEP_M)
-    extra = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
-    if cloud.deviation_mm is not None:
-        extra["deviation_mm"] = cloud.deviation_mm
-    header.add_extra_dims([laspy.ExtraBytesParams(name=name, type=values.dtype) for name, values in extra.items()])
+    header.add_extra_dims([laspy.ExtraBytesParams(name=name, type=values.dtype) for name, values in fields.items()])
     table = laspy.LasData(header)
     table.x, table.y, table.z = points.T
-    table.intensity = np.rint(np.nan_to_num(cloud.intensity)).clip(*_INTENSITY_LIMITS).astype(np.uint16)
-    for name, values in extra.items():
+    table.intensity = np.rint(np.nan_to_num(intensity)).clip(*_INTENSITY_LIMITS).astype(np.uint16)
+    for name, values in fields.items():
         table[name] = values
     # In memory: the compressor has errors of its own where storage fails.
     content = BytesIO()
