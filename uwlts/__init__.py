@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from uwlts.measurement.verification import Verification, verify
     from uwlts.metrology.change import SurfaceChange, compare_clouds
     from uwlts.metrology.gauge import GaugeStudy, gauge_study
+    from uwlts.metrology.surface_mesh import mesh
     from uwlts.model.calibration import Calibration
     from uwlts.model.errors import Error
     from uwlts.model.library import load_sensor
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
     from uwlts.storage.export_ import export
     from uwlts.storage.import_ import Imported, import_images
+    from uwlts.storage.mesh_file import SurfaceMesh, write_mesh
     from uwlts.storage.mount_files import read_mount, write_mount
     from uwlts.storage.pose_files import read_trajectory
     from uwlts.storage.truth import Truth, read_truth
@@ -75,6 +77,7 @@ __all__ = [
     "Sensor",
     "StripeOptions",
     "SurfaceChange",
+    "SurfaceMesh",
     "ThesisReport",
     "Trajectory",
     "Truth",
@@ -96,6 +99,7 @@ __all__ = [
     "import_images",
     "load_calibration",
     "load_sensor",
+    "mesh",
     "nominal",
     "open_capture",
     "plot",
@@ -117,6 +121,7 @@ __all__ = [
     "write_change",
     "write_cloud",
     "write_evaluation",
+    "write_mesh",
     "write_models",
     "write_mount",
     "write_report",
@@ -144,6 +149,7 @@ _MODULES = {
     "Sensor": "uwlts.model.sensor",
     "StripeOptions": "uwlts.stripe",
     "SurfaceChange": "uwlts.metrology.change",
+    "SurfaceMesh": "uwlts.storage.mesh_file",
     "ThesisReport": "uwlts.thesis.report",
     "Trajectory": "uwlts.model.trajectory",
     "Truth": "uwlts.storage.truth",
@@ -165,6 +171,7 @@ _MODULES = {
     "import_images": "uwlts.storage.import_",
     "load_calibration": "uwlts.storage.calibration_file",
     "load_sensor": "uwlts.model.library",
+    "mesh": "uwlts.metrology.surface_mesh",
     "nominal": "uwlts.optics.nominal",
     "open_capture": "uwlts.storage.capture",
     "plot": "uwlts.report.plot",
@@ -186,6 +193,7 @@ _MODULES = {
     "write_change": "uwlts.report.change_page",
     "write_cloud": "uwlts.storage.cloud",
     "write_evaluation": "uwlts.measurement.evaluation",
+    "write_mesh": "uwlts.storage.mesh_file",
     "write_models": "uwlts.report.model_comparison",
     "write_mount": "uwlts.storage.mount_files",
     "write_report": "uwlts.report.campaign_page",

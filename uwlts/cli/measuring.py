@@ -2,7 +2,9 @@
 
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
 
 import uwlts
 from uwlts.cli.options import (
@@ -19,8 +21,12 @@ from uwlts.cli.options import (
     stripe_settings,
     warn,
 )
+from uwlts.model.errors import OutputError
 from uwlts.runtime.console import progress_bar
 from uwlts.storage.files import refuse_unsuitable, written_aside
+
+Direction = tuple[float, float, float]
+Box = tuple[Direction, Direction]
 
 
 @app.command
@@ -281,6 +287,40 @@ def compare(
 
 
 @app.command
+def mesh(
+    *clouds: Path,
+    out: Path,
+    cube_mm: float | None = None,
+    radius_mm: float | None = None,
+    towards: Annotated[tuple[Direction, ...] | None, Parameter(negative="")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Make a mesh from one or several clouds of one frame, open where nothing was seen, with uncertainty.
+
+    Example: uwlts mesh left.ply right.ply --out pipe.glb
+
+    Args:
+        clouds: Clouds (.ply or .h5); the scans of a merged cloud count on their own.
+        out: Mesh to write: .ply (with the uncertainty of every vertex), .glb (glTF, m) or .stl.
+        cube_mm: Edge of the cubes; walls need to be thicker. A third of the radius, or two thirds of the thinnest wall,
+            unless given.
+        radius_mm: Radius over which points are averaged; holes that are much smaller are closed. For some thirty points
+            and three images unless given.
+        towards: Direction x y z from the surface to the sensor, once for each cloud; -Z of its scan unless given.
+    """
+    from uwlts.storage.mesh_file import MESH_FORMATS
+
+    if out.suffix.lower() not in MESH_FORMATS:
+        raise OutputError(f"{out} ends with none of {', '.join(MESH_FORMATS)}, which name the format of a mesh")
+    refuse_unsuitable(out, overwrite=overwrite)
+    with progress_bar("meshing") as progress:
+        surface = uwlts.mesh(*clouds, cube_mm=cube_mm, radius_mm=radius_mm, towards=towards, progress=progress)
+    show(surface.lines())
+    uwlts.write_mesh(out, surface, overwrite=overwrite)
+    print(f"wrote {out}")
+
+
+@app.command
 def gauge(
     table: Path,
     *,
@@ -444,18 +484,30 @@ def import_images(folder: Path, *, out: Path, description: Path | None = None, o
 
 
 @app.command
-def export(file: Path, *, out: Path, images: Literal["png", "tiff"] = "png", overwrite: Flag = False) -> None:
+def export(
+    file: Path,
+    *,
+    out: Path,
+    images: Literal["png", "tiff"] = "png",
+    region_mm: Box | None = None,
+    at_most: int | None = None,
+    overwrite: Flag = False,
+) -> None:
     """Write a capture as a folder of images that `uwlts import` reads back, or a cloud in another format.
 
     Example: uwlts export scan.ply --out scan.laz
 
     Args:
-        file: Capture (.h5) or cloud (.ply or .h5).
-        out: New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz or
-            .e57.
+        file: Capture (.h5) or cloud (.ply, .h5 or .copc.laz).
+        out: New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
+            .e57 or .copc.laz (an octree for viewers, written a part at a time).
         images: Format of a capture's images; both keep all bits.
+        region_mm: Only the points in a box: x y z of one corner, x y z of the other.
+        at_most: Only an even sample of about so many points.
         overwrite: Replace an existing cloud.
     """
     with progress_bar(f"exporting {file.name}") as progress:
-        written = uwlts.export(file, out, images=images, overwrite=overwrite, progress=progress)
+        written = uwlts.export(
+            file, out, images=images, region_mm=region_mm, at_most=at_most, overwrite=overwrite, progress=progress
+        )
     print(f"wrote {written} images and import.toml to {out}" if out.is_dir() else f"wrote {out} with {written} points")

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from uwlts.metrology.change_reference import (
     Reference,
     ReferencePoints,
-    disc_of,
     local_normals,
     read_datums,
     read_reference,
@@ -23,6 +22,7 @@ from uwlts.metrology.change_reference import (
 )
 from uwlts.metrology.ideal_shapes import IdealShape, place_shape
 from uwlts.metrology.local_means import TWO_SIDED, LocalMeans, local_means
+from uwlts.metrology.point_spacing import disc_of
 from uwlts.metrology.registration import Registration, SampledSurface, register_to_surface
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
@@ -246,13 +246,13 @@ def compare_clouds(
     for name, length in (("disc_mm", disc_mm), ("deep_mm", deep_mm)):
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
-    disc = disc_mm or disc_of(require_enough(new.points_mm, "cloud"))
+    disc = disc_mm or disc_of(require_enough(new.points_mm, "cloud"), new.frame)
     surface = read_reference(reference, unit=unit, disc_mm=disc)
     fixed = None if datums is None else read_datums(datums)
     if isinstance(surface, ReferencePoints):
         require_same_unit(new.points_mm, require_enough(surface.points_mm, "reference"))
         if disc_mm is None and not surface.meshed:
-            disc = max(disc, disc_of(surface.points_mm))
+            disc = max(disc, disc_of(surface.points_mm, surface.frame))
         if fixed is not None and not register:
             raise EvaluationError("datums hold a registration: ask for that, too (--register)")
         sides = _against_points(new, surface, fixed, register=register, disc=disc, deep=deep_mm or _DEEP * disc)

@@ -13,14 +13,13 @@ from scipy.spatial import KDTree
 
 from uwlts.metrology.evaluation import TOWARDS_SENSOR
 from uwlts.metrology.ideal_shapes import KINDS, IdealShape, read_shape
+from uwlts.metrology.point_spacing import POINTS_PER_DISC
 from uwlts.model.errors import CaptureError, DescriptionError, EvaluationError, problems_of
 from uwlts.model.input_file import MOST_TOML_BYTES, parsed_toml, read_text, require_regular_file
 from uwlts.model.sensor import Description, Positive, Vector
 from uwlts.storage.cloud import PointCloud, PointUncertainty, read_cloud
 from uwlts.storage.pose_files import MM_PER_UNIT, Unit, checked_unit
 
-POINTS_PER_DISC = 30
-"""Neighbours in the disc over which points are averaged unless its size is given: their mean's noise is a fifth."""
 _SAMPLES_PER_DISC = 60
 _MOST_SAMPLES = 3_000_000
 _AT_A_TIME = 20_000
@@ -159,14 +158,6 @@ def require_same_unit(cloud: np.ndarray, reference: np.ndarray) -> None:
         )
     if sizes[1] > 1000 * _OTHER_UNIT * sizes[0]:
         raise EvaluationError(f"the cloud is {sizes[0]:.4g} mm across, the reference {sizes[1]:.4g} mm: is it in mm?")
-
-
-def disc_of(points: np.ndarray) -> float:
-    """Diameter of discs that hold some thirty points, from the usual distance of the sixth neighbour."""
-    sample = points[:: max(1, len(points) // 2000)]
-    seventh = KDTree(points).query(sample, k=7)[0][:, 6]
-    # A disc of radius r about a point holds six neighbours more: the area for thirty is five times as large.
-    return float(2 * np.median(seventh) * np.sqrt(POINTS_PER_DISC / 6.0))
 
 
 def local_normals(
