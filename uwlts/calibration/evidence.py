@@ -14,7 +14,7 @@ from uwlts.calibration.target_stripes import TargetStripe, stripe_on_target
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, TargetError, problems_of
 from uwlts.storage.capture import Capture
-from uwlts.stripe import StripeOptions, StripeSettings, extract_stripe, why_no_stripe
+from uwlts.stripe import StripeOptions, StripeSettings, stripe_in, why_no_stripe
 from uwlts.stripe.recording import shown_stripe
 from uwlts.targets import Target, TargetView, parse_target
 
@@ -112,11 +112,11 @@ def air_evidence(
                 warnings.append(f"{capture.path.name}, frame {frame}: left out, {reason}")
             done = _report(progress, "target", done, total)
         positions = np.array([image.stage_mm for image in images[first:]])
-        for frame, image in capture.frames(laser_on=True):
+        for frame in np.flatnonzero(capture.laser_on).tolist():
             here = np.flatnonzero(np.abs(positions - capture.stage_mm[frame]) <= _SAME_POSITION_MM)
             if len(here):
                 place = first + int(here[0])
-                found = _stripe_of(capture, frame, image, stripe, warnings, on=(views[place], targets[0]))
+                found = _stripe_of(capture, frame, stripe, warnings, on=(views[place], targets[0]))
                 stripes[place] = np.vstack([stripes[place], found.pixels])
                 outliers[place] += found.outliers
             else:
@@ -168,8 +168,8 @@ def step_evidence(
         if index is None:
             index = capture.header.medium.refractive_index(wavelength)
             index_std = capture.header.medium.index_uncertainty(wavelength, known)
-        for frame, image in capture.frames(laser_on=True):
-            pixels = _stripe_of(capture, frame, image, stripe, warnings).pixels
+        for frame in np.flatnonzero(capture.laser_on).tolist():
+            pixels = _stripe_of(capture, frame, stripe, warnings).pixels
             if len(pixels):
                 x, y, z = (float(capture.stage_mm[frame]) * np.array(capture.header.stage_direction)).tolist()
                 source = f"{capture.path.name}, frame {frame}"
@@ -185,6 +185,8 @@ def no_stripe_in(captures: Sequence[Capture]) -> str:
         return f"{_names(captures)}: no image with the laser on; take one at every position"
     along, where = header.sensor.camera.stripe_along, f"laser images of {_names(captures)}"
     lit = [image for capture in captures for image in _lit(capture, _LOOKED_AT)]
+    if not lit:
+        return f"no stripe in any of the {count} centre lines of {_names(captures)}: is the laser on?"
     if any(shown_stripe(image, stripe_along=along) == "along" for image in lit):
         return f"the {where} with a stripe were taken at other stage positions than those at which the target was found"
     reason = why_no_stripe(lit, stripe_along=along, full_dn=header.saturation_dn)
@@ -217,8 +219,8 @@ def _why_no_target(captures: Sequence[Capture], target: Target, reasons: Counter
 
 
 def _lit(capture: Capture, most: int) -> Iterator[np.ndarray]:
-    """At most so many of the images with the laser on, from the first to the last."""
-    lit = np.flatnonzero(capture.laser_on)
+    """At most so many of the images with the laser on, from the first to the last; no centre lines."""
+    lit = np.flatnonzero(capture.laser_on & capture.has_image)
     for place in np.unique(np.linspace(0, len(lit) - 1, most).astype(int)) if len(lit) else ():
         yield capture.image(int(lit[place]))
 
@@ -226,22 +228,20 @@ def _lit(capture: Capture, most: int) -> Iterator[np.ndarray]:
 def _stripe_of(
     capture: Capture,
     frame: int,
-    image: np.ndarray,
     settings: StripeSettings,
     warnings: list[str],
     *,
     on: tuple[TargetView, Target] | None = None,
 ) -> TargetStripe:
-    """The stripe in an image, of a target as it was seen there if that is given; none, and a warning, if of no use."""
+    """The stripe of a laser frame, of a target as seen there if that is given; none, and a warning, if of no use."""
     sensor, clip = capture.header.sensor, capture.header.saturation_dn
     along, options = sensor.camera.stripe_along, StripeOptions.of(sensor, settings)
+    seen = capture.seen(frame)
     try:
         if on is None:
-            found = TargetStripe(
-                extract_stripe(image, stripe_along=along, options=options, saturation=clip).pixels(), 0
-            )
+            found = TargetStripe(stripe_in(seen, stripe_along=along, options=options, saturation=clip).pixels(), 0)
         else:
-            found = stripe_on_target(image, *on, stripe_along=along, options=options, saturation=clip)
+            found = stripe_on_target(seen, *on, stripe_along=along, options=options, saturation=clip)
         if len(found.pixels) >= _FEWEST_LINES:
             return found
         reason = f"found on {len(found.pixels)} lines only, at least {_FEWEST_LINES} are of use"

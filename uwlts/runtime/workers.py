@@ -9,6 +9,7 @@ and leaves its processes behind where the command is killed.
 import multiprocessing
 import os
 import signal
+import socket
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -27,6 +28,7 @@ from typing import Any, Literal, TypeVar, assert_never
 
 from uwlts.model.errors import Error, SetupError
 from uwlts.runtime.interrupts import interrupts_kept
+from uwlts.runtime.unfinished import remove_unfinished
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -35,7 +37,9 @@ Send = Callable[[Any], None]
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 _GRACE_S = 5.0
-"""Time in which a process may leave its files in order before it is killed."""
+"""Time in which a process that is stopped may leave its files in order; then it removes those that are not complete."""
+_LEAVE_S = 5.0
+"""Further time, on a busy machine, before it is killed."""
 
 _AHEAD = 2
 """Jobs handed to a cluster per worker: one in work, one waiting, so that no worker waits for this process."""
@@ -137,7 +141,7 @@ class _Processes(Workers):
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         for process in self._processes:
             process.stop(at_once=kind is not None)
-        deadline = time.monotonic() + _GRACE_S
+        deadline = time.monotonic() + _GRACE_S + _LEAVE_S
         for process in self._processes:
             process.end(deadline)
 
@@ -291,7 +295,7 @@ def _serve(connection: Connection) -> None:
     work: Callable[[Any, Send], Any] | None = None
     try:
         signal.signal(signal.SIGTERM, stop)
-        threading.Thread(target=_end_with_parent, daemon=True).start()
+        threading.Thread(target=_end_when_stopped, args=(_signals(),), daemon=True).start()
         with interrupts_kept():
             while (given := connection.recv()) is not None:
                 kind, content = given
@@ -308,15 +312,32 @@ def _serve(connection: Connection) -> None:
     finally:
         # Whatever the interrupt has become on its way through a library, there is nothing to say about it.
         if stopped.is_set():
+            remove_unfinished()
             os._exit(1)
 
 
-def _end_with_parent() -> None:
+def _signals() -> socket.socket:
+    """A socket that can be read as soon as a signal comes, also while a library computes, when no handler runs."""
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    # Without a warning where the socket is full: one signal is enough.
+    signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
+    return reader
+
+
+def _end_when_stopped(signals: socket.socket) -> None:
+    """End the process after a signal, or after the end of the process that has started it."""
     parent = multiprocessing.parent_process()
     assert parent is not None
-    parent.join()
-    os.kill(os.getpid(), signal.SIGTERM)
+    while True:
+        ready = wait([parent.sentinel, signals])
+        if signals in ready and signal.SIGTERM in signals.recv(64):
+            break
+        if parent.sentinel in ready:
+            os.kill(os.getpid(), signal.SIGTERM)
+            break
     time.sleep(_GRACE_S)
+    remove_unfinished()
     os._exit(1)
 
 
