@@ -50,6 +50,7 @@ PAIRS: dict[str, tuple[str, set[str], set[str]]] = {
     "uwlts evaluate": ("uwlts.evaluate", WRITES | {"coloured"}, {"source"}),
     "uwlts compare": ("uwlts.compare_clouds", WRITES | {"coloured"}, set()),
     "uwlts mesh": ("uwlts.mesh", WRITES, set()),
+    "uwlts inspect": ("uwlts.inspect", WRITES | {"coloured"}, set()),
     "uwlts gauge": ("uwlts.gauge_study", WRITES, set()),
     "uwlts report": ("uwlts.write_report", set(), set()),
     "uwlts thesis": ("uwlts.evaluate_thesis", set(), set()),

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from uwlts.measurement.reconstruction import ScanCloud, reconstruct
     from uwlts.measurement.verification import Verification, verify
     from uwlts.metrology.change import SurfaceChange, compare_clouds
+    from uwlts.metrology.features import Inspection
     from uwlts.metrology.gauge import GaugeStudy, gauge_study
+    from uwlts.metrology.inspection import inspect
     from uwlts.metrology.surface_mesh import mesh
     from uwlts.model.calibration import Calibration
     from uwlts.model.errors import Error
@@ -67,6 +69,7 @@ __all__ = [
     "GaugeStudy",
     "GuidedRecording",
     "Imported",
+    "Inspection",
     "Mount",
     "PointCloud",
     "PolynomialCalibration",
@@ -97,6 +100,7 @@ __all__ = [
     "export",
     "gauge_study",
     "import_images",
+    "inspect",
     "load_calibration",
     "load_sensor",
     "mesh",
@@ -139,6 +143,7 @@ _MODULES = {
     "GaugeStudy": "uwlts.metrology.gauge",
     "GuidedRecording": "uwlts.hardware.guided.recording",
     "Imported": "uwlts.storage.import_",
+    "Inspection": "uwlts.metrology.features",
     "Mount": "uwlts.model.mount",
     "PointCloud": "uwlts.storage.cloud",
     "PolynomialCalibration": "uwlts.model.polynomial_calibration",
@@ -169,6 +174,7 @@ _MODULES = {
     "export": "uwlts.storage.export_",
     "gauge_study": "uwlts.metrology.gauge",
     "import_images": "uwlts.storage.import_",
+    "inspect": "uwlts.metrology.inspection",
     "load_calibration": "uwlts.storage.calibration_file",
     "load_sensor": "uwlts.model.library",
     "mesh": "uwlts.metrology.surface_mesh",

@@ -1,6 +1,7 @@
 """Commands that record and measure, from scans to evaluated point clouds, and commands about sensors and files."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -318,6 +319,50 @@ def mesh(
     show(surface.lines())
     uwlts.write_mesh(out, surface, overwrite=overwrite)
     print(f"wrote {out}")
+
+
+@app.command
+def inspect(
+    cloud: Path,
+    kind: Literal["pipe", "weld", "step", "flange", "gap"] = "pipe",
+    *,
+    out: Path | None = None,
+    coloured: Path | None = None,
+    section_mm: float | None = None,
+    wall_mm: float | None = None,
+    false_alarm: float = 0.05,
+    datum: Path | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Find the features of a pipe, weld, step, flange or gap in a cloud and measure them, with uncertainty.
+
+    Example: uwlts inspect pipe.ply --wall-mm 9.5 --out pipe.json
+
+    Args:
+        cloud: Cloud of the object (.ply or .h5).
+        kind: What the cloud shows.
+        out: Findings to write (JSON), each value with its definition and its source.
+        coloured: Also write the cloud with each point's distance from the undamaged surface to this file.
+        section_mm: Length of a section along a pipe (up to twelve unless given) or a weld.
+        wall_mm: Thickness of a pipe's undamaged wall, for the wall that remains.
+        false_alarm: Probability that anything is found on the whole of a pipe's surface where nothing is.
+        datum: Cloud of another face in the same frame, to which a flange's face is to be parallel.
+    """
+    from uwlts.storage.json_files import json_text
+
+    for path in (out, coloured):
+        if path:
+            refuse_unsuitable(path, overwrite=overwrite)
+    measured = uwlts.read_cloud(cloud)
+    found = uwlts.inspect(measured, kind, section_mm=section_mm, wall_mm=wall_mm, false_alarm=false_alarm, datum=datum)
+    show(found.lines())
+    if coloured:
+        uwlts.write_cloud(coloured, replace(measured, deviation_mm=found.deviation_mm), overwrite=overwrite)
+        print(f"wrote {coloured}")
+    if out:
+        with written_aside(out, overwrite=overwrite) as aside:
+            aside.write_text(json_text(found.record(), indent=1), encoding="utf-8")
+        print(f"wrote {out}")
 
 
 @app.command

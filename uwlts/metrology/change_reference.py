@@ -171,9 +171,11 @@ def local_normals(
     if given is not None:
         return given[tree.query(places, workers=-1)[1]]
     result = np.empty_like(places)
+    # About the nearest point: of a place beside the surface the nearest points would lie on a line, its border.
+    middles = surface[tree.query(places, workers=-1)[1]]
     for start in range(0, len(places), _AT_A_TIME):
         here = slice(start, start + _AT_A_TIME)
-        away, neighbours = tree.query(places[here], k=min(2 * POINTS_PER_DISC, len(surface)), workers=-1)
+        away, neighbours = tree.query(middles[here], k=min(2 * POINTS_PER_DISC, len(surface)), workers=-1)
         kept = ((away <= np.maximum(disc_mm, away[:, 7:8])) | (np.arange(away.shape[1]) < 8))[..., None]
         near = surface[neighbours]
         about = kept * (near - (kept * near).sum(axis=1, keepdims=True) / kept.sum(axis=1, keepdims=True))
