@@ -51,6 +51,7 @@ PAIRS: dict[str, tuple[str, set[str], set[str]]] = {
     "uwlts compare": ("uwlts.compare_clouds", WRITES | {"coloured"}, set()),
     "uwlts mesh": ("uwlts.mesh", WRITES, set()),
     "uwlts inspect": ("uwlts.inspect", WRITES | {"coloured"}, set()),
+    "uwlts findings-report": ("uwlts.write_findings", set(), set()),
     "uwlts gauge": ("uwlts.gauge_study", WRITES, set()),
     "uwlts report": ("uwlts.write_report", set(), set()),
     "uwlts thesis": ("uwlts.evaluate_thesis", set(), set()),

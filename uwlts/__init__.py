@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from uwlts.report.certificate import check_certificate
     from uwlts.report.certificate_page import write_certificate
     from uwlts.report.change_page import write_change
+    from uwlts.report.findings_page import write_findings
     from uwlts.report.inventory import describe, design
     from uwlts.report.model_comparison import write_models
     from uwlts.storage.calibration_file import load_calibration, write_calibration
@@ -125,6 +126,7 @@ __all__ = [
     "write_change",
     "write_cloud",
     "write_evaluation",
+    "write_findings",
     "write_mesh",
     "write_models",
     "write_mount",
@@ -199,6 +201,7 @@ _MODULES = {
     "write_change": "uwlts.report.change_page",
     "write_cloud": "uwlts.storage.cloud",
     "write_evaluation": "uwlts.measurement.evaluation",
+    "write_findings": "uwlts.report.findings_page",
     "write_mesh": "uwlts.storage.mesh_file",
     "write_models": "uwlts.report.model_comparison",
     "write_mount": "uwlts.storage.mount_files",

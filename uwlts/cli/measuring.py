@@ -10,6 +10,7 @@ from cyclopts import Parameter
 import uwlts
 from uwlts.cli.options import (
     CalibrationOut,
+    Files,
     Flag,
     Index,
     Method,
@@ -363,6 +364,61 @@ def inspect(
         with written_aside(out, overwrite=overwrite) as aside:
             aside.write_text(json_text(found.record(), indent=1), encoding="utf-8")
         print(f"wrote {out}")
+
+
+@app.command
+def findings_report(
+    cloud: Path,
+    kind: Literal["pipe", "weld", "step", "flange", "gap"] = "pipe",
+    *,
+    out: Path,
+    pdf: Flag = False,
+    title: str | None = None,
+    captures: Files = (),
+    calibration: Path | None = None,
+    certificate: Path | None = None,
+    section_mm: float | None = None,
+    wall_mm: float | None = None,
+    false_alarm: float = 0.05,
+    datum: Path | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Inspect a cloud and write the report for the object's owner: a page, the same as JSON, and as PDF.
+
+    Example: uwlts findings-report pipe.ply --wall-mm 9.5 --calibration water.json --out pipe.html --pdf
+
+    Args:
+        cloud: Cloud of the object.
+        kind: What the cloud shows.
+        out: Page to write, with the findings as JSON beside it.
+        pdf: Also print the page to a PDF beside it, with the Chromium or Chrome that is installed.
+        title: Title of the report.
+        captures: Captures that the cloud was reconstructed from, for the traceability.
+        calibration: Calibration of the sensor, the one that the cloud names.
+        certificate: Its certificate (JSON), whose seal is checked.
+        section_mm: Length of a section along a pipe (up to twelve unless given) or a weld.
+        wall_mm: Thickness of a pipe's undamaged wall, for the wall that remains.
+        false_alarm: Probability that anything is found on the whole of a pipe's surface where nothing is.
+        datum: Cloud of another face in the same frame, to which a flange's face is to be parallel.
+    """
+    found = uwlts.write_findings(
+        cloud,
+        kind,
+        out=out,
+        pdf=pdf,
+        title=title,
+        captures=captures,
+        calibration=calibration,
+        certificate=certificate,
+        section_mm=section_mm,
+        wall_mm=wall_mm,
+        false_alarm=false_alarm,
+        datum=datum,
+        overwrite=overwrite,
+    )
+    show(found.lines())
+    beside = [out.with_suffix(suffix).name for suffix in ((".json", ".pdf") if pdf else (".json",))]
+    print(f"wrote {out}, {', '.join(beside)}")
 
 
 @app.command
