@@ -8,6 +8,7 @@ theirs by propagation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -121,6 +122,7 @@ class LocalSurface:
         height, found = np.zeros(len(places)), np.zeros(len(places), np.bool_)
         normals, variance = np.zeros((len(places), 3)), np.zeros((len(places), 2))
         scans = int(self._scan.max(initial=0)) + 1
+        columns: Any = self._columns
         _patches(
             places,
             grid.points_mm,
@@ -128,7 +130,7 @@ class LocalSurface:
             grid.low,
             grid.shape,
             self.radius_mm,
-            *self._columns,
+            *columns,
             self._patterns if with_uncertainty else self._patterns[:, :0],
             self._scan,
             scans,

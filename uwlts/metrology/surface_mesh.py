@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -184,7 +185,8 @@ def _thinnest_wall(points: SurfacePoints, radius: float) -> float:
     places, tree = points.points_mm, KDTree(points.points_mm)
     chosen = np.arange(len(places))[:: max(1, len(places) // _WALLS_ASKED)]
     # Some of the neighbours are enough: a wall has many points on its other side.
-    found = [np.asarray(each)[:: max(1, len(each) // 200)] for each in tree.query_ball_point(places[chosen], radius)]
+    neighbours: Any = tree.query_ball_point(places[chosen], radius)
+    found = [near[:: max(1, len(near) // 200)] for near in neighbours]
     owner, other = np.repeat(chosen, [len(each) for each in found]), np.concatenate(found)
     opposite = np.einsum("ni,ni->n", points.normals[owner], points.normals[other]) < -_OPPOSITE
     below = -np.einsum("ni,ni->n", places[other] - places[owner], points.normals[owner])

@@ -47,6 +47,10 @@ from uwlts.storage.files import refuse_unsuitable, sha256_of
 from uwlts.storage.json_files import json_text
 
 _BLEMISHES = (FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
+_FIRST = ("depth", "height", "remaining wall")
+"""Values that stand first in the table of findings."""
+_SMALLEST = 1e-6
+"""An uncertainty below it is written as 0."""
 _MOST_PICTURES = 40
 _MOST_DRAWN = 60_000
 _AROUND = 1.2
@@ -202,7 +206,7 @@ def _page(found: Inspection, cloud: PointCloud, sources: list[Source], *, title:
 
 def _with_interval(value: FeatureValue) -> str:
     half = COVERAGE_FACTOR * value.uncertainty
-    if half == 0:
+    if half <= _SMALLEST:
         return f"{value.value:.4g}"
     shown = as_fine_as(value.value, half, digits=2)
     if value.low > value.value - 0.9 * half:
@@ -213,7 +217,9 @@ def _with_interval(value: FeatureValue) -> str:
 
 def _value_row(value: FeatureValue) -> tuple[str, ...]:
     parts = value.random, value.systematic
-    fine = [MISSING if part is None else as_fine_as(part, max(part, 1e-9), digits=2) for part in parts]
+    fine = [
+        MISSING if part is None else as_fine_as(part, part, digits=2) if part > _SMALLEST else "0" for part in parts
+    ]
     return value.name, value.unit, _with_interval(value), *fine
 
 
@@ -222,6 +228,7 @@ def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str,
     if not features:
         return None
     units = {value.name: value.unit for each in features for value in each.values}
+    units = {name: units[name] for name in (*(n for n in _FIRST if n in units), *(n for n in units if n not in _FIRST))}
     rows = []
     for each in features:
         place = " ".join(f"{number:.1f}" for number in each.place_mm)
@@ -257,15 +264,18 @@ def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:
     seen = seen[:: max(1, len(seen) // _MOST_DRAWN)]
     whole = found.features[0] if found.features else None
     pipe = whole if whole is not None and whole.kind == FeatureKind.PIPE else None
-    u, v = _flat(cloud.points_mm[seen], pipe)
-    figure, (axes,) = new_figure(9.0, 5.0)
+    middle = cloud.points_mm[seen].mean(axis=0)
+    u, v = _flat(cloud.points_mm[seen], pipe, middle)
+    # As wide as the surface asks for at a height of 5 inches, with the bar of colours beside it.
+    width = 1.8 + 4.5 * float(np.ptp(u)) / max(float(np.ptp(v)), 1e-9)
+    figure, (axes,) = new_figure(float(np.clip(width, 4.0, 9.0)), 5.0)
     # A robust range: the findings are drawn larger below.
     limit = float(np.quantile(np.abs(found.deviation_mm[seen]), 0.995)) or 1e-3
     style: dict[str, Any] = {"cmap": DEVIATIONS, "vmin": -limit, "vmax": limit, "linewidths": 0, "s": 3}
     colours = axes.scatter(u, v, c=found.deviation_mm[seen], rasterized=True, **style)
     figure.colorbar(colours, ax=axes, label="above the undamaged surface / mm")
     for each in parts:
-        x, y = _flat(each.place_mm[None], pipe)
+        x, y = _flat(each.place_mm[None], pipe, middle)
         axes.annotate(each.name, (x[0], y[0]), xytext=(8, 8), textcoords="offset points", fontsize=8, color=INK)
         axes.plot(x, y, "o", markersize=14, markerfacecolor="none", markeredgecolor=RED)
     labels = ("along the axis / mm", "around the circumference / mm") if pipe else ("first extent / mm", "second / mm")
@@ -273,12 +283,14 @@ def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:
     return png_data_uri(figure, dpi=130)
 
 
-def _flat(points: np.ndarray, pipe: Feature | None) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates (N,) of points on a map: along and around a pipe, else X and Y."""
+def _flat(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates (N,) of points on a map: along and around a pipe from the side of ``middle`` (3,), else X and Y."""
     if pipe is None:
         return points[:, 0], points[:, 1]
     away = (points - pipe.place_mm) @ pipe.axes.T
-    return away[:, 2], np.arctan2(away[:, 1], away[:, 0]) * pipe["diameter"].value / 2
+    side = (middle - pipe.place_mm) @ pipe.axes.T
+    angle = np.arctan2(away[:, 1], away[:, 0]) - np.arctan2(side[1], side[0])
+    return away[:, 2], (np.remainder(angle + np.pi, 2 * np.pi) - np.pi) * pipe["diameter"].value / 2
 
 
 def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:

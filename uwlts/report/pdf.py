@@ -9,14 +9,7 @@ from pathlib import Path
 from uwlts.model.errors import OutputError, SetupError
 from uwlts.storage.files import written_aside
 
-BROWSERS = (
-    "chromium",
-    "chromium-headless-shell",
-    "google-chrome",
-    "google-chrome-stable",
-    "chromium-browser",
-    "msedge",
-)
+BROWSERS = ("chromium", "chromium-headless-shell", "google-chrome", "google-chrome-stable", "msedge")
 """Names on PATH; the environment variable CHROMIUM names another one."""
 
 _PATIENCE_S = 120.0
@@ -55,8 +48,8 @@ def find_browser() -> str:
         if found := shutil.which(name):
             return found
     raise SetupError(
-        "a PDF needs Chromium, Chrome or Edge, and none is on PATH: install one (Debian: apt-get install chromium), let "
-        "the environment variable CHROMIUM name one, or print the page from a browser"
+        "a PDF needs Chromium, Chrome or Edge, and none is on PATH: install one (Debian: apt-get install chromium), "
+        "let the environment variable CHROMIUM name one, or print the page from a browser"
     )
 
 

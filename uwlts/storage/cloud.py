@@ -11,6 +11,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import ArrayLike
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from uwlts.model.errors import CaptureError
@@ -227,7 +228,7 @@ def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None)
 
 
 def read_region(
-    path: str | os.PathLike[str], low_mm: np.ndarray, high_mm: np.ndarray, at_most: int | None = None
+    path: str | os.PathLike[str], low_mm: ArrayLike, high_mm: ArrayLike, at_most: int | None = None
 ) -> PointCloud:
     """The points of a cloud's file in the box from ``low_mm`` (3,) to ``high_mm`` (3,), an even sample of ``at_most``.
 
@@ -239,7 +240,8 @@ def read_region(
     if is_copc(path):
         return _read_copc(path, (low, high), at_most)[0]
     found = [
-        part.selected(((part.points_mm >= low) & (part.points_mm <= high)).all(axis=1)) for part in cloud_parts(path)
+        part.selected(np.flatnonzero(np.all((part.points_mm >= low) & (part.points_mm <= high), axis=1)))
+        for part in cloud_parts(path)
     ]
     whole = joined(found)
     return whole.selected(_every(len(whole), at_most))
