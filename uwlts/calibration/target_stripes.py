@@ -101,15 +101,15 @@ class _Curve:
         """The curve on which most points lie; None where too few do."""
         middle, half = 0.5 * (lines.max() + lines.min()), max(0.5 * np.ptp(lines), 1.0)
         powers = ((lines - middle) / half)[:, None] ** np.arange(3)
-        rng = np.random.default_rng(0)
-        best = np.zeros(len(lines), bool)
-        for chosen in rng.integers(len(lines), size=(_TRIALS, 3)):
-            if np.ptp(lines[chosen]) < 0.1 * half:
-                continue
-            parabola, _, rank, _ = np.linalg.lstsq(powers[chosen], across[chosen], rcond=None)
-            near = np.abs(across - powers @ parabola) <= tolerance_px
-            if rank == 3 and near.sum() > best.sum():
-                best = near
+        chosen = np.sort(np.random.default_rng(0).integers(len(lines), size=(_TRIALS, 3)), axis=1)
+        # Through three different lines there is one parabola.
+        apart = np.diff(lines[chosen], axis=1)
+        chosen = chosen[(apart != 0).all(axis=1) & (np.ptp(lines[chosen], axis=1) >= 0.1 * half)]
+        if not len(chosen):
+            return None
+        parabolas = np.linalg.solve(powers[chosen], across[chosen][:, :, None])[:, :, 0]
+        near = np.abs(across - parabolas @ powers.T) <= tolerance_px
+        best = near[near.sum(axis=1).argmax()]
         if best.sum() < _FEWEST:
             return None
         parabola = np.polynomial.Polynomial.fit(lines[best], across[best], 2)

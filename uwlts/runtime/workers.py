@@ -15,7 +15,7 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for_futures
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -30,6 +30,7 @@ from uwlts.model.errors import Error, SetupError
 from uwlts.runtime.interrupts import interrupts_kept
 from uwlts.runtime.unfinished import remove_unfinished
 
+Item = TypeVar("Item")
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 Send = Callable[[Any], None]
@@ -119,6 +120,24 @@ def work_through(
                 raise SetupError(result.reason)
             results[number] = result
     return [results[number] for number in range(len(jobs))]
+
+
+def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:
+    """Pairs of an item and ``function(item)``, in their order, from one thread per processor.
+
+    For functions that spend their time outside the interpreter, in OpenCV, NumPy or compiled code. Items are taken in
+    this thread, only shortly before their turn. What a function raises leaves this function.
+    """
+    threads = _processors()
+    with ThreadPoolExecutor(threads) as pool:
+        waiting: deque[tuple[Item, Future[Result]]] = deque()
+        for item in items:
+            waiting.append((item, pool.submit(function, item)))
+            if len(waiting) > threads:
+                done, result = waiting.popleft()
+                yield done, result.result()
+        for done, result in waiting:
+            yield done, result.result()
 
 
 def _processors() -> int:
