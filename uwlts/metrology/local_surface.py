@@ -122,15 +122,15 @@ class LocalSurface:
         height, found = np.zeros(len(places)), np.zeros(len(places), np.bool_)
         normals, variance = np.zeros((len(places), 3)), np.zeros((len(places), 2))
         scans = int(self._scan.max(initial=0)) + 1
-        columns: Any = self._columns
-        _patches(
+        fill: Any = _patches
+        fill(
             places,
             grid.points_mm,
             grid.keys,
             grid.low,
             grid.shape,
             self.radius_mm,
-            *columns,
+            *self._columns,
             self._patterns if with_uncertainty else self._patterns[:, :0],
             self._scan,
             scans,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import cast
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -185,7 +185,7 @@ def _thinnest_wall(points: SurfacePoints, radius: float) -> float:
     places, tree = points.points_mm, KDTree(points.points_mm)
     chosen = np.arange(len(places))[:: max(1, len(places) // _WALLS_ASKED)]
     # Some of the neighbours are enough: a wall has many points on its other side.
-    neighbours: Any = tree.query_ball_point(places[chosen], radius)
+    neighbours = cast(list[list[int]], tree.query_ball_point(places[chosen], radius))
     found = [near[:: max(1, len(near) // 200)] for near in neighbours]
     owner, other = np.repeat(chosen, [len(each) for each in found]), np.concatenate(found)
     opposite = np.einsum("ni,ni->n", points.normals[owner], points.normals[other]) < -_OPPOSITE

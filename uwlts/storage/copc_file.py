@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from uwlts.model.errors import CaptureError, OutputError
-from uwlts.model.input_file import require_regular_file
+from uwlts.model.input_file import opened
 from uwlts.storage.files import written_aside
 from uwlts.storage.las_file import INTENSITY_LIMITS, LAZ_STEP_M, las_middle, library
 
@@ -206,9 +206,9 @@ def read_copc(
     CaptureError where it cannot be read or is no COPC; SetupError without laspy.
     """
     laspy, path = library("laspy", "COPC"), Path(path)
-    require_regular_file(path, called="cloud")
     try:
-        with laspy.CopcReader.open(path) as reader:
+        with opened(path, called="cloud") as file:
+            reader = laspy.CopcReader(file)
             total = int(reader.header.point_count)
             box = None if box_mm is None else laspy.copc.Bounds(1e-3 * box_mm[0], 1e-3 * box_mm[1])
             found = _queried(reader, box, at_most)
