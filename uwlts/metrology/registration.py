@@ -25,6 +25,8 @@ _OPEN_SHARE = 1e-3
 _TUKEY = 4.685
 """Of Tukey's biweight, in standard deviations: 95 % efficient for normal noise."""
 _STILL_MM = 1e-5
+_LEAST_MM2 = 1e-8
+"""A tenth of a micrometre, squared, so that no point weighs infinitely."""
 _FEWEST = 50
 _NAMES = "shift along x", "shift along y", "shift along z", "turn about x", "turn about y", "turn about z"
 
@@ -236,12 +238,12 @@ def _by_movement(points: np.ndarray, normals: np.ndarray, middle: np.ndarray, *,
 
 
 def _variance_along(known: PointUncertainty | None, normals: np.ndarray) -> np.ndarray:
-    """Variance (N,) of points along normals (N, 3) by what is not common to all of them; 1 where it is not known."""
+    """Variance (N,) of points along normals (N, 3) by what is not common to them; the least where it is not known."""
     if known is None:
-        return np.ones(len(normals))
+        # The scatter about the surface makes it as large as it is.
+        return np.full(len(normals), _LEAST_MM2)
     moved = np.einsum("ni,ni->n", known.position_mm, normals)
-    # A tenth of a micrometre, so that no point weighs infinitely.
-    return np.maximum(variance_along(known.random_mm2, normals) + moved**2, 1e-8)
+    return np.maximum(variance_along(known.random_mm2, normals) + moved**2, _LEAST_MM2)
 
 
 class _Found(NamedTuple):
