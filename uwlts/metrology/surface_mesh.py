@@ -200,7 +200,7 @@ def _corners_near(cells: np.ndarray) -> np.ndarray:
     """Corners (C, 3) of the cubes that hold points, and of those two around."""
     corners = np.unique(cells, axis=0)
     shape = corners.max(axis=0) + 8
-    keys = np.ravel_multi_index(tuple(corners.T + 3), tuple(shape))
+    keys = np.asarray(np.ravel_multi_index(tuple(corners.T + 3), tuple(shape)))
     for axis in range(3):
         step = int(np.prod(shape[axis + 1 :]))
         keys = np.unique((keys[:, None] + step * np.arange(-2, 4)).ravel())
