@@ -1,8 +1,9 @@
 """What all objects of a scene have: a pose, a finish, and the triangles of free forms."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Hashable
 from functools import lru_cache
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self, cast
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -111,7 +112,8 @@ class FreeForm(Placed, ABC):
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
         """The same arrays, kept for the next caller: they cannot be written to."""
-        return _kept(self)
+        # Frozen models are hashable, which type checkers do not see.
+        return _kept(cast(Hashable, self))
 
 
 @lru_cache(maxsize=4)

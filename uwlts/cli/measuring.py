@@ -158,7 +158,7 @@ def reconstruct(
     index: Index = None,
     method: Method = None,
     stripe: Stripe = (),
-    peak: Literal["strongest", "first", "last"] | None = None,
+    peak: Literal["direct", "strongest", "first", "last"] | None = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Turn a capture into a point cloud.
@@ -180,7 +180,7 @@ def reconstruct(
         pose_unit: Unit of the trajectory's positions.
         clock_offset_s: What to add to the times of the images for those of the trajectory; as the mount says unless
             given.
-        peak: Which of several stripes on a line counts; the strongest, or as the sensor's table [stripe] says.
+        peak: Which of several stripes on a line counts; the direct one, or as the sensor's table [stripe] says.
     """
     refuse_unsuitable(out, overwrite=overwrite)
     known = uwlts.load_calibration(calibration)
