@@ -277,7 +277,7 @@ def draw_curves(curves: dict, path: Path) -> None:
         ax.axhline(0.9, color="#999999", linewidth=0.7)
         ax.set(title=f"{water} water", xlabel="depth of the pit / mm")
     axes[0].set(ylabel="probability of detection")
-    axes[1].legend(frameon=False, title="dots: a90/95")
+    axes[1].legend(frameon=False, title="dots: a90/95", loc="center left")
     figure.savefig(path)
 
 
@@ -291,7 +291,7 @@ def draw_map(folder: Path, path: Path) -> None:
         DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z),
         x,
         c=found.deviation_mm[::2],
-        s=1,
+        s=5,
         cmap="magma",
         vmin=-3,
         vmax=0.2,

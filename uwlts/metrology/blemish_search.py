@@ -52,7 +52,7 @@ _EDGE_STD = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class UnrolledSurface:
     """An unrolled surface: places (N, 2) in mm, heights (N,) over the undamaged shape, and standard deviations (N,)."""
 
     places: np.ndarray
@@ -91,7 +91,7 @@ class BlemishSearch:
     false_alarm: float
 
 
-def search_blemishes(surface: Surface, *, false_alarm: float) -> BlemishSearch:
+def search_blemishes(surface: UnrolledSurface, *, false_alarm: float) -> BlemishSearch:
     """Find where a surface departs from its shape.
 
     ``false_alarm`` is the probability that anything is found, inwards or outwards, where nothing is. The most
@@ -131,7 +131,7 @@ def search_blemishes(surface: Surface, *, false_alarm: float) -> BlemishSearch:
     return BlemishSearch(tuple(found), outliers, plain, level, noise, smallest, false_alarm)
 
 
-def _isolated(surface: Surface, tree: KDTree) -> np.ndarray:
+def _isolated(surface: UnrolledSurface, tree: KDTree) -> np.ndarray:
     """Points (N,) bool that stand alone off their neighbours, on slopes measured by how these scatter."""
     found: Any = tree.query(surface.places, k=_NEIGHBOURS + 1)
     nearest = found[1][:, 1:]
@@ -181,7 +181,7 @@ class _Map:
         return self.spread[self._cells(places)]
 
 
-def _matched(surface: Surface, plain: np.ndarray, radius: float) -> _Map:
+def _matched(surface: UnrolledSurface, plain: np.ndarray, radius: float) -> _Map:
     cell = radius / _CELLS_PER_RADIUS
     places = surface.places[plain]
     origin = surface.places.min(axis=0) - 0.5 * cell
@@ -337,7 +337,7 @@ def _chosen(maps: Sequence[_Map], threshold: float) -> list[_Peak]:
 
 
 def _indication(
-    surface: Surface, plain: np.ndarray, tree: KDTree, maps: Sequence[_Map], peak: _Peak, smallest: float
+    surface: UnrolledSurface, plain: np.ndarray, tree: KDTree, maps: Sequence[_Map], peak: _Peak, smallest: float
 ) -> Indication | None:
     """A peak with its region: cells about it that depart from the surroundings in the same direction."""
     noise, reach, points = float(maps[0].noise_at(peak.place[None])[0]), 3.0 * peak.radius, np.zeros(0, int)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.spatial import KDTree
 
-from uwlts.metrology.blemish_search import BlemishSearch, Indication, Surface
+from uwlts.metrology.blemish_search import BlemishSearch, Indication, UnrolledSurface
 from uwlts.metrology.features import FeatureKind, FeatureValue
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.metrology.propagation import NormalErrors, plain_value
@@ -51,7 +51,7 @@ class Blemish:
 
 
 def measure_blemish(
-    surface: Surface,
+    surface: UnrolledSurface,
     search: BlemishSearch,
     indication: Indication,
     errors: NormalErrors,
@@ -83,6 +83,11 @@ def measure_blemish(
         drawn.append(field.figures(depths + sign * field.depths(moves), edge, None) - plain)
     # Half of the middle 68 %: some draws let the contour run into its neighbour.
     random = 0.5 * np.diff(np.quantile(drawn, [0.1587, 0.8413], axis=0), axis=0)[0]
+    # A noisy contour reaches farther, by about as much as it does with as much noise again; wider quadratics show what
+    # these blur.
+    bias, blur = np.median(drawn, axis=0), field.figures(sign * field.wide @ heights, edge, None) - plain
+    bias[0] = blur[0] = 0.0
+    seen, plain, random = plain, np.maximum(plain - bias, 0), np.sqrt(random**2 + bias**2 + blur**2)
     # The depth at its own place: the deepest of a noisy surface is too deep.
     at = np.array([sign * field.depths_at(deepest, moves) for moves in _draws(rng, noise, images, own)])
     random[0] = float(np.std(at, ddof=1))
@@ -91,7 +96,7 @@ def measure_blemish(
     random[0] = float(np.hypot(random[0], cut))
     common = None
     if own.patterns_mm is not None:
-        moved = [field.figures(depths + sign * field.depths(p), edge, deepest) - plain for p in own.patterns_mm]
+        moved = [field.figures(depths + sign * field.depths(p), edge, deepest) - seen for p in own.patterns_mm]
         common = np.sqrt(np.sum(np.square(moved), axis=0))
     length, width = plain[1], plain[2]
     kind = FeatureKind.PROTRUSION
@@ -122,7 +127,8 @@ class _Field:
     """Depths on a grid (G, 2) of shape ``shape`` as sums over the points ``near`` (n,), by ``rows`` (G, n).
 
     ``region`` (G,) are the cells of the blemish, ``narrow`` (n,) the row of the deepest place by a narrower quadratic,
-    ``richardson`` the factor of the difference that leads to none at all, ``stride`` half a bandwidth in cells.
+    ``richardson`` the factor of the difference that leads to none at all, ``stride`` half a bandwidth in cells,
+    ``wide`` (G, n) the rows of wider quadratics.
     """
 
     near: np.ndarray
@@ -133,10 +139,11 @@ class _Field:
     narrow: np.ndarray
     richardson: float
     stride: int
+    wide: sparse.csr_array
     region: np.ndarray
 
     @classmethod
-    def about(cls, surface: Surface, search: BlemishSearch, indication: Indication) -> _Field:
+    def about(cls, surface: UnrolledSurface, search: BlemishSearch, indication: Indication) -> _Field:
         own = surface.places[indication.points]
         low, high = own.min(axis=0), own.max(axis=0)
         radius = 0.25 * float(np.sum(high - low))
@@ -163,6 +170,7 @@ class _Field:
         smooth = _quadratic_rows(grid, places, tree, bandwidth)
         base = sparse.csr_array(np.column_stack([np.ones(len(grid)), grid]) @ plane)
         rows = sparse.csr_array(smooth - base)
+        wide = sparse.csr_array(_quadratic_rows(grid, places, tree, np.sqrt(2) * bandwidth) - base)
         region = KDTree(places[~ring]).query(grid)[0] < bandwidth
         depths = np.sign(indication.height_mm) * (rows @ heights)
         deepest = int(np.argmax(np.where(region, depths, -np.inf)))
@@ -172,7 +180,7 @@ class _Field:
         row = np.asarray((narrow - sparse.csr_array(np.column_stack([[1.0], at]) @ plane)).todense()).ravel()
         stride = max(1, round(0.5 * bandwidth / cell))
         share = 1 / (1 - (narrower / bandwidth) ** 4)
-        return cls(near, grid + middle, shape, cell, rows, row, share, stride, region)
+        return cls(near, grid + middle, shape, cell, rows, row, share, stride, wide, region)
 
     def depths(self, heights: np.ndarray) -> np.ndarray:
         """Heights (G,) over the undamaged surface for heights (n,) of the points."""

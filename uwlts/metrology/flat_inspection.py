@@ -34,6 +34,9 @@ _LEAST_GAP = 4
 """Lines without a point on the face from which they are a gap; fewer are lines that were lost."""
 _EDGE_STD = 1 / np.sqrt(12.0)
 """Of a point's spacing: an edge lies anywhere between two lines (GUM, 4.3.7)."""
+_EDGE_BLUR = 0.5
+"""Standard uncertainty, in the spacing of points, of where all edges are seen together: the camera's blur lets the
+stripe end up to about a line beyond the edge."""
 _FEWEST_EDGES = 8
 _ROUND_SHARE = 0.08
 """Of a hole's radius: scatter of its edge from which it is none."""
@@ -153,11 +156,12 @@ def inspect_gap(cloud: PointCloud) -> Inspection:
     weights = sign * np.hstack([-rows[0], rows[1]])
     noise = max(float(np.sqrt(np.sum(left**2) / max(len(left) - 4, 1))), edges.spacing * _EDGE_STD)
     random = noise**2 * weights @ weights.T
-    common = None
+    # Both edges are blurred alike, whether or not the cloud states more.
+    common = np.diag([(2 * _EDGE_BLUR * edges.spacing) ** 2, 0.0])
     order = np.concatenate([np.flatnonzero(edges.first), np.flatnonzero(~edges.first)])
     if edges.patterns is not None:
         moved = weights @ (edges.patterns[:, order] @ across).T
-        common = moved @ moved.T
+        common = common + moved @ moved.T
     width, slope = sign * (lines[1] - lines[0])
     kind = FeatureKind.GAP
     angle = float(np.degrees(np.arctan(slope)))
@@ -203,13 +207,14 @@ class _Edges(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Hole:
-    """A circle in a face: middle (2,), radius, covariance (3, 3), changes (M, 3) with patterns, edge points."""
+    """A circle in a face: middle (2,), radius, covariance (3, 3), changes (M, 3) with patterns, edge points, blur."""
 
     middle: np.ndarray
     radius_mm: float
     random: np.ndarray
     moved: np.ndarray | None
     points: np.ndarray
+    blur_mm: float
 
 
 def _require_points(cloud: PointCloud) -> None:
@@ -381,7 +386,7 @@ def _hole(cloud: PointCloud, face: _Face, edges: _Edges) -> _Hole | None:
     moved = None
     if edges.patterns is not None:
         moved = np.einsum("mej,ej->me", edges.patterns, away / distance[:, None]) @ rows.T
-    return _Hole(solved[:2], float(solved[2]), random, moved, edges.points)
+    return _Hole(solved[:2], float(solved[2]), random, moved, edges.points, _EDGE_BLUR * edges.spacing)
 
 
 def _circle(places: np.ndarray) -> np.ndarray:
@@ -402,7 +407,9 @@ def _circle(places: np.ndarray) -> np.ndarray:
 
 
 def _diameter(kind: FeatureKind, name: str, hole: _Hole) -> FeatureValue:
-    common = None if hole.moved is None else 2 * float(np.linalg.norm(hole.moved[:, 2]))
+    # Both ends of a diameter are blurred alike, whether or not the cloud states more.
+    shared = 0.0 if hole.moved is None else float(np.linalg.norm(hole.moved[:, 2]))
+    common = 2 * float(np.hypot(shared, hole.blur_mm))
     return plain_value(kind, name, 2 * hole.radius_mm, 2 * float(np.sqrt(hole.random[2, 2])), common)
 
 

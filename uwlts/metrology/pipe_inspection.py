@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.metrology.blemish_search import BlemishSearch, Surface, search_blemishes
+from uwlts.metrology.blemish_search import BlemishSearch, UnrolledSurface, search_blemishes
 from uwlts.metrology.blemishes import Blemish, measure_blemish
 from uwlts.metrology.features import Feature, FeatureKind, Inspection
 from uwlts.metrology.least_squares import MAD_TO_STD
@@ -109,7 +109,7 @@ def _cut_open(form: PipeForm, chosen: np.ndarray) -> _Seam:
     return _Seam(cut, points, angle, 2 * np.pi)
 
 
-def _unrolled(cloud: PointCloud, form: PipeForm, seam: _Seam) -> Surface:
+def _unrolled(cloud: PointCloud, form: PipeForm, seam: _Seam) -> UnrolledSurface:
     """The surface of the points of a seam."""
     angle = form.angle[seam.points] - seam.cut
     # The form may have moved a little since it was cut open.
@@ -118,11 +118,16 @@ def _unrolled(cloud: PointCloud, form: PipeForm, seam: _Seam) -> Surface:
     heights = form.distance_mm[seam.points]
     spread = max(MAD_TO_STD * float(np.median(np.abs(heights - np.median(heights)))), 1e-9)
     std = errors.single_mm if np.all(errors.single_mm > 0) else np.full(len(heights), spread)
-    return Surface(np.column_stack([form.along_mm[seam.points], form.radius_mm * angle]), heights, std)
+    return UnrolledSurface(np.column_stack([form.along_mm[seam.points], form.radius_mm * angle]), heights, std)
 
 
 def _blemish_features(
-    cloud: PointCloud, form: PipeForm, surface: Surface, search: BlemishSearch, seam: _Seam, wall_mm: float | None
+    cloud: PointCloud,
+    form: PipeForm,
+    surface: UnrolledSurface,
+    search: BlemishSearch,
+    seam: _Seam,
+    wall_mm: float | None,
 ) -> list[Feature]:
     chosen = seam.points
     errors = normal_errors(cloud, chosen, form.outwards[chosen])

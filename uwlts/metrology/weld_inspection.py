@@ -7,7 +7,7 @@ by noise drawn anew (GUM Supplement 1, JCGM 101:2008).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -102,7 +102,8 @@ class _Bead:
 
     ``axes`` (3, 3) are along, across and outwards, ``chosen`` (n,) the points on and beside the bead, ``raw_mm`` (n,)
     their heights over the middle, ``heights_mm`` (n,) those over the plates, ``half_mm`` about half of its width and
-    ``noise_mm`` the standard deviation of a point that gives local means their scatter.
+    ``noise_mm`` the standard deviation of a point that gives local means their scatter; ``wider`` are profiles by wider
+    local quadratics.
     """
 
     axes: np.ndarray
@@ -115,6 +116,7 @@ class _Bead:
     length_mm: float
     noise_mm: float
     profiles: _Profiles
+    wider: _Profiles
 
 
 def _bead_of(cloud: PointCloud, section_mm: float | None) -> _Bead:
@@ -147,12 +149,13 @@ def _bead_of(cloud: PointCloud, section_mm: float | None) -> _Bead:
     cells = np.column_stack([np.ones(count * len(grid)), np.repeat(centres, len(grid)), np.tile(grid, count)])
     part = np.clip((cells[:, 2:] + half) / (2 * half), 0, 1)
     profiles = _Profiles(grid, count, smooth, ((cells * (1 - part), rows[0]), (cells * part, rows[1])))
+    wider = replace(profiles, smooth=_profile_rows(across, section, count, grid, np.sqrt(2) * bandwidth))
     beside = np.abs(cells[:, 2]) > half * (1 + _BEYOND_SHARE)
     means = profiles.of(raw).ravel()[beside]
     expected = np.sqrt(np.asarray(smooth.power(2).sum(axis=1)).ravel()[beside])
     seen = MAD_TO_STD * float(np.nanmedian(np.abs(means) / expected))
     on_bead = np.abs(across) < half
-    return _Bead(axes, middle, chosen, raw, heights, on_bead, half, length, seen, profiles)
+    return _Bead(axes, middle, chosen, raw, heights, on_bead, half, length, seen, profiles, wider)
 
 
 def _found(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
@@ -255,7 +258,10 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
     # The extreme of a noisy profile is too far out, by about as much as with as much noise again.
     extremes = ["undercut" in name or "height" in name for name in _NAMES]
     bias[extremes] = np.maximum(np.nanmean(drawn, axis=0)[extremes], 0)
-    plain, random = np.where(extremes, np.maximum(seen - bias, 0), seen), np.hypot(random, bias)
+    # Wider local quadratics show what these blur.
+    blur = _figures(replace(bead, profiles=bead.wider), bead.raw_mm, whole, toes) - seen
+    random = np.sqrt(random**2 + bias**2 + np.nan_to_num(blur) ** 2)
+    plain = np.where(extremes, np.maximum(seen - bias, 0), seen)
     common = None
     if errors.patterns_mm is not None:
         moved = [_figures(bead, bead.raw_mm + pattern, whole, toes) - seen for pattern in errors.patterns_mm]

@@ -13,7 +13,7 @@ import pytest
 
 import uwlts
 from uwlts.cli import app
-from uwlts.metrology.blemish_search import Surface, search_blemishes
+from uwlts.metrology.blemish_search import UnrolledSurface, search_blemishes
 from uwlts.metrology.features import DEFINITIONS, FeatureKind
 from uwlts.metrology.pipe_form import fit_pipe, pipe_features
 from uwlts.model.errors import EvaluationError
@@ -98,7 +98,7 @@ def field(rng, *, side=50.0, step=0.5, heights=None, correlated=True):
     noise = (drawn[:, :-2] + drawn[:, 1:-1] + drawn[:, 2:]) / np.sqrt(3) if correlated else drawn[:, 2:]
     shape = 0.0 if heights is None else heights(u, v)
     values = (shape + NOISE_MM * noise).ravel()
-    return Surface(np.column_stack([u.ravel(), v.ravel()]), values, np.full(u.size, NOISE_MM))
+    return UnrolledSurface(np.column_stack([u.ravel(), v.ravel()]), values, np.full(u.size, NOISE_MM))
 
 
 @pytest.mark.slow
@@ -116,7 +116,7 @@ def test_outliers_and_holes_are_no_blemishes():
     wild = rng.choice(len(spoilt), 150, replace=False)
     spoilt[wild] -= rng.uniform(0.5, 5, 150)
     seen = np.hypot(*(surface.places - 25).T) > 6
-    search = search_blemishes(Surface(surface.places[seen], spoilt[seen], surface.std[seen]), false_alarm=1e-3)
+    search = search_blemishes(UnrolledSurface(surface.places[seen], spoilt[seen], surface.std[seen]), false_alarm=1e-3)
     assert not search.indications
     kept = np.isin(np.flatnonzero(seen), wild)
     # Two wild neighbours in ten thousand points hide each other now and then.
@@ -263,7 +263,7 @@ def test_a_gap_is_measured():
     gap = uwlts.inspect(cloud, "gap").features[0]
     # Square to the middle line, which leans by 0.02.
     within(gap, {"width": 3.0 * np.cos(0.02), "parallelism": np.degrees(0.008), "flush": 0.3})
-    assert gap["width"].uncertainty < 0.03
+    assert gap["width"].random < 0.03 and gap["width"].uncertainty < 0.2
 
 
 def weld_height(x, y, *, undercut, offset):
