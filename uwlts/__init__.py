@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from uwlts.metrology.features import Inspection
     from uwlts.metrology.gauge import GaugeStudy, gauge_study
     from uwlts.metrology.inspection import inspect
+    from uwlts.metrology.surface_mesh import mesh
     from uwlts.model.calibration import Calibration
     from uwlts.model.errors import Error
     from uwlts.model.library import load_sensor
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from uwlts.report.certificate import check_certificate
     from uwlts.report.certificate_page import write_certificate
     from uwlts.report.change_page import write_change
+    from uwlts.report.findings_page import write_findings
     from uwlts.report.inventory import describe, design
     from uwlts.report.model_comparison import write_models
     from uwlts.storage.calibration_file import load_calibration, write_calibration
@@ -47,6 +49,7 @@ if TYPE_CHECKING:
     from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
     from uwlts.storage.export_ import export
     from uwlts.storage.import_ import Imported, import_images
+    from uwlts.storage.mesh_file import SurfaceMesh, write_mesh
     from uwlts.storage.mount_files import read_mount, write_mount
     from uwlts.storage.pose_files import read_trajectory
     from uwlts.storage.truth import Truth, read_truth
@@ -78,6 +81,7 @@ __all__ = [
     "Sensor",
     "StripeOptions",
     "SurfaceChange",
+    "SurfaceMesh",
     "ThesisReport",
     "Trajectory",
     "Truth",
@@ -100,6 +104,7 @@ __all__ = [
     "inspect",
     "load_calibration",
     "load_sensor",
+    "mesh",
     "nominal",
     "open_capture",
     "plot",
@@ -121,6 +126,8 @@ __all__ = [
     "write_change",
     "write_cloud",
     "write_evaluation",
+    "write_findings",
+    "write_mesh",
     "write_models",
     "write_mount",
     "write_report",
@@ -149,6 +156,7 @@ _MODULES = {
     "Sensor": "uwlts.model.sensor",
     "StripeOptions": "uwlts.stripe",
     "SurfaceChange": "uwlts.metrology.change",
+    "SurfaceMesh": "uwlts.storage.mesh_file",
     "ThesisReport": "uwlts.thesis.report",
     "Trajectory": "uwlts.model.trajectory",
     "Truth": "uwlts.storage.truth",
@@ -171,6 +179,7 @@ _MODULES = {
     "inspect": "uwlts.metrology.inspection",
     "load_calibration": "uwlts.storage.calibration_file",
     "load_sensor": "uwlts.model.library",
+    "mesh": "uwlts.metrology.surface_mesh",
     "nominal": "uwlts.optics.nominal",
     "open_capture": "uwlts.storage.capture",
     "plot": "uwlts.report.plot",
@@ -192,6 +201,8 @@ _MODULES = {
     "write_change": "uwlts.report.change_page",
     "write_cloud": "uwlts.storage.cloud",
     "write_evaluation": "uwlts.measurement.evaluation",
+    "write_findings": "uwlts.report.findings_page",
+    "write_mesh": "uwlts.storage.mesh_file",
     "write_models": "uwlts.report.model_comparison",
     "write_mount": "uwlts.storage.mount_files",
     "write_report": "uwlts.report.campaign_page",

@@ -3,11 +3,14 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
 
 import uwlts
 from uwlts.cli.options import (
     CalibrationOut,
+    Files,
     Flag,
     Index,
     Method,
@@ -20,8 +23,12 @@ from uwlts.cli.options import (
     stripe_settings,
     warn,
 )
+from uwlts.model.errors import OutputError
 from uwlts.runtime.console import progress_bar
 from uwlts.storage.files import refuse_unsuitable, written_aside
+
+Direction = tuple[float, float, float]
+Box = tuple[Direction, Direction]
 
 
 @app.command
@@ -240,26 +247,29 @@ def evaluate(
 @app.command
 def compare(
     cloud: Path,
-    reference: Path,
+    reference: str,
     *,
     out: Path,
     coloured: Path | None = None,
     register: Flag = False,
+    datums: Path | None = None,
     disc_mm: float | None = None,
     deep_mm: float | None = None,
     unit: Literal["mm", "m"] = "mm",
     overwrite: Overwrite = False,
 ) -> None:
-    """Find where a surface differs from an earlier cloud or a mesh by more than the uncertainty.
+    """Find where a surface differs from an earlier cloud, a mesh or an ideal shape by more than the uncertainty.
 
     Example: uwlts compare after.ply before.ply --out change.html
 
     Args:
         cloud: Cloud of the surface (.ply or .h5).
-        reference: Earlier cloud, or a mesh (.stl, .obj, .off, or .ply with faces).
+        reference: Earlier cloud; a mesh (.stl, .obj, .off, or .ply with faces); or an ideal shape: plane, sphere or
+            cylinder to fit one, or a TOML file with its kind and what is known of it (docs/how-to/compare-scans.md).
         out: Page to write, with the figures as JSON beside it.
-        coloured: Also write the places with distance, level of detection and significance to this PLY file.
+        coloured: Also write the places with distance, level of detection and significance to this PLY or LAZ file.
         register: Move the cloud onto the reference first; else both have one frame.
+        datums: TOML file with spheres that hold what has not changed; only points in them count for the registration.
         disc_mm: Diameter over which points are averaged; about 30 points unless given.
         deep_mm: Largest distance that is looked for; three diameters unless given.
         unit: Unit of the reference.
@@ -269,11 +279,47 @@ def compare(
     refuse_unsuitable_page(out, example="change.html", overwrite=overwrite)
     if coloured:
         refuse_unsuitable(coloured, overwrite=overwrite)
-    change = uwlts.compare_clouds(cloud, reference, register=register, disc_mm=disc_mm, deep_mm=deep_mm, unit=unit)
+    change = uwlts.compare_clouds(
+        cloud, reference, register=register, datums=datums, disc_mm=disc_mm, deep_mm=deep_mm, unit=unit
+    )
     show(change.lines())
-    title = f"{cloud.name} against {reference.name}"
+    title = f"{cloud.name} against {Path(reference).name}"
     uwlts.write_change(out, change, title=title, coloured=coloured, overwrite=overwrite)
     print(f"wrote {out} and {out.with_suffix('.json').name}")
+
+
+@app.command
+def mesh(
+    *clouds: Path,
+    out: Path,
+    cube_mm: float | None = None,
+    radius_mm: float | None = None,
+    towards: Annotated[tuple[Direction, ...] | None, Parameter(negative="")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Make a mesh from one or several clouds of one frame, open where nothing was seen, with uncertainty.
+
+    Example: uwlts mesh left.ply right.ply --out pipe.glb
+
+    Args:
+        clouds: Clouds (.ply or .h5); the scans of a merged cloud count on their own.
+        out: Mesh to write: .ply (with the uncertainty of every vertex), .glb (glTF, m) or .stl.
+        cube_mm: Edge of the cubes; walls need to be thicker. A third of the radius, or two thirds of the thinnest wall,
+            unless given.
+        radius_mm: Radius over which points are averaged; holes that are much smaller are closed. For some thirty points
+            and three images unless given.
+        towards: Direction x y z from the surface to the sensor, once for each cloud; -Z of its scan unless given.
+    """
+    from uwlts.storage.mesh_file import MESH_FORMATS
+
+    if out.suffix.lower() not in MESH_FORMATS:
+        raise OutputError(f"{out} ends with none of {', '.join(MESH_FORMATS)}, which name the format of a mesh")
+    refuse_unsuitable(out, overwrite=overwrite)
+    with progress_bar("meshing") as progress:
+        surface = uwlts.mesh(*clouds, cube_mm=cube_mm, radius_mm=radius_mm, towards=towards, progress=progress)
+    show(surface.lines())
+    uwlts.write_mesh(out, surface, overwrite=overwrite)
+    print(f"wrote {out}")
 
 
 @app.command
@@ -318,6 +364,61 @@ def inspect(
         with written_aside(out, overwrite=overwrite) as aside:
             aside.write_text(json_text(found.record(), indent=1), encoding="utf-8")
         print(f"wrote {out}")
+
+
+@app.command
+def findings_report(
+    cloud: Path,
+    kind: Literal["pipe", "weld", "step", "flange", "gap"] = "pipe",
+    *,
+    out: Path,
+    pdf: Flag = False,
+    title: str | None = None,
+    captures: Files = (),
+    calibration: Path | None = None,
+    certificate: Path | None = None,
+    section_mm: float | None = None,
+    wall_mm: float | None = None,
+    false_alarm: float = 0.05,
+    datum: Path | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Inspect a cloud and write the report for the object's owner: a page, the same as JSON, and as PDF.
+
+    Example: uwlts findings-report pipe.ply --wall-mm 9.5 --calibration water.json --out pipe.html --pdf
+
+    Args:
+        cloud: Cloud of the object.
+        kind: What the cloud shows.
+        out: Page to write, with the findings as JSON beside it.
+        pdf: Also print the page to a PDF beside it, with the Chromium or Chrome that is installed.
+        title: Title of the report.
+        captures: Captures that the cloud was reconstructed from, for the traceability.
+        calibration: Calibration of the sensor, the one that the cloud names.
+        certificate: Its certificate (JSON), whose seal is checked.
+        section_mm: Length of a section along a pipe (up to twelve unless given) or a weld.
+        wall_mm: Thickness of a pipe's undamaged wall, for the wall that remains.
+        false_alarm: Probability that anything is found on the whole of a pipe's surface where nothing is.
+        datum: Cloud of another face in the same frame, to which a flange's face is to be parallel.
+    """
+    found = uwlts.write_findings(
+        cloud,
+        kind,
+        out=out,
+        pdf=pdf,
+        title=title,
+        captures=captures,
+        calibration=calibration,
+        certificate=certificate,
+        section_mm=section_mm,
+        wall_mm=wall_mm,
+        false_alarm=false_alarm,
+        datum=datum,
+        overwrite=overwrite,
+    )
+    show(found.lines())
+    beside = [out.with_suffix(suffix).name for suffix in ((".json", ".pdf") if pdf else (".json",))]
+    print(f"wrote {out}, {', '.join(beside)}")
 
 
 @app.command
@@ -484,18 +585,30 @@ def import_images(folder: Path, *, out: Path, description: Path | None = None, o
 
 
 @app.command
-def export(file: Path, *, out: Path, images: Literal["png", "tiff"] = "png", overwrite: Flag = False) -> None:
+def export(
+    file: Path,
+    *,
+    out: Path,
+    images: Literal["png", "tiff"] = "png",
+    region_mm: Box | None = None,
+    at_most: int | None = None,
+    overwrite: Flag = False,
+) -> None:
     """Write a capture as a folder of images that `uwlts import` reads back, or a cloud in another format.
 
     Example: uwlts export scan.ply --out scan.laz
 
     Args:
-        file: Capture (.h5) or cloud (.ply or .h5).
-        out: New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz or
-            .e57.
+        file: Capture (.h5) or cloud (.ply, .h5 or .copc.laz).
+        out: New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
+            .e57 or .copc.laz (an octree for viewers, written a part at a time).
         images: Format of a capture's images; both keep all bits.
+        region_mm: Only the points in a box: x y z of one corner, x y z of the other.
+        at_most: Only an even sample of about so many points.
         overwrite: Replace an existing cloud.
     """
     with progress_bar(f"exporting {file.name}") as progress:
-        written = uwlts.export(file, out, images=images, overwrite=overwrite, progress=progress)
+        written = uwlts.export(
+            file, out, images=images, region_mm=region_mm, at_most=at_most, overwrite=overwrite, progress=progress
+        )
     print(f"wrote {written} images and import.toml to {out}" if out.is_dir() else f"wrote {out} with {written} points")

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from io import BytesIO
 from pathlib import Path
@@ -10,16 +11,21 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import ArrayLike
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from uwlts.model.errors import CaptureError
 from uwlts.model.input_file import opened, parsed_json, require_plain, require_regular_file, shortened
 from uwlts.model.sensor import Description, Table
+from uwlts.storage.copc_file import is_copc, read_copc
 from uwlts.storage.files import written_aside
 from uwlts.storage.hdf5_file import find_dataset, format_of, read_array, read_label, write_label
 
 FORMAT = "uwlts-cloud"
 VERSION = 1
+
+POINTS_OF_PART = 1_000_000
+"""Points of a part of a large cloud."""
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """The coordinates whose covariances are kept of the symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz."""
@@ -39,6 +45,7 @@ _LONGEST_PLY_HEADER = 2**24
 _MOST_PROPERTIES = 1000
 _TYPE_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _TYPE_BYTES |= {f"{kind}{bits}": bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)}
+_Rows = Callable[[int], slice]
 _PIECE = re.compile(rf"{_COMMENT} (\d+)/(\d+) (.*);")
 
 
@@ -152,6 +159,16 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.points_mm)
 
+    def selected(self, selection: slice | np.ndarray) -> "PointCloud":
+        """The cloud of a selection of the points, by a slice, indices or a mask."""
+        known, deviation = self.uncertainty, self.deviation_mm
+        return PointCloud(
+            *(getattr(self, name)[selection] for name in _PER_POINT),
+            deviation_mm=None if deviation is None else deviation[selection],
+            uncertainty=None if known is None else known[selection],
+            metadata=self.metadata,
+        )
+
     @property
     def covariance_mm2(self) -> np.ndarray | None:
         """Covariance (N, 3, 3) of the coordinates of each point, mm2, of all kinds together; None where not known."""
@@ -187,7 +204,7 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
 
 
 def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
-    """Read a cloud from HDF5 where the path ends with ``.h5``, else from PLY, also another program's (x, y, z suffice).
+    """Read a cloud from HDF5 (``.h5``), COPC (``.copc.laz``) or PLY, also another program's (x, y, z suffice).
 
     Fields that CloudCompare has saved again (`scalar_intensity` and so on) are recognised. Missing intensity is NaN,
     missing frame and line are -1, a deviation that is missing or NaN throughout is None.
@@ -203,11 +220,81 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
 def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None) -> tuple[PointCloud, int]:
     """Every n-th point of a cloud's file, ``at_most`` so many, and the number of points in the file; see `read_cloud`.
 
-    Of HDF5 and binary PLY only these are held in memory.
+    Of HDF5 and binary PLY only these are held in memory. Of COPC the upper levels are read, an even sample.
     """
-    path = Path(path)
+    if is_copc(path):
+        return _read_copc(path, None, at_most)
+    return _read_rows(Path(path), lambda count: _every(count, at_most))
+
+
+def read_region(
+    path: str | os.PathLike[str], low_mm: ArrayLike, high_mm: ArrayLike, at_most: int | None = None
+) -> PointCloud:
+    """The points of a cloud's file in the box from ``low_mm`` (3,) to ``high_mm`` (3,), an even sample of ``at_most``.
+
+    Of COPC only the nodes in the box are read, of other files a part at a time.
+    """
+    low, high = np.asarray(low_mm, float), np.asarray(high_mm, float)
+    if low.shape != (3,) or high.shape != (3,) or not (np.isfinite([low, high]).all() and (low < high).all()):
+        raise CaptureError(f"a region goes from x, y, z to larger x, y, z; found {low.tolist()} to {high.tolist()} mm")
+    if is_copc(path):
+        return _read_copc(path, (low, high), at_most)[0]
+    found = [
+        part.selected(np.flatnonzero(np.all((part.points_mm >= low) & (part.points_mm <= high), axis=1)))
+        for part in cloud_parts(path)
+    ]
+    whole = joined(found)
+    return whole.selected(_every(len(whole), at_most))
+
+
+def cloud_parts(path: str | os.PathLike[str], most: int = POINTS_OF_PART) -> Iterator[PointCloud]:
+    """The points of a cloud's file in their order, so many at a time, as `read_cloud` gives all of them.
+
+    Of HDF5 and binary PLY only one part is held in memory.
+    """
+    if is_copc(path):
+        whole = read_cloud(path)
+        yield from (whole.selected(slice(start, start + most)) for start in range(0, max(len(whole), 1), most))
+        return
+    start, total = 0, 1
+    while start < total:
+        part, total = _read_rows(Path(path), lambda _, start=start: slice(start, start + most))
+        yield part
+        start += most
+
+
+def joined(parts: Sequence[PointCloud]) -> PointCloud:
+    """One cloud of the parts of one cloud."""
+    known = [part.uncertainty for part in parts if part.uncertainty is not None]
+    deviations = [part.deviation_mm for part in parts if part.deviation_mm is not None]
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _PER_POINT}
+    return PointCloud(
+        **columns,
+        deviation_mm=np.concatenate(deviations) if len(deviations) == len(parts) else None,
+        uncertainty=PointUncertainty(
+            np.concatenate([each.random_mm2 for each in known]),
+            np.concatenate([each.position_mm for each in known]),
+            np.concatenate([each.patterns_mm for each in known], axis=1),
+        )
+        if len(known) == len(parts)
+        else None,
+        metadata=parts[0].metadata,
+    )
+
+
+def _read_copc(
+    path: str | os.PathLike[str], box: tuple[np.ndarray, np.ndarray] | None, at_most: int | None
+) -> tuple[PointCloud, int]:
+    found = read_copc(path, box_mm=box, at_most=at_most)
+    unknown = np.full(len(found.points_mm), NO_INDEX)
+    frame, line = (unknown if each is None else each for each in (found.frame, found.line))
+    return PointCloud(found.points_mm, found.intensity, frame, line, found.deviation_mm), found.total
+
+
+def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
+    """The rows of a file that are selected by the number of all, and that number."""
     try:
-        return _read_hdf5(path, at_most) if _in_hdf5(path) else _read_ply(path, at_most)
+        return _read_hdf5(path, rows) if _in_hdf5(path) else _read_ply(path, rows)
     except CaptureError as error:
         raise CaptureError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
@@ -219,7 +306,7 @@ def _every(count: int, at_most: int | None) -> slice:
 
 def is_cloud(path: str | os.PathLike[str]) -> bool:
     """Whether a file is a cloud: by its ending, where that is not the captures' as well, and else by its label."""
-    return format_of(Path(path)) == FORMAT if _in_hdf5(path) else Path(path).suffix.lower() == ".ply"
+    return format_of(Path(path)) == FORMAT if _in_hdf5(path) else is_copc(path) or Path(path).suffix.lower() == ".ply"
 
 
 def _in_hdf5(path: str | os.PathLike[str]) -> bool:
@@ -276,7 +363,7 @@ def _metadata(comments: list[str]) -> Table:
     return metadata
 
 
-def _read_ply(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
+def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     with opened(path, called="cloud") as file:
         _refuse_impossible_header(file.read(_LONGEST_PLY_HEADER), size=os.fstat(file.fileno()).st_size, path=path)
     try:
@@ -288,7 +375,7 @@ def _read_ply(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
     if "vertex" not in ply:
         raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
     whole = ply["vertex"].data
-    vertices, names = whole[_every(len(whole), at_most)], whole.dtype.names or ()
+    vertices, names = whole[rows(len(whole))], whole.dtype.names or ()
     if missing := [axis for axis in "xyz" if axis not in names]:
         raise CaptureError(f"the vertices have no {', '.join(missing)}, only {', '.join(names) or 'nothing'}")
     known = {name.removeprefix("scalar_"): name for name in names} | {name: name for name in names}
@@ -375,7 +462,7 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
         aside.write_bytes(content.getbuffer())
 
 
-def _read_hdf5(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
+def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     require_regular_file(path, called="cloud")
     names = [part.name for part in fields(PointUncertainty)]
     try:
@@ -383,10 +470,10 @@ def _read_hdf5(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
             header = read_label(file, _CloudHeader, path=path, format=FORMAT, version=VERSION)
             points = find_dataset(file, "points_mm", path=path)
             total = 0 if points is None or not points.ndim else len(points)
-            every = _every(total, at_most)
-            rows: dict[str, tuple[slice, ...]] = dict.fromkeys((*_KINDS, *names), (every,))
-            rows["patterns_mm"] = (slice(None), every)
-            found = {name: read_array(file, name, path=path, selection=rows[name]) for name in rows}
+            chosen = rows(total)
+            selection: dict[str, tuple[slice, ...]] = dict.fromkeys((*_KINDS, *names), (chosen,))
+            selection["patterns_mm"] = (slice(None), chosen)
+            found = {name: read_array(file, name, path=path, selection=selection[name]) for name in selection}
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
     arrays = {name: values for name, values in found.items() if values is not None}
