@@ -67,6 +67,13 @@ class Trajectory:
     def _rotations(self) -> RotationSpline:
         return RotationSpline(self.times_s, Rotation.from_matrix(self.poses[:, :3, :3]))
 
+    def rates_at(self, times_s: np.ndarray) -> np.ndarray:
+        """Velocities in mm/s and turns in rad/s (M, 6) in the base frame at times (M,) within the path."""
+        wanted = np.asarray(times_s, dtype=np.float64)
+        # SciPy's rates are in the moving frame.
+        turns = self._rotations(wanted).apply(self._rotations(wanted, 1))
+        return np.hstack([self._positions(wanted, 1), turns])
+
     def covariance_at(self, times_s: np.ndarray) -> np.ndarray | None:
         """Covariances (M, 6, 6) at times (M,), linear between those of the poses; None where they are not known."""
         if self.covariance is None:

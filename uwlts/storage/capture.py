@@ -100,6 +100,12 @@ class FrameTable:
         )
 
 
+def sensor_poses(capture: "Capture | FrameTable") -> np.ndarray:
+    """``T_scene_object`` (N, 4, 4) of the sensor's OCS: the poses, or the platform's with the mount of the drawing."""
+    mount = capture.header.T_platform_sensor
+    return capture.pose if mount is None else capture.pose @ np.array(mount)
+
+
 def part_path(path: Path) -> Path:
     """Name of an unfinished recording of ``path``."""
     return path.with_name(path.name + ".part")
