@@ -53,9 +53,6 @@ def main(calibration_path: str, *paths: str) -> None:
         for name, poses in {"ideal": truth.pose @ np.linalg.inv(true), "as reported": reported}.items():
             mount = uwlts.calibrate_mount(profiles[:FOR_THE_MOUNT], poses[:FOR_THE_MOUNT], radius_mm=RADIUS_MM)
             shift, turn = errors(mount, true)
-            middle = (
-                mount.transform()[:3, :3] @ true[:3, :3].T @ true[:3, 3] * 0 + mount.transform()[:3, 3] - true[:3, 3]
-            )
             assert isinstance(mount.artefact, SphereFound)
             centre = np.array(mount.artefact.centre_mm)
             held = profiles[FOR_THE_MOUNT:], poses[FOR_THE_MOUNT:]
