@@ -58,6 +58,8 @@ class Mask(IntFlag):
     """Light that the water scattered once exceeds the standard deviation of the pixel's noise."""
     SECONDARY = 8
     """Light on longer ways exceeds it: from one surface to another, or scattered more often."""
+    PARTICLES = 16
+    """Light of grains and bubbles in the sheet exceeds it."""
 
 
 FAINT_BELOW = 3.0

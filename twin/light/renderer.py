@@ -10,7 +10,7 @@ stand still in the scene, so nothing is rebuilt or recompiled between frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,10 +19,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, opaque, to_jit
+from twin.backend.arrays import Float, Point3f, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, ray_segments
 from twin.light.illumination import Light, lights
 from twin.light.image_sampling import NODE_SPACING_PX, lattice, near_sheet, over_corners, pupil_shifts, widened
+from twin.light.particles import Body, spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet
 from twin.light.walk import Walker
@@ -48,6 +49,10 @@ _WALKS_PER_SAMPLE = 0.15
 """Random walks per cell and sample of a lit pixel in clear water; turbid water takes more."""
 _SPOT_ASIDE = 0.25
 """Slope of an uneven lamp's axis against the camera's over that of the view's corner: the lamp is mounted beside it."""
+_DRIFTING_STREAM = 7
+"""Keeps the random numbers of grains and bubbles apart from those of walks and noise."""
+_CAUSTIC_WAVES, _CAUSTIC_MM = 10, (20.0, 120.0)
+"""Waves of the surface that throw caustics, and their wavelengths in mm where they fall: a rippled tank or harbour."""
 _TRAVEL_STEP_MM = 0.2
 """While the sensor travels, the lit pixels are looked for at places this far apart."""
 _REACH_SHARE = 1.5
@@ -59,12 +64,14 @@ class LaserFrame:
     """Irradiance on the image sensor in W/mm2: (H, W) of the scattered light, and the stripe's pixels on their own.
 
     ``scattered`` is all light on longer ways, ``haze`` (H, W) the part of it that the water scattered once out of the
-    sheet into the camera's rays. ``rows`` and ``columns`` (P,) name the stripe's pixels, ``stripe`` (P,) is the light
+    sheet into the camera's rays, ``particles`` (H, W) that of grains and bubbles in the sheet, which is not among it.
+    ``rows`` and ``columns`` (P,) name the stripe's pixels, ``stripe`` (P,) is the light
     that came straight from the lit surface; ``polarisation`` and ``roughness_um`` (P,) are that surface's, for speckle.
     """
 
     scattered: np.ndarray
     haze: np.ndarray
+    particles: np.ndarray
     rows: np.ndarray
     columns: np.ndarray
     stripe: np.ndarray
@@ -73,7 +80,7 @@ class LaserFrame:
 
     def irradiance(self, factors: np.ndarray | float = 1.0) -> np.ndarray:
         """All light (H, W), the stripe's multiplied by ``factors`` (P,)."""
-        image = self.scattered.copy()
+        image = self.scattered + self.particles
         image[self.rows, self.columns] += self.stripe * factors
         return image
 
@@ -87,15 +94,25 @@ class LaserFrame:
 class Renderer:
     """One sensor in one medium before one scene.
 
-    ``uneven_lamp`` is the relative loss of the lamp's light away from its spot (`Flaws.uneven_lamp`).
+    ``uneven_lamp`` is the relative loss of the lamp's light away from its spot, ``caustics`` the contrast of the day's
+    on surfaces, ``drifting`` how many bodies of each kind drift in a litre (`twin.options.Flaws`).
     DesignError or DescriptionError where the sensor cannot work in the medium, or an object cannot be built.
     """
 
     def __init__(
-        self, sensor: Sensor, medium: Medium, scene: Scene, *, effects: Effects = ALL, uneven_lamp: float = 0.0
+        self,
+        sensor: Sensor,
+        medium: Medium,
+        scene: Scene,
+        *,
+        effects: Effects = ALL,
+        uneven_lamp: float = 0.0,
+        caustics: float = 0.0,
+        drifting: Mapping[Body, float] | None = None,
     ):
         self.design, self._uneven_lamp = check_design(sensor, medium), uneven_lamp
         self.sensor, self.medium, self.effects = sensor, medium, effects
+        self._caustics, self._drifting = caustics, drifting or {}
         wavelength = sensor.laser.wavelength_nm
         self.objects = build_objects(
             scene, medium_index=medium.refractive_index(wavelength), wavelength_nm=wavelength, gloss=effects.gloss
@@ -144,7 +161,31 @@ class Renderer:
         ]
         stripe, polarised, rough = np.concatenate([np.zeros((3, 0), np.float32), *facts], axis=1)
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
-        return LaserFrame(image, haze, rows, columns, stripe, np.clip(polarised / bright, 0, 1), rough / bright)
+        particles, polarisation = self._particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
+        return LaserFrame(image, haze, particles, rows, columns, stripe, polarisation, rough / bright)
+
+    def _particles(self, direct: list[Light], pose: SensorPose, *, seed: int) -> np.ndarray:
+        """Irradiance (H, W) in W/mm2 of grains and bubbles in the sheets."""
+        camera = self.sensor.camera
+        image = np.zeros((camera.height_px, camera.width_px), np.float32)
+        rng = np.random.default_rng([seed, _DRIFTING_STREAM])
+        for body, per_litre in self._drifting.items():
+            for light in direct if per_litre > 0 else ():
+                seen = spots(
+                    self.view,
+                    light,
+                    self.objects,
+                    pose,
+                    body=body,
+                    per_litre=per_litre,
+                    extinction=self.scattering.c,
+                    wavelength_nm=self.sensor.laser.wavelength_nm,
+                    defocus=self.effects.defocus,
+                    sparkle=self.effects.speckle,
+                    rng=rng,
+                )
+                image += seen.drawn(camera.height_px, camera.width_px)
+        return image
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the pixels whose chief rays meet the first laser's own stripe."""
@@ -315,12 +356,35 @@ class Renderer:
         level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
         left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
         radiance = dr.select(segment.valid, self.objects.albedo(segment.si) * left, 0.0)
+        if self._caustics and ambient:
+            radiance *= self._caustic(segment.si.p)
         if self.effects.haze and self.scattering.coefficient > 0:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
             radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
         if self._uneven_lamp and not ambient:
             radiance *= self._lamp_share(segment)
         return (segment.weight * level * radiance,)
+
+    def _caustic(self, p: Point3f) -> Float:
+        """Factor of the day's light on surfaces at points of the scene, focused by waves; about 1 in the mean.
+
+        Rays of a wavy surface of the height h are displaced by the slopes times a length L, so that the irradiance goes
+        as 1 / |det(1 - L H)|, H being h's second derivatives (Lock and Andrews, Am. J. Phys. 60, 397, 1992). Waves of
+        all directions give the trace of L H the standard deviation ``caustics``; folds are cut off.
+        """
+        rng = np.random.default_rng(_DRIFTING_STREAM)
+        angle, phase = rng.uniform(0, 2 * math.pi, (2, _CAUSTIC_WAVES))
+        number = 2 * math.pi / np.geomspace(*_CAUSTIC_MM, _CAUSTIC_WAVES)
+        xx, xy, yy = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
+        for k, a, start in zip(number.tolist(), angle.tolist(), phase.tolist(), strict=True):
+            x, y = math.cos(a), math.sin(a)
+            bend = math.sqrt(2 / _CAUSTIC_WAVES) * dr.cos(k * (x * p.x + y * p.y) + start)
+            xx, xy, yy = xx + x * x * bend, xy + x * y * bend, yy + y * y * bend
+        size = opaque(self._caustics)
+        determinant = (1 - size * xx) * (1 - size * yy) - dr.square(size * xy)
+        # Of a normal trace t the mean of 1 / (1 - t) is 1 + std^2 + 3 std^4 and so on.
+        mean = 1 + dr.square(size) + 3 * dr.square(dr.square(size))
+        return 1 / (dr.clip(dr.abs(determinant), 0.15, 10.0) * mean)
 
     def _lamp_share(self, segment: RaySegment) -> Float:
         """Share of the lamp's light where camera rays end: a round Gaussian spot about the lamp's axis.

@@ -23,7 +23,7 @@ from twin.scene.finish import shift_points
 from twin.scene.motion import Light, Shot
 from twin.scene.platforms import Platform
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
-from twin.sensor.flaws import as_built, delivered, laser_shares, veiled, vignette
+from twin.sensor.flaws import as_built, delivered, dirt, laser_shares, veiled, vignette
 from twin.sensor.peak_finder import INVALID, PeakFinder
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.model.errors import DesignError, OutputError
@@ -108,8 +108,8 @@ class Exposed:
 
     ``image`` (H, W) holds grey values. The others are (H, W), float32, without speckle and noise: ``direct`` is the
     laser's light straight from the lit surfaces; ``scattered_once`` what the water scattered out of the sheet into the
-    camera's rays; ``longer_ways`` what was scattered more often or went from one surface to another; ``even`` that of
-    lamp and day.
+    camera's rays; ``longer_ways`` what was scattered more often or went from one surface to another; ``particles`` that
+    of grains and bubbles in the sheet; ``even`` that of lamp and day.
     """
 
     image: np.ndarray
@@ -117,11 +117,12 @@ class Exposed:
     direct: np.ndarray
     scattered_once: np.ndarray
     longer_ways: np.ndarray
+    particles: np.ndarray
     even: np.ndarray
 
     def total(self) -> np.ndarray:
         """All of them together (H, W)."""
-        return self.direct + self.scattered_once + self.longer_ways + self.even
+        return self.direct + self.scattered_once + self.longer_ways + self.particles + self.even
 
 
 class Studio:
@@ -137,12 +138,20 @@ class Studio:
         self.scene, self.options = scene, options
         self.medium = medium_of(sensor, scene)
         self.renderer = Renderer(
-            self.sensor, self.medium, scene, effects=options.effects, uneven_lamp=flaws.uneven_lamp
+            self.sensor,
+            self.medium,
+            scene,
+            effects=options.effects,
+            uneven_lamp=flaws.uneven_lamp,
+            caustics=flaws.caustics,
+            drifting={"particles": flaws.particles, "bubbles": flaws.bubbles},
         )
         check_scene(self.renderer, scene)
         camera, laser = self.sensor.camera, self.sensor.laser
         self._speckle = Speckle(camera, wavelength_nm=laser.wavelength_nm, seed=options.seed)
         self._vignette = vignette(camera, flaws.vignetting) if flaws.vignetting else 1.0
+        if flaws.dirt and mounted:
+            self._vignette = self._vignette * dirt(camera, flaws.dirt, seed=options.seed)
         self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else 1.0
         self.peak_finder = None
         if flaws.camera_3d:
@@ -308,7 +317,9 @@ class Studio:
         even, laser = self._light_of(shot, index)
         exposure_ms = exposure * self.exposure_ms[shot.light] * shot.exposure
         nothing = np.zeros_like(even)
-        parts = [nothing] * 3 if laser is None else [laser.direct(), laser.haze, laser.scattered - laser.haze]
+        parts = [nothing] * 4
+        if laser is not None:
+            parts = [laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles]
         parts = [self._laser_shares * self._through_lens(part) if part.any() else nothing for part in parts]
         parts = [exposure_ms * self._to_electrons(part) for part in (*parts, self._through_lens(even))]
         image = self._taken(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)

@@ -12,7 +12,9 @@ from typing import Annotated, ClassVar, Literal, Self, TypeVar
 import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, SerializeAsAny, Tag, model_validator
 
-from twin.scene.motion import Motion, Pose
+from twin.scene.forms import AnyForm
+from twin.scene.motion import Motion
+from twin.scene.placed import Flat, Placed, Pose, Reflectance
 from twin.scene.platforms import IdealPath, LinearGuide, Platform, Robot, RotaryTable, Vehicle
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, read_table, validated
@@ -20,13 +22,6 @@ from uwlts.model.sensor import Description, NotNegative, Positive, Table
 from uwlts.targets import CircleTarget, Target, parse_target
 
 Kind = TypeVar("Kind", bound=Description)
-Reflectance = Annotated[float, Field(ge=0, le=1)]
-Finish = Literal["diffuse", "painted", "pvc", "metal"]
-
-TYPICAL_ALPHA = {"diffuse": 1.0, "painted": 0.3, "pvc": 0.15, "metal": 0.3}
-"""GGX roughness: a satin paint, an extruded pipe, ground steel."""
-TYPICAL_ROUGHNESS_UM = {"diffuse": 5.0, "painted": 5.0, "pvc": 5.0, "metal": 1.0}
-"""Rms heights in um. Light out of a diffuse body has run through some um of it, whatever its surface."""
 
 
 def altered(described: Kind, **changes: object) -> Kind:
@@ -40,70 +35,6 @@ def altered(described: Kind, **changes: object) -> Kind:
             for name, change in changes.items()
         }
     )
-
-
-class Placed(Pose):
-    """Base of all objects: a pose and a finish.
-
-    ``finish`` says how the surface reflects: "diffuse" as Lambert's law says; "painted" and "pvc" as a diffuse body
-    under a clear, slightly rough coat; "metal" as rough steel. ``reflectance`` is the diffuse reflectance, that of the
-    body under a coat, and scales the reflection of a metal. The grey values (0 to 1) of picture ``texture`` multiply
-    it, laid out by the shape's own uv coordinates with the picture's last row at v = 0; a relative path starts at the
-    scene's folder. ``alpha`` is the GGX roughness of coat or metal (Walter et al. 2007), ``roughness_um`` the surface's
-    rms height.
-    """
-
-    reflectance: Reflectance = 0.8
-    finish: Finish = "diffuse"
-    alpha: Annotated[float, Field(ge=0.02, le=1)] | None = None
-    roughness_um: NotNegative | None = None
-    texture: str | None = None
-
-    _no_texture: ClassVar[str] = ""
-    """Reason for which objects of a class have no texture."""
-
-    @model_validator(mode="after")
-    def _has_what_its_finish_and_shape_take(self) -> Self:
-        if self.texture is not None and self._no_texture:
-            raise ValueError(f"texture {self.texture} {self._no_texture}")
-        if self.finish == "diffuse" and self.alpha is not None:
-            raise ValueError(f"alpha {self.alpha:g} roughens a gloss, but finish 'diffuse' has none: leave alpha out")
-        return self
-
-    def gloss_alpha(self) -> float:
-        """GGX roughness, the finish's usual one unless given."""
-        return TYPICAL_ALPHA[self.finish] if self.alpha is None else self.alpha
-
-    def rms_height_um(self) -> float:
-        """Rms height of the surface in um, the finish's usual one unless given."""
-        return TYPICAL_ROUGHNESS_UM[self.finish] if self.roughness_um is None else self.roughness_um
-
-    def mirror_share(self) -> float:
-        """Share of light that is reflected as by a plane mirror."""
-        return getattr(self, "mirror", 0.0)
-
-    def polarisation(self) -> float:
-        """Degree of polarisation of scattered laser light: 1 from a metal or mirror, 0 out of a diffuse body."""
-        return 1.0 if self.finish == "metal" or self.mirror_share() > 0 else 0.0
-
-
-class Flat(Placed):
-    """Base of objects with flat faces, which may be mirrors.
-
-    ``mirror`` is the share of light that the faces reflect as plane mirrors do, beside what they scatter: the weak
-    stripe on a mirror comes from a small ``reflectance``.
-    """
-
-    mirror: Reflectance = 0.0
-
-    @model_validator(mode="after")
-    def _reflects_at_most_all(self) -> "Flat":
-        if self.reflectance + self.mirror > 1:
-            both = f"reflectance {self.reflectance:g} and mirror {self.mirror:g}"
-            raise ValueError(f"{both} add up to more than all light: lower one of them")
-        if self.mirror > 0 and self.finish in ("painted", "pvc"):
-            raise ValueError(f"mirror {self.mirror:g} under a coat: a mirror's finish is 'diffuse' or 'metal'")
-        return self
 
 
 class Sphere(Placed):
@@ -142,105 +73,6 @@ class Mesh(Placed):
     kind: Literal["mesh"]
     path: str
     scale: Positive = 1.0
-
-
-class FreeForm(Placed):
-    """Base of free-form surfaces of a shape of their own. They have no uv coordinates for a texture."""
-
-    _no_texture: ClassVar[str] = "on a surface without uv coordinates: leave it out, or use a mesh"
-
-
-class Head(FreeForm):
-    """A dummy head with the stub of its neck, about its own origin; its face looks along -z, its crown lies at +y.
-
-    ``height_mm`` runs from the neck's cut to the crown.
-    """
-
-    kind: Literal["head"]
-    height_mm: Positive = 160.0
-
-
-class Weld(FreeForm):
-    """Rippled weld beads on the front of a plate in its own x-y plane, facing -z (towards the sensor).
-
-    The beads run along the plate's x or y axis (``along``), side by side, ``spacing_mm`` from middle to middle;
-    ``length_mm``, ``width_mm`` and ``height_mm`` are those of one bead, ``ripple_height_mm`` is that from trough to
-    crest. ``irregularity`` is how much width and height change on the way, as a share of them, and how far the path
-    and the ripples' places wander, in widths and pitches; ``seed`` chooses how. Grooves of ``undercut_depth_mm`` and
-    ``undercut_width_mm`` run along both toes of each bead.
-    """
-
-    kind: Literal["weld"]
-    plate_mm: tuple[Positive, Positive] = (80.0, 120.0)
-    beads: Annotated[int, Field(ge=1, le=100)] = 3
-    spacing_mm: Positive = 18.0
-    along: Literal["x", "y"] = "x"
-    length_mm: Positive = 56.0
-    width_mm: Positive = 10.0
-    height_mm: Positive = 2.0
-    ripple_pitch_mm: Positive = 3.0
-    ripple_height_mm: NotNegative = 0.25
-    irregularity: Annotated[float, Field(ge=0, le=0.3)] = 0.06
-    undercut_depth_mm: NotNegative = 0.0
-    undercut_width_mm: Positive = 1.5
-    seed: Annotated[int, Field(ge=0)] = 0
-
-    def bead_reach_mm(self) -> float:
-        """Largest distance that a bead reaches sideways from its straight middle line, irregularities included."""
-        groove = 0.5 * self.undercut_width_mm if self.undercut_depth_mm else 0.0
-        return self.width_mm * (0.5 + 1.5 * self.irregularity) + groove
-
-    @model_validator(mode="after")
-    def _beads_have_room(self) -> "Weld":
-        plate = self.plate_mm if self.along == "x" else self.plate_mm[::-1]
-        wide = (self.beads - 1) * self.spacing_mm + 2 * self.bead_reach_mm()
-        if self.length_mm < self.width_mm:
-            raise ValueError(f"a bead of length_mm {self.length_mm:g} is shorter than its width_mm {self.width_mm:g}")
-        if self.beads > 1 and self.spacing_mm < 2 * self.bead_reach_mm():
-            touching = f"lets beads touch that may be {2 * self.bead_reach_mm():g} mm wide"
-            raise ValueError(f"spacing_mm {self.spacing_mm:g} {touching}")
-        if self.length_mm > plate[0] or wide > plate[1]:
-            raise ValueError(
-                f"beads of {self.length_mm:g} mm along {self.along} and {wide:g} mm together across it do not fit on "
-                f"plate_mm {self.plate_mm[0]:g} x {self.plate_mm[1]:g}"
-            )
-        if self.ripple_height_mm > 2 * (1 - self.irregularity) * self.height_mm:
-            raise ValueError(
-                f"ripple_height_mm {self.ripple_height_mm:g} lets troughs dip into the plate under a bead of height_mm "
-                f"{self.height_mm:g}"
-            )
-        return self
-
-
-class PittedPipe(FreeForm):
-    """The outside of a corroded pipe, not quite round; its axis is its own x axis, its middle its origin.
-
-    The diameter along z is the largest, that square to it the smallest: ``ovality`` is their difference over
-    ``diameter_mm``, their mean. ``pits`` pits of ``pit_diameter_mm`` and ``pit_depth_mm`` lie within 60 deg of -z;
-    ``seed`` chooses where (`twin.scene.shapes.pit_places`).
-    """
-
-    kind: Literal["pitted_pipe"]
-    diameter_mm: Positive = 100.0
-    length_mm: Positive = 120.0
-    ovality: Annotated[float, Field(ge=0, le=0.2)] = 0.0
-    pits: Annotated[int, Field(ge=0, le=1000)] = 12
-    pit_diameter_mm: Positive = 10.0
-    pit_depth_mm: NotNegative = 2.0
-    seed: Annotated[int, Field(ge=0)] = 0
-
-    @model_validator(mode="after")
-    def _has_room_for_pits(self) -> Self:
-        if self.pit_diameter_mm > min(self.length_mm, self.diameter_mm / 2):
-            raise ValueError(
-                f"pit_diameter_mm {self.pit_diameter_mm:g} is more than length_mm {self.length_mm:g}, or than half of "
-                f"diameter_mm {self.diameter_mm:g}"
-            )
-        if self.pit_depth_mm > self.diameter_mm / 4:
-            raise ValueError(
-                f"pit_depth_mm {self.pit_depth_mm:g} is more than a quarter of diameter_mm {self.diameter_mm:g}"
-            )
-        return self
 
 
 class Printed(Placed, ABC):
@@ -352,8 +184,7 @@ class TargetPlate(Printed):
 
 
 AnyObject = Annotated[
-    Sphere | Plate | Block | Pipe | Mesh | Head | Weld | PittedPipe | CirclePlate | TargetPlate,
-    Field(discriminator="kind"),
+    Sphere | Plate | Block | Pipe | Mesh | CirclePlate | TargetPlate | AnyForm, Field(discriminator="kind")
 ]
 
 

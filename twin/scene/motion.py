@@ -6,25 +6,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.spatial.transform import Rotation
 
 from uwlts.model.sensor import Bracket, Description, NotNegative, Vector
 
 Light = Literal["lamp", "laser", "day"]
-
-
-class Pose(Description):
-    """Placement of an object: rotated about the scene's X, then Y, then Z axis, then moved."""
-
-    position_mm: Vector = (0.0, 0.0, 0.0)
-    rotation_deg: Vector = (0.0, 0.0, 0.0)
-
-    def matrix(self) -> np.ndarray:
-        """Rigid transform (4, 4) from the object's own frame to the parent's."""
-        transform = np.eye(4)
-        transform[:3, :3] = Rotation.from_euler("xyz", self.rotation_deg, degrees=True).as_matrix()
-        transform[:3, 3] = self.position_mm
-        return transform
 
 
 class Motion(Description):

@@ -16,8 +16,9 @@ from scipy.interpolate import Akima1DInterpolator, CubicSpline
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from twin.scene.motion import Light, Pose, Shot
+from twin.scene.motion import Light, Shot
 from twin.scene.navigation import Navigation, Sea, drift_of, waves_of
+from twin.scene.placed import Pose
 from uwlts.model.errors import DescriptionError
 from uwlts.model.sensor import Bracket, Description, NotNegative, Positive, Vector
 from uwlts.storage.pose_files import Unit, read_trajectory

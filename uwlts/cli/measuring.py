@@ -151,7 +151,7 @@ def reconstruct(
     index: Index = None,
     method: Method = None,
     stripe: Stripe = (),
-    peak: Literal["strongest", "first", "last"] | None = None,
+    peak: Literal["direct", "strongest", "first", "last"] | None = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Turn a capture into a point cloud.
@@ -175,7 +175,7 @@ def reconstruct(
             given.
         pose_correlation_s: Time over which errors of poses stay alike, inf where all err together. Unless given, poses
             in the capture err each by itself, and those of a trajectory as a navigation filter's of its covariances.
-        peak: Which of several stripes on a line counts; the strongest, or as the sensor's table [stripe] says.
+        peak: Which of several stripes on a line counts; the direct one, or as the sensor's table [stripe] says.
     """
     refuse_unsuitable(out, overwrite=overwrite)
     known = uwlts.load_calibration(calibration)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twin.scene.motion import Pose
 from twin.scene.navigation import Navigation, Sea, drift_of, waves_of
+from twin.scene.placed import Pose
 from twin.scene.platforms import IdealPath, LinearGuide, Robot, RotaryTable, Vehicle
 from uwlts.model.errors import DescriptionError
 from uwlts.model.trajectory import Trajectory
