@@ -386,4 +386,5 @@ def _moved(
     patterns = known.patterns_mm @ rotation.T
     followed = [found.moves_mm(step, points) for step in found.by_cloud]
     patterns = patterns + np.array(followed, np.float32).reshape(patterns.shape)
-    return points, PointUncertainty(pairs, known.position_mm @ rotation.T, patterns.astype(np.float32))
+    poses = None if known.poses_mm is None else known.poses_mm @ rotation.T
+    return points, PointUncertainty(pairs, known.position_mm @ rotation.T, patterns.astype(np.float32), poses)

@@ -108,12 +108,14 @@ def _stated(
     """Variances (P,) of the mean of each place's points along the normal: of single points; of images and patterns."""
     size, normal, many = len(number), normals[place], np.maximum(number, 1)
     single = np.bincount(place, variance_along(known.random_mm2[point], normal), minlength=size) / many**2
-    moved = np.einsum("ni,ni->n", known.position_mm[point], normal)
     image = np.arange(len(point)) if frame is None else frame[point].astype(np.int64)
     # Points of one image move together, those of different images do not.
     group, owner = np.unique(np.column_stack([place, image]), axis=0, return_inverse=True)
-    together = np.bincount(owner.ravel(), moved / many[place])
-    result = np.bincount(group[:, 0], together**2, minlength=size)
+    result = np.zeros(size)
+    for part in known.by_image_mm():
+        moved = np.einsum("ni,ni->n", part[point], normal)
+        together = np.bincount(owner.ravel(), moved / many[place])
+        result += np.bincount(group[:, 0], together**2, minlength=size)
     for pattern in known.patterns_mm:
         along = np.einsum("ni,ni->n", pattern[point], normal)
         result += (np.bincount(place, along, minlength=size) / many) ** 2

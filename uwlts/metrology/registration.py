@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.errors import EvaluationError
-from uwlts.storage.cloud import PointUncertainty, variance_along
+from uwlts.storage.cloud import PointUncertainty, images_along, variance_along
 
 _ROUNDS = 40
 _MOST_POINTS = 50_000
@@ -242,8 +242,8 @@ def _variance_along(known: PointUncertainty | None, normals: np.ndarray) -> np.n
     if known is None:
         # The scatter about the surface makes it as large as it is.
         return np.full(len(normals), _LEAST_MM2)
-    moved = np.einsum("ni,ni->n", known.position_mm, normals)
-    return np.maximum(variance_along(known.random_mm2, normals) + moved**2, _LEAST_MM2)
+    of_images = np.sum(images_along(known, normals) ** 2, axis=0)
+    return np.maximum(variance_along(known.random_mm2, normals) + of_images, _LEAST_MM2)
 
 
 class _Found(NamedTuple):
@@ -296,11 +296,12 @@ class _Shared:
         return np.einsum("mni,ni->mn", self._known.patterns_mm, self._normals) @ answer.T
 
     def position(self, answer: np.ndarray) -> np.ndarray:
-        """Covariance (K, K) of the answer by the positions of images, which move the points of each together."""
+        """Covariance (K, K) of the answer by what moves the points of each image together: its position and pose."""
         if self._known is None:
             return np.zeros((len(answer), len(answer)))
-        along = answer * np.einsum("ni,ni->n", self._known.position_mm, self._normals)
-        return _grouped(along, np.arange(along.shape[1]) if self._frame is None else self._frame)
+        image = np.arange(answer.shape[1]) if self._frame is None else self._frame
+        parts = images_along(self._known, self._normals)
+        return np.sum([_grouped(answer * part, image) for part in parts], axis=0)
 
     def noise(self, answer: np.ndarray, index: np.ndarray) -> np.ndarray:
         """Covariance (K, K) of the answer by the noise of points that are used several times, by index (N,)."""

@@ -20,7 +20,7 @@ from uwlts.metrology.evaluation import TOWARDS_SENSOR
 from uwlts.metrology.local_surface import LocalSurface, SurfacePoints, surface_normals
 from uwlts.metrology.point_spacing import disc_of
 from uwlts.model.errors import EvaluationError
-from uwlts.storage.cloud import PointCloud, read_cloud, variance_along
+from uwlts.storage.cloud import PointCloud, images_along, read_cloud, variance_along
 from uwlts.storage.mesh_file import SurfaceMesh
 
 _BLOCK = 48
@@ -162,7 +162,8 @@ def _surface_points(scans: list[tuple[PointCloud, np.ndarray]], radius: float) -
         weight = np.ones(count)
         if known is not None:
             noise = np.maximum(variance_along(known.random_mm2, normals), 0.0)
-            position = np.einsum("ni,ni->n", known.position_mm, normals)
+            # Shift and turn of an image count together, as if they moved all its points alike.
+            position = np.sqrt(np.sum(images_along(known, normals) ** 2, axis=0))
             patterns[: len(known.patterns_mm)] = np.einsum("mni,ni->mn", known.patterns_mm, normals)
             # A tenth of a micrometre, so that no point weighs infinitely.
             weight = 1.0 / np.maximum(noise + position**2 + np.sum(patterns**2, axis=0), 1e-8)

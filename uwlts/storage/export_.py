@@ -195,7 +195,7 @@ def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> N
             fields = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
             if cloud.deviation_mm is not None:
                 fields["deviation_mm"] = cloud.deviation_mm
-            aside.write_bytes(laz_content(cloud.points_mm, cloud.intensity, fields))
+            aside.write_bytes(laz_content(cloud.points_mm, cloud.intensity, fields, time_s=cloud.time_s))
         else:
             _write_e57(cloud, aside, path)
 

@@ -16,8 +16,10 @@ _REACH_M = LAZ_STEP_M * (2**31 - 1)
 INTENSITY_LIMITS = 0, 2**16 - 1
 
 
-def laz_content(points_mm: np.ndarray, intensity: np.ndarray, fields: dict[str, np.ndarray]) -> bytes:
-    """Content of a LAZ file of points (N, 3), their intensity (N,), and fields (N,) by name."""
+def laz_content(
+    points_mm: np.ndarray, intensity: np.ndarray, fields: dict[str, np.ndarray], *, time_s: np.ndarray | None = None
+) -> bytes:
+    """Content of a LAZ file of points (N, 3), their intensity (N,), fields (N,) by name, and times (N,)."""
     laspy = library("laspy", "LAZ")
     library("lazrs", "LAZ")
     points = 1e-3 * points_mm
@@ -28,6 +30,8 @@ def laz_content(points_mm: np.ndarray, intensity: np.ndarray, fields: dict[str, 
     table = laspy.LasData(header)
     table.x, table.y, table.z = points.T
     table.intensity = np.rint(np.nan_to_num(intensity)).clip(*INTENSITY_LIMITS).astype(np.uint16)
+    if time_s is not None:
+        table.gps_time = time_s
     for name, values in fields.items():
         table[name] = values
     # In memory: the compressor has errors of its own where storage fails.

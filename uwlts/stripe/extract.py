@@ -12,7 +12,7 @@ from uwlts.model.errors import ImageError
 from uwlts.model.stripe import Stripe, StripeStatus
 from uwlts.stripe.candidates import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
 from uwlts.stripe.direct import SeenStripes
-from uwlts.stripe.ends import leave_ends_out
+from uwlts.stripe.ends import copied, leave_ends_out
 from uwlts.stripe.learned import find_learned
 from uwlts.stripe.methods import amplitudes, place_centre
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
@@ -88,10 +88,10 @@ def see_stripes(
 ) -> SeenStripes:
     """The stripe as of `extract_stripe`, its ends included, and the candidates on lines that hold more than one.
 
-    These only under the rule `PeakRule.DIRECT`. The stripe of a 3D camera is taken as it is.
+    These only under the rule `PeakRule.DIRECT`. A 3D camera has found its stripe by itself.
     """
     if isinstance(image, Stripe):
-        return SeenStripes(image, None, options.threshold_floor, options.half_window_px / 2, 0)
+        return SeenStripes(copied(image), None, options.threshold_floor, options.half_window_px / 2, options.end_lines)
     found = _extracted(image, stripe_along, options, None, saturation)
     seen, jump_px = found.detection, found.options.half_window_px / 2
     if seen is None or options.peak is not PeakRule.DIRECT:
@@ -171,15 +171,7 @@ def stripe_in(
     Of the ``options`` a 3D camera's stripe takes `StripeOptions.end_lines` alone.
     """
     if isinstance(seen, Stripe):
-        if not options.end_lines:
-            return seen
-        good, jump_px = seen.status == _OK, options.half_window_px / 2
-        ends = _half_lit(good, seen.centre_px, lines=options.end_lines, jump_px=jump_px)
-        centre, amplitude, width, status = (
-            each.copy() for each in (seen.centre_px, seen.amplitude, seen.width_px, seen.status)
-        )
-        centre[ends], amplitude[ends], width[ends], status[ends] = np.nan, np.nan, np.nan, _END
-        return Stripe(centre, amplitude, width, status, seen.stripe_along)
+        return leave_ends_out(copied(seen), lines=options.end_lines, jump_px=options.half_window_px / 2)
     return extract_stripe(seen, stripe_along=stripe_along, options=options, saturation=saturation)
 
 
