@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from uwlts.measurement.verification import Verification, verify
     from uwlts.metrology.change import SurfaceChange, compare_clouds
     from uwlts.metrology.gauge import GaugeStudy, gauge_study
+    from uwlts.metrology.scan_registration import RegisteredScans, register
     from uwlts.model.calibration import Calibration
     from uwlts.model.errors import Error
     from uwlts.model.library import load_sensor
@@ -40,13 +41,14 @@ if TYPE_CHECKING:
     from uwlts.report.change_page import write_change
     from uwlts.report.inventory import describe, design
     from uwlts.report.model_comparison import write_models
+    from uwlts.report.registration_page import write_registration
     from uwlts.storage.calibration_file import load_calibration, write_calibration
     from uwlts.storage.capture import Capture, Frame, open_capture
     from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
     from uwlts.storage.export_ import export
     from uwlts.storage.import_ import Imported, import_images
     from uwlts.storage.mount_files import read_mount, write_mount
-    from uwlts.storage.pose_files import read_trajectory
+    from uwlts.storage.pose_files import read_poses, read_trajectory, write_poses
     from uwlts.storage.truth import Truth, read_truth
     from uwlts.stripe import StripeOptions
     from uwlts.thesis.report import ThesisReport, evaluate_thesis
@@ -70,6 +72,7 @@ __all__ = [
     "PolynomialCalibration",
     "PolynomialResult",
     "Refreshed",
+    "RegisteredScans",
     "Report",
     "ScanCloud",
     "Sensor",
@@ -101,11 +104,13 @@ __all__ = [
     "plot",
     "read_cloud",
     "read_mount",
+    "read_poses",
     "read_trajectory",
     "read_truth",
     "reconstruct",
     "record_guided",
     "refresh",
+    "register",
     "scan",
     "serve_desk",
     "verify",
@@ -119,6 +124,8 @@ __all__ = [
     "write_evaluation",
     "write_models",
     "write_mount",
+    "write_poses",
+    "write_registration",
     "write_report",
 ]
 
@@ -139,6 +146,7 @@ _MODULES = {
     "PolynomialCalibration": "uwlts.model.polynomial_calibration",
     "PolynomialResult": "uwlts.calibration.polynomial",
     "Refreshed": "uwlts.calibration.joint.refresh",
+    "RegisteredScans": "uwlts.metrology.scan_registration",
     "Report": "uwlts.report.campaign_page",
     "ScanCloud": "uwlts.measurement.reconstruction",
     "Sensor": "uwlts.model.sensor",
@@ -170,11 +178,13 @@ _MODULES = {
     "plot": "uwlts.report.plot",
     "read_cloud": "uwlts.storage.cloud",
     "read_mount": "uwlts.storage.mount_files",
+    "read_poses": "uwlts.storage.pose_files",
     "read_trajectory": "uwlts.storage.pose_files",
     "read_truth": "uwlts.storage.truth",
     "reconstruct": "uwlts.measurement.reconstruction",
     "record_guided": "uwlts.desk.guided",
     "refresh": "uwlts.calibration.joint.refresh",
+    "register": "uwlts.metrology.scan_registration",
     "scan": "uwlts.hardware.scanning",
     "serve_desk": "uwlts.desk.operator_page",
     "verify": "uwlts.measurement.verification",
@@ -188,6 +198,8 @@ _MODULES = {
     "write_evaluation": "uwlts.measurement.evaluation",
     "write_models": "uwlts.report.model_comparison",
     "write_mount": "uwlts.storage.mount_files",
+    "write_poses": "uwlts.storage.pose_files",
+    "write_registration": "uwlts.report.registration_page",
     "write_report": "uwlts.report.campaign_page",
 }
 

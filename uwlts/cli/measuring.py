@@ -276,6 +276,70 @@ def compare(
 
 
 @app.command
+def register(
+    *clouds: Path,
+    out: Path,
+    page: Path | None = None,
+    poses_out: Path | None = None,
+    poses: Path | None = None,
+    pose_format: str = "matrix",
+    pose_unit: Literal["mm", "m"] = "mm",
+    start_std_mm: float | None = None,
+    start_std_deg: float | None = None,
+    search: Flag = False,
+    sphere_mm: float | None = None,
+    reach_mm: float | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Bring scans that overlap into the frame of the first, and merge them into one cloud with its uncertainty.
+
+    Example: uwlts register top.ply left.ply right.ply --out pipe.ply --page pipe.html
+
+    Args:
+        clouds: Two or more clouds (.ply or .h5), in any order.
+        out: Merged cloud to write (.ply or .h5).
+        page: Page to write, with all figures, poses and their covariance as JSON beside it.
+        poses_out: Poses of the scans to write (CSV, matrix, mm).
+        poses: CSV file with the pose of every scan at the start, in the order of the clouds; the scans' frames are
+            taken as one unless given.
+        pose_format: Format of the poses: matrix, quaternion-xyzw, euler-ZYX-deg and others, as for uwlts reconstruct.
+        pose_unit: Unit of the poses' positions.
+        start_std_mm: Standard uncertainty of the start along each axis: it counts as evidence then.
+        start_std_deg: The same of its turns.
+        search: Search the start by the shape of the surfaces, or by spheres.
+        sphere_mm: Diameter of spheres in the scene that tie scans together.
+        reach_mm: How far overlapping surfaces lie apart at the start, at most; a 20th of a scan's size unless given.
+    """
+    from uwlts.report.page_toolkit import refuse_unsuitable_page
+
+    for path in (out, poses_out):
+        if path:
+            refuse_unsuitable(path, overwrite=overwrite)
+    if page:
+        refuse_unsuitable_page(page, example="registration.html", overwrite=overwrite)
+    start = None if poses is None else uwlts.read_poses(poses, pose_format=pose_format, unit=pose_unit)[0]
+    with progress_bar(f"registering {len(clouds)} scans") as progress:
+        found = uwlts.register(
+            clouds,
+            poses=start,
+            start_std_mm=start_std_mm,
+            start_std_deg=start_std_deg,
+            search=search,
+            sphere_mm=sphere_mm,
+            reach_mm=reach_mm,
+            progress=progress,
+        )
+    show(found.lines())
+    uwlts.write_cloud(out, found.cloud, overwrite=overwrite)
+    if poses_out:
+        uwlts.write_poses(poses_out, found.poses, overwrite=overwrite)
+    if page:
+        uwlts.write_registration(page, found, overwrite=overwrite)
+    written = [str(path) for path in (out, poses_out, page) if path]
+    print(f"wrote {', '.join(written)}")
+
+
+@app.command
 def gauge(
     table: Path,
     *,

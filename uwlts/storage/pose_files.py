@@ -14,7 +14,7 @@ from uwlts.model.calibration import is_rigid
 from uwlts.model.errors import DescriptionError
 from uwlts.model.input_file import read_bytes
 from uwlts.model.trajectory import Trajectory
-from uwlts.storage.files import sha256_of
+from uwlts.storage.files import sha256_of, written_aside
 from uwlts.storage.ros_bags import read_bag_poses
 
 Unit = Literal["mm", "m"]
@@ -125,6 +125,23 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
     if times is None:
         raise DescriptionError(f"{path} has no column time_s: a trajectory needs the time of each pose")
     return _trajectory(path, times, scaled(matrices_of(rows, pose_format, path), unit))
+
+
+def write_poses(
+    path: str | Path, poses: np.ndarray, *, times_s: np.ndarray | None = None, overwrite: bool = False
+) -> None:
+    """Write poses (P, 4, 4), mm, as CSV with 12 elements of the matrix a line, and a column ``time_s`` where given.
+
+    `read_poses` and `read_trajectory` read them back with the format ``matrix`` to the last digit. OutputError where
+    the file exists and ``overwrite`` is not set, or cannot be written.
+    """
+    names = [f"m{row}{column}" for row in range(3) for column in range(4)]
+    rows = np.asarray(poses, dtype=np.float64)[:, :3].reshape(-1, 12)
+    if times_s is not None:
+        names, rows = ["time_s", *names], np.column_stack([times_s, rows])
+    with written_aside(path, overwrite=overwrite) as aside:
+        lines = [",".join(names), *(",".join(map(repr, row)) for row in rows.tolist())]
+        aside.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def _trajectory(path: Path, times: np.ndarray, poses: np.ndarray) -> Trajectory:
