@@ -4,15 +4,17 @@ Independent of the code under test, which gets points, their stated uncertainty,
 """
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
+from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 
 from uwlts.storage.cloud import PointCloud, PointUncertainty
 
 RADIUS_MM, OVALITY_MM = 150.0, 0.6
 NOISE_MM = 0.02
-AWAY_MM, FAN_DEG, RAYS, LINES, STEP_MM = 380.0, 44.0, 500, 61, 2.0
+AWAY_MM, FAN_DEG, RAYS, LINES, STEP_MM = 380.0, 44.0, 320, 61, 2.0
 
 Radius = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -27,16 +29,22 @@ def oval(angle: np.ndarray, along: np.ndarray) -> np.ndarray:
     return RADIUS_MM + OVALITY_MM / 4 * np.cos(2 * angle - 0.7)
 
 
-def pitted(angle: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """An oval pipe with shallow pits and bumps of 8 to 16 mm all over."""
+@cache
+def _pits() -> RectBivariateSpline:
+    """Height over angle and length of pits and bumps of 8 to 16 mm, as a smooth function."""
     rng = np.random.default_rng(99)
-    radius = oval(angle, along)
-    for _ in range(120):
-        at, place = rng.uniform(-np.pi, np.pi), rng.uniform(-75, 75)
-        wide, high = rng.uniform(4, 8), rng.uniform(-1.2, 0.8)
+    angle, along = np.linspace(-np.pi, np.pi, 945), np.linspace(-80, 80, 161)
+    height = np.zeros((len(angle), len(along)))
+    for _ in range(150):
+        at, place, wide, high = *rng.uniform([-3.0, -75], [3.0, 75]), rng.uniform(4, 8), rng.uniform(-2.5, 1.5)
         off = np.angle(np.exp(1j * (angle - at))) * RADIUS_MM
-        radius = radius + high * np.exp(-(off**2 + (along - place) ** 2) / (2 * wide**2))
-    return radius
+        height += high * np.outer(np.exp(-(off**2) / (2 * wide**2)), np.exp(-((along - place) ** 2) / (2 * wide**2)))
+    return RectBivariateSpline(angle, along, height)
+
+
+def pitted(angle: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """An oval pipe with shallow pits and bumps all over."""
+    return oval(angle, along) + _pits().ev(angle, along)
 
 
 def side_pose(angle: float) -> np.ndarray:

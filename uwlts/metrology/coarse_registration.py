@@ -17,9 +17,12 @@ from uwlts.metrology.marker_spheres import MarkerSphere, movement_by_markers
 from uwlts.metrology.patches import Patches, distances_between
 from uwlts.model.errors import EvaluationError, SetupError
 
-_VOXELS = 50.0
-"""Size of a scan over that of the first voxels, from which features of that scale are taken."""
-_FINER = (1.0, 0.5, 2.0)
+_TRIES = ((0.55, 2.0, 6.0), (0.55, 3.0, 5.0), (0.8, 2.0, 6.0), (0.8, 3.0, 5.0), (1.6, 3.0, 5.0))
+"""Size of the voxels in radii of patches, and in voxels the radii within which normals and features are taken."""
+_VOXEL_UNITS = 0.3
+"""Size of a voxel in the units of KISS-Matcher, its default."""
+_LEAST_SHARE = 0.6
+"""Of the patches that lie near each other, those that agree within their noise: a wrong start leaves a few."""
 _LEAST_OVERLAP = 30
 """Patches on each other that make a pair; chance gives a few."""
 _REFINING_ROUNDS = 12
@@ -28,6 +31,7 @@ _CLOSE = 5.0
 
 
 def coarse_poses(
+    points_mm: Sequence[np.ndarray],
     patches: Sequence[Patches],
     markers: Sequence[Sequence[MarkerSphere]],
     names: Sequence[str],
@@ -40,7 +44,7 @@ def coarse_poses(
     """
     edges = []
     for a, b in combinations(range(len(patches)), 2):
-        if (found := _movement(patches[a], patches[b], markers[a], markers[b], sphere_mm)) is not None:
+        if found := _movement(patches[a], patches[b], points_mm[a], points_mm[b], markers[a], markers[b], sphere_mm):
             edges.append((found[1], a, b, found[0]))
     poses: dict[int, np.ndarray] = {0: np.eye(4)}
     # The best pair that leads to a new scan, again and again (Prim).
@@ -63,6 +67,8 @@ def coarse_poses(
 def _movement(
     a: Patches,
     b: Patches,
+    points_a: np.ndarray,
+    points_b: np.ndarray,
     spheres_a: Sequence[MarkerSphere],
     spheres_b: Sequence[MarkerSphere],
     sphere_mm: float | None,
@@ -70,32 +76,35 @@ def _movement(
     """Movement (4, 4) of the first scan onto the second and a score; None where nothing fits."""
     if sphere_mm is not None and (found := movement_by_markers(spheres_a, spheres_b, sphere_mm)) is not None:
         return found[0], 1e6 * found[1]
-    best: tuple[np.ndarray, float] | None = None
-    for finer in _FINER:
-        movement = _by_features(a, b, finer)
-        if movement is None:
-            continue
-        refined, score = _refined(a, b, movement)
-        if score >= _LEAST_OVERLAP and (best is None or score > best[1]):
-            best = refined, score
-    return best
+    for voxel, *gains in _TRIES:
+        movement = _by_features(points_a, points_b, voxel * a.radius_mm, *gains)
+        if movement is not None and (found := _refined(a, b, movement))[1] >= _LEAST_OVERLAP:
+            return found
+    return None
 
 
-def _by_features(a: Patches, b: Patches, finer: float) -> np.ndarray | None:
+def _by_features(
+    a: np.ndarray, b: np.ndarray, voxel: float, normal_gain: float, feature_gain: float
+) -> np.ndarray | None:
     kiss = _library()
-    size = float(np.linalg.norm(np.ptp(a.places_mm, axis=0)))
-    voxel = max(size / _VOXELS * finer, 0.5 * a.radius_mm)
-    matcher = kiss.KISSMatcher(kiss.KISSMatcherConfig(voxel_size=voxel))
-    found = matcher.estimate(a.places_mm.astype(np.float32), b.places_mm.astype(np.float32))
+    # The library warns of bounds above one unit on standard output.
+    gains = {"normal_r_gain": normal_gain, "fpfh_r_gain": feature_gain}
+    matcher = kiss.KISSMatcher(kiss.KISSMatcherConfig(voxel_size=_VOXEL_UNITS, **gains))
+    source, target = ((_VOXEL_UNITS / voxel * each).astype(np.float32) for each in (a, b))
+    found = matcher.estimate(source, target)
     if not found.valid:
         return None
     result = np.eye(4)
-    result[:3, :3], result[:3, 3] = np.asarray(found.rotation), np.asarray(found.translation)
+    result[:3, :3], result[:3, 3] = np.asarray(found.rotation), np.asarray(found.translation) * voxel / _VOXEL_UNITS
     return result if np.isfinite(result).all() else None
 
 
 def _refined(a: Patches, b: Patches, movement: np.ndarray) -> tuple[np.ndarray, float]:
-    """A movement after a few rounds of the joint estimate for this pair, and the patches that lie on each other."""
+    """A movement after a few rounds of the joint estimate for this pair, and the number of patches on each other.
+
+    The number is 0 where many patches disagree, and where the shape leaves a direction open, as a pipe or a plane does:
+    then any place along it would fit as well.
+    """
     poses = np.array([np.eye(4), movement])
     joint = JointRegistration([b, a], [[], []], poses, start_std=None, sphere_mm=None)
     reach = 4 * max(a.radius_mm, b.radius_mm)
@@ -105,8 +114,11 @@ def _refined(a: Patches, b: Patches, movement: np.ndarray) -> tuple[np.ndarray, 
             return movement, 0.0
         joint.move(joint.solved(list(pairs.values())).step)
         reach = max(0.8 * reach, a.radius_mm)
+    if not (pairs := joint.evidence(reach)) or len(joint.solved(list(pairs.values())).open_directions):
+        return movement, 0.0
     found = distances_between(a, joint.poses[1], b, joint.poses[0], reach_mm=reach)
-    return joint.poses[1], float(np.count_nonzero(np.abs(found.distance_mm) < _CLOSE * found.std_mm))
+    fits = np.abs(found.distance_mm) < _CLOSE * found.std_mm
+    return joint.poses[1], float(np.count_nonzero(fits)) if len(fits) and np.mean(fits) > _LEAST_SHARE else 0.0
 
 
 def _library() -> Any:

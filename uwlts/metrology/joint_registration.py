@@ -150,17 +150,25 @@ class JointRegistration:
         reduced = normal[:count, :count] - normal[:count, count:] @ within
         reduced = (reduced + reduced.T) / 2
         rounding = _ROUNDING / _NOISE * float(np.linalg.eigvalsh(reduced)[-1])
-        values, vectors = eigh(reduced, spurious + max(rounding, 1e-300) * np.eye(count))
+        metric = spurious + max(rounding, 1e-300) * np.eye(count)
+        values, vectors = eigh(reduced, metric)
         known = values > _NOISE
+        ways, strengths = vectors[:, known], values[known]
         down = gradient[:count] - within.T @ gradient[count:]
+        open_ways = np.linalg.qr(vectors[:, np.logical_not(known)])[0]
+        off = self._from_start()
         if self.start_std is None:
-            covariance = (vectors[:, known] / values[known]) @ vectors[:, known].T
+            ways = ways - open_ways @ (open_ways.T @ ways)
+            covariance = (ways / strengths) @ ways.T
         else:
-            beforehand, off = self._prior()
-            beforehand = beforehand * self.units[:count] ** 2
-            covariance = np.linalg.inv(reduced + np.diag(beforehand))
-            down = down + beforehand * off / self.units[:count]
+            beforehand = np.tile(np.repeat(1 / np.square(self.start_std), 3), count // 6) * self.units[:count] ** 2
+            by = metric @ ways
+            covariance = np.linalg.inv((by * strengths) @ by.T + np.diag(beforehand))
+            down = by @ (ways.T @ down) + beforehand * off / self.units[:count]
         step = -covariance @ down
+        if self.start_std is None:
+            # Along open directions scans go back to where they were: a wrong start may seem to tell more.
+            step = step - open_ways @ (open_ways.T @ (off / self.units[:count]))
         rest = -np.linalg.solve(beside, gradient[count:]) - within @ step
         whole = np.block(
             [
@@ -168,8 +176,7 @@ class JointRegistration:
                 [-within @ covariance, np.linalg.inv(beside) + within @ covariance @ within.T],
             ]
         )
-        open_directions = np.linalg.qr(vectors[:, np.logical_not(known)])[0].T * self.units[:count]
-        return Solved(self.units * np.append(step, rest), whole * scale, open_directions)
+        return Solved(self.units * np.append(step, rest), whole * scale, open_ways.T * self.units[:count])
 
     def move(self, step: np.ndarray) -> None:
         """Change the state by a step (U,)."""
@@ -286,14 +293,11 @@ class JointRegistration:
             result += block.T @ ((weight * found.slope_variance)[:, None] * block)
         return result
 
-    def _prior(self) -> tuple[np.ndarray, np.ndarray]:
-        """Weights (P,) of the poses at the start, and how far (P,) the poses are from them now."""
-        assert self.start_std is not None
-        shift, turn = self.start_std
-        weights = np.tile(np.repeat([1 / shift**2, 1 / turn**2], 3), len(self.patches) - 1)
+    def _from_start(self) -> np.ndarray:
+        """Shifts and turns (P,) of the poses from the start."""
         turned = Rotation.from_matrix(self.poses[1:, :3, :3] @ self.start[1:, :3, :3].transpose(0, 2, 1)).as_rotvec()
         before = np.einsum("nij,nj->ni", self.start[1:, :3, :3], self.local_middles[1:]) + self.start[1:, :3, 3]
-        return weights, np.hstack([self.middles_mm[1:] - before, turned]).ravel()
+        return np.hstack([self.middles_mm[1:] - before, turned]).ravel()
 
 
 def _usual_distance(points: np.ndarray) -> float:

@@ -215,7 +215,11 @@ def register(
             raise EvaluationError(f"{name}: {error}") from error
         progress(number + 1, steps)
     markers = [find_markers(scan, sphere_mm) if sphere_mm else [] for scan in scans]
-    start = coarse_poses(patches, markers, names, sphere_mm=sphere_mm) if search else _given(poses, len(scans))
+    start = (
+        coarse_poses([scan.points_mm for scan in scans], patches, markers, names, sphere_mm=sphere_mm)
+        if search
+        else _given(poses, len(scans))
+    )
     std = None if start_std_mm is None or start_std_deg is None else (start_std_mm, float(np.radians(start_std_deg)))
     joint = JointRegistration(patches, markers, start, start_std=std, sphere_mm=sphere_mm)
     least = 2 * max(each.radius_mm for each in patches)

@@ -89,7 +89,9 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def read_poses(path: str | Path, *, pose_format: PoseFormat, unit: Unit = "mm") -> tuple[np.ndarray, np.ndarray | None]:
+def read_poses(
+    path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit = "mm"
+) -> tuple[np.ndarray, np.ndarray | None]:
     """``T_base_platform`` (P, 4, 4), mm, and their times (P,) or None, from a CSV file with one pose a line.
 
     Columns ``pose`` and ``time_s``, recognised by name, come in addition. The others are, in this order, 12 or 16
