@@ -147,6 +147,7 @@ def reconstruct(
     pose_format: str = "matrix",
     pose_unit: Literal["mm", "m"] = "mm",
     clock_offset_s: float | None = None,
+    pose_correlation_s: float | None = None,
     index: Index = None,
     method: Method = None,
     stripe: Stripe = (),
@@ -162,8 +163,8 @@ def reconstruct(
         calibration: Calibration of the sensor, or one by polynomials.
         out: Cloud to write, PLY or by its ending HDF5 (.h5), with intensity, frame and line of every point, and from a
             joint calibration its uncertainty.
-        mount: Where the sensor is on its platform (uwlts mount). Poses are the platform's then, and points are given in
-            the frame of the poses.
+        mount: Where the sensor is on its platform (uwlts mount), in place of what the capture states. Poses are the
+            platform's then, and points are given in the frame of the poses.
         trajectory: CSV file or ROS bag with times and poses of the platform (of the sensor without a mount), which
             replace poses in the capture and the stage.
         pose_format: Format of the trajectory: matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg,
@@ -172,6 +173,8 @@ def reconstruct(
         pose_unit: Unit of the trajectory's positions.
         clock_offset_s: What to add to the times of the images for those of the trajectory; as the mount says unless
             given.
+        pose_correlation_s: Time over which errors of poses stay alike, inf where all err together. Unless given, poses
+            in the capture err each by itself, and those of a trajectory as a navigation filter's of its covariances.
         peak: Which of several stripes on a line counts; the strongest, or as the sensor's table [stripe] says.
     """
     refuse_unsuitable(out, overwrite=overwrite)
@@ -184,6 +187,7 @@ def reconstruct(
             mount=mount,
             trajectory=path,
             clock_offset_s=clock_offset_s,
+            pose_correlation_s=pose_correlation_s,
             stripe=stripe_settings(stripe, method, peak),
             index=index,
             progress=progress,

@@ -386,12 +386,13 @@ def _variance(
         (1 if i == j else 2) * pairs[:, column] * normal[:, i] * normal[:, j] for column, (i, j) in enumerate(PAIRS)
     )
     result = np.maximum(rough, np.bincount(place, single, minlength=size) / many**2)
-    moved = np.einsum("ni,ni->n", known.position_mm[point], normal)
     image = np.arange(len(point)) if frame is None else frame[point].astype(np.int64)
     # Points of one image move together, those of different images do not.
     group, owner = np.unique(np.column_stack([place, image]), axis=0, return_inverse=True)
-    together = np.bincount(owner.ravel(), moved / many[place])
-    result += np.bincount(group[:, 0], together**2, minlength=size)
+    for part in known.by_image_mm():
+        moved = np.einsum("ni,ni->n", part[point], normal)
+        together = np.bincount(owner.ravel(), moved / many[place])
+        result += np.bincount(group[:, 0], together**2, minlength=size)
     for pattern in known.patterns_mm:
         along = np.einsum("ni,ni->n", pattern[point], normal)
         result += (np.bincount(place, along, minlength=size) / many) ** 2
@@ -412,4 +413,5 @@ def _turned(known: PointUncertainty | None, rotation: np.ndarray) -> PointUncert
     matrices = rotation @ _matrices(known.random_mm2) @ rotation.T
     pairs = np.stack([matrices[:, i, j] for i, j in PAIRS], axis=1)
     turned = replace(known, random_mm2=pairs, position_mm=known.position_mm @ rotation.T)
-    return replace(turned, patterns_mm=known.patterns_mm @ rotation.T)
+    poses = None if known.poses_mm is None else known.poses_mm @ rotation.T
+    return replace(turned, patterns_mm=known.patterns_mm @ rotation.T, poses_mm=poses)

@@ -38,6 +38,7 @@ def merged_cloud(
         frames.append(np.where(scan.frame == NO_INDEX, NO_INDEX, scan.frame + first))
         firsts.append(first)
         first += int(scan.frame.max(initial=-1)) + 1
+    times = [scan.time_s for scan in scans if scan.time_s is not None]
     return PointCloud(
         points_mm=np.vstack(points),
         intensity=np.concatenate([scan.intensity for scan in scans]),
@@ -47,9 +48,24 @@ def merged_cloud(
             np.vstack(random).astype(np.float32),
             np.vstack(position).astype(np.float32),
             _patterns(scans, points, joint, covariance),
+            _by_pose(scans, joint),
         ),
+        time_s=np.concatenate(times) if len(times) == len(scans) else None,
         metadata=_metadata(scans, names, joint, firsts),
     )
+
+
+def _by_pose(scans: Sequence[PointCloud], joint: JointRegistration) -> np.ndarray | None:
+    """Parts (K, N, 3) of the poses of images, in the common frame; None where no scan has any."""
+    known = [None if scan.uncertainty is None else scan.uncertainty.poses_mm for scan in scans]
+    count = max((len(each) for each in known if each is not None), default=0)
+    if not count:
+        return None
+    parts = [np.zeros((count, len(scan), 3), np.float32) for scan in scans]
+    for number, each in enumerate(known):
+        if each is not None:
+            parts[number][: len(each)] = each @ joint.poses[number, :3, :3].T
+    return np.concatenate(parts, axis=1)
 
 
 def _corrected(scan: PointCloud, amounts: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 import json
 import os
 import re
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ NO_INDEX = -1
 _PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
 _PER_POINT = ("points_mm", "intensity", "frame", "line")
 _KINDS = dict(zip(_PER_POINT, (np.float64, np.float32, np.int32, np.int32), strict=True)) | {"deviation_mm": np.float32}
+_KINDS |= {"time_s": np.float64}
 _COMMENT = "uwlts-metadata"
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
@@ -54,15 +55,26 @@ class PointUncertainty:
         How each point moves for one standard deviation of its image's stage position, independent from image to image.
     patterns_mm : (M, N, 3) float32
         How each point moves for one standard deviation of what is independent in calibration and stage, largest first.
+    poses_mm : (K, N, 3) float32 or None
+        How each point moves for one standard deviation of each independent part of its image's pose, which is
+        independent from image to image.
     """
 
     random_mm2: np.ndarray
     position_mm: np.ndarray
     patterns_mm: np.ndarray
+    poses_mm: np.ndarray | None = None
 
     def __getitem__(self, selection: Any) -> "PointUncertainty":
         """That of a selection of the points, by a slice, indices or a mask."""
-        return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], self.patterns_mm[:, selection])
+        poses = None if self.poses_mm is None else self.poses_mm[:, selection]
+        patterns = self.patterns_mm[:, selection]
+        return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], patterns, poses)
+
+    def by_image_mm(self) -> np.ndarray:
+        """All that moves the points of an image together and is independent from image to image (1 + K, N, 3)."""
+        position = self.position_mm[None]
+        return position if self.poses_mm is None else np.concatenate([position, self.poses_mm])
 
     def systematic_mm2(self) -> np.ndarray:
         """Covariance (N, 6) of each point by calibration and stage."""
@@ -71,7 +83,8 @@ class PointUncertainty:
     def covariance_mm2(self) -> np.ndarray:
         """Covariance (N, 3, 3) of the coordinates of each point, of all kinds together."""
         pairs = self.random_mm2 + self.systematic_mm2()
-        covariance = np.einsum("ni,nj->nij", self.position_mm, self.position_mm)
+        by_image = self.by_image_mm()
+        covariance = np.einsum("kni,knj->nij", by_image, by_image)
         for column, (i, j) in enumerate(PAIRS):
             covariance[:, i, j] += pairs[:, column]
             if i != j:
@@ -100,6 +113,8 @@ class PointCloud:
         Image of the scan and row (or column) of that image; -1 where unknown.
     deviation_mm : (N,) float32 or None
         Signed distance to the fitted or true surface; NaN where not evaluated.
+    time_s : (N,) float64 or None
+        Time of each point's image by the camera's clock, of scans by a moving platform.
     uncertainty : PointUncertainty or None
         How well the points are known.
     metadata : dict
@@ -117,6 +132,7 @@ class PointCloud:
     line: np.ndarray
     deviation_mm: np.ndarray | None = None
     uncertainty: PointUncertainty | None = None
+    time_s: np.ndarray | None = None
     metadata: Table = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -132,14 +148,15 @@ class PointCloud:
             raise CaptureError(f"{unusable} of {len(points)} points of the cloud are not finite; leave them out")
         if len(points) and (farthest := np.abs(points).max()) > _FARTHEST_MM:
             raise CaptureError(f"a point lies {farthest:g} mm from the origin; expected at most {_FARTHEST_MM:g} mm")
-        for name in (*_PER_POINT[1:], "deviation_mm"):
+        for name in (*_PER_POINT[1:], "deviation_mm", "time_s"):
             column = getattr(self, name)
             if column is not None and column.shape != (len(points),):
                 raise CaptureError(f"{name} has the shape {column.shape}; the cloud has {len(points)} points")
         if self.uncertainty is not None:
             known = self.uncertainty
             shapes = known.random_mm2.shape, known.position_mm.shape, known.patterns_mm.shape[1:]
-            if shapes != ((len(points), 6), points.shape, points.shape):
+            by_pose = None if known.poses_mm is None else known.poses_mm.shape[1:]
+            if shapes != ((len(points), 6), points.shape, points.shape) or by_pose not in (None, points.shape):
                 raise CaptureError(f"the uncertainty of {len(points)} points has the shapes {shapes}")
         _as_json(self.metadata)
 
@@ -156,10 +173,11 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
     """Write a cloud as HDF5 where the path ends with ``.h5``, else as binary little-endian PLY; whole or not at all.
 
     In HDF5 the datasets are those of `PointCloud` and `PointUncertainty`, by their names, with systematic_mm2 (N, 6)
-    besides. In PLY the vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int). Where
-    the uncertainty is known there are its covariances in mm2, random_xx to random_zz and systematic_xx to
-    systematic_zz, and in mm position_x to position_z, pattern0_x, pattern0_y and so on (`PointUncertainty`). The
-    metadata is JSON in numbered comments, short enough for every reader.
+    besides. In PLY the vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int), and
+    perhaps time (double, s). Where the uncertainty is known there are its covariances in mm2, random_xx to random_zz
+    and systematic_xx to systematic_zz, and in mm position_x to position_z, pattern0_x, pattern0_y and so on, and
+    perhaps pose0_x to pose5_z (`PointUncertainty`). The metadata is JSON in numbered comments,
+    short enough for every reader.
 
     Raises
     ------
@@ -171,6 +189,8 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
         return
     deviation = np.full(len(cloud), np.nan, np.float32) if cloud.deviation_mm is None else cloud.deviation_mm
     columns = dict(zip("xyz", cloud.points_mm.T, strict=True)) | {"intensity": cloud.intensity, "deviation": deviation}
+    if cloud.time_s is not None:
+        columns["time"] = cloud.time_s
     columns |= {"frame": cloud.frame, "line": cloud.line} | _uncertainty_columns(cloud.uncertainty)
     vertices = np.empty(len(cloud), [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
     for name, values in columns.items():
@@ -232,7 +252,15 @@ def _uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.n
     names += _move_names(len(uncertainty.patterns_mm))
     patterns = np.moveaxis(uncertainty.patterns_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
     parts = uncertainty.random_mm2.T, uncertainty.systematic_mm2().T, uncertainty.position_mm.T, patterns
-    return dict(zip(names, np.vstack(parts).astype(np.float32), strict=True))
+    columns = dict(zip(names, np.vstack(parts).astype(np.float32), strict=True))
+    if uncertainty.poses_mm is not None:
+        poses = np.moveaxis(uncertainty.poses_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
+        columns |= dict(zip(_pose_names(len(uncertainty.poses_mm)), poses.astype(np.float32), strict=True))
+    return columns
+
+
+def _pose_names(count: int) -> list[str]:
+    return [f"pose{k}_{axis}" for k in range(count) for axis in "xyz"]
 
 
 def _as_json(metadata: Table) -> str:
@@ -308,6 +336,10 @@ def _read_ply(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
         columns = np.stack([column(name, np.nan) for name in wanted])
         random, position, patterns = columns[:6].T.copy(), columns[6:9].T.copy(), columns[9:].reshape(count, 3, -1)
         uncertainty = PointUncertainty(random, position, np.ascontiguousarray(np.moveaxis(patterns, 1, 2)))
+        parts = sum(f"pose{k}_x" in known for k in range(len(known)))
+        if parts and known.keys() >= set(_pose_names(parts)):
+            poses = np.stack([column(name, np.nan) for name in _pose_names(parts)]).reshape(parts, 3, -1)
+            uncertainty = replace(uncertainty, poses_mm=np.ascontiguousarray(np.moveaxis(poses, 1, 2)))
     deviation = column("deviation", np.nan)
     cloud = PointCloud(
         points_mm=np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"]),
@@ -316,6 +348,7 @@ def _read_ply(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
         line=indices("line"),
         deviation_mm=None if np.isnan(deviation).all() else deviation,
         uncertainty=uncertainty,
+        time_s=column("time", np.nan, np.float64) if "time" in known else None,
         metadata=_metadata(ply.comments),
     )
     return cloud, len(whole)
@@ -354,10 +387,9 @@ class _CloudHeader(Description):
 
 def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool) -> None:
     arrays = {name: getattr(cloud, name) for name in _PER_POINT}
-    if cloud.deviation_mm is not None:
-        arrays["deviation_mm"] = cloud.deviation_mm
+    arrays |= {name: each for name in ("deviation_mm", "time_s") if (each := getattr(cloud, name)) is not None}
     if cloud.uncertainty is not None:
-        arrays |= {part.name: getattr(cloud.uncertainty, part.name) for part in fields(PointUncertainty)}
+        arrays |= {name: each for name, each in vars(cloud.uncertainty).items() if each is not None}
         arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()
     # In memory first: HDF5 does not survive a full disk.
     content = BytesIO()
@@ -379,7 +411,7 @@ def _read_hdf5(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
             total = 0 if points is None or not points.ndim else len(points)
             every = _every(total, at_most)
             rows: dict[str, tuple[slice, ...]] = dict.fromkeys((*_KINDS, *names), (every,))
-            rows["patterns_mm"] = (slice(None), every)
+            rows["patterns_mm"] = rows["poses_mm"] = (slice(None), every)
             found = {name: read_array(file, name, path=path, selection=rows[name]) for name in rows}
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
@@ -392,9 +424,10 @@ def _read_hdf5(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
         n for n in ("frame", "line") if n in arrays and (np.abs(arrays[n].astype(np.float64)) >= 2**31).any()
     ]:
         raise CaptureError(f"{path} is damaged: {', '.join(unusable)} has values of more than 32 bits")
-    wanted = [*_PER_POINT, *(names if any(name in arrays for name in names) else ())]
+    needed = [name for name in names if name != "poses_mm"]
+    wanted = [*_PER_POINT, *(needed if any(name in arrays for name in names) else ())]
     if missing := [name for name in wanted if name not in arrays]:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
-    known = PointUncertainty(*(arrays[name] for name in names)) if names[0] in arrays else None
+    known = PointUncertainty(*(arrays.get(name) for name in names)) if names[0] in arrays else None
     per_point = {name: arrays[name] for name in _KINDS if name in arrays}
     return PointCloud(**per_point, uncertainty=known, metadata=header.metadata), total

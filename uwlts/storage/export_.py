@@ -185,6 +185,8 @@ def _laz(cloud: PointCloud) -> bytes:
     table = laspy.LasData(header)
     table.x, table.y, table.z = points.T
     table.intensity = np.rint(np.nan_to_num(cloud.intensity)).clip(*_INTENSITY_LIMITS).astype(np.uint16)
+    if cloud.time_s is not None:
+        table.gps_time = cloud.time_s
     for name, values in extra.items():
         table[name] = values
     # In memory: the compressor has errors of its own where storage fails.

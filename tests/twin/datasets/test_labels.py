@@ -10,7 +10,8 @@ from twin.datasets.description import FAINT_BELOW, LineStatus, Mask
 from twin.datasets.labels import labelled, noise_std_e, stripe_quality
 from twin.options import Effects, Options
 from twin.recording.studio import Exposed, Studio
-from twin.scene.description import Motion, PittedPipe, Shot
+from twin.scene.description import PittedPipe
+from twin.scene.motion import Motion, Shot
 from twin.scene.shapes import pitted_radius
 from uwlts.model.sensor import Sensor
 
