@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from uwlts.metrology.change import SurfaceChange, compare_clouds
     from uwlts.metrology.gauge import GaugeStudy, gauge_study
     from uwlts.metrology.scan_registration import RegisteredScans, register
+    from uwlts.metrology.trajectory_alignment import AlignedTrajectory, align_trajectory
     from uwlts.model.calibration import Calibration
     from uwlts.model.errors import Error
     from uwlts.model.library import load_sensor
@@ -48,7 +49,7 @@ if TYPE_CHECKING:
     from uwlts.storage.export_ import export
     from uwlts.storage.import_ import Imported, import_images
     from uwlts.storage.mount_files import read_mount, write_mount
-    from uwlts.storage.pose_files import read_poses, read_trajectory, write_poses
+    from uwlts.storage.pose_files import read_poses, read_trajectory, write_poses, write_trajectory
     from uwlts.storage.truth import Truth, read_truth
     from uwlts.stripe import StripeOptions
     from uwlts.thesis.report import ThesisReport, evaluate_thesis
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "AlignedTrajectory",
     "Calibration",
     "CameraCalibration",
     "Capture",
@@ -82,6 +84,7 @@ __all__ = [
     "Trajectory",
     "Truth",
     "Verification",
+    "align_trajectory",
     "calibrate",
     "calibrate_camera",
     "calibrate_mount",
@@ -127,9 +130,11 @@ __all__ = [
     "write_poses",
     "write_registration",
     "write_report",
+    "write_trajectory",
 ]
 
 _MODULES = {
+    "AlignedTrajectory": "uwlts.metrology.trajectory_alignment",
     "Calibration": "uwlts.model.calibration",
     "CameraCalibration": "uwlts.calibration.photographs",
     "Capture": "uwlts.storage.capture",
@@ -156,6 +161,7 @@ _MODULES = {
     "Trajectory": "uwlts.model.trajectory",
     "Truth": "uwlts.storage.truth",
     "Verification": "uwlts.measurement.verification",
+    "align_trajectory": "uwlts.metrology.trajectory_alignment",
     "calibrate": "uwlts.calibration.calibrate",
     "calibrate_camera": "uwlts.calibration.photographs",
     "calibrate_mount": "uwlts.calibration.mount",
@@ -201,6 +207,7 @@ _MODULES = {
     "write_poses": "uwlts.storage.pose_files",
     "write_registration": "uwlts.report.registration_page",
     "write_report": "uwlts.report.campaign_page",
+    "write_trajectory": "uwlts.storage.pose_files",
 }
 
 

@@ -344,6 +344,58 @@ def register(
 
 
 @app.command
+def align(
+    cloud: Path,
+    *,
+    trajectory: Path,
+    out: Path,
+    aligned: Path | None = None,
+    pose_format: str = "quaternion-xyzw",
+    pose_unit: Literal["mm", "m"] = "mm",
+    clock_offset_s: float = 0.0,
+    drift_mm: float | None = None,
+    drift_deg: float | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Correct a trajectory so that surfaces which the scan shows twice agree.
+
+    Reconstruct the scan along the corrected trajectory afterwards: its points then have the uncertainty that is left.
+
+    Example: uwlts align pass.ply --trajectory pass.trajectory.csv --drift-mm 300 --drift-deg 1 --out corrected.csv
+
+    Args:
+        cloud: Cloud along the trajectory with the times of its points (uwlts reconstruct --trajectory).
+        trajectory: CSV file or ROS bag with times and poses, as the cloud was reconstructed with.
+        out: Corrected trajectory to write, with the covariance of each pose (CSV), and the crossings as JSON beside it.
+        aligned: Also write the cloud along the corrected trajectory.
+        pose_format: Format of the trajectory, as for uwlts reconstruct.
+        pose_unit: Unit of the trajectory's positions.
+        clock_offset_s: What to add to the times of the points for those of the trajectory.
+        drift_mm: Standard uncertainty of the navigation at the end, along each axis; as the trajectory's covariance
+            says unless given.
+        drift_deg: The same of its turns.
+    """
+    from uwlts.storage.json_files import json_text
+
+    beside = out.with_suffix(".json")
+    for path in (out, beside, aligned):
+        if path:
+            refuse_unsuitable(path, overwrite=overwrite)
+    path = uwlts.read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
+    with progress_bar(f"aligning {cloud.name}") as progress:
+        found = uwlts.align_trajectory(
+            cloud, path, clock_offset_s=clock_offset_s, drift_mm=drift_mm, drift_deg=drift_deg, progress=progress
+        )
+    show(found.lines())
+    uwlts.write_trajectory(out, found.trajectory, overwrite=overwrite)
+    with written_aside(beside, overwrite=overwrite) as aside:
+        aside.write_text(json_text(found.record(), indent=1), encoding="utf-8")
+    if aligned:
+        uwlts.write_cloud(aligned, found.cloud, overwrite=overwrite)
+    print(f"wrote {out} and {beside.name}" + (f", {aligned}" if aligned else ""))
+
+
+@app.command
 def gauge(
     table: Path,
     *,

@@ -86,6 +86,10 @@ def _movement(
 def _by_features(
     a: np.ndarray, b: np.ndarray, voxel: float, normal_gain: float, feature_gain: float
 ) -> np.ndarray | None:
+    """Movement (4, 4) of points (N, 3) onto others by features in voxels of a size, mm; None where none match.
+
+    Normals and features are taken within so many voxels. SetupError where KISS-Matcher is not installed.
+    """
     kiss = _library()
     # The library warns of bounds above one unit on standard output.
     gains = {"normal_r_gain": normal_gain, "fpfh_r_gain": feature_gain}

@@ -259,6 +259,11 @@ def _columns(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
+def averaged_points(points_mm: np.ndarray, cell_mm: float) -> np.ndarray:
+    """Means (C, 3) of the points (N, 3) in each cube of a size."""
+    return _averaged(points_mm, cell_mm)[1]
+
+
 def _averaged(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cube (N,) of each point, and means (C, 3) and counts (C,) of the points of each cube."""
     cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)

@@ -1,37 +1,49 @@
 """Self-consistency of a scan along a path: a smooth correction of the path, by surfaces that it shows more than once.
 
 Unknown is a correction of every pose, a shift (mm) and a turn (rad) in the base frame about the platform, as a cubic
-B-spline in time. Known beforehand is how a navigation drifts: half of its variance as a steady rate and half as a random
+B-spline in time. Known beforehand is how a navigation drifts: half of its variance as a steady rate, half as a random
 walk, from an exact start. Residuals are distances between patches of the surface where the path crosses itself.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.spatial.transform import Rotation
 
-from uwlts.metrology.patches import Distances, Patches, disc_radius, distances_between, scatter, surface_patches
+from uwlts.metrology.height_correlation import shifts_of_heights
+from uwlts.metrology.joint_registration import JointRegistration
+from uwlts.metrology.patches import (
+    Distances,
+    Patches,
+    averaged_points,
+    disc_radius,
+    distances_between,
+    scatter,
+    surface_patches,
+)
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory
-from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud import PointCloud, read_cloud
 
 _TUKEY = 4.685
-_PIECES_PER_SWATH = 1.0
-"""Pieces of the path are as long as the stripe is wide, so that they are as good for a search as they can be."""
+_VOXEL = 0.4
+"""Of the radius of patches: points for a search by features."""
+_INTERVALS = 100
+"""Of the spline: between two knots a random walk goes a tenth of the drift of the whole path."""
 _FEWEST = 30
 """Patches of a piece, and of a crossing."""
 _ROUNDS = 15
 _SIGMAS = 3.0
 """How far, in standard deviations of the drift, a crossing is searched."""
-_MOST_STARTS = 4000
-_SCORED = 120
-"""Patches with which a start is scored."""
 _REFINED = 12
+"""Rounds of a pair's own estimate."""
 _STILL_MM = 1e-3
 _EXACT_MM, _EXACT_RAD = 1e-3, 1e-7
 """Standard uncertainty of the start of the path, which is the frame's: as good as exact."""
@@ -47,7 +59,7 @@ class Crossing:
 
     ``before_mm`` and ``after_mm`` are root mean square distances of the patches near each other by the path as it was
     and as it is. ``held_out_before_mm`` and ``held_out_after_mm`` are of patches that the estimate has not used.
-    ``predicted_mm`` is the shift by which the navigation missed here.
+    ``missed_mm`` is the shift by which the navigation missed here.
     """
 
     times_s: tuple[float, float]
@@ -60,7 +72,7 @@ class Crossing:
 
 
 @dataclass(frozen=True, eq=False)
-class AlignedPath:
+class AlignedTrajectory:
     """A path that agrees with the surfaces that it shows.
 
     Attributes
@@ -71,7 +83,7 @@ class AlignedPath:
         Shift (mm) and turn (rad) that each pose was given.
     crossings : tuple of Crossing
     cloud : PointCloud
-        The cloud along the corrected path.
+        The cloud along the corrected path, without uncertainty: to have that, reconstruct it along the path anew.
     """
 
     trajectory: Trajectory
@@ -108,21 +120,21 @@ class AlignedPath:
         return lines
 
 
-def align_path(
-    cloud: PointCloud,
+def align_trajectory(
+    cloud: PointCloud | str | os.PathLike[str],
     trajectory: Trajectory,
     *,
     clock_offset_s: float = 0.0,
     drift_mm: float | None = None,
     drift_deg: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> AlignedPath:
-    """Correct a path so that surfaces which it shows twice agree, and move the cloud with it.
+) -> AlignedTrajectory:
+    """Correct a trajectory so that surfaces which it shows twice agree, and move the cloud with it.
 
     Parameters
     ----------
     cloud
-        Cloud in the base frame by the trajectory, with the time of each point.
+        Cloud or its file, in the base frame by the trajectory, with the time of each point (`reconstruct`).
     trajectory
         Path of the platform (of the sensor without a mount).
     clock_offset_s
@@ -133,9 +145,14 @@ def align_path(
 
     Raises
     ------
+    CaptureError
+        The file cannot be read.
+    DescriptionError
+        Points were measured before or after the trajectory.
     EvaluationError
         Points have no times, the drift is not known, or the path shows no surface twice that tells where it is.
     """
+    cloud = cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
     if cloud.time_s is None:
         raise EvaluationError("the cloud has no times of its points: reconstruct it with a trajectory")
     times = cloud.time_s + clock_offset_s
@@ -147,8 +164,8 @@ def align_path(
         progress(number + 1, len(pieces))
     if not joint.pairs:
         raise EvaluationError(
-            f"the path shows no surface twice, within {_SIGMAS:g} standard deviations of its drift, that tells where it "
-            "is: cross an earlier part of the path over a surface with features"
+            f"the path shows no surface twice, within {_SIGMAS:g} standard deviations of its drift, that tells where "
+            "it is: cross an earlier part of the path over a surface with features"
         )
     joint.settle()
     return joint.result(cloud, trajectory, times)
@@ -171,7 +188,7 @@ def _drift(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | No
 
 @dataclass(frozen=True, eq=False)
 class _Path:
-    """Knots of the spline and the prior (C, C) of its coefficients for each component, over the time of the points."""
+    """A trajectory, the knots of the spline over the time of the points, and the drift at its end, mm and rad."""
 
     trajectory: Trajectory
     knots: np.ndarray
@@ -181,17 +198,10 @@ class _Path:
 
     @classmethod
     def of(cls, trajectory: Trajectory, drift: tuple[float, float], times: np.ndarray) -> _Path:
-        first, last = float(trajectory.times_s[0]), float(trajectory.times_s[-1])
-        seen = np.unique(np.round(times, 6))
-        positions = trajectory.poses_at(seen)[:, :3, 3]
-        way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(positions, axis=0), axis=1)))
-        return cls(trajectory, np.array([first, last]), drift, first, last)._with_knots(seen, way)
-
-    def _with_knots(self, seen: np.ndarray, way: np.ndarray) -> _Path:
-        """Knots so close that the drift between two is a hundredth of that of the whole path."""
-        inner = np.linspace(self.first_s, self.last_s, 101)
-        knots = np.concatenate([np.repeat(self.first_s, 3), inner, np.repeat(self.last_s, 3)])
-        return replace(self, knots=knots)
+        first, last = float(times.min()), float(times.max())
+        inner = np.linspace(first, last, _INTERVALS + 1)
+        knots = np.concatenate([np.repeat(first, 3), inner, np.repeat(last, 3)])
+        return cls(trajectory, knots, drift, first, last)
 
     @property
     def count(self) -> int:
@@ -219,12 +229,18 @@ class _Path:
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """A part of the path: patches of its surface, their times (P,) and the platform's places (P, 3) then."""
+    """A part of the path: patches of its surface, their times (P,), the platform's places (P, 3) then, and its points.
+
+    ``held_out`` (P,) are patches that judge the gain, ``points_mm`` (N, 3) all points by the path as it was, and
+    ``patch_of`` (N,) the patch nearest to each.
+    """
 
     patches: Patches
     times_s: np.ndarray
     platform_mm: np.ndarray
     held_out: np.ndarray
+    points_mm: np.ndarray
+    patch_of: np.ndarray
 
     @property
     def middle_s(self) -> float:
@@ -233,7 +249,7 @@ class _Piece:
 
 def _pieces(cloud: PointCloud, times: np.ndarray, path: _Path) -> list[_Piece]:
     """Parts of the path about as long as the stripe is wide."""
-    frames, first = np.unique(times, return_index=True)
+    frames = np.unique(times)
     order = np.argsort(times, kind="stable")
     sorted_times = times[order]
     starts = np.searchsorted(sorted_times, frames)
@@ -242,13 +258,13 @@ def _pieces(cloud: PointCloud, times: np.ndarray, path: _Path) -> list[_Piece]:
     swath = float(np.median(widths))
     middles = np.array([cloud.points_mm[order[a:b]].mean(axis=0) for a, b in zip(starts, ends, strict=True)])
     way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(middles, axis=0), axis=1)))
-    count = max(2, round(way[-1] / swath * _PIECES_PER_SWATH))
+    count = max(2, round(way[-1] / swath))
     number = np.minimum((way / way[-1] * count).astype(int), count - 1)
-    longest = order[: max(1, len(order))]
-    radius = disc_radius(cloud.points_mm[longest[number[np.searchsorted(frames, times[longest])] == count // 2]])
+    of_piece = number[np.searchsorted(frames, sorted_times)]
+    radius = disc_radius(cloud.points_mm[order[of_piece == count // 2]])
     pieces = []
     for k in range(count):
-        own = order[number[np.searchsorted(frames, sorted_times)] == k]
+        own = order[of_piece == k]
         known = None if cloud.uncertainty is None else cloud.uncertainty[own]
         # What all points share does not tell one pass from another along a path.
         known = None if known is None else replace(known, patterns_mm=known.patterns_mm[:0], poses_mm=None)
@@ -261,7 +277,9 @@ def _pieces(cloud: PointCloud, times: np.ndarray, path: _Path) -> list[_Piece]:
         at = times[own][patches.numbers]
         cubes = np.floor(patches.places_mm / (4 * radius)).astype(np.int64)
         held_out = (cubes @ np.array([1, 2, 3])) % _HELD_OUT == 0
-        pieces.append(_Piece(patches, at, path.trajectory.poses_at(at)[:, :3, 3], held_out))
+        points = averaged_points(cloud.points_mm[own], radius * _VOXEL)
+        near: Any = patches.tree.query(points)
+        pieces.append(_Piece(patches, at, path.trajectory.poses_at(at)[:, :3, 3], held_out, points, near[1]))
     return pieces
 
 
@@ -306,7 +324,7 @@ class _Alignment:
             apart = np.maximum(low - reach - other.places_mm.max(axis=0), other.places_mm.min(axis=0) - high - reach)
             if (apart > 0).any():
                 continue
-            start = self._start(own, other, reach)
+            start = self._start(number, earlier, reach)
             if start is None:
                 continue
             self.pairs.append((earlier, number))
@@ -314,46 +332,39 @@ class _Alignment:
                 self.pairs.pop()
             own = self.moved(number)
 
-    def _start(self, own: Patches, other: Patches, reach: np.ndarray) -> np.ndarray | None:
-        """Shift (3,) by which a piece lies best on an earlier one; None where it lies nowhere.
+    def _start(self, number: int, earlier: int, reach: np.ndarray) -> np.ndarray | None:
+        """Pose (4, 4) in which a piece lies best on an earlier one; None where it lies nowhere within reach (3,).
 
-        Shifts across the mean normal are tried from the most likely on; the shift along it is the median distance.
+        Maps of the heights of both, with what lies beside them on the path, are correlated for all shifts.
         """
+        own, other = self.moved(number), self.moved(earlier)
         normal = np.linalg.eigh(other.normals.T @ other.normals)[1][:, 2]
         first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
         first /= np.linalg.norm(first)
-        across = np.stack([first, np.cross(normal, first)])
-        spans = np.abs(across) @ reach
-        step = max(2 * own.radius_mm, float(np.sqrt(4 * spans.prod() / _MOST_STARTS)))
-        grids = [step * np.arange(-int(np.ceil(span / step)), int(np.ceil(span / step)) + 1) for span in spans]
-        shifts = np.stack([each.ravel() for each in np.meshgrid(*grids)], axis=1)
-        chosen = own[:: max(1, len(own) // _SCORED)]
-        depth = float(np.abs(normal) @ reach) + own.radius_mm
-        scored = []
-        for shift in shifts[np.argsort(np.sum((shifts / np.maximum(spans, step)) ** 2, axis=1))]:
-            pose = np.eye(4)
-            pose[:3, 3] = shift @ across
-            found = distances_between(chosen, pose, other, np.eye(4), reach_mm=depth)
-            if len(found.source) < 0.15 * len(chosen) or len(found.source) < 8:
-                continue
-            middle = float(np.median(found.distance_mm))
-            spread = float(np.median(np.abs(found.distance_mm - middle)))
-            # Many patches that agree count more than few that agree better by chance.
-            scored.append((spread / np.sqrt(len(found.source)), *pose[:3, 3], middle))
-        scored.sort()
+        frame = np.stack([first, np.cross(normal, first), normal])
+        beside = [range(max(0, k - 1), min(len(self.pieces), k + 2)) for k in (number, earlier)]
+        clouds = [np.vstack([self._points(k) for k in near]) @ frame.T for near in beside]
         best: tuple[float, np.ndarray] | None = None
-        for _, x, y, z, middle in scored[:_REFINED]:
-            refined = self._refined(own, other, np.array([x, y, z]) - middle * normal)
+        for shift in shifts_of_heights(*clouds, pixel_mm=0.5 * own.radius_mm, reach_mm=np.abs(frame) @ reach):
+            pose = np.eye(4)
+            pose[:3, 3] = shift @ frame
+            refined = self._refined(own, other, pose)
             if refined is not None and (best is None or refined[0] > best[0]):
                 best = refined
         return None if best is None else best[1]
 
-    def _refined(self, own: Patches, other: Patches, shift: np.ndarray) -> tuple[float, np.ndarray] | None:
-        """Number of patches that agree, and pose (4, 4), after a pair's own estimate from a shift."""
-        from uwlts.metrology.joint_registration import JointRegistration
+    def _points(self, number: int) -> np.ndarray:
+        """Points (N, 3) of a piece along the path as it is now."""
+        piece = self.pieces[number]
+        correction, platform = self.corrections(self.bases[number])[piece.patch_of], piece.platform_mm[piece.patch_of]
+        turned = Rotation.from_rotvec(correction[:, 3:]).apply(piece.points_mm - platform)
+        return turned + platform + correction[:, :3]
 
-        pose = np.eye(4)
-        pose[:3, 3] = shift
+    def _refined(self, own: Patches, other: Patches, pose: np.ndarray) -> tuple[float, np.ndarray] | None:
+        """Number of patches that agree, and pose (4, 4), after a pair's own estimate from a pose.
+
+        Pieces are bent by what the navigation drifts within them; the estimate of the path is the judge in the end.
+        """
         joint = JointRegistration([other, own], [[], []], np.array([np.eye(4), pose]), start_std=None, sphere_mm=None)
         reach = 4 * own.radius_mm
         for _ in range(_REFINED):
@@ -365,15 +376,16 @@ class _Alignment:
         if not (pairs := joint.evidence(reach)) or len(joint.solved(list(pairs.values())).open_directions):
             return None
         found = distances_between(own, joint.poses[1], other, np.eye(4), reach_mm=reach)
-        fits = np.abs(found.distance_mm) < 5 * found.std_mm
+        bent = self.path.drift[0] / len(self.pieces)
+        fits = np.abs(found.distance_mm) < np.maximum(5 * found.std_mm, bent)
         if np.count_nonzero(fits) < _FEWEST or np.mean(fits) < _SHARE:
             return None
         return float(np.count_nonzero(fits)), joint.poses[1]
 
     def _estimated(self, seed: dict[tuple[int, int], np.ndarray]) -> bool:
-        """Estimate the correction anew, with the matches of pairs by the poses that a search has found; whether it holds.
+        """Estimate the correction anew; whether the last pair agrees then.
 
-        A found pose counts as the correction's for the first matches only.
+        Poses that a search has found, by their pairs, give the first matches.
         """
         before = self.coefficients.copy(), self.covariance
         for done in range(_ROUNDS):
@@ -389,7 +401,7 @@ class _Alignment:
         return False
 
     def settle(self) -> None:
-        """Estimate until nothing moves."""
+        """Estimate until nothing moves any more."""
         for _ in range(_ROUNDS):
             if self._round({}, reach_mm=self._reach()) < _STILL_MM:
                 break
@@ -440,19 +452,20 @@ class _Alignment:
         if seeded is not None:
             # Matched by another pose than the present one: from the places as they lie now.
             second = seeded is poses[0]
-            still = places if not second else places
             back = np.linalg.inv(seeded)
-            moved_back = still @ back[:3, :3].T + back[:3, 3]
-            gap = np.einsum("qi,qi->q", moved_back - still, normals)
+            gap = np.einsum("qi,qi->q", places @ back[:3, :3].T + back[:3, 3] - places, normals)
             residual = residual + gap if second else residual - gap
         derivatives = np.zeros((len(residual), 6 * self.path.count))
         for number, rows, sign in ((source, rows_s, 1.0), (target, rows_t, -1.0)):
             piece, basis = self.pieces[number], self.bases[number][rows]
-            by = np.hstack([normals, np.cross(places - piece.platform_mm[rows], normals)])
+            # Turns are about the platform where the present correction has it.
+            platform = piece.platform_mm[rows] + self.corrections(basis)[:, :3]
+            lever = moved[int(number == max(source, target))].places_mm[rows] - platform
+            by = np.hstack([normals, np.cross(lever, normals)])
             derivatives += sign * np.einsum("qc,qi->qci", basis, by).reshape(len(rows), -1)
         return residual, derivatives
 
-    def result(self, cloud: PointCloud, trajectory: Trajectory, times: np.ndarray) -> AlignedPath:
+    def result(self, cloud: PointCloud, trajectory: Trajectory, times: np.ndarray) -> AlignedTrajectory:
         basis = self.path.basis(trajectory.times_s)
         correction = self.corrections(basis)
         poses = trajectory.poses.copy()
@@ -465,8 +478,11 @@ class _Alignment:
         platform = trajectory.poses_at(times)[:, :3, 3]
         points = Rotation.from_rotvec(by_point[:, 3:]).apply(cloud.points_mm - platform) + platform + by_point[:, :3]
         crossings = tuple(self._crossing(pair) for pair in self.pairs)
-        return AlignedPath(
-            Trajectory(trajectory.times_s, poses, covariance), correction, crossings, replace(cloud, points_mm=points)
+        return AlignedTrajectory(
+            Trajectory(trajectory.times_s, poses, covariance),
+            correction,
+            crossings,
+            replace(cloud, points_mm=points, uncertainty=None),
         )
 
     def _crossing(self, pair: tuple[int, int]) -> Crossing:
