@@ -566,8 +566,8 @@ def export(file: Path, *, out: Path, images: Literal["png", "tiff"] = "png", ove
 
     Args:
         file: Capture (.h5) or cloud (.ply or .h5).
-        out: New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz or
-            .e57.
+        out: New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
+            .e57, .mcap (ROS 2) or .foxglove.mcap.
         images: Format of a capture's images; both keep all bits.
         overwrite: Replace an existing cloud.
     """
