@@ -24,13 +24,15 @@ from twin.scene.motion import Light, Shot
 from twin.scene.platforms import Platform
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
 from twin.sensor.flaws import as_built, delivered, laser_shares, veiled, vignette
+from twin.sensor.peak_finder import INVALID, PeakFinder
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.model.errors import DesignError, OutputError
 from uwlts.model.library import validated
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium, Sensor, Table
+from uwlts.model.stripe import Coordinates
 from uwlts.model.trajectory import Trajectory
-from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame, Seen
 from uwlts.storage.pose_files import trajectory_path, write_trajectory
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, truth_path, write_truth
 
@@ -142,6 +144,9 @@ class Studio:
         self._speckle = Speckle(camera, wavelength_nm=laser.wavelength_nm, seed=options.seed)
         self._vignette = vignette(camera, flaws.vignetting) if flaws.vignetting else 1.0
         self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else 1.0
+        self.peak_finder = None
+        if flaws.camera_3d:
+            self.peak_finder = PeakFinder(camera, self.sensor.detector.full_scale_dn(), flaws.camera_3d)
         self._pattern = None
         if options.effects.fixed_pattern:
             self._pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
@@ -177,20 +182,37 @@ class Studio:
         """``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
         return true_pose(self.scene, shot)
 
+    def speed_mm_per_s(self) -> float:
+        """Speed of the stage along its positions while an image is exposed; 0 on other platforms."""
+        motion = self.scene.motion
+        if isinstance(motion, Platform):
+            return 0.0
+        return motion.speed_mm_per_s * (1 if motion.step_mm >= 0 else -1)
+
     def travel(self, shot: Shot) -> Travel | None:
         """Motion of the sensor during the exposure of a shot; None if it stands still."""
-        motion, detector = self.scene.motion, self.sensor.detector
+        exposure_ms = self.exposure_ms.get(shot.light, 0.0) * shot.exposure
+        motion = self.scene.motion
+        if not isinstance(motion, Platform):
+            return self.travel_at(self.speed_mm_per_s(), exposure_ms=exposure_ms)
         if not (motion.moves() and self.options.effects.motion):
             return None
-        exposure_s, turn = 1e-3 * self.exposure_ms.get(shot.light, 0.0) * shot.exposure, None
-        if isinstance(motion, Platform):
-            velocity, turn = motion.course().twist(shot, exposure_s=exposure_s)
-        else:
-            velocity = motion.speed_mm_per_s * (1 if motion.step_mm >= 0 else -1) * motion.unit_direction()
+        velocity, turn = motion.course().twist(shot, exposure_s=1e-3 * exposure_ms)
+        return self._travel(velocity, turn, exposure_ms)
+
+    def travel_at(self, speed: float, *, exposure_ms: float) -> Travel | None:
+        """Movement of the sensor during an exposure at a speed of the stage in mm/s; None if it stands still."""
+        motion = self.scene.motion
+        if speed == 0 or not self.options.effects.motion or isinstance(motion, Platform):
+            return None
+        return self._travel(speed * motion.unit_direction(), None, exposure_ms)
+
+    def _travel(self, velocity: np.ndarray, turn: np.ndarray | None, exposure_ms: float) -> Travel:
+        detector = self.sensor.detector
         return Travel(
             velocity_mm_s=velocity,
             turn_rad_s=turn,
-            exposure_s=exposure_s,
+            exposure_s=1e-3 * exposure_ms,
             row_s=1e-6 * detector.line_time_us if detector.shutter == "rolling" else 0.0,
             middle_row=(self.sensor.camera.height_px - 1) / 2,
         )
@@ -256,14 +278,25 @@ class Studio:
             pose = course.reported[number]
             covariance = None if course.covariance is None else course.covariance[number]
         return Frame(
-            image=self.image(shot, index),
+            self.seen(shot, index),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
             exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
             time_s=index * self.period_s if shot.time_s is None else shot.time_s,
             pose=pose,
             pose_covariance=covariance,
+            speed_mm_per_s=self.speed_mm_per_s(),
         )
+
+    def seen(self, shot: Shot, index: int) -> Seen:
+        """The image of a shot, or what a 3D camera finds in it."""
+        image = self.image(shot, index)
+        if self.peak_finder is None or shot.light != "laser":
+            return image
+        camera = self.sensor.camera
+        length = camera.height_px if camera.stripe_along == "width" else camera.width_px
+        meant = Coordinates(scale=self.peak_finder.scale_px(), invalid=INVALID)
+        return meant.stripe(self.peak_finder.numbers(image), stripe_along=camera.stripe_along, length_px=length)
 
     def image(self, shot: Shot, index: int) -> np.ndarray:
         """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
@@ -580,8 +613,10 @@ def record_scene(
         "spp": studio.options.spp,
     }
     known = isinstance(motion, Platform) and motion.states_covariance
+    lines = studio.peak_finder is not None
+    kinds = {"centre_lines": lines, "moving": studio.speed_mm_per_s() != 0, "covariances": known}
     files = {"overwrite": overwrite, "resume": resume}
-    with CaptureWriter(path, header, dtype=dtype, plan=plan, covariances=known, **files) as writer:
+    with CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer:
         done = len(writer)
         for index, shot in enumerate(shots):
             truths.append(studio.truth(shot))

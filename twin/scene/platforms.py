@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import Akima1DInterpolator, CubicSpline
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -191,8 +191,8 @@ class _Route(Platform):
 
     ``waypoints`` are its places one after the other, or ``trajectory`` is a file of times and poses in
     ``trajectory_format`` and ``trajectory_unit`` (`uwlts.read_trajectory`); a relative path starts at the scene's
-    folder. Between them it follows a cubic spline, at a speed of about ``speed_mm_per_s`` and at most
-    ``turn_deg_per_s``. With a speed of 0 it stops at every waypoint.
+    folder. Between them it follows Akima's curve (rotations a spline), at a speed of about ``speed_mm_per_s`` and at
+    most ``turn_deg_per_s``. With a speed of 0 it stops at every waypoint.
     """
 
     waypoints: tuple[Pose, ...] = ()
@@ -488,14 +488,16 @@ def _path(times: np.ndarray, poses: np.ndarray, *, stops: bool) -> Poses:
     """Poses through (K, 4, 4) at times (K,): standing at each, or along splines and straight on beyond both ends."""
     if stops or len(times) == 1:
         return lambda wanted: poses[_stop(times, wanted)]
-    positions = CubicSpline(times, poses[:, :3, 3], bc_type="natural")
+    # Cubic pieces that do not swing beyond the points, as splines of two continuous derivatives do at tight turns.
+    positions = Akima1DInterpolator(times, poses[:, :3, 3], method="makima")
+    velocities = positions.derivative()
     rotations = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))
 
     def at(wanted: np.ndarray) -> np.ndarray:
         inside = np.clip(wanted, times[0], times[-1])
         beyond = (np.asarray(wanted) - inside)[:, None]
         found = np.tile(np.eye(4), (len(inside), 1, 1))
-        found[:, :3, 3] = positions(inside) + beyond * positions(inside, 1)
+        found[:, :3, 3] = positions(inside) + beyond * velocities(inside)
         found[:, :3, :3] = (rotations(inside) * Rotation.from_rotvec(beyond * rotations(inside, 1))).as_matrix()
         return found
 

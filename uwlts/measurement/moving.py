@@ -85,7 +85,8 @@ def carried(capture: Capture, ride: Ride, mount: Mount | None) -> FrameTable:
     header = capture.header
     if mount is not None:
         header = header.model_copy(update={"T_platform_sensor": tuple(map(tuple, mount.transform().tolist()))})
-    return FrameTable(header, capture.path, capture.stage_mm, capture.exposure_ms, ride.poses)
+    known = capture.stage_mm, capture.exposure_ms, ride.poses, capture.speed_mm_per_s
+    return FrameTable(header, capture.path, *known)
 
 
 def with_platform(

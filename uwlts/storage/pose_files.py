@@ -19,7 +19,7 @@ from uwlts.storage.ros_bags import read_bag_poses
 
 Unit = Literal["mm", "m"]
 PoseFormat = str
-"""matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, or euler-ORDER-deg, euler-ORDER-rad."""
+"""matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ORDER-deg or -rad, angle-deg, angle-rad."""
 MM_PER_UNIT: dict[Unit, float] = {"mm": 1.0, "m": 1000.0}
 FARTHEST_MM = 1e7
 """Ten kilometres: no platform reaches farther, and squares of larger numbers would lose the noise."""
@@ -98,8 +98,11 @@ def read_poses(
     elements of the matrix row by row; or the translation, then a quaternion (``quaternion-xyzw``, ``quaternion-wxyz``),
     a rotation vector (``rotvec-rad``, ``rotvec-deg``) or three Euler angles: ``euler-ZYX-deg`` turns about the moved
     axes (intrinsic), the first letter first; ``euler-zyx-deg`` about the fixed axes (extrinsic), as SciPy's
-    `Rotation.from_euler`. DescriptionError for a wrong count, numbers that are not finite, matrices that are not rigid,
-    quaternions without unit length and angles that look like degrees where radians are stated.
+    `Rotation.from_euler`. One column ``angle-deg`` or ``angle-rad`` is the angle of a rotary table that turns the
+    object about its z axis: the poses are then those of the sensor's side as seen from the object.
+
+    DescriptionError for a wrong count, numbers that are not finite, matrices that are not rigid, quaternions without
+    unit length and angles that look like degrees where radians are stated.
     """
     path = Path(path)
     rows, times = pose_rows(path, {})
@@ -221,6 +224,8 @@ def matrices_of(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
         "quaternion-wxyz": (7,),
         "rotvec-rad": (6,),
         "rotvec-deg": (6,),
+        "angle-deg": (1,),
+        "angle-rad": (1,),
     }
     expected = (6,) if euler else counts.get(pose_format)
     if expected is None:
@@ -234,6 +239,11 @@ def matrices_of(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
     if pose_format == "matrix":
         result[:, : rows.shape[1] // 4] = rows.reshape(len(rows), -1, 4)
         return checked_matrices(result, path)
+    if pose_format.startswith("angle"):
+        # The object turns with the table; seen from it, the sensor turns the other way round.
+        angles = rows[:, 0] if pose_format.endswith("rad") else np.radians(rows[:, 0])
+        result[:, :3, :3] = Rotation.from_rotvec(np.outer(-angles, (0, 0, 1))).as_matrix()
+        return result
     result[:, :3, 3] = rows[:, :3]
     turns = rows[:, 3:]
     if pose_format.startswith("quaternion"):
