@@ -15,7 +15,7 @@ from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from uwlts.metrology.marker_spheres import MarkerSphere, common_markers
-from uwlts.metrology.patches import Distances, Patches, distances_between, scatter
+from uwlts.metrology.patches import PatchDistances, Patches, distances_between, scatter
 from uwlts.model.errors import EvaluationError
 
 _TUKEY = 4.685
@@ -110,7 +110,7 @@ class JointRegistration:
     def evidence(self, reach_mm: float) -> dict[tuple[int, int], PairEvidence]:
         """What all pairs of scans that overlap or share spheres say, about the present state."""
         moved = [self._moved(number) for number in range(len(self.patches))]
-        found: dict[tuple[int, int], Distances] = {}
+        found: dict[tuple[int, int], PatchDistances] = {}
         others = [np.ones(len(each)) for each in moved]
         for a, b in permutations(range(len(moved)), 2):
             distances = distances_between(moved[a], self.poses[a], moved[b], self.poses[b], reach_mm=reach_mm)
@@ -225,7 +225,7 @@ class JointRegistration:
         self,
         a: int,
         b: int,
-        ways: list[tuple[int, int, Distances]],
+        ways: list[tuple[int, int, PatchDistances]],
         others: list[np.ndarray],
         spheres: list[tuple[MarkerSphere, MarkerSphere, int]],
     ) -> PairEvidence:
@@ -280,7 +280,7 @@ class JointRegistration:
         """Motion (Q, 6) of places (Q, 3) along directions (Q, 3) by shift and turn of a scan."""
         return np.hstack([directions, np.cross(places - self.middles_mm[number], directions)])
 
-    def _spurious(self, source: int, target: int, found: Distances, weight: np.ndarray) -> np.ndarray:
+    def _spurious(self, source: int, target: int, found: PatchDistances, weight: np.ndarray) -> np.ndarray:
         """Information (P, P) that the noise of the normals alone would give."""
         across = np.cross(found.normals, np.eye(3)[np.argmin(np.abs(found.normals), axis=1)])
         across /= np.linalg.norm(across, axis=1, keepdims=True)

@@ -187,8 +187,8 @@ def disc_radius(points_mm: np.ndarray) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Distances:
-    """Distances of patches from the patches of another cloud, Q of them, in the common frame.
+class PatchDistances:
+    """PatchDistances of patches from the patches of another cloud, Q of them, in the common frame.
 
     Attributes
     ----------
@@ -213,8 +213,8 @@ class Distances:
 
 def distances_between(
     source: Patches, source_pose: np.ndarray, target: Patches, target_pose: np.ndarray, *, reach_mm: float
-) -> Distances:
-    """Distances of the patches of one cloud from the surface of another, where both lie within ``reach_mm``.
+) -> PatchDistances:
+    """PatchDistances of the patches of one cloud from the surface of another, where both lie within ``reach_mm``.
 
     Poses (4, 4) are into the common frame. A patch counts where the nearest patch of the other faces the same way and
     lies within one radius across its normal, so that nothing is extrapolated.
@@ -243,7 +243,7 @@ def distances_between(
     rows, nearest, columns = rows[good], nearest[good], columns[good]
     covariance = target.covariance[nearest]
     variance = source.covariance[rows, 0, 0] + np.einsum("qa,qab,qb->q", columns, covariance, columns)
-    return Distances(
+    return PatchDistances(
         rows,
         nearest,
         places[rows],

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.metrology.height_correlation import shifts_of_heights
 from uwlts.metrology.joint_registration import JointRegistration
 from uwlts.metrology.patches import (
-    Distances,
+    PatchDistances,
     Patches,
     averaged_points,
     disc_radius,
@@ -437,14 +437,14 @@ class _Alignment:
 
     def _residuals(
         self,
-        found: Distances,
+        found: PatchDistances,
         used: np.ndarray,
         source: int,
         target: int,
         poses: tuple[np.ndarray, np.ndarray],
         moved: tuple[Patches, Patches],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Distances (Q,) of matched patches as they lie now, and their derivatives (Q, 6 C) by the coefficients."""
+        """PatchDistances (Q,) of matched patches as they lie now, and their derivatives (Q, 6 C) by the coefficients."""
         rows_s, rows_t = found.source[used], found.target[used]
         normals, places = found.normals[used], found.places_mm[used]
         residual = found.distance_mm[used]

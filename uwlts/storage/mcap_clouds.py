@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib import import_module
 from io import BytesIO
 from typing import Any
 
@@ -69,9 +68,12 @@ def _moments(cloud: PointCloud) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def _ros2(cloud: PointCloud) -> bytes:
-    typesys: Any = _library("rosbags.typesys")
-    writer_module: Any = _library("mcap.writer")
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    try:
+        from mcap.writer import Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise _missing(error) from error
+    store: Any = get_typestore(Stores.ROS2_HUMBLE)
     point_cloud2, field = store.types[_POINT_CLOUD2], store.types["sensor_msgs/msg/PointField"]
     header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
     kinds = {"<f4": field.FLOAT32, "<f8": field.FLOAT64, "<i4": field.INT32}
@@ -81,7 +83,7 @@ def _ros2(cloud: PointCloud) -> bytes:
         for name, (kind, offset) in _layout(table).items()
     ]
     content = BytesIO()
-    writer = writer_module.Writer(content)
+    writer = Writer(content)
     writer.start(profile="ros2", library="uwlts")
     text = store.generate_msgdef(_POINT_CLOUD2, ros_version=2)[0]
     schema = writer.register_schema(name=_POINT_CLOUD2, encoding="ros2msg", data=text.encode())
@@ -105,9 +107,11 @@ def _ros2(cloud: PointCloud) -> bytes:
 
 
 def _foxglove(cloud: PointCloud) -> bytes:
-    foxglove: Any = _library("foxglove")
-    messages: Any = _library("foxglove.messages")
-    channels: Any = _library("foxglove.channels")
+    try:
+        import foxglove
+        from foxglove import channels, messages
+    except ImportError as error:
+        raise _missing(error) from error
     kind_of = messages.PackedElementFieldNumericType
     kinds = {"<f4": kind_of.Float32, "<f8": kind_of.Float64, "<i4": kind_of.Int32}
     table = _table(cloud)
@@ -139,10 +143,5 @@ def _layout(table: np.ndarray) -> dict[str, tuple[np.dtype, int]]:
     return {name: (entry[0], entry[1]) for name, entry in (table.dtype.fields or {}).items()}
 
 
-def _library(name: str) -> Any:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise SetupError(
-            f"MCAP needs the library {name.partition('.')[0]}, which is not installed: pip install 'uwlts[ros]'"
-        ) from error
+def _missing(error: ImportError) -> SetupError:
+    return SetupError(f"MCAP needs the library {error.name}, which is not installed: pip install 'uwlts[ros]'")
