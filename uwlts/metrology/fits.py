@@ -53,7 +53,7 @@ class FlatFit:
         return self.axes[0]
 
     def distances_mm(self, points: np.ndarray) -> np.ndarray:
-        """PatchDistances (M,) of any points (M, D), as in `residuals_mm`."""
+        """Distances (M,) of any points (M, D), as in `residuals_mm`."""
         return _lengths((np.asarray(points, dtype=np.float64) - self.point_mm) @ self.normals.T)
 
 
@@ -95,7 +95,7 @@ def _flat_fit(unit: Normalised, axes: np.ndarray, normals: np.ndarray) -> FlatFi
 
 
 def _lengths(across: np.ndarray) -> np.ndarray:
-    """PatchDistances from components (..., C) across a line or plane, signed where there is one."""
+    """Distances from components (..., C) across a line or plane, signed where there is one."""
     return across[..., 0] if across.shape[-1] == 1 else np.linalg.norm(across, axis=-1)
 
 

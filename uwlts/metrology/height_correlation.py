@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import gaussian_filter, maximum_filter
@@ -28,7 +30,9 @@ def shifts_of_heights(
     """
     low = np.minimum(source_mm[:, :2].min(axis=0), target_mm[:, :2].min(axis=0))
     maps = [_height_map(points, low, pixel_mm) for points in (source_mm, target_mm)]
-    sizes = [next_fast_len(a + b - 1, real=True) for a, b in zip(maps[0][0].shape, maps[1][0].shape, strict=True)]
+    sizes: list[Any] = [
+        next_fast_len(a + b - 1, real=True) for a, b in zip(maps[0][0].shape, maps[1][0].shape, strict=True)
+    ]
     (f, m), (g, k) = (
         [rfft2(each, sizes) for each in (h * w, w)] for h, w in ((d, w) for _, d, w in _with_detail(maps))
     )

@@ -188,7 +188,7 @@ def disc_radius(points_mm: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PatchDistances:
-    """PatchDistances of patches from the patches of another cloud, Q of them, in the common frame.
+    """Distances of patches from the patches of another cloud, Q of them, in the common frame.
 
     Attributes
     ----------
@@ -214,7 +214,7 @@ class PatchDistances:
 def distances_between(
     source: Patches, source_pose: np.ndarray, target: Patches, target_pose: np.ndarray, *, reach_mm: float
 ) -> PatchDistances:
-    """PatchDistances of the patches of one cloud from the surface of another, where both lie within ``reach_mm``.
+    """Distances of the patches of one cloud from the surface of another, where both lie within ``reach_mm``.
 
     Poses (4, 4) are into the common frame. A patch counts where the nearest patch of the other faces the same way and
     lies within one radius across its normal, so that nothing is extrapolated.

@@ -444,7 +444,7 @@ class _Alignment:
         poses: tuple[np.ndarray, np.ndarray],
         moved: tuple[Patches, Patches],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """PatchDistances (Q,) of matched patches as they lie now, and their derivatives (Q, 6 C) by the coefficients."""
+        """Distances (Q,) of matched patches as they lie now, and their derivatives (Q, 6 C) by the coefficients."""
         rows_s, rows_t = found.source[used], found.target[used]
         normals, places = found.normals[used], found.places_mm[used]
         residual = found.distance_mm[used]
