@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.fft import irfft2, next_fast_len, rfft2
+from numpy.fft import irfft2, rfft2
+from scipy.fft import next_fast_len
 from scipy.ndimage import gaussian_filter, maximum_filter
 
 _SMOOTH = 1.0
