@@ -15,7 +15,7 @@ from stripe_tables import table
 import uwlts
 from twin.scene.description import Scene
 from twin.scene.platforms import Robot
-from uwlts.calibration.mount import _profiles_of
+from uwlts.calibration.mount import profiles_of
 from uwlts.metrology.fits import fit_sphere
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount, SphereFound
@@ -49,7 +49,7 @@ def main(calibration_path: str, *paths: str) -> None:
         assert isinstance(motion, Robot) and truth.pose is not None
         true = (motion.true_mount or motion.mount).matrix()
         with uwlts.open_capture(path) as capture:
-            profiles, reported, _, _ = _profiles_of(capture, calibration, None, None)
+            profiles, reported, _, _ = profiles_of(capture, calibration, None, None)
         for name, poses in {"ideal": truth.pose @ np.linalg.inv(true), "as reported": reported}.items():
             mount = uwlts.calibrate_mount(profiles[:FOR_THE_MOUNT], poses[:FOR_THE_MOUNT], radius_mm=RADIUS_MM)
             shift, turn = errors(mount, true)

@@ -121,7 +121,7 @@ def calibrate_mount(
                 if radius_mm is not None or scale or time or axis is not None:
                     raise DescriptionError("the capture shows a target: give no radius, axis, scale or time")
                 return mount_by_board([capture], known, table)
-            profiles, table, profile_times_s, pose_times_s = _profiles_of(capture, known, table, times)
+            profiles, table, profile_times_s, pose_times_s = profiles_of(capture, known, table, times)
         poses = table
     evidence = read_mount_evidence(
         profiles,
@@ -143,7 +143,7 @@ def calibrate_mount(
         raise CalibrationError(f"{error}. {_advice(evidence)}") from error
 
 
-def _profiles_of(
+def profiles_of(
     capture: Capture, calibration: Calibration, poses: np.ndarray | None, pose_times_s: np.ndarray | None
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray | None]:
     """Profiles (N, 3) in the sensor's frame of all laser images, poses, and the times of both.

@@ -62,7 +62,7 @@ def start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, 
     angles = -Rotation.from_matrix(rotations[0].T @ rotations).as_rotvec()[:, 2]
     centres, radii = np.array([arc.centre_mm for arc in arcs]), np.array([arc.radius_mm for arc in arcs])
     design = np.column_stack([np.ones(len(arcs)), np.cos(angles), np.sin(angles)])
-    weights = np.ones(len(arcs))
+    weights, flat = np.ones(len(arcs)), np.zeros((3, 2))
     for _ in range(_REWEIGHTED):
         flat = np.linalg.lstsq(design * weights[:, None], centres * weights[:, None], rcond=None)[0]
         off = np.linalg.norm(centres - design @ flat, axis=1)

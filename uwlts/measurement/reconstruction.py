@@ -233,7 +233,7 @@ def _beside(capture: Capture | FrameTable, calibration: Calibration, stripes: Fo
 def _posed(points: np.ndarray, capture: Capture | FrameTable, frame: np.ndarray) -> np.ndarray:
     """Points of frames that carry a full pose ``T_scene_object`` are placed by it instead of by the stage."""
     poses = sensor_poses(capture)
-    posed = np.isfinite(poses).all(axis=(1, 2))
+    posed = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     if not posed.any():
         return points
     own = np.ones(len(points), bool) if posed[frame].all() else posed[frame]

@@ -428,6 +428,8 @@ def _read_hdf5(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
     wanted = [*_PER_POINT, *(needed if any(name in arrays for name in names) else ())]
     if missing := [name for name in wanted if name not in arrays]:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
-    known = PointUncertainty(*(arrays.get(name) for name in names)) if names[0] in arrays else None
+    known = None
+    if needed[0] in arrays:
+        known = PointUncertainty(*(arrays[name] for name in needed), poses_mm=arrays.get("poses_mm"))
     per_point = {name: arrays[name] for name in _KINDS if name in arrays}
     return PointCloud(**per_point, uncertainty=known, metadata=header.metadata), total
