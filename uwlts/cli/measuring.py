@@ -426,6 +426,122 @@ def findings_report(
 
 
 @app.command
+def register(
+    *clouds: Path,
+    out: Path,
+    page: Path | None = None,
+    poses_out: Path | None = None,
+    poses: Path | None = None,
+    pose_format: str = "matrix",
+    pose_unit: Literal["mm", "m"] = "mm",
+    start_std_mm: float | None = None,
+    start_std_deg: float | None = None,
+    search: Flag = False,
+    sphere_mm: float | None = None,
+    reach_mm: float | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Bring scans that overlap into the frame of the first, and merge them into one cloud with its uncertainty.
+
+    Example: uwlts register top.ply left.ply right.ply --out pipe.ply --page pipe.html
+
+    Args:
+        clouds: Two or more clouds (.ply or .h5), in any order.
+        out: Merged cloud to write (.ply or .h5).
+        page: Page to write, with all figures, poses and their covariance as JSON beside it.
+        poses_out: Poses of the scans to write (CSV, matrix, mm).
+        poses: CSV file with the pose of every scan at the start, in the order of the clouds; the scans' frames are
+            taken as one unless given.
+        pose_format: Format of the poses: matrix, quaternion-xyzw, euler-ZYX-deg and others, as for uwlts reconstruct.
+        pose_unit: Unit of the poses' positions.
+        start_std_mm: Standard uncertainty of the start along each axis: it counts as evidence then.
+        start_std_deg: The same of its turns.
+        search: Search the start by the shape of the surfaces, or by spheres.
+        sphere_mm: Diameter of spheres in the scene that tie scans together.
+        reach_mm: How far overlapping surfaces lie apart at the start, at most; a 20th of a scan's size unless given.
+    """
+    from uwlts.report.page_toolkit import refuse_unsuitable_page
+
+    for path in (out, poses_out):
+        if path:
+            refuse_unsuitable(path, overwrite=overwrite)
+    if page:
+        refuse_unsuitable_page(page, example="registration.html", overwrite=overwrite)
+    start = None if poses is None else uwlts.read_poses(poses, pose_format=pose_format, unit=pose_unit)[0]
+    with progress_bar(f"registering {len(clouds)} scans") as progress:
+        found = uwlts.register(
+            clouds,
+            poses=start,
+            start_std_mm=start_std_mm,
+            start_std_deg=start_std_deg,
+            search=search,
+            sphere_mm=sphere_mm,
+            reach_mm=reach_mm,
+            progress=progress,
+        )
+    show(found.lines())
+    uwlts.write_cloud(out, found.cloud, overwrite=overwrite)
+    if poses_out:
+        uwlts.write_poses(poses_out, found.poses, overwrite=overwrite)
+    if page:
+        uwlts.write_registration(page, found, overwrite=overwrite)
+    written = [str(path) for path in (out, poses_out, page) if path]
+    print(f"wrote {', '.join(written)}")
+
+
+@app.command
+def align(
+    cloud: Path,
+    *,
+    trajectory: Path,
+    out: Path,
+    aligned: Path | None = None,
+    pose_format: str = "quaternion-xyzw",
+    pose_unit: Literal["mm", "m"] = "mm",
+    clock_offset_s: float = 0.0,
+    drift_mm: float | None = None,
+    drift_deg: float | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Correct a trajectory so that surfaces which the scan shows twice agree.
+
+    Reconstruct the scan along the corrected trajectory afterwards: its points then have the uncertainty that is left.
+
+    Example: uwlts align pass.ply --trajectory pass.trajectory.csv --drift-mm 300 --drift-deg 1 --out corrected.csv
+
+    Args:
+        cloud: Cloud along the trajectory with the times of its points (uwlts reconstruct --trajectory).
+        trajectory: CSV file or ROS bag with times and poses, as the cloud was reconstructed with.
+        out: Corrected trajectory to write, with the covariance of each pose (CSV), and the crossings as JSON beside it.
+        aligned: Also write the cloud along the corrected trajectory.
+        pose_format: Format of the trajectory, as for uwlts reconstruct.
+        pose_unit: Unit of the trajectory's positions.
+        clock_offset_s: What to add to the times of the points for those of the trajectory.
+        drift_mm: Standard uncertainty of the navigation at the end, along each axis; as the trajectory's covariance
+            says unless given.
+        drift_deg: The same of its turns.
+    """
+    from uwlts.storage.json_files import json_text
+
+    beside = out.with_suffix(".json")
+    for path in (out, beside, aligned):
+        if path:
+            refuse_unsuitable(path, overwrite=overwrite)
+    path = uwlts.read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
+    with progress_bar(f"aligning {cloud.name}") as progress:
+        found = uwlts.align_trajectory(
+            cloud, path, clock_offset_s=clock_offset_s, drift_mm=drift_mm, drift_deg=drift_deg, progress=progress
+        )
+    show(found.lines())
+    uwlts.write_trajectory(out, found.trajectory, overwrite=overwrite)
+    with written_aside(beside, overwrite=overwrite) as aside:
+        aside.write_text(json_text(found.record(), indent=1), encoding="utf-8")
+    if aligned:
+        uwlts.write_cloud(aligned, found.cloud, overwrite=overwrite)
+    print(f"wrote {out} and {beside.name}" + (f", {aligned}" if aligned else ""))
+
+
+@app.command
 def gauge(
     table: Path,
     *,
@@ -605,7 +721,7 @@ def export(
     Args:
         file: Capture (.h5) or cloud (.ply, .h5 or .copc.laz).
         out: New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
-            .e57 or .copc.laz (an octree for viewers, written a part at a time).
+            .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers, written a part at a time).
         images: Format of a capture's images; both keep all bits.
         region_mm: Only the points in a box: x y z of one corner, x y z of the other.
         at_most: Only an even sample of about so many points.

@@ -1,4 +1,4 @@
-"""Export of captures as folders of images that `uwlts import` reads back, and of clouds as PLY, HDF5, XYZ, LAZ, E57."""
+"""Export of captures as folders of images that `uwlts import` reads back, and of clouds in other formats."""
 
 import csv
 import os
@@ -30,6 +30,7 @@ from uwlts.storage.files import refuse_unsuitable, require_possible_name, writte
 from uwlts.storage.import_.description import NAME
 from uwlts.storage.import_.matching import POSE_COLUMNS
 from uwlts.storage.las_file import laz_content, library
+from uwlts.storage.mcap_clouds import covariance_columns, mcap_of
 from uwlts.stripe import Stripe
 
 HEADER, TABLE = "header.json", "frames.csv"
@@ -55,7 +56,7 @@ def export(
         Capture (.h5) or cloud (.ply, .h5 or .copc.laz).
     out : str or Path
         New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
-        .e57, or .copc.laz, which is written a part at a time.
+        .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz, which is written a part at a time.
     images : {"png", "tiff"}
         Format of a capture's images; both keep all bits.
     region_mm : pair of (3,), optional
@@ -155,7 +156,7 @@ def export_capture(
         shutil.rmtree(aside, ignore_errors=True)
 
 
-CLOUD_FORMATS = (".ply", ".h5", ".xyz", ".laz", ".e57")
+CLOUD_FORMATS = (".ply", ".h5", ".xyz", ".laz", ".e57", ".mcap")
 
 
 def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> None:
@@ -165,9 +166,14 @@ def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> N
     - ``.xyz``: text, a line of names, then X Y Z in mm and the intensity (nan where unknown) of every point, with all
       the digits that they have.
     - ``.laz``: LAS 1.4, point format 6, metres in steps of 1e-7 m. The standard intensity is rounded to whole numbers
-      (0 where unknown); ``amplitude`` holds it as it is, ``frame``, ``line`` and ``deviation_mm`` the rest.
-    - ``.copc.laz``: the same as COPC, in an octree with levels of detail.
-    - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate.
+      (0 where unknown); ``amplitude`` holds it as it is, the standard ``gps_time`` the time in s where it is known,
+      ``frame``, ``line``, ``deviation_mm`` and the covariance ``cov_xx_mm2`` to ``cov_zz_mm2`` the rest.
+    - ``.copc.laz``: the same without times and covariances as COPC, in an octree with levels of detail.
+    - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate; the
+      image as column, the line as row where both are known and below 65536. The library writes neither times nor
+      covariances.
+    - ``.mcap``: messages sensor_msgs/msg/PointCloud2 of ROS 2, and where the name ends with ``.foxglove.mcap``
+      foxglove.PointCloud; one for each image where the points' times are known (`uwlts.storage.mcap_clouds`).
 
     OutputError where the suffix is none of these, the file exists, the cloud is empty, too wide for LAZ, or lacks
     intensities that E57 cannot leave out, or storage fails; SetupError where the format's library is not installed.
@@ -195,7 +201,10 @@ def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> N
             fields = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
             if cloud.deviation_mm is not None:
                 fields["deviation_mm"] = cloud.deviation_mm
+            fields |= covariance_columns(cloud)
             aside.write_bytes(laz_content(cloud.points_mm, cloud.intensity, fields, time_s=cloud.time_s))
+        elif suffix == ".mcap":
+            aside.write_bytes(mcap_of(cloud, foxglove=path.name.lower().endswith(".foxglove.mcap")))
         else:
             _write_e57(cloud, aside, path)
 
@@ -213,6 +222,8 @@ def _write_e57(cloud: PointCloud, aside: Path, path: Path) -> None:
     data: dict[str, np.ndarray] = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), columns, strict=True))
     if not unknown.any():
         data["intensity"] = cloud.intensity
+    if all(numbers.min() >= 0 and numbers.max() < 2**16 for numbers in (cloud.frame, cloud.line)):
+        data |= {"columnIndex": cloud.frame.astype(np.uint16), "rowIndex": cloud.line.astype(np.uint16)}
     try:
         file = pye57.E57(str(aside), mode="w")
         file.write_scan_raw(data, name=path.stem)

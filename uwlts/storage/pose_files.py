@@ -89,7 +89,9 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def read_poses(path: str | Path, *, pose_format: PoseFormat, unit: Unit = "mm") -> tuple[np.ndarray, np.ndarray | None]:
+def read_poses(
+    path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit = "mm"
+) -> tuple[np.ndarray, np.ndarray | None]:
     """``T_base_platform`` (P, 4, 4), mm, and their times (P,) or None, from a CSV file with one pose a line.
 
     Columns ``pose`` and ``time_s``, recognised by name, come in addition. The others are, in this order, 12 or 16
@@ -134,6 +136,19 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
     if times is None:
         raise DescriptionError(f"{path} has no column time_s: a trajectory needs the time of each pose")
     return _trajectory(path, times, scaled(matrices_of(rows, pose_format, path), unit), covariance)
+
+
+def write_poses(path: str | Path, poses: np.ndarray, *, overwrite: bool = False) -> None:
+    """Write poses (P, 4, 4), mm, as CSV with 12 elements of the matrix a line.
+
+    `read_poses` reads them back with the format ``matrix``. OutputError where the file exists and ``overwrite`` is not
+    set, or cannot be written.
+    """
+    names = [f"m{row}{column}" for row in range(3) for column in range(4)]
+    rows = np.asarray(poses, dtype=np.float64)[:, :3].reshape(-1, 12)
+    with written_aside(path, overwrite=overwrite) as aside:
+        lines = [",".join(names), *(",".join(map(repr, row)) for row in rows.tolist())]
+        aside.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 _COVARIANCE = {f"cov_{i}{j}": (i, j) for i in range(6) for j in range(i, 6)}
