@@ -35,7 +35,7 @@ from uwlts.storage.one_writer import lock_path, one_writer
 
 if TYPE_CHECKING:
     from twin.recording.studio import Exposed, Studio
-    from twin.scene.description import Shot
+    from twin.scene.motion import Shot
 
 MOST_ATTEMPTS = 20
 """A scene that the sensor cannot measure is drawn anew; where so many in a row are, the description is at fault."""

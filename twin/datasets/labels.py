@@ -39,7 +39,7 @@ from uwlts.model.sensor import Detector
 
 if TYPE_CHECKING:
     from twin.recording.studio import Exposed, Studio
-    from twin.scene.description import Shot
+    from twin.scene.motion import Shot
 
 _WINDOW_PX = 96
 """Pixels to either side of a centre in which its stripe is looked for; wider ones are cut off there."""
@@ -85,7 +85,7 @@ def _line_labels(studio: Studio, shot: Shot, taken: Exposed, noise: np.ndarray) 
     count, truth, number = camera.lines(), no_stripe(camera.lines()), np.full(camera.lines(), -1, np.int16)
     status = np.full(count, LineStatus.LASER_OFF, np.uint8)
     if studio.shows(shot, "laser"):
-        found = crossings(studio.renderer, studio.pose(shot), travel=studio.travel(shot.light))
+        found = crossings(studio.renderer, studio.pose(shot), travel=studio.travel(shot))
         truth, order = brightest(found, count), lit_dimmest_first(found)
         number[found.line[order]] = found.thing[order]
         status[:] = LineStatus.NOT_CROSSED

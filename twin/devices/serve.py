@@ -20,7 +20,8 @@ from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
 from twin.options import CPU, Options, Variant, use_variant
 from twin.recording.recording import AnyScene, AnySensor, choose_scene, choose_sensors
-from twin.scene.description import Light, Motion, Shot, altered
+from twin.scene.description import altered
+from twin.scene.motion import Light, Motion, Shot
 from uwlts.model.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
 
@@ -351,13 +352,16 @@ def serve(
         raise DescriptionError("lamp-and-laser cannot be served, as the controller switches the laser: leave it out")
     if not speed_up > 0:
         raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
+    motion = described.motion
+    if not isinstance(motion, Motion):
+        raise DescriptionError(f"{described.title} moves on a {motion.kind}; a stage is served: give steps of a stage")
     _, built = choose_sensors(sensor, as_built)
     faults = [parse_fault(text) for text in fault]
     use_variant(variant)
     from twin.recording.studio import Studio
 
-    track = Track.on(built.stage, described.motion, start_mm=stage_start)
-    lamp = "lamp" in described.motion.lights if lamp is None else lamp
+    track = Track.on(built.stage, motion, start_mm=stage_start)
+    lamp = "lamp" in motion.lights if lamp is None else lamp
     # The controller moves the stage, and a frame may ask for any light.
     at_rest = {"lights": ("lamp", "laser") if lamp else ("laser",), "speed_mm_per_s": 0.0}
     studio = Studio(built, altered(described, motion=at_rest), options)

@@ -29,8 +29,8 @@ from twin.light.sheet import Sheet
 from twin.light.walk import Walker
 from twin.light.water import Scattering, single_scattering
 from twin.options import ALL, Effects
-from twin.scene.description import Light as LightName
 from twin.scene.description import Scene
+from twin.scene.motion import Light as LightName
 from twin.scene.objects import build_objects
 from uwlts.model.placement import camera_from_object, check_design
 from uwlts.model.sensor import Medium, Sensor
@@ -55,6 +55,8 @@ _CAUSTIC_WAVES, _CAUSTIC_MM = 10, (20.0, 120.0)
 """Waves of the surface that throw caustics, and their wavelengths in mm where they fall: a rippled tank or harbour."""
 _TRAVEL_STEP_MM = 0.2
 """While the sensor travels, the lit pixels are looked for at places this far apart."""
+_REACH_SHARE = 1.5
+"""Distance of what is seen from the OCS's origin, at most about, over the stand-off."""
 
 
 @dataclass(frozen=True)
@@ -196,30 +198,30 @@ class Renderer:
         rows, columns = np.nonzero(self._repeated(np.any(near, axis=0)))
         return rows, columns
 
-    def laser(self, pose: SensorPose, bundle: Rays, travel_mm: Float | None = None) -> Float:
+    def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> Float:
         """Irradiance of the first laser's light per ray in W/mm2: the lit surface seen straight, nothing around it."""
         direct, _ = lights(self._sheets[:1], pose)
-        segment = next(self._segments(pose, bundle, travel_mm))
-        return segment.weight * self._radiance(pose, segment, direct, travel_mm)
+        segment = next(self._segments(pose, bundle, after_s))
+        return segment.weight * self._radiance(pose, segment, direct, after_s)
 
     # --- the lit surface ----------------------------------------------------------------------------------------------
 
-    def _segments(self, pose: SensorPose, bundle: Rays, travel_mm: Float | None) -> Iterator[RaySegment]:
+    def _segments(self, pose: SensorPose, bundle: Rays, after_s: Float | None) -> Iterator[RaySegment]:
         mirrors = _MIRRORS if self._mirrors else 0
-        return ray_segments(self.objects, self.scattering.c, pose, bundle, travel_mm, mirrors=mirrors)
+        return ray_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=mirrors)
 
     def _sigmas(self, light: Light, segment: RaySegment) -> Float:
         """The light's distance across at segments' ends in standard deviations; infinity where there is no surface."""
         here = light.at(segment.end())
         return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
 
-    def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], travel_mm: Float | None) -> Float:
+    def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None) -> Float:
         """Radiance in W/mm2/sr that lit surfaces send back along segments, as it arrives at their beginning."""
         radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
-            here = light.at(end, travel_mm)
-            lit = light.reaches(self.objects.scene, end, here, travel_mm, segment.valid & (here.irradiance > 0))
-            towards = segment.si.to_local(pose.direction(-here.direction))
+            here = light.at(end, after_s)
+            lit = light.reaches(self.objects.scene, end, here, after_s, segment.valid & (here.irradiance > 0))
+            towards = segment.si.to_local(pose.direction(-here.direction, after_s))
             radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), segment.si, towards, lit)[0] * here.irradiance, 0.0)
         return radiance * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
 
@@ -260,8 +262,9 @@ class Renderer:
         yield pose, sources
         if pose.travel is not None:
             first, last = pose.travel.ends(self.sensor.camera.height_px)
-            for travel_mm in np.linspace(first, last, 2 + int((last - first) / _TRAVEL_STEP_MM)):
-                moved = pose.moved(float(travel_mm))
+            way_mm = (last - first) * pose.travel.fastest_mm_s(_REACH_SHARE * self.design.standoff_mm)
+            for after_s in np.linspace(first, last, 2 + int(way_mm / _TRAVEL_STEP_MM)):
+                moved = pose.moved(float(after_s))
                 direct, mirrored = lights(self._sheets, moved, self._mirrors)
                 yield moved, direct + mirrored
 
@@ -340,7 +343,7 @@ class Renderer:
             image[rows, columns] = fine[0]
         return image
 
-    def _evenly_lit(self, pose: SensorPose, bundle: Rays, travel_mm: Float | None, ambient: bool) -> tuple[Float]:
+    def _evenly_lit(self, pose: SensorPose, bundle: Rays, after_s: Float | None, ambient: bool) -> tuple[Float]:
         """Irradiance per ray in W/mm2 where every surface is evenly lit, seen through the water and its veil.
 
         A surface of albedo A that receives E sends back the radiance A E / pi. Daylight comes from all around, so the
@@ -348,7 +351,7 @@ class Renderer:
         is scattered backwards returns. Up to the distance t that veil is E / pi times the scattered share of the
         extinction, times 1 - exp(-c t) (Duntley 1963, Eq. 4, for an even light field).
         """
-        segment = next(self._segments(pose, bundle, travel_mm))
+        segment = next(self._segments(pose, bundle, after_s))
         lamp = self.sensor.lamp
         level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
         left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
@@ -397,12 +400,12 @@ class Renderer:
     # --- pixels -------------------------------------------------------------------------------------------------------
 
     def _stripe_sums(
-        self, pose: SensorPose, bundle: Rays, travel_mm: Float | None, sources: list[Light]
+        self, pose: SensorPose, bundle: Rays, after_s: Float | None, sources: list[Light]
     ) -> tuple[Float, Float, Float]:
         """Irradiance per ray of lit surfaces seen straight or in a mirror, and it times what speckle depends on."""
         total, polarised, rough = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
-        for segment in self._segments(pose, bundle, travel_mm):
-            value = segment.weight * self._radiance(pose, segment, sources, travel_mm)
+        for segment in self._segments(pose, bundle, after_s):
+            value = segment.weight * self._radiance(pose, segment, sources, after_s)
             total += value
             polarised += value * self.objects.polarisation(segment.si)
             rough += value * self.objects.roughness_um(segment.si)
@@ -438,9 +441,9 @@ class Renderer:
                 u, v = u + dr.gather(mi.Float, shift_u, pixel), v + dr.gather(mi.Float, shift_v, pixel)
                 u, v = u - dr.floor(u), v - dr.floor(v)
             pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
-        travel_mm = None if pose.travel is None else pose.travel.at(row, places[-1])
+        after_s = None if pose.travel is None else pose.travel.at(row, places[-1])
         bundle = self.view.bundle(dr.gather(mi.Float, x, pixel) + places[0] - 0.5, row + places[1] - 0.5, pupil)
-        values = light(pose, bundle, travel_mm, *rest)
+        values = light(pose, bundle, after_s, *rest)
         dr.eval(values)  # together: each sum on its own would trace the rays anew
         return np.stack([dr.block_sum(value, spp).numpy() / spp for value in values])
 

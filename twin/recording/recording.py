@@ -107,7 +107,7 @@ def render(
     return Recording(
         np.stack([frame.image for frame in taken]),
         *(np.array([getattr(frame, name) for frame in taken]) for name in FRAME_DATA),
-        truth=truth_of_recording(studio, truths, first=shots[0][1]),
+        truth=truth_of_recording(studio, truths, shots=[shot for _, shot in shots]),
         sensor=studio.sensor,
         medium=studio.medium,
         scene=described,

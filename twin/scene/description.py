@@ -1,27 +1,27 @@
-"""Description of a virtual scene: objects, their poses, and the motion of the stage that scans them.
+"""Description of a virtual scene: objects and their poses, and the motion of the sensor that scans them.
 
 Scene coordinates are the sensor's object coordinate system (OCS) at stage position 0: X normal to the sheet, the
 direction of a scan; Y along the stripe; Z along the laser's axis away from the sensor; the origin is the stand-off.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, SerializeAsAny, Tag, model_validator
 
 from twin.scene.forms import AnyForm
+from twin.scene.motion import Motion
 from twin.scene.placed import Flat, Placed, Pose, Reflectance
+from twin.scene.platforms import IdealPath, LinearGuide, Platform, Robot, RotaryTable, Vehicle
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, read_table, validated
-from uwlts.model.sensor import Bracket, Description, NotNegative, Positive, Table, Vector
+from uwlts.model.sensor import Description, NotNegative, Positive, Table
 from uwlts.targets import CircleTarget, Target, parse_target
 
 Kind = TypeVar("Kind", bound=Description)
-Light = Literal["lamp", "laser", "day"]
 
 
 def altered(described: Kind, **changes: object) -> Kind:
@@ -188,78 +188,20 @@ AnyObject = Annotated[
 ]
 
 
-class Motion(Description):
-    """Stage positions of a scan: ``count`` of them from ``start_mm`` in steps of ``step_mm`` along ``direction``.
-
-    ``direction`` is where the stage truly carries the sensor; the capture records ``nominal_direction``. At every
-    position the images in ``lights`` are taken in turn, those with the laser at every multiple of its exposure in
-    ``bracket``. ``position_errors_mm`` is how much farther than recorded the stage truly stands at each position, 0
-    unless given. ``speed_mm_per_s`` is how fast the stage moves along
-    ``direction`` while an image is exposed; at 0 it stands still.
-    """
-
-    start_mm: float = 0.0
-    step_mm: float = 1.0
-    count: Annotated[int, Field(ge=1, le=100000)] = 1
-    direction: Vector = (1.0, 0.0, 0.0)
-    nominal_direction: Vector | None = None
-    position_errors_mm: tuple[float, ...] = ()
-    lights: tuple[Literal["lamp", "laser"], ...] = ("laser",)
-    bracket: Bracket = (1.0,)
-    speed_mm_per_s: NotNegative = 0.0
-
-    @model_validator(mode="after")
-    def _has_direction(self) -> "Motion":
-        for vector in (self.direction, self.nominal_direction):
-            if vector is not None and np.linalg.norm(vector) < 1e-9:
-                raise ValueError(f"direction {vector} has no length")
-        if self.position_errors_mm and len(self.position_errors_mm) != self.count:
-            raise ValueError(f"position_errors_mm has {len(self.position_errors_mm)} values for {self.count} positions")
-        if not self.lights:
-            raise ValueError("lights is empty: name 'lamp', 'laser' or both")
-        if self.speed_mm_per_s > 0 and self.images() > self.count:
-            raise ValueError(
-                "a moving stage takes one image at each position: name one light and no bracket, or stop with speed 0"
-            )
-        return self
-
-    def unit_direction(self) -> np.ndarray:
-        """True unit direction (3,) of the sensor's travel in the scene."""
-        return np.array(self.direction) / np.linalg.norm(self.direction)
-
-    def recorded_direction(self) -> tuple[float, float, float]:
-        """Unit direction that the capture states."""
-        vector = np.array(self.nominal_direction or self.direction)
-        x, y, z = (vector / np.linalg.norm(vector)).tolist()
-        return x, y, z
-
-    def shots(self) -> Iterator["Shot"]:
-        """Every image of the scan in its order."""
-        for index in range(self.count):
-            stage_mm = self.start_mm + index * self.step_mm
-            error = self.position_errors_mm[index] if self.position_errors_mm else 0.0
-            for light in self.lights:
-                for exposure in self.bracket if light == "laser" else (1.0,):
-                    yield Shot(stage_mm=stage_mm, travelled_mm=stage_mm + error, light=light, exposure=exposure)
-
-    def images(self) -> int:
-        """Number of images of the scan."""
-        laser = self.lights.count("laser")
-        return self.count * (len(self.lights) + laser * (len(self.bracket) - 1))
+def _kind_of_motion(motion: object) -> str:
+    return str(motion.get("kind", "") if isinstance(motion, Mapping) else getattr(motion, "kind", ""))
 
 
-@dataclass(frozen=True)
-class Shot:
-    """One image to take.
-
-    Recorded and true position of the stage in mm, the light that is on beside the day's, and the multiple of its
-    exposure.
-    """
-
-    stage_mm: float
-    travelled_mm: float
-    light: Light
-    exposure: float = 1.0
+AnyMotion = Annotated[
+    Annotated[Motion, Tag("")]
+    | Annotated[IdealPath, Tag("path")]
+    | Annotated[LinearGuide, Tag("linear_guide")]
+    | Annotated[RotaryTable, Tag("rotary_table")]
+    | Annotated[Robot, Tag("robot")]
+    | Annotated[Vehicle, Tag("vehicle")],
+    Discriminator(_kind_of_motion),
+]
+"""A stage's steps, or a platform that ``kind`` names."""
 
 
 class Scene(Description):
@@ -275,7 +217,7 @@ class Scene(Description):
     title: str
     medium: str = "water"
     water: str | Annotated[float, Field(ge=0, le=3)] | None = None
-    motion: Motion = Motion()
+    motion: AnyMotion = Motion()
     objects: Annotated[tuple[AnyObject, ...], Field(min_length=1)]
     placements: dict[str, Pose] = {"standoff": Pose()}
     placement: str = "standoff"
@@ -316,17 +258,19 @@ def load_scene(
     placement: str | None = None,
     medium: str | None = None,
     water: str | float | None = None,
-    motion: Motion | Mapping[str, object] | None = None,
+    motion: Motion | Platform | Mapping[str, object] | None = None,
 ) -> Scene:
     """Scene by name (``spheres``) or path, with what is given in place of its own; a motion may be a table."""
     path = find(name_or_path)
     table: dict[str, object] = dict(read_table(path))
-    motion = motion.model_dump() if isinstance(motion, Motion) else motion
+    motion = motion.model_dump() if isinstance(motion, Description) else motion
     given = {"placement": placement, "medium": medium, "water": water, "motion": motion}
     table |= {key: value for key, value in given.items() if value is not None}
     objects = table.get("objects", [])
     if not isinstance(objects, list) or not all(isinstance(thing, dict) for thing in objects):
         raise DescriptionError(f"{path}: objects must be written as [[objects]] tables")
+    if isinstance(moved := table.get("motion"), Mapping) and isinstance(moved.get("trajectory"), str):
+        table["motion"] = {**moved, "trajectory": str(path.parent / str(moved["trajectory"]))}
     table["objects"] = [_with_paths_from(path.parent, thing) for thing in objects]
     return validated(Scene, table, path)
 

@@ -23,7 +23,7 @@ from uwlts.model.stripe import pixels_of
 from uwlts.optics.brightness import BLUR_STD, beside_std
 from uwlts.optics.line_table import LineTable
 from uwlts.runtime.compiled import compiled
-from uwlts.storage.capture import Capture, CaptureHeader, FrameTable
+from uwlts.storage.capture import Capture, CaptureHeader, FrameTable, sensor_poses
 from uwlts.storage.cloud import PointUncertainty
 from uwlts.storage.files import sha256_of
 
@@ -73,10 +73,10 @@ def point_uncertainty(
     """Uncertainty of the points that stripe centres (N,) of a capture give by a joint calibration.
 
     In the OCS, or in the scene where the frames carry poses. What the stage does by its positions, scale and direction
-    is part of it, about the middle of its positions; what poses add is not. The water may have drifted since the
-    calibration, unless that was made from this very capture. ``blur_px`` (N,), how far blur may move the centres, and
-    ``beside_mm`` (N, 3), how far points were moved to where their light comes from (`uwlts.optics.brightness`), are
-    each wrong by some share, the same for all points.
+    is part of it, about the middle of its positions; what poses add is not (`uwlts.measurement.moving`). The water may
+    have drifted since the calibration, unless that was made from this very capture. ``blur_px`` (N,), how far blur may
+    move the centres, and ``beside_mm`` (N, 3), how far points were moved to where their light comes from
+    (`uwlts.optics.brightness`), are each wrong by some share, the same for all points.
 
     Raises
     ------
@@ -92,12 +92,15 @@ def point_uncertainty(
     # Neighbours err together, so that they show only a part of the noise.
     shared = require_joint(calibration).shared_variance.get(STRIPE, 1.0)
     noise = stripe_noise_px(frame, line, centre_px) * float(np.sqrt(shared))
-    pose = capture.pose[:, :3, :3]
-    posed = np.all(np.isfinite(capture.pose), axis=(1, 2), keepdims=True)
+    of_sensor = sensor_poses(capture)
+    pose = of_sensor[:, :3, :3]
+    posed = np.all(np.isfinite(of_sensor), axis=(1, 2), keepdims=True)
     into_object = calibration.object_transform()[:3, :3].T
     pose_of = np.where(posed, pose, np.eye(3))
     root = covariance_root(known.covariance)
-    stage = np.where(posed[:, 0, 0], 0.0, capture.stage_mm - np.mean(capture.stage_mm))
+    by_stage_alone = ~posed[:, 0, 0]
+    middle = np.mean(capture.stage_mm[by_stage_alone]) if by_stage_alone.any() else 0.0
+    stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
     by_stage = stage_root(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
     exact = partial(_derivatives, known, stripe_along=calibration.stripe_along, turn=into_object)

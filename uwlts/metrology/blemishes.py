@@ -75,11 +75,10 @@ def measure_blemish(
     edge = max(_EDGE_SHARE * depth, _EDGE_STD * float(np.median(by_noise)))
     plain = field.figures(depths, edge, deepest)
     rng, own = np.random.default_rng(_SEED), errors[field.near]
-    images = np.unique(own.image, return_inverse=True)[1]
     drawn = []
     for _ in range(_DRAWS):
         moves = rng.standard_normal(len(noise)) * noise
-        moves += rng.standard_normal(images.max() + 1)[images] * own.image_mm
+        moves += own.drawn_of_images(rng)
         drawn.append(field.figures(depths + sign * field.depths(moves), edge, None) - plain)
     # Half of the middle 68 %: some draws let the contour run into its neighbour.
     random = 0.5 * np.diff(np.quantile(drawn, [0.1587, 0.8413], axis=0), axis=0)[0]
@@ -89,7 +88,7 @@ def measure_blemish(
     bias[0] = blur[0] = 0.0
     seen, plain, random = plain, np.maximum(plain - bias, 0), np.sqrt(random**2 + bias**2 + blur**2)
     # The depth at its own place: the deepest of a noisy surface is too deep.
-    at = np.array([sign * field.depths_at(deepest, moves) for moves in _draws(rng, noise, images, own)])
+    at = np.array([sign * field.depths_at(deepest, moves) for moves in _draws(rng, noise, own)])
     random[0] = float(np.std(at, ddof=1))
     # A quadratic over a radius cuts the bottom by its fourth power: Richardson's estimate from a narrower one.
     cut = field.richardson * (float(sign * field.narrow @ heights) - depth)
@@ -115,11 +114,8 @@ def measure_blemish(
     return Blemish(kind, tuple(values), field.grid[deepest], extent, indication.points)
 
 
-def _draws(rng: np.random.Generator, noise: np.ndarray, images: np.ndarray, own: NormalErrors) -> list[np.ndarray]:
-    return [
-        rng.standard_normal(len(noise)) * noise + rng.standard_normal(images.max() + 1)[images] * own.image_mm
-        for _ in range(_DRAWS)
-    ]
+def _draws(rng: np.random.Generator, noise: np.ndarray, own: NormalErrors) -> list[np.ndarray]:
+    return [rng.standard_normal(len(noise)) * noise + own.drawn_of_images(rng) for _ in range(_DRAWS)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -319,7 +319,7 @@ def _flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> FeatureValue:
     noise = np.maximum(errors.single_mm, face.std_mm)
     for _ in range(_DRAWS):
         moves = rng.standard_normal(len(used)) * noise
-        moves += rng.standard_normal(errors.image.max() + 1)[errors.image] * errors.image_mm
+        moves += errors.drawn_of_images(rng)
         drawn.append(float(np.ptp(found + means(moves))))
     bias = max(float(np.mean(drawn)) - value, 0.0)
     common = None

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.metrology.features import COVERAGE_FACTOR, DEFINITIONS, FeatureKind, FeatureValue
-from uwlts.storage.cloud import PointCloud, variance_along
+from uwlts.storage.cloud import PointCloud, images_along, variance_along
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,8 +20,8 @@ class NormalErrors:
     """Errors of points (N,) along the normals of a surface, mm.
 
     ``single_mm`` (N,) is the standard uncertainty of each point alone, zero where the cloud states none, ``image_mm``
-    (N,) the motion for one standard deviation of the position of its ``image`` (N,), ``patterns_mm`` (M, N) that for
-    one standard deviation of each common pattern; None where the cloud states nothing.
+    (K, N) the motion for one standard deviation of each part of the position and pose of its ``image`` (N,),
+    ``patterns_mm`` (M, N) that for one standard deviation of each common pattern; None where the cloud states nothing.
     """
 
     single_mm: np.ndarray
@@ -32,7 +32,15 @@ class NormalErrors:
     def __getitem__(self, chosen: np.ndarray) -> NormalErrors:
         """Those of a selection of the points."""
         patterns = None if self.patterns_mm is None else self.patterns_mm[:, chosen]
-        return NormalErrors(self.single_mm[chosen], self.image_mm[chosen], self.image[chosen], patterns)
+        return NormalErrors(self.single_mm[chosen], self.image_mm[:, chosen], self.image[chosen], patterns)
+
+    def drawn_of_images(self, rng: np.random.Generator) -> np.ndarray:
+        """One draw (N,) of the motions that the points of an image share."""
+        image = np.unique(self.image, return_inverse=True)[1]
+        moves = np.zeros(len(image))
+        for part in self.image_mm:
+            moves += rng.standard_normal(image.max() + 1)[image] * part
+        return moves
 
     def covariances(
         self, weights: np.ndarray, residuals: np.ndarray, groups: np.ndarray
@@ -42,7 +50,8 @@ class NormalErrors:
         ``residuals`` (N,) are the points' distances that are left, ``groups`` (N,) numbers of neighbourhoods whose
         points may err together. Where the residuals scatter more than stated, the noise is theirs.
         """
-        noise = (weights * self.single_mm**2) @ weights.T + _grouped(weights * self.image_mm, self.image)
+        noise = (weights * self.single_mm**2) @ weights.T
+        noise = noise + sum(_grouped(weights * part, self.image) for part in self.image_mm)
         seen = _grouped(weights * residuals, groups)
         size = np.maximum(np.diag(seen), 1e-300) / np.maximum(np.diag(noise), 1e-300)
         # As a whole, so that what is left stays a covariance.
@@ -60,11 +69,12 @@ def normal_errors(cloud: PointCloud, chosen: np.ndarray, normals: np.ndarray) ->
     frame = cloud.frame[chosen]
     image = np.unique(frame, return_inverse=True)[1] if np.any(frame >= 0) else np.arange(len(chosen))
     if (known := cloud.uncertainty) is None:
-        return NormalErrors(np.zeros(len(chosen)), np.zeros(len(chosen)), image, None)
+        return NormalErrors(np.zeros(len(chosen)), np.empty((0, len(chosen))), image, None)
     known = known[chosen]
     single = np.sqrt(np.maximum(variance_along(known.random_mm2, normals), 0))
-    position = np.einsum("ni,ni->n", known.position_mm, normals)
-    return NormalErrors(single, position, image, np.einsum("mni,ni->mn", known.patterns_mm, normals))
+    return NormalErrors(
+        single, images_along(known, normals), image, np.einsum("mni,ni->mn", known.patterns_mm, normals)
+    )
 
 
 def _grouped(moves: np.ndarray, group: np.ndarray) -> np.ndarray:

@@ -252,7 +252,7 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
     drawn = []
     for _ in range(_DRAWS):
         moves = rng.standard_normal(len(noise)) * noise
-        moves += rng.standard_normal(errors.image.max() + 1)[errors.image] * errors.image_mm
+        moves += errors.drawn_of_images(rng)
         drawn.append(_figures(bead, bead.raw_mm + moves, whole, toes) - seen)
     random, bias = np.nanstd(drawn, axis=0), np.zeros(len(seen))
     # The extreme of a noisy profile is too far out, by about as much as with as much noise again.

@@ -15,6 +15,12 @@ _NONE = np.empty(0, np.intp)
 _OK, _END = np.uint8(StripeStatus.OK), np.uint8(StripeStatus.END)
 
 
+def copied(stripe: Stripe) -> Stripe:
+    """A stripe of its own arrays."""
+    arrays = (each.copy() for each in (stripe.centre_px, stripe.amplitude, stripe.width_px, stripe.status))
+    return Stripe(*arrays, stripe.stripe_along)
+
+
 def leave_ends_out(stripe: Stripe, *, lines: int, jump_px: float) -> Stripe:
     """A stripe without the last ``lines`` before it ends or jumps, END from now on; see `StripeOptions.end_lines`.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,7 +12,7 @@ from uwlts.model.errors import ImageError
 from uwlts.model.stripe import Stripe, StripeStatus
 from uwlts.stripe.candidates import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
 from uwlts.stripe.direct import SeenStripes
-from uwlts.stripe.ends import leave_ends_out
+from uwlts.stripe.ends import copied, leave_ends_out
 from uwlts.stripe.learned import find_learned
 from uwlts.stripe.methods import amplitudes, place_centre
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
@@ -89,12 +88,10 @@ def see_stripes(
 ) -> SeenStripes:
     """The stripe as of `extract_stripe`, its ends included, and the candidates on lines that hold more than one.
 
-    These only under the rule `PeakRule.DIRECT`. The stripe of a 3D camera has none.
+    These only under the rule `PeakRule.DIRECT`. A 3D camera has found its stripe by itself.
     """
     if isinstance(image, Stripe):
-        # The ends are left out of it later.
-        own, jump_px = deepcopy(image), options.half_window_px / 2
-        return SeenStripes(own, None, options.threshold_floor, jump_px, options.end_lines)
+        return SeenStripes(copied(image), None, options.threshold_floor, options.half_window_px / 2, options.end_lines)
     found = _extracted(image, stripe_along, options, None, saturation)
     seen, jump_px = found.detection, found.options.half_window_px / 2
     if seen is None or options.peak is not PeakRule.DIRECT:
@@ -174,7 +171,7 @@ def stripe_in(
     Of the ``options`` a 3D camera's stripe takes `StripeOptions.end_lines` alone.
     """
     if isinstance(seen, Stripe):
-        return leave_ends_out(deepcopy(seen), lines=options.end_lines, jump_px=options.half_window_px / 2)
+        return leave_ends_out(copied(seen), lines=options.end_lines, jump_px=options.half_window_px / 2)
     return extract_stripe(seen, stripe_along=stripe_along, options=options, saturation=saturation)
 
 

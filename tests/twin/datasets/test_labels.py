@@ -10,8 +10,8 @@ from twin.datasets.description import FAINT_BELOW, LineStatus, Mask
 from twin.datasets.labels import labelled, noise_std_e, stripe_quality
 from twin.options import Effects, Options
 from twin.recording.studio import Exposed, Studio
-from twin.scene.description import Motion, Shot
 from twin.scene.forms.pitted_pipe import PittedPipe, pitted_radius
+from twin.scene.motion import Motion, Shot
 from uwlts.model.sensor import Sensor
 
 ALL_LABELS = ("centre", "quality", "points", "masks", "light", "depth", "sensor")

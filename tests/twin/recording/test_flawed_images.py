@@ -135,11 +135,13 @@ def test_dirt_takes_its_share_in_patches_as_wide_as_the_pupil(sensor):
 
 def test_a_rolling_shutter_delays_the_rows_of_a_moving_sensor(sensor):
     scene = scene_of(plate(), motion={"speed_mm_per_s": 40.0})
-    travels = [
-        Studio(sensor, scene, Options(effects=replace(NONE, motion=True), flaws=Flaws.of(*effects))).travel("laser")
+    studios = [
+        Studio(sensor, scene, Options(effects=replace(NONE, motion=True), flaws=Flaws.of(*effects)))
         for effects in (["rolling-shutter=25"], [])
     ]
-    assert [travel.row_mm for travel in travels if travel] == pytest.approx([40.0 * 25e-6, 0.0])
+    travels = [each.travel(next(scene.motion.shots())) for each in studios]
+    assert [travel.row_s for travel in travels if travel] == pytest.approx([25e-6, 0.0])
+    assert [travel.velocity_mm_s[0] for travel in travels if travel] == pytest.approx([40.0, 40.0])
 
 
 def test_lamp_and_laser_together_are_the_sum_of_both(sensor, apart):
