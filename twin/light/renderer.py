@@ -22,7 +22,15 @@ import numpy as np
 from twin.backend.arrays import Float, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, ray_segments
 from twin.light.illumination import Light, lights
-from twin.light.image_sampling import NODE_SPACING_PX, lattice, near_sheet, over_corners, pupil_shifts, widened
+from twin.light.image_sampling import (
+    NODE_SPACING_PX,
+    lattice,
+    near_sheet,
+    over_corners,
+    pupil_shifts,
+    widened,
+    without_outliers,
+)
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet
 from twin.light.walk import Walker
@@ -46,6 +54,9 @@ _MIRRORS = 2
 """Largest number of mirrors that the camera looks into one after the other."""
 _WALKS_PER_SAMPLE = 0.15
 """Random walks per cell and sample of a lit pixel in clear water; turbid water takes more."""
+_WALKS_BESIDE_STRIPE = 8
+_CELLS_BESIDE_STRIPE = 2
+"""So many times more walks are taken in so many cells beside the stripe, where light is bright and steep."""
 _SPOT_ASIDE = 0.25
 """Slope of an uneven lamp's axis against the camera's over that of the view's corner: the lamp is mounted beside it."""
 _TRAVEL_STEP_MM = 0.2
@@ -246,8 +257,12 @@ class Renderer:
         """Add multiply scattered and secondary light to an image (H, W), in large cells but for those in ``lit``."""
         camera = self.sensor.camera
         rows, columns = -(-camera.height_px // WALK_CELL_PX), -(-camera.width_px // WALK_CELL_PX)
-        row, column = (g.ravel() for g in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
-        large = self._walked(walker, row, column, WALK_CELL_PX, seed=2 * seed, walks=walks).reshape(rows, columns)
+        beside = self._beside_stripe(lit, rows, columns)
+        cell = np.arange(rows * columns)
+        cell = np.concatenate([cell, np.repeat(np.flatnonzero(beside), _WALKS_BESIDE_STRIPE - 1)])
+        each = self._walked(walker, cell // columns, cell % columns, WALK_CELL_PX, seed=2 * seed, walks=walks)
+        large = (np.bincount(cell, each) / np.bincount(cell)).reshape(rows, columns)
+        large = without_outliers(large, ~beside)
         size = columns * WALK_CELL_PX, rows * WALK_CELL_PX
         smooth = cv2.resize(large, size, interpolation=cv2.INTER_LINEAR)[: camera.height_px, : camera.width_px]
         row, column = np.nonzero(lit)
@@ -256,6 +271,14 @@ class Renderer:
             small[row, column] = self._walked(walker, row, column, NODE_SPACING_PX, seed=2 * seed + 1, walks=4 * walks)
             smooth = np.where(self._repeated(lit), self._repeated(small), smooth)
         image += smooth
+
+    def _beside_stripe(self, lit: np.ndarray, rows: int, columns: int) -> np.ndarray:
+        """Large cells (rows, columns) on the stripe, whose small cells are ``lit``, and next to it."""
+        on_stripe = np.zeros((rows, columns), np.uint8)
+        row, column = np.nonzero(lit)
+        on_stripe[row * NODE_SPACING_PX // WALK_CELL_PX, column * NODE_SPACING_PX // WALK_CELL_PX] = 1
+        across = 2 * _CELLS_BESIDE_STRIPE + 1
+        return cv2.dilate(on_stripe, np.ones((across, across), np.uint8)) > 0
 
     def _walked(
         self, walker: Walker, rows: np.ndarray, columns: np.ndarray, size_px: int, *, seed: int, walks: int
