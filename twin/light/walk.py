@@ -10,7 +10,8 @@ Every place that it comes to collects three parts of the laser's light:
 The last two count the same light; each is weighted by how probable the other one was (the balance heuristic of Veach
 1997, Eq. 9.8), which leaves no rare bright samples: a stripe close by is found by the walk itself, a distant one by
 connecting. Directions are drawn from the surface's or the water's own scattering, and in scattering water also from
-forward scattering about the direction to the laser, from which most scattered light arrives.
+forward scattering about the direction to the laser, from which most scattered light arrives, and into the sheet nearby
+in proportion to what it scatters from there (`SheetLobe`).
 
 Left out: light that went by way of a mirror and was scattered or reflected by something else before or after.
 """
