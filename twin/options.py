@@ -83,6 +83,8 @@ class Flaws:
     """Quality of lossy compression; 8-bit images only."""
     colour_filter: bool = False
     """A colour image sensor (RGGB) in place of a grey one; its red channel is recorded."""
+    camera_3d: int = _flaw(off=0, typical=16, least=1, most=32)
+    """Steps per pixel of a 3D camera, which finds the stripe itself: laser images are recorded as centre lines."""
 
     def __post_init__(self) -> None:
         for each in fields(self):

@@ -21,7 +21,11 @@ class _InMemory:
     def __init__(self, capture: Capture):
         self.path, self.header, self.laser_on, self.pose = capture.path, capture.header, capture.laser_on, capture.pose
         self.stage_mm, self.exposure_ms = capture.stage_mm, capture.exposure_ms
+        self.has_image = capture.has_image
         self._images = [capture.image(number) for number in range(len(capture))]
+
+    def seen(self, index: int) -> np.ndarray:
+        return self._images[index]
 
     def image(self, index: int) -> np.ndarray:
         return self._images[index]

@@ -179,7 +179,8 @@ def test_more_designs_may_be_asked_for(study, tmp_path, expected):
         assert done.returncode == 0, done.stderr
         found = read_parts(out / "screen")
         assert found["design"].tolist() == list(range(count))
-        np.testing.assert_array_equal(found["sigma_z_rms_mm"], expected["sigma_z_rms_mm"][:count])
+        # A batch of few designs is judged without compiled formulas, which round otherwise.
+        np.testing.assert_allclose(found["sigma_z_rms_mm"], expected["sigma_z_rms_mm"][:count], rtol=1e-9)
 
 
 def test_an_optimiser_beats_chance_and_goes_on_where_it_was(study, tmp_path):

@@ -3,7 +3,6 @@ which Dr.Jit derives from the formulas of all designs, and others to look at."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,7 +15,7 @@ from twin.design.description import Study
 from twin.design.designs import Columns, Design, Marked, built, described, judged, row_of, sensor_of
 from twin.design.figures import DEPTHS, PLACES, Field, depths_in_view, field_of
 from twin.design.geometry import Array, standoff_mm
-from twin.design.parameters import SensorArrays, followed, numbers_of
+from twin.design.parameters import PARAMETER_OF, SensorArrays, followed, numbers_of, parameters_alone
 from twin.options import use_variant
 from uwlts.model.errors import DesignError, Error, EvaluationError, RangeError
 
@@ -178,32 +177,6 @@ def choose(study: Study, columns: Columns) -> Chosen:
 
 # --- refinement -------------------------------------------------------------------------------------------------------
 
-PARAMETER_OF: dict[str, tuple[str, float]] = {
-    "laser.baseline_mm": ("baseline_mm", 1.0),
-    "laser.triangulation_angle_deg": ("angle_rad", math.pi / 180),
-    "laser.roll_deg": ("roll_rad", math.pi / 180),
-    "laser.power_mw": ("power_w", 1e-3),
-    "laser.waist_radius_mm": ("waist_mm", 1.0),
-    "laser.waist_distance_mm": ("waist_distance_mm", 1.0),
-    "laser.beam_quality_m2": ("beam_quality", 1.0),
-    "laser.window.distance_mm": ("laser_window_distance_mm", 1.0),
-    "laser.window.thickness_mm": ("laser_window_thickness_mm", 1.0),
-    "camera.focal_length_mm": ("focal_mm", 1.0),
-    "camera.f_number": ("f_number", 1.0),
-    "camera.focus_distance_mm": ("focus_mm", 1.0),
-    "camera.window.distance_mm": ("window_distance_mm", 1.0),
-    "camera.window.thickness_mm": ("window_thickness_mm", 1.0),
-    "camera.window.tilt_x_deg": ("window_tilt_x_rad", math.pi / 180),
-    "camera.window.tilt_y_deg": ("window_tilt_y_rad", math.pi / 180),
-    "volume.near_mm": ("near_mm", 1.0),
-    "volume.far_mm": ("far_mm", 1.0),
-}
-"""Numbers of the description along which figures can be derived, with the parameter and its unit per the path's; what a
-window's glass absorbs is taken as it is at the starting point."""
-
-_OF_BASELINE = ("laser.baseline_mm", "laser.triangulation_angle_deg", "laser.roll_deg")
-"""Numbers without a meaning for a laser that is placed by its axis."""
-
 _STEPS, _TOLERANCE = 40, 1e-7
 _HALVINGS = 12
 
@@ -258,9 +231,7 @@ class DerivedFigures:
 
         self._dr, self._float = dr, Float64
         sensor = sensor_of(study, design)
-        known = set(PARAMETER_OF) - (set() if sensor.laser.baseline_mm is not None else set(_OF_BASELINE))
-        free = ((path, one) for path, one in study.variables.items() if path in known)
-        self.paths = [path for path, variable in free if variable.values is None and not variable.whole]
+        self.paths = [path for path in parameters_alone(sensor) if path in study.continuous()]
         self._figures, self._study = figures, study
         self._parameters = numbers_of(sensor, study.medium_of(sensor))
         shares, places = np.meshgrid(np.linspace(0, 1, DEPTHS), np.linspace(-1, 1, PLACES), indexing="ij")

@@ -183,6 +183,10 @@ class Study(Description):
         """All that is free, in order: variables, then choices by the names of their options."""
         return self.variables | {name: Variable(values=tuple(options)) for name, options in self.choices.items()}
 
+    def continuous(self) -> list[str]:
+        """Paths of the variables that take any number of a range."""
+        return [path for path, one in self.variables.items() if one.values is None and not one.whole]
+
     def wanted(self) -> list[str]:
         """Figures of the objectives and of the constraints, in this order."""
         return list(dict.fromkeys([*(objective.figure for objective in self.objectives), *self.constraints]))

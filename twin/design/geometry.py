@@ -27,6 +27,11 @@ _TINY_MM = 1e-9
 """Keeps the direction of a point on the window's normal defined; far below anything that matters."""
 
 
+def where(xp: ModuleType, mask: Array, true: Array, false: Array) -> Array:
+    """Elements of two arrays by a mask."""
+    return (xp.where if xp is np else xp.select)(mask, true, false)
+
+
 def dot(a: Vector, b: Vector) -> Array:
     """Inner product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

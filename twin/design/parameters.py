@@ -12,7 +12,18 @@ from typing import Literal
 import numpy as np
 from numpy.polynomial import Chebyshev
 
-from twin.design.geometry import Array, LaserFan, Lens, Vector, WindowGeometry, dot, path_to, pose_at, standoff_mm
+from twin.design.geometry import (
+    Array,
+    LaserFan,
+    Lens,
+    Vector,
+    WindowGeometry,
+    dot,
+    path_to,
+    pose_at,
+    standoff_mm,
+    where,
+)
 from twin.sensor.speckle import coherence, pixel_contrast
 from uwlts.model.errors import DescriptionError
 from uwlts.model.placement import laser_pose
@@ -24,6 +35,34 @@ _DIFFUSE_ROUGHNESS_UM = 5.0
 """Rms height of a diffuse surface, for the loss of speckle contrast in light of some line width."""
 _GRAINS_PX = (0.02, 64.0)
 """Speckle grains for which the averaging over pixels is known; others count as these."""
+
+PARAMETER_OF: dict[str, tuple[str, float]] = {
+    "laser.baseline_mm": ("baseline_mm", 1.0),
+    "laser.triangulation_angle_deg": ("angle_rad", math.pi / 180),
+    "laser.roll_deg": ("roll_rad", math.pi / 180),
+    "laser.power_mw": ("power_w", 1e-3),
+    "laser.waist_radius_mm": ("waist_mm", 1.0),
+    "laser.waist_distance_mm": ("waist_distance_mm", 1.0),
+    "laser.beam_quality_m2": ("beam_quality", 1.0),
+    "laser.window.distance_mm": ("laser_window_distance_mm", 1.0),
+    "laser.window.thickness_mm": ("laser_window_thickness_mm", 1.0),
+    "camera.focal_length_mm": ("focal_mm", 1.0),
+    "camera.f_number": ("f_number", 1.0),
+    "camera.focus_distance_mm": ("focus_mm", 1.0),
+    "camera.window.distance_mm": ("window_distance_mm", 1.0),
+    "camera.window.thickness_mm": ("window_thickness_mm", 1.0),
+    "camera.window.tilt_x_deg": ("window_tilt_x_rad", math.pi / 180),
+    "camera.window.tilt_y_deg": ("window_tilt_y_rad", math.pi / 180),
+    "volume.near_mm": ("near_mm", 1.0),
+    "volume.far_mm": ("far_mm", 1.0),
+}
+"""Numbers of the description that are a parameter of their own, times a factor, and no part of another one.
+
+The description's rules for them are bounds of each and of the difference of two, so that numbers between such as keep
+them keep them, too."""
+
+_OF_BASELINE = ("laser.baseline_mm", "laser.triangulation_angle_deg", "laser.roll_deg")
+"""Numbers without a meaning for a laser that is placed by its axis."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +94,8 @@ class SensorArrays:
     window_tilt_x_rad: Array
     window_tilt_y_rad: Array
     window_index: Array
-    window_passes: Array
+    window_faces_pass: Array
+    window_absorption_per_mm: Array
     window_aperture_mm: Array
     wavelength_mm: Array
     power_w: Array
@@ -72,7 +112,8 @@ class SensorArrays:
     laser_window_distance_mm: Array
     laser_window_thickness_mm: Array
     laser_window_index: Array
-    laser_window_passes: Array
+    laser_window_faces_pass: Array
+    laser_window_absorption_per_mm: Array
     laser_window_aperture_mm: Array
     medium_index: Array
     extinction_per_mm: Array
@@ -92,18 +133,22 @@ class SensorArrays:
     near_mm: Array
     far_mm: Array
 
+    def at(self, places: np.ndarray) -> SensorArrays:
+        """Parameters of the sensors at some places (M,) of arrays (N, 1, 1), as arrays (M, 1, 1)."""
+
+        def taken(values: Array) -> Array:
+            return tuple(map(taken, values)) if isinstance(values, tuple) else values[places]
+
+        return SensorArrays(**{name: taken(values) for name, values in vars(self).items()})
+
     def pose(self, xp: ModuleType) -> LaserFan:
         """Fan of the laser in the camera frame."""
         towards = (1.0 - self.along_width, -self.along_width, 0.0 * self.along_width)
         baseline, angle, roll = self.baseline_mm, self.angle_rad, self.roll_rad
         by_angle = pose_at(xp, baseline_mm=baseline, angle_rad=angle, roll_rad=roll, towards=towards)
-        if not np.isfinite(self.placed[0][0]).any():
-            return by_angle
-        if xp is not np:
-            return LaserFan(*self.placed)
         vectors = by_angle.origin, by_angle.axis, by_angle.fan, by_angle.normal
         pairs = (zip(given, found, strict=True) for given, found in zip(self.placed, vectors, strict=True))
-        return LaserFan(*(tuple(np.where(np.isfinite(own), own, other) for own, other in pair) for pair in pairs))
+        return LaserFan(*(tuple(where(xp, xp.isfinite(own), own, other) for own, other in pair) for pair in pairs))
 
     def along(self, pixels: tuple[Array, Array]) -> Array:
         """The one of a pair for x and y that belongs to the pixel along the stripe."""
@@ -137,6 +182,16 @@ class SensorArrays:
         """The laser's window, taken as square to its axis."""
         distance, thickness = self.laser_window_distance_mm, self.laser_window_thickness_mm
         return WindowGeometry(axis, distance, thickness, self.laser_window_index, self.medium_index)
+
+    def window_passes(self, xp: ModuleType) -> Array:
+        """Share of light that passes the camera's window (Beer and Lambert)."""
+        return self.window_faces_pass * xp.exp(-self.window_absorption_per_mm * self.window_thickness_mm)
+
+    def laser_window_passes(self, xp: ModuleType) -> Array:
+        """Share of light that passes the laser's window."""
+        return self.laser_window_faces_pass * xp.exp(
+            -self.laser_window_absorption_per_mm * self.laser_window_thickness_mm
+        )
 
     def pixel_contrast(self, xp: ModuleType) -> Array:
         """Speckle contrast of a pixel, averaged over its area and two polarisations that do not interfere."""
@@ -174,6 +229,12 @@ class SensorArrays:
     def working_f_number(self) -> Array:
         """N (1 + m) with the magnification m at the focus distance."""
         return self.f_number * (1 + self.focal_mm / (self.focus_mm - self.focal_mm))
+
+
+def parameters_alone(sensor: Sensor) -> list[str]:
+    """Paths of a sensor's numbers that are parameters of their own: `PARAMETER_OF`, as far as its laser has them."""
+    by_axis = sensor.laser.origin_mm is not None
+    return [path for path in PARAMETER_OF if not (by_axis and path in _OF_BASELINE)]
 
 
 def parameters_of(sensors: Sequence[Sensor], media: Sequence[Medium]) -> SensorArrays:
@@ -266,13 +327,14 @@ def numbers_of(sensor: Sensor, medium: Medium) -> SensorArrays:
     }
     for name, one in (("window", window), ("laser_window", laser.window)):
         glass = one.index(wavelength) if one.mounted else 1.0
-        # The light that passes both faces and the glass, square to them (Fresnel; Beer and Lambert).
+        # The light that passes both faces, square to them (Fresnel).
         faces = (1 - ((glass - 1) / (glass + 1)) ** 2) * (1 - ((glass - index) / (glass + index)) ** 2)
         numbers |= {
             f"{name}_distance_mm": one.distance_mm,
             f"{name}_thickness_mm": one.thickness_mm,
             f"{name}_index": glass,
-            f"{name}_passes": faces * math.exp(-(one.absorption_per_mm() * one.thickness_mm * one.mounted)),
+            f"{name}_faces_pass": faces,
+            f"{name}_absorption_per_mm": one.absorption_per_mm() if one.mounted else 0.0,
             f"{name}_aperture_mm": one.aperture_diameter_mm if one.mounted else math.inf,
         }
     # Powers per rad that integrate to 1.
@@ -319,7 +381,12 @@ def _line_series() -> Chebyshev:
 
 
 def followed(xp: ModuleType, parameters: SensorArrays, follow: Sequence[Follow]) -> SensorArrays:
-    """Parameters with what is adjusted on the bench set to the stand-off.
+    """Parameters with what is adjusted on the bench set to the stand-off, see `following`."""
+    return replace(parameters, **following(xp, parameters, follow))
+
+
+def following(xp: ModuleType, parameters: SensorArrays, follow: Sequence[Follow]) -> dict[str, Array]:
+    """Parameters, by their names, that are adjusted to the stand-off on the bench.
 
     "focus" focuses the lens where the stand-off appears to be through window and medium; "waist" focuses the laser on
     it; "volume" moves the measuring volume, in its own depth, so that it lies about the stand-off as it did.
@@ -337,4 +404,4 @@ def followed(xp: ModuleType, parameters: SensorArrays, follow: Sequence[Follow])
         middle = 0.5 * (parameters.near_mm + parameters.far_mm)
         moved = depth - parameters.outer_mm(xp) - middle
         changes |= {"near_mm": parameters.near_mm + moved, "far_mm": parameters.far_mm + moved}
-    return replace(parameters, **changes)
+    return changes

@@ -3,14 +3,18 @@
 import ctypes
 import socket
 import struct
+import tempfile
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from ctypes import c_char_p, c_double, c_int, c_size_t, c_uint32, c_uint64, c_void_p
+from dataclasses import dataclass
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Literal, Self
+from typing import Literal, Protocol, Self
+from xml.etree import ElementTree
 
 import numpy as np
 
@@ -22,24 +26,41 @@ _BYTES_PER_S, _TOGETHER = 125e6, 8
 # Headers of IP, UDP and GVSP are counted in the size of a packet.
 _OVERHEAD_BYTES = 36
 _LEADER, _TRAILER, _PAYLOAD, _IMAGE, _MONO8 = 1, 2, 3, 1, 0x01080001
+# Of profiles: the pixel format (GenICam Pixel Format Naming Convention), and chunks by numbers of the camera's own.
+_COORD3D_C16, _WITH_CHUNKS, _IMAGE_CHUNK, _ENCODER_CHUNK = 0x011000B8, 0x4000, 0x45430000, 0x45430001
+_CHUNK_BYTES = 8 + 16
+"""Room of the chunks behind an image."""
 
 
 def image_packets(
-    image: np.ndarray, time_ns: int, *, number: int, region: tuple[int, int, int, int], packet_bytes: int
+    image: np.ndarray,
+    time_ns: int,
+    *,
+    number: int,
+    region: tuple[int, int, int, int],
+    packet_bytes: int,
+    encoder: int | None = None,
 ) -> list[bytes]:
-    """Leader, parts of the region, and trailer of an image (H, W) of uint8.
+    """Leader, parts of the region, and trailer of an image (H, W) of uint8, or of profiles (H, W) of uint16.
 
     ``time_ns`` is its time stamp, ``number`` its number of 16 bits, ``region`` left, top, width and height in px, of
-    which what lies beyond the image is dark, and ``packet_bytes`` the size of a packet with all its headers.
+    which what lies beyond the image is dark, and ``packet_bytes`` the size of a packet with all its headers. An
+    ``encoder`` count follows the image as chunk data (GigE Vision 2.0, extended chunk mode).
     """
     x, y, width, height = region
-    seen = np.zeros((height, width), np.uint8)
+    seen = np.zeros((height, width), image.dtype)
     part = image[y : y + height, x : x + width]
     seen[: part.shape[0], : part.shape[1]] = part
-    pixels, room = seen.tobytes(), packet_bytes - _OVERHEAD_BYTES
-    leader = struct.pack(">HHQIIIIIHH", 0, _IMAGE, time_ns, _MONO8, width, height, x, y, 0, 0)
+    pixels, room = seen.astype(seen.dtype.newbyteorder("<")).tobytes(), packet_bytes - _OVERHEAD_BYTES
+    kind, pixel_format = _IMAGE, _MONO8 if image.dtype == np.uint8 else _COORD3D_C16
+    if encoder is not None:
+        kind |= _WITH_CHUNKS
+        count = struct.pack(">q", encoder)
+        for chunk, data in ((_IMAGE_CHUNK, b""), (_ENCODER_CHUNK, count)):
+            pixels += data + struct.pack(">II", chunk, len(data) if data else len(pixels))
+    leader = struct.pack(">HHQIIIIIHH", 0, kind, time_ns, pixel_format, width, height, x, y, 0, 0)
     parts = [pixels[start : start + room] for start in range(0, len(pixels), room)]
-    bodies = [(_LEADER, leader), *((_PAYLOAD, each) for each in parts), (_TRAILER, struct.pack(">II", _IMAGE, height))]
+    bodies = [(_LEADER, leader), *((_PAYLOAD, each) for each in parts), (_TRAILER, struct.pack(">II", kind, height))]
     return [struct.pack(">HHI", 0, number, kind << 24 | index) + body for index, (kind, body) in enumerate(bodies)]
 
 
@@ -54,6 +75,7 @@ def send_paced(stream: socket.socket, packets: list[bytes], to: tuple[str, int])
             time.sleep(ahead_s)
 
 
+_GENAPI = "http://www.genicam.org/GenApi/Version_1_0"
 LOOPBACK = "127.0.0.1"
 # GigE Vision's control port.
 PORT = 3956
@@ -81,13 +103,16 @@ class _Register:
     MAKER, MODEL, STREAM_PORT, PACKET_SIZE, STREAM_IP = 0x48, 0x68, 0xD00, 0xD04, 0xD18
     WIDTH, HEIGHT, SENSOR_HEIGHT, SENSOR_WIDTH = 0x100, 0x104, 0x118, 0x11C
     ACQUISITION, OFFSET_X, OFFSET_Y = 0x124, 0x130, 0x134
-    TRIGGER_SOFTWARE, DEVICE_ID = 0x30C, 0xD8
+    TRIGGER_SOFTWARE, DEVICE_ID, PIXEL_FORMAT = 0x30C, 0xD8, 0x128
+    SCAN3D_SCALE, SCAN3D_OFFSET, SCAN3D_INVALID, CHUNKS, ENCODER_CHUNK = 0x1000, 0x1008, 0x1010, 0x1020, 0x1024
 
 
 _REGION = (_Register.OFFSET_X, _Register.OFFSET_Y, _Register.WIDTH, _Register.HEIGHT)
 
 _FUNCTIONS = {
-    "arv_gv_fake_camera_new": (c_void_p, [c_char_p, c_char_p]),
+    "arv_gv_fake_camera_new_full": (c_void_p, [c_char_p, c_char_p, c_char_p]),
+    "arv_fake_camera_new": (c_void_p, [c_char_p]),
+    "arv_fake_camera_get_genicam_xml": (c_void_p, [c_void_p, ctypes.POINTER(c_size_t)]),
     "arv_gv_fake_camera_get_fake_camera": (c_void_p, [c_void_p]),
     "arv_gv_fake_camera_is_running": (c_int, [c_void_p]),
     "arv_fake_camera_set_fill_pattern": (None, [c_void_p, _FILL, c_void_p]),
@@ -103,8 +128,32 @@ _FUNCTIONS = {
 }
 
 
-_Shot = tuple[np.ndarray, int]
-"""An image with the time in ns at which its exposure began."""
+_Shot = tuple[np.ndarray, int, int | None]
+"""An image or profile, the time in ns at which its exposure began, and the encoder's count in its middle."""
+
+
+@dataclass(frozen=True)
+class Exposed:
+    """An exposure: its middle in s of the monotonic clock, the encoder's count then, and what makes its image.
+
+    ``image(exposure_ms)`` returns the whole image (H, W) of uint8.
+    """
+
+    middle_s: float
+    encoder: int | None
+    image: Callable[[float], np.ndarray]
+
+
+class Scan3d(Protocol):
+    """A peak finder inside the camera."""
+
+    def scale_px(self) -> float:
+        """Pixels of one step of its numbers."""
+        ...
+
+    def numbers(self, image: np.ndarray) -> np.ndarray:
+        """A number (L,), uint16, for each profile line of an image (H, W)."""
+        ...
 
 
 class GigeCamera:
@@ -114,6 +163,14 @@ class GigeCamera:
     the same. An exception of it leaves the frame out and is kept in ``failure``. A trigger that comes while an image is
     being made replaces the one before, which stays without an answer. HardwareError where another camera is served on
     this machine, SetupError where Aravis is not installed.
+
+    With ``scan3d`` it is a 3D camera: its pixel format is Coord3D_C16 until a program asks for Mono8, and each frame
+    holds the profile that is found in the image, with 0 for no stripe. ``encoder()`` is the count of an encoder that is
+    wired to the camera, sent as chunk data where a program asks for it.
+
+    With ``expose`` a free-running camera exposes at its frame rate with true time stamps, however long its images take:
+    it is called in the middle of each exposure, and frames wait in the camera's memory, as in one that is faster than
+    its cable. They are lost at the end of the acquisition.
     """
 
     def __init__(
@@ -124,11 +181,14 @@ class GigeCamera:
         height_px: int = 1024,
         serial: str = "1",
         first_number: int = 1,
+        scan3d: Scan3d | None = None,
+        encoder: Callable[[], int] | None = None,
+        expose: Callable[[], Exposed] | None = None,
     ):
         if not serial.isascii() or not 0 < len(serial) < _SERIAL_BYTES:
             raise HardwareError(f"serial is '{serial}': it must have 1 to {_SERIAL_BYTES - 1} ASCII characters")
         self.failure: BaseException | None = None
-        self._frame = frame
+        self._frame, self._scan3d, self._encoder, self._expose = frame, scan3d, encoder, expose
         self._size = (height_px, width_px)
         self._serial = serial.encode()
         self._library = _functions()
@@ -198,7 +258,11 @@ class GigeCamera:
         # Aravis would also listen at the broadcast address of all networks, which is held while the camera starts.
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as guard:
             guard.bind(("255.255.255.255", PORT))
-            self._server = library.arv_gv_fake_camera_new(LOOPBACK.encode(), self._serial)
+            with tempfile.NamedTemporaryFile(suffix=".xml") as features:
+                features.write(self._features())
+                features.flush()
+                interface, name = LOOPBACK.encode(), features.name.encode()
+                self._server = library.arv_gv_fake_camera_new_full(interface, self._serial, name)
         if not library.arv_gv_fake_camera_is_running(self._server):
             self.disconnect()
             raise HardwareError(f"Aravis's camera does not start on {LOOPBACK}: is the loopback interface up?")
@@ -220,14 +284,63 @@ class GigeCamera:
             (_Register.PACKET_SIZE, _PACKET_BYTES),
         ):
             library.arv_fake_camera_write_register(self._camera, register, number)
+        if self._scan3d is not None:
+            library.arv_fake_camera_write_register(self._camera, _Register.PIXEL_FORMAT, _COORD3D_C16)
+            scale = self._scan3d.scale_px()
+            places = (_Register.SCAN3D_SCALE, scale), (_Register.SCAN3D_OFFSET, 0.0), (_Register.SCAN3D_INVALID, 0.0)
+            for register, value in places:
+                library.arv_fake_camera_write_memory(self._camera, register, 8, struct.pack(">d", value))
         library.arv_fake_camera_set_trigger_frequency(self._camera, _LOOKS_FOR_TRIGGER_HZ)
         library.arv_fake_camera_set_fill_pattern(self._camera, self._callback, None)
 
+    def _features(self) -> bytes:
+        """The description of the camera's features: those of Aravis's fake camera, and of a 3D camera or encoder."""
+        library, size = self._library, c_size_t()
+        usual = library.arv_fake_camera_new(self._serial)
+        described = ctypes.string_at(library.arv_fake_camera_get_genicam_xml(usual, ctypes.byref(size)), size.value)
+        library.g_object_unref(usual)
+        root = ElementTree.fromstring(described)
+        more = ElementTree.fromstring((Path(__file__).parent / "scan3d_features.xml").read_bytes())
+        scan3d = {} if self._scan3d is None else {"Coord3D_C16": _COORD3D_C16}
+        for feature in more:
+            name = feature.get("Name", "")
+            if (name.startswith("Scan3d") and scan3d) or (not name.startswith("Scan3d") and self._encoder is not None):
+                root.append(feature)
+        formats = root.find(f"{{{_GENAPI}}}Enumeration[@Name='PixelFormat']")
+        payload = root.find(f"{{{_GENAPI}}}IntSwissKnife[@Name='PayloadSize']/{{{_GENAPI}}}Formula")
+        assert formats is not None and payload is not None and payload.text is not None
+        for name, number in scan3d.items():
+            entry = ElementTree.Element(f"{{{_GENAPI}}}EnumEntry", Name=name)
+            ElementTree.SubElement(entry, f"{{{_GENAPI}}}Value").text = str(number)
+            formats.insert(0, entry)
+        if self._encoder is not None:
+            payload.text += f" + {_CHUNK_BYTES}"
+        ElementTree.register_namespace("", _GENAPI)
+        return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+
     def _fill(self, _buffer: int, _data: None, exposure_us: int, _gain: int, _pixel_format: int) -> None:
         """Called by the library when a frame is due; what it sends itself is lost."""
-        shot = self._due(1e-3 * exposure_us)
-        if shot is None:
+        if self._expose is not None and not self._library.arv_fake_camera_is_in_software_trigger_mode(self._camera):
+            self._stopping.wait(0.5e-6 * exposure_us)
+            self._maker_thread.submit(self._develop, self._expose(), 1e-3 * exposure_us)
             return
+        shot = self._due(1e-3 * exposure_us)
+        if shot is not None:
+            self._send(shot)
+
+    def _develop(self, exposed: Exposed, exposure_ms: float) -> None:
+        """Make the image of an exposure in memory and send it; called in the second thread, in turn."""
+        with self._lock:
+            if self._server is None or not self._read(_Register.ACQUISITION):
+                return
+        try:
+            seen = self._seen(exposed.image(exposure_ms))
+        except BaseException as error:
+            self.failure = error
+            raise
+        self._send((seen, round(1e9 * exposed.middle_s - 0.5e6 * exposure_ms), exposed.encoder))
+
+    def _send(self, shot: _Shot) -> None:
         with self._lock:
             if self._server is None:
                 return
@@ -240,9 +353,13 @@ class GigeCamera:
             host, port, packet_bytes = map(self._read, names)
             x, y, width, height = map(self._read, _REGION)
             region = x, y, width, height
+            image, time_ns, count = shot
+            asked = self._read(_Register.CHUNKS) and self._read(_Register.ENCODER_CHUNK)
         if not dropped:
             size = packet_bytes & 0xFFFF
-            packets = image_packets(*shot, number=self._number, region=region, packet_bytes=size)
+            packets = image_packets(
+                image, time_ns, number=self._number, region=region, packet_bytes=size, encoder=count if asked else None
+            )
             if shortened:
                 lost = range(_CUT_EVERY - 1, len(packets), _CUT_EVERY) or (len(packets) - 2,)
                 packets = [packet for index, packet in enumerate(packets) if index not in lost]
@@ -292,7 +409,14 @@ class GigeCamera:
         image = self._frame(exposure_ms)
         if image.shape != self._size or image.dtype != np.uint8:
             raise ImageError(f"the camera shows {self._size} uint8, the image is {image.shape} {image.dtype}")
-        return image, began_ns
+        count = None if self._encoder is None else self._encoder()
+        return self._seen(image), began_ns, count
+
+    def _seen(self, image: np.ndarray) -> np.ndarray:
+        """The image, or the profile (1, L) that a 3D camera finds in it."""
+        if self._scan3d is not None and self._read(_Register.PIXEL_FORMAT) == _COORD3D_C16:
+            return self._scan3d.numbers(image)[None]
+        return image
 
     def _read(self, register: int) -> int:
         number = c_uint32()

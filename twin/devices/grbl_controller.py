@@ -35,13 +35,22 @@ _BUSY_MS, _IDLE_MS = 2, 20
 
 @dataclass(frozen=True)
 class StageState:
-    """True state of the stage and the laser at this moment; ``power`` is 0 when no light comes out."""
+    """True state of the stage and the laser at a moment; ``power`` is 0 when no light comes out.
 
+    ``time_s`` is that of the monotonic clock.
+    """
+
+    time_s: float
     position_mm: float
-    moving: bool
+    speed_mm_per_s: float
     laser_on: bool
     power: float
     port_open: bool
+
+    @property
+    def moving(self) -> bool:
+        """Whether the stage is not at rest."""
+        return self.speed_mm_per_s != 0
 
 
 class GrblController:
@@ -93,8 +102,13 @@ class GrblController:
         with self._lock:
             lit = self._powered and not self._laser_broken and (self._port_open or not self._gated)
             power = self._firmware.laser_power() if lit else 0.0
-            speed = self._firmware.axis.at(self._now())[1]
-            return StageState(self._firmware.stage_mm, speed != 0, power > 0, power, self._port_open)
+            time_s = time.monotonic()
+            position, speed = self._firmware.stage_at((time_s - self._origin) * self._speed_up)
+            return StageState(time_s, position, speed * self._speed_up, power > 0, power, self._port_open)
+
+    def steps(self, state: StageState | None = None) -> int:
+        """Count of an encoder on the axis, a step each, in a state; now unless given."""
+        return round((state or self.state()).position_mm / self._firmware.step_mm)
 
     def disconnect(self) -> None:
         """Pull the cable out: the line is gone and, with it, the controller's power."""

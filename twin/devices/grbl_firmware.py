@@ -124,7 +124,12 @@ class GrblFirmware:
     @property
     def stage_mm(self) -> float:
         """Position of the stage."""
-        return self.axis.at(self._now())[0] + self.shift_mm
+        return self.stage_at(self._now())[0]
+
+    def stage_at(self, time_s: float) -> tuple[float, float]:
+        """True position in mm and signed speed in mm/s at a time of the controller, now or a little before."""
+        position, speed = self.axis.at(time_s)
+        return position + self.shift_mm, speed
 
     @property
     def step_mm(self) -> float:

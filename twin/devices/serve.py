@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from twin.devices.gige_camera import GigeCamera
+from twin.devices.gige_camera import Exposed, GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
 from twin.options import CPU, Options, Variant, use_variant
 from twin.recording.recording import AnyScene, AnySensor, choose_scene, choose_sensors
@@ -25,9 +25,10 @@ from uwlts.model.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
 
 if TYPE_CHECKING:  # it needs Mitsuba
+    from twin.light.pose import Travel
     from twin.recording.studio import Studio
 
-_STEPS_PER_MM, _TRAVEL = 100, 130
+_STEPS_PER_MM, _SPEED, _ACCELERATION, _TRAVEL = 100, 110, 120, 130
 _WATCH_S = 0.2
 _FORM = re.compile(r"(?P<name>[a-z-]+)(:(?P<argument>[^@]+))?(@(?P<frame>[1-9]\d*))?")
 
@@ -186,11 +187,20 @@ class Bench:
         self._travelled_mm = math.nan
         self._seen: dict[str, np.ndarray] = {}
 
-    def frame(self, exposure_ms: float) -> np.ndarray:
-        """Image (height_px, width_px) of uint8 of this moment; noise differs from call to call."""
-        began, state, known = time.perf_counter(), self._state(), len(self._seen)
+    def frame(self, exposure_ms: float, state: StageState | None = None) -> np.ndarray:
+        """Image (height_px, width_px) of uint8 of a moment, now unless given; noise differs from call to call.
+
+        The stage's movement shows in the image if the moment is given.
+        """
+        began, known = time.perf_counter(), len(self._seen)
+        travel = None if state is None else self._studio.travel_at(state.speed_mm_per_s, exposure_ms=exposure_ms)
+        state = state or self._state()
+        if travel is not None:
+            self._seen.clear()
         at_rest = self._track.shot(state.position_mm, "laser").travelled_mm == self._travelled_mm
-        light = exposure_ms * self._electrons_per_ms(state)
+        light = exposure_ms * self._electrons_per_ms(state, travel)
+        if travel is not None:
+            self._seen.clear()
         noise_seed = [self._studio.options.seed, _NOISE, self.rates.frames]
         image = self._studio.detected(light, exposure_ms=exposure_ms, noise_seed=noise_seed)
         seconds, rates = time.perf_counter() - began, replace(self.rates, frames=self.rates.frames + 1)
@@ -200,27 +210,27 @@ class Bench:
             self.rates = replace(rates, rendered=rates.rendered + 1, rendering_s=rates.rendering_s + seconds)
         return image
 
-    def _electrons_per_ms(self, state: StageState) -> np.ndarray:
+    def _electrons_per_ms(self, state: StageState, travel: "Travel | None") -> np.ndarray:
         """Mean photo-electrons per ms (H, W), without noise; the latest place's are kept."""
         travelled_mm = self._track.shot(state.position_mm, "laser").travelled_mm
         if travelled_mm != self._travelled_mm:
             self._travelled_mm, self._seen = travelled_mm, {}
         if state.power == 0:
-            return self._light("lamp" if self._lamp else "day", state)
-        laser = self._light("laser", state)
+            return self._light("lamp" if self._lamp else "day", state, travel)
+        laser = self._light("laser", state, travel)
         if state.power >= 1:
             return laser
         # A laser frame holds the daylight, which a weaker laser leaves as it is.
-        day = self._light("day", state)
+        day = self._light("day", state, travel)
         return day + np.float32(state.power) * np.maximum(laser - day, 0)
 
-    def _light(self, light: Light, state: StageState) -> np.ndarray:
+    def _light(self, light: Light, state: StageState, travel: "Travel | None") -> np.ndarray:
         if light not in self._seen:
             shot, options = self._track.shot(state.position_mm, light), self._studio.options
             # Whole um, which are all different places; seeds must not be negative.
             place = round(1e3 * shot.travelled_mm) % 2**32
             seed = int(np.random.SeedSequence([options.seed, _WALKS, place]).generate_state(1)[0])
-            self._seen[light] = self._studio.electrons_per_ms(shot, spp=options.spp, seed=seed)
+            self._seen[light] = self._studio.electrons_per_ms(shot, spp=options.spp, seed=seed, travel=travel)
         return self._seen[light]
 
 
@@ -287,7 +297,8 @@ def serve(
 ) -> Iterator[ServedTwin]:
     """Serve a scene as hardware: a GigE Vision camera and a Grbl controller with stage and laser.
 
-    A frame shows what the camera sees where the stage stands, with the laser as it is. Camera and controller can be
+    A frame shows what the camera sees where the stage stands, with the laser as it is. A free-running camera exposes at
+    its frame rate whatever rendering takes; its frames come later, with true time stamps. Camera and controller can be
     reached from this machine only.
 
     Parameters
@@ -298,8 +309,10 @@ def serve(
         Named place of the objects, such as near, standoff or far.
     effects
         Effects of real images to add, as for `simulate`, but for lamp-and-laser: the controller switches the laser.
+        With camera-3d the camera's pixel format is Coord3D_C16 until a program sets Mono8.
     without
-        Effects to leave out, as for `simulate`; a moving stage does not blur the image in any case.
+        Effects to leave out, as for `simulate`. A moving stage blurs the images of a free-running camera, not those of
+        a triggered one.
     ideal
         Leave out all of these: a pinhole's sharp image without noise.
     stage_start
@@ -348,7 +361,12 @@ def serve(
     # The controller moves the stage, and a frame may ask for any light.
     at_rest = {"lights": ("lamp", "laser") if lamp else ("laser",), "speed_mm_per_s": 0.0}
     studio = Studio(built, altered(described, motion=at_rest), options)
-    settings = {_STEPS_PER_MM: 1 / built.stage.resolution_mm, _TRAVEL: built.stage.travel_mm}
+    settings = {
+        _STEPS_PER_MM: 1 / built.stage.resolution_mm,
+        _SPEED: 60 * built.stage.speed_mm_per_s,
+        _ACCELERATION: built.stage.acceleration_mm_per_s2,
+        _TRAVEL: built.stage.travel_mm,
+    }
     controller = GrblController(settings=settings, position_mm=track.start_mm, speed_up=speed_up)
     bench = Bench(studio, state=controller.state, track=track, lamp=lamp)
     numbers = count(1)
@@ -366,7 +384,21 @@ def serve(
         inject(number + 1, ahead=True)
         return image
 
-    camera = GigeCamera(frame, width_px=built.camera.width_px, height_px=built.camera.height_px)
+    size = {"width_px": built.camera.width_px, "height_px": built.camera.height_px}
+    if studio.peak_finder is not None and built.camera.stripe_along != "width":
+        raise DesignError("a 3D camera's profile lines are its columns: take a sensor with stripe_along = 'width'")
+
+    def expose() -> Exposed:
+        state = controller.state()
+
+        def image(exposure_ms: float) -> np.ndarray:
+            number = next(numbers)
+            inject(number, ahead=False)
+            return bench.frame(exposure_ms, state)
+
+        return Exposed(state.time_s, controller.steps(state), image)
+
+    camera = GigeCamera(frame, **size, scan3d=studio.peak_finder, encoder=controller.steps, expose=expose)
     inject(1, ahead=True)
     with controller, camera:
         yield ServedTwin(controller, camera, track, studio.exposure_ms, lambda: bench.rates)

@@ -6,7 +6,7 @@ Mitsuba is imported when the first scene is rendered, after its variant and libL
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -78,7 +78,9 @@ def render(
     ----------
     frames
         Numbers of the scan's images to render, from 0 on; all of them unless given.
-    scene, sensor, as_built, placement, medium, spp, seed, water, effects, without, ideal, variant
+    effects
+        As for `simulate`; with camera-3d the images in which the camera would look for the stripe.
+    scene, sensor, as_built, placement, medium, spp, seed, water, without, ideal, variant
         As for `simulate`; scene and sensors may also be descriptions, and there is one placement.
 
     Raises
@@ -89,6 +91,8 @@ def render(
     described = choose_scene(scene, placement=placement, medium=medium, water=water)
     _, built = choose_sensors(sensor, as_built)
     options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
+    # The images in which a 3D camera looks for the stripe.
+    options = replace(options, flaws=replace(options.flaws, camera_3d=0))
     shots = list(enumerate(described.motion.shots()))
     if frames is not None:
         if not frames or not all(0 <= number < len(shots) for number in frames):
@@ -158,7 +162,7 @@ def simulate(
     effects
         Effects of real images to add, NAME of typical strength or NAME=STRENGTH: glare=0.02, vignetting=0.4,
         uneven-lamp=0.6, lamp-and-laser, pixel-aspect=1.002, tangential=0.001, rolling-shutter=10 (us per row),
-        jpeg=90, colour-filter.
+        jpeg=90, colour-filter, camera-3d=16 (steps per px; laser images become centre lines).
     without
         Effects to leave out: defocus, haze, multiple-scattering, secondary-light, gloss, motion, ambient, speckle,
         fixed-pattern, noise.

@@ -21,12 +21,14 @@ from twin.scene.description import Light, Printed, Scene, Shot, altered
 from twin.scene.finish import shift_points
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
 from twin.sensor.flaws import as_built, delivered, laser_shares, veiled, vignette
+from twin.sensor.peak_finder import INVALID, PeakFinder
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.model.errors import DesignError, OutputError
 from uwlts.model.library import validated
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium, Sensor, Table
-from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
+from uwlts.model.stripe import Coordinates
+from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame, Seen
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, truth_path, write_truth
 
 Progress = Callable[[int, int], None]
@@ -125,6 +127,9 @@ class Studio:
         self._speckle = Speckle(camera, wavelength_nm=laser.wavelength_nm, seed=options.seed)
         self._vignette = vignette(camera, flaws.vignetting) if flaws.vignetting else 1.0
         self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else 1.0
+        self.peak_finder = None
+        if flaws.camera_3d:
+            self.peak_finder = PeakFinder(camera, self.sensor.detector.full_scale_dn(), flaws.camera_3d)
         self._pattern = None
         if options.effects.fixed_pattern:
             self._pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
@@ -150,16 +155,24 @@ class Studio:
         transform[:3, 3] = shot.travelled_mm * self.scene.motion.unit_direction()
         return transform
 
+    def speed_mm_per_s(self) -> float:
+        """Speed of the stage along its positions while an image is exposed."""
+        motion = self.scene.motion
+        return motion.speed_mm_per_s * (1 if motion.step_mm >= 0 else -1)
+
     def travel(self, light: Light) -> Travel | None:
         """Movement of the sensor during an exposure; None if it stands still."""
-        motion, detector = self.scene.motion, self.sensor.detector
-        if motion.speed_mm_per_s == 0 or not self.options.effects.motion:
+        return self.travel_at(self.speed_mm_per_s(), exposure_ms=self.exposure_ms.get(light, 0.0))
+
+    def travel_at(self, speed: float, *, exposure_ms: float) -> Travel | None:
+        """Movement of the sensor during an exposure at a speed in mm/s; None if it stands still."""
+        detector = self.sensor.detector
+        if speed == 0 or not self.options.effects.motion:
             return None
-        speed = motion.speed_mm_per_s * (1 if motion.step_mm >= 0 else -1)
         row_s = 1e-6 * detector.line_time_us if detector.shutter == "rolling" else 0.0
         return Travel(
-            direction=motion.unit_direction(),
-            exposure_mm=speed * 1e-3 * self.exposure_ms.get(light, 0.0),
+            direction=self.scene.motion.unit_direction(),
+            exposure_mm=speed * 1e-3 * exposure_ms,
             row_mm=speed * row_s,
             middle_row=(self.sensor.camera.height_px - 1) / 2,
         )
@@ -219,12 +232,23 @@ class Studio:
     def frame(self, shot: Shot, index: int) -> Frame:
         """Image number ``index`` of the scan with what a capture records of it."""
         return Frame(
-            image=self.image(shot, index),
+            self.seen(shot, index),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
             exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
             time_s=index * self.period_s,
+            speed_mm_per_s=self.speed_mm_per_s(),
         )
+
+    def seen(self, shot: Shot, index: int) -> Seen:
+        """The image of a shot, or what a 3D camera finds in it."""
+        image = self.image(shot, index)
+        if self.peak_finder is None or shot.light != "laser":
+            return image
+        camera = self.sensor.camera
+        length = camera.height_px if camera.stripe_along == "width" else camera.width_px
+        meant = Coordinates(scale=self.peak_finder.scale_px(), invalid=INVALID)
+        return meant.stripe(self.peak_finder.numbers(image), stripe_along=camera.stripe_along, length_px=length)
 
     def image(self, shot: Shot, index: int) -> np.ndarray:
         """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
@@ -534,7 +558,10 @@ def record_scene(
         "seed": studio.options.seed,
         "spp": studio.options.spp,
     }
-    with CaptureWriter(path, header, dtype=dtype, plan=plan, overwrite=overwrite, resume=resume) as writer:
+    lines = studio.peak_finder is not None
+    kinds = {"centre_lines": lines, "moving": studio.speed_mm_per_s() != 0}
+    files = {"overwrite": overwrite, "resume": resume}
+    with CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer:
         done = len(writer)
         for index, shot in enumerate(shots):
             truths.append(studio.truth(shot))

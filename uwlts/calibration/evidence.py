@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from pydantic import ValidationError
@@ -13,8 +14,9 @@ from uwlts.calibration.target_images import TargetImage
 from uwlts.calibration.target_stripes import TargetStripe, stripe_on_target
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.errors import CalibrationError, DescriptionError, ImageError, TargetError, problems_of
+from uwlts.runtime.workers import in_threads
 from uwlts.storage.capture import Capture
-from uwlts.stripe import StripeOptions, StripeSettings, extract_stripe, why_no_stripe
+from uwlts.stripe import Stripe, StripeOptions, StripeSettings, stripe_in, why_no_stripe
 from uwlts.stripe.recording import shown_stripe
 from uwlts.targets import Target, TargetView, parse_target
 
@@ -98,32 +100,28 @@ def air_evidence(
     reasons: Counter[str] = Counter()
     for number, capture in enumerate(captures):
         first = len(images)
-        for frame, image in capture.frames(laser_on=False):
-            try:
-                view = targets[0].detect(image)
-                images.append(TargetImage(view.points_mm, view.pixels, float(capture.stage_mm[frame]), number))
+        detect = partial(_target_in, capture, targets[0], number)
+        for (frame, _), found in in_threads(detect, capture.frames(laser_on=False)):
+            if isinstance(found, str):
+                reasons[found] += 1
+                warnings.append(f"{capture.path.name}, frame {frame}: left out, {found}")
+            else:
+                view, target_image = found
+                images.append(target_image)
                 frames.append((number, frame))
                 views.append(view)
                 stripes.append(np.empty((0, 2)))
                 outliers.append(0)
-            except (TargetError, CalibrationError) as error:
-                reason = why_not_found(image, str(error), full_dn=capture.header.saturation_dn)
-                reasons[reason] += 1
-                warnings.append(f"{capture.path.name}, frame {frame}: left out, {reason}")
             done = _report(progress, "target", done, total)
         positions = np.array([image.stage_mm for image in images[first:]])
-        for frame, image in capture.frames(laser_on=True):
-            here = np.flatnonzero(np.abs(positions - capture.stage_mm[frame]) <= _SAME_POSITION_MM)
-            if len(here):
-                place = first + int(here[0])
-                found = _stripe_of(capture, frame, image, stripe, warnings, on=(views[place], targets[0]))
-                stripes[place] = np.vstack([stripes[place], found.pixels])
-                outliers[place] += found.outliers
+        on_target = partial(_stripe_beside, capture, stripe, first, views[first:], positions, targets[0])
+        for (frame, _), found in in_threads(on_target, _laser_frames(capture)):
+            if isinstance(found, str):
+                warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {found}")
             else:
-                warnings.append(
-                    f"{capture.path.name}, frame {frame}: stripe left out, no target was found at "
-                    f"{capture.stage_mm[frame]:g} mm"
-                )
+                place, on = found
+                stripes[place] = np.vstack([stripes[place], on.pixels])
+                outliers[place] += on.outliers
             done = _report(progress, "target", done, total)
         rejected, kept = sum(outliers[first:]), sum(map(len, stripes[first:]))
         if rejected > _MANY_OUTLIERS * (rejected + kept):
@@ -168,9 +166,10 @@ def step_evidence(
         if index is None:
             index = capture.header.medium.refractive_index(wavelength)
             index_std = capture.header.medium.index_uncertainty(wavelength, known)
-        for frame, image in capture.frames(laser_on=True):
-            pixels = _stripe_of(capture, frame, image, stripe, warnings).pixels
-            if len(pixels):
+        for (frame, _), pixels in in_threads(partial(_stripe_in, capture, stripe), _laser_frames(capture)):
+            if isinstance(pixels, str):
+                warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {pixels}")
+            else:
                 x, y, z = (float(capture.stage_mm[frame]) * np.array(capture.header.stage_direction)).tolist()
                 source = f"{capture.path.name}, frame {frame}"
                 found.append(StepEvidence(pixels, standard, index, source, (x, y, z), index_std))
@@ -185,6 +184,8 @@ def no_stripe_in(captures: Sequence[Capture]) -> str:
         return f"{_names(captures)}: no image with the laser on; take one at every position"
     along, where = header.sensor.camera.stripe_along, f"laser images of {_names(captures)}"
     lit = [image for capture in captures for image in _lit(capture, _LOOKED_AT)]
+    if not lit:
+        return f"no stripe in any of the {count} centre lines of {_names(captures)}: is the laser on?"
     if any(shown_stripe(image, stripe_along=along) == "along" for image in lit):
         return f"the {where} with a stripe were taken at other stage positions than those at which the target was found"
     reason = why_no_stripe(lit, stripe_along=along, full_dn=header.saturation_dn)
@@ -217,38 +218,74 @@ def _why_no_target(captures: Sequence[Capture], target: Target, reasons: Counter
 
 
 def _lit(capture: Capture, most: int) -> Iterator[np.ndarray]:
-    """At most so many of the images with the laser on, from the first to the last."""
-    lit = np.flatnonzero(capture.laser_on)
+    """At most so many of the images with the laser on, from the first to the last; no centre lines."""
+    lit = np.flatnonzero(capture.laser_on & capture.has_image)
     for place in np.unique(np.linspace(0, len(lit) - 1, most).astype(int)) if len(lit) else ():
         yield capture.image(int(lit[place]))
 
 
-def _stripe_of(
-    capture: Capture,
-    frame: int,
-    image: np.ndarray,
-    settings: StripeSettings,
-    warnings: list[str],
-    *,
-    on: tuple[TargetView, Target] | None = None,
-) -> TargetStripe:
-    """The stripe in an image, of a target as it was seen there if that is given; none, and a warning, if of no use."""
-    sensor, clip = capture.header.sensor, capture.header.saturation_dn
-    along, options = sensor.camera.stripe_along, StripeOptions.of(sensor, settings)
+_Seen = tuple[int, np.ndarray | Stripe]
+"""A laser frame's number and its image, or its stripe where a 3D camera has found that."""
+
+
+def _laser_frames(capture: Capture) -> Iterator[_Seen]:
+    for frame in np.flatnonzero(capture.laser_on).tolist():
+        yield frame, capture.seen(frame)
+
+
+def _target_in(
+    capture: Capture, target: Target, placement: int, numbered: tuple[int, np.ndarray]
+) -> tuple[TargetView, TargetImage] | str:
+    """The target in an image with the laser off, or why it is of no use."""
+    frame, image = numbered
     try:
-        if on is None:
-            found = TargetStripe(
-                extract_stripe(image, stripe_along=along, options=options, saturation=clip).pixels(), 0
-            )
-        else:
-            found = stripe_on_target(image, *on, stripe_along=along, options=options, saturation=clip)
-        if len(found.pixels) >= _FEWEST_LINES:
-            return found
-        reason = f"found on {len(found.pixels)} lines only, at least {_FEWEST_LINES} are of use"
+        view = target.detect(image)
+        return view, TargetImage(view.points_mm, view.pixels, float(capture.stage_mm[frame]), placement)
+    except (TargetError, CalibrationError) as error:
+        return why_not_found(image, str(error), full_dn=capture.header.saturation_dn)
+
+
+def _stripe_beside(
+    capture: Capture,
+    settings: StripeSettings,
+    first: int,
+    views: Sequence[TargetView],
+    positions_mm: np.ndarray,
+    target: Target,
+    numbered: _Seen,
+) -> tuple[int, TargetStripe] | str:
+    """The stripe on the target, and the place from ``first`` on of the target's image at this position, or why none."""
+    frame, seen = numbered
+    here = np.flatnonzero(np.abs(positions_mm - capture.stage_mm[frame]) <= _SAME_POSITION_MM)
+    if not len(here):
+        return f"no target was found at {capture.stage_mm[frame]:g} mm"
+    place = int(here[0])
+    along, options, clip = _how_to_find(capture, settings)
+    try:
+        found = stripe_on_target(seen, views[place], target, stripe_along=along, options=options, saturation=clip)
     except ImageError as error:
-        reason = str(error)
-    warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {reason}")
-    return TargetStripe(np.empty((0, 2)), 0)
+        return str(error)
+    return _too_short(found.pixels) or (first + place, found)
+
+
+def _stripe_in(capture: Capture, settings: StripeSettings, numbered: _Seen) -> np.ndarray | str:
+    """The stripe (N, 2) of a laser frame, or why it is of no use."""
+    along, options, clip = _how_to_find(capture, settings)
+    try:
+        pixels = stripe_in(numbered[1], stripe_along=along, options=options, saturation=clip).pixels()
+    except ImageError as error:
+        return str(error)
+    return _too_short(pixels) or pixels
+
+
+def _how_to_find(capture: Capture, settings: StripeSettings) -> tuple[str, StripeOptions, float]:
+    sensor = capture.header.sensor
+    return sensor.camera.stripe_along, StripeOptions.of(sensor, settings), capture.header.saturation_dn
+
+
+def _too_short(pixels: np.ndarray) -> str:
+    enough = len(pixels) >= _FEWEST_LINES
+    return "" if enough else f"found on {len(pixels)} lines only, at least {_FEWEST_LINES} are of use"
 
 
 def _report(progress: Progress | None, name: str, done: int, total: int) -> int:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from uwlts.metrology.least_squares import MAD_TO_STD
-from uwlts.stripe import Stripe, StripeOptions, StripeStatus, extract_stripe
+from uwlts.stripe import Stripe, StripeOptions, StripeStatus, extract_stripe, stripe_in
 from uwlts.targets import Target, TargetView
 
 _DEGREE = 4  # bends of lens, window, line optics and plate; more would follow outliers
@@ -26,7 +26,7 @@ class TargetStripe:
 
 
 def stripe_on_target(
-    image: np.ndarray,
+    seen: np.ndarray | Stripe,
     view: TargetView,
     target: Target,
     *,
@@ -37,17 +37,19 @@ def stripe_on_target(
     """Find the stripe on a flat target whose points were seen at the same place.
 
     The stripe is where most of the points lie on one smooth curve. Where lines show something else it is looked for a
-    second time, near the curve alone. Points beside the curve, as of reflections, are left out; so are those outside
-    the plate. Parameters and errors as of `extract_stripe`.
+    second time, near the curve alone, if it is an image. Points beside the curve, as of reflections, are left out; so
+    are those outside the plate. Parameters and errors as of `extract_stripe`.
     """
-    stripe = extract_stripe(image, stripe_along=stripe_along, saturation=saturation, options=options)
+    stripe = stripe_in(seen, stripe_along=stripe_along, saturation=saturation, options=options)
     to_plate, pixels = _to_plate(view), stripe.pixels()
     on_plate = _on_plate(pixels, to_plate, target)
     lines = stripe.lines[on_plate]
     across = stripe.centre_px[lines]
     if len(lines) < _FEWEST:
         return TargetStripe(pixels[on_plate], 0)
-    curve = _Curve.through(lines, across, tolerance_px=max(2.0, 0.25 * float(np.median(stripe.width_px[lines]))))
+    # A 3D camera may not give the width.
+    width = float(np.nan_to_num(np.median(stripe.width_px[lines])))
+    curve = _Curve.through(lines, across, tolerance_px=max(2.0, 0.25 * width))
     if curve is None:
         return TargetStripe(np.empty((0, 2)), len(lines))
     near = curve.holds(lines, across)
@@ -56,9 +58,9 @@ def stripe_on_target(
     missing = np.setdiff1d(along_curve[expected], lines[near])
     outliers = int(np.count_nonzero(~near))
     lines, across = lines[near], across[near]
-    if len(missing) > _LOST * np.count_nonzero(expected):
+    if isinstance(seen, np.ndarray) and len(missing) > _LOST * np.count_nonzero(expected):
         width = float(np.median(stripe.width_px[lines]))
-        more_lines, more_across = _near_curve(image, curve, missing, stripe_along, saturation, options, width)
+        more_lines, more_across = _near_curve(seen, curve, missing, stripe_along, saturation, options, width)
         lines, across = np.concatenate([lines, more_lines]), np.concatenate([across, more_across])
         curve = curve.refined(lines, across)
         near = curve.holds(lines, across)
@@ -99,15 +101,15 @@ class _Curve:
         """The curve on which most points lie; None where too few do."""
         middle, half = 0.5 * (lines.max() + lines.min()), max(0.5 * np.ptp(lines), 1.0)
         powers = ((lines - middle) / half)[:, None] ** np.arange(3)
-        rng = np.random.default_rng(0)
-        best = np.zeros(len(lines), bool)
-        for chosen in rng.integers(len(lines), size=(_TRIALS, 3)):
-            if np.ptp(lines[chosen]) < 0.1 * half:
-                continue
-            parabola, _, rank, _ = np.linalg.lstsq(powers[chosen], across[chosen], rcond=None)
-            near = np.abs(across - powers @ parabola) <= tolerance_px
-            if rank == 3 and near.sum() > best.sum():
-                best = near
+        chosen = np.sort(np.random.default_rng(0).integers(len(lines), size=(_TRIALS, 3)), axis=1)
+        # Through three different lines there is one parabola.
+        apart = np.diff(lines[chosen], axis=1)
+        chosen = chosen[(apart != 0).all(axis=1) & (np.ptp(lines[chosen], axis=1) >= 0.1 * half)]
+        if not len(chosen):
+            return None
+        parabolas = np.linalg.solve(powers[chosen], across[chosen][:, :, None])[:, :, 0]
+        near = np.abs(across - parabolas @ powers.T) <= tolerance_px
+        best = near[near.sum(axis=1).argmax()]
         if best.sum() < _FEWEST:
             return None
         parabola = np.polynomial.Polynomial.fit(lines[best], across[best], 2)

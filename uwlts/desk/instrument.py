@@ -3,6 +3,7 @@
 Buttons put work into a queue; only `laser_off`, `pause`, `resume` and `stop` act at once, whatever is being done.
 """
 
+import math
 import os
 import queue
 import sys
@@ -35,7 +36,7 @@ from uwlts.model.errors import DescriptionError, Error, HardwareError
 from uwlts.model.sensor import Sensor
 from uwlts.report.inventory import calibration_lines
 from uwlts.storage.calibration_file import load_calibration, write_calibration
-from uwlts.storage.capture import Capture, Frame, part_path
+from uwlts.storage.capture import Capture, Frame, part_path, picture_of
 from uwlts.storage.files import refuse_unsuitable
 
 _PREVIEW_S = 0.15
@@ -335,7 +336,7 @@ class Instrument:
             self._rig = None
             return
         try:
-            image, exposure_ms = self._rig_of(connected).image(light, self.exposure_ms[light])
+            frame = self._rig_of(connected).frame(light, self.exposure_ms[light])
         except HardwareError:
             # A busy computer loses frames now and then.
             self._lost += 1
@@ -343,14 +344,16 @@ class Instrument:
                 raise
             return
         self._lost = 0
-        seen = brightness(image, connected.sensor, light)
-        full = connected.sensor.detector.full_scale_dn()
-        caption, pixels = f"live, {light}, exposure {exposure_ms:.4g} ms, {100 * seen.level:.0f} % of full scale", None
+        seen = brightness(frame.seen, connected.sensor, light)
+        full, exposure_ms = connected.sensor.detector.full_scale_dn(), frame.exposure_ms or self.exposure_ms[light]
+        level = "centre line" if math.isnan(seen.level) else f"{100 * seen.level:.0f} % of full scale"
+        caption, pixels = f"live, {light}, exposure {exposure_ms:.4g} ms, {level}", None
         if light == "laser":
-            stripe = stripe_of(image, connected.sensor)
+            stripe = stripe_of(frame.seen, connected.sensor)
             pixels = stripe.pixels()
             caption += f"; stripe on {len(pixels)} of {len(stripe.status)} profile lines"
         saturated = seen.saturated / max(seen.counted, 1)
+        image = picture_of(frame.seen, connected.sensor.camera)
         self._board.show(Picture(image, full_dn=full, caption=caption, stripe=pixels, saturated=saturated))
 
     def _scan(self, plan: ScanPlan, out: Path, calibration: Path | None, resume: bool, overwrite: bool) -> None:

@@ -14,8 +14,8 @@ from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.errors import CaptureError
 from uwlts.storage.calibration_file import loaded_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, part_path
-from uwlts.stripe import FoundStripes, extract_stripe, warm_up
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, part_path, picture_of
+from uwlts.stripe import FoundStripes, stripe_in, warm_up
 
 LOOK_S = 0.1
 """Time between two looks for new images; one takes some ms."""
@@ -32,7 +32,7 @@ class _Profile:
     points_mm: np.ndarray
     intensity: np.ndarray
     lines: int
-    saturated: float
+    saturated: float | None
     remarks: tuple[str, ...]
 
 
@@ -63,7 +63,13 @@ class RecordingView:
         self._found, self._lines = self._found + len(profile.pixels), self._lines + profile.lines
         caption += f"; stripe on {self._found:,} of {self._lines:,} profile lines so far"
         board.show(
-            Picture(frame.image, full_dn=full, caption=caption, stripe=profile.pixels, saturated=profile.saturated)
+            Picture(
+                picture_of(frame.seen, self._header.sensor.camera),
+                full_dn=full,
+                caption=caption,
+                stripe=profile.pixels,
+                saturated=profile.saturated,
+            )
         )
         if len(profile.points_mm):
             board.cloud.add(profile.points_mm, intensity=profile.intensity)
@@ -76,7 +82,7 @@ class RecordingView:
 
 def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | None) -> _Profile:
     along, full = header.sensor.camera.stripe_along, header.saturation_dn
-    stripe = extract_stripe(frame.image, stripe_along=along, saturation=full)
+    stripe = stripe_in(frame.seen, stripe_along=along, saturation=full)
     line, points, intensity = stripe.lines, np.empty((0, 3)), np.empty(0)
     centre = stripe.centre_px[line]
     if calibration is not None and len(line):
@@ -84,12 +90,14 @@ def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | 
         stripes = FoundStripes(own, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
         cloud = reconstruct_stripes(FrameTable.of(header, [frame]), stripes, calibration)
         points, intensity = cloud.points_mm, cloud.intensity
-    brightest = frame.image.max(axis=0 if along == "width" else 1)
-    saturated, remarks = float((brightest >= full).mean()), []
-    if saturated > _MANY:
-        remarks.append("saturated on many lines: shorten the exposure")
-    elif np.quantile(brightest, 0.98) < _FAINT * full:
-        remarks.append("faint: lengthen the exposure, or is the laser lit?")
+    saturated, remarks = None, []
+    if isinstance(frame.seen, np.ndarray):
+        brightest = frame.seen.max(axis=0 if along == "width" else 1)
+        saturated = float((brightest >= full).mean())
+        if saturated > _MANY:
+            remarks.append("saturated on many lines: shorten the exposure")
+        elif np.quantile(brightest, 0.98) < _FAINT * full:
+            remarks.append("faint: lengthen the exposure, or is the laser lit?")
     if len(line) < _FEW * len(stripe.status):
         remarks.append("hardly any stripe: is the object in the volume?")
     return _Profile(stripe.pixels(), points, intensity, len(stripe.status), saturated, tuple(remarks))

@@ -7,8 +7,8 @@ import stat
 import threading
 import time
 from contextlib import suppress
-from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_size_t, c_uint, c_uint16, c_uint64, c_void_p
-from dataclasses import dataclass
+from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_int64, c_size_t, c_uint, c_uint16, c_uint64, c_void_p
+from dataclasses import dataclass, replace
 from ipaddress import ip_address
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,8 +16,20 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.hardware.camera import BUFFERS, MONO_BITS, CameraDevice, CameraInfo, CameraSettings, Delivered, Region
+from uwlts.hardware.camera import (
+    BUFFERS,
+    CENTRE_LINES,
+    COORDINATE_BITS,
+    MONO_BITS,
+    CameraDevice,
+    CameraInfo,
+    CameraSettings,
+    Delivered,
+    Region,
+    require_uncalibrated,
+)
 from uwlts.model.errors import HardwareError
+from uwlts.model.stripe import Coordinates
 from uwlts.runtime.shared_library import load_aravis
 
 BUFFER_COMPLETE = 0
@@ -46,6 +58,12 @@ _OF_CAMERA: tuple[tuple[Any, str, list[Any]], ...] = (
     (None, "set_exposure_time set_gain set_frame_rate", [c_double]),
     (c_void_p, "create_stream", [c_void_p] * 2),
     (c_uint, "get_payload", []),
+    (c_void_p, "create_chunk_parser", []),
+    (None, "set_chunk_mode", [c_int]),
+    (None, "set_chunk_state", [c_char_p, c_int]),
+    (c_double, "get_float", [c_char_p]),
+    (c_int, "get_boolean", [c_char_p]),
+    (c_char_p, "get_string", [c_char_p]),
 )
 # Result, whole names, and all arguments.
 _OTHERS: tuple[tuple[Any, str, list[Any]], ...] = (
@@ -64,6 +82,8 @@ _OTHERS: tuple[tuple[Any, str, list[Any]], ...] = (
     (c_void_p, "arv_buffer_get_data", [c_void_p, POINTER(c_size_t)]),
     (c_uint64, "arv_buffer_get_frame_id arv_buffer_get_timestamp", [c_void_p]),
     (c_int, "arv_buffer_get_image_width arv_buffer_get_image_height", [c_void_p]),
+    (c_int64, "arv_chunk_parser_get_integer_value", [c_void_p, c_void_p, c_char_p, POINTER(POINTER(_GError))]),
+    (c_int, "arv_buffer_has_chunks", [c_void_p]),
     (None, "g_object_unref g_free g_error_free", [c_void_p]),
 )
 
@@ -153,6 +173,7 @@ class AravisCamera(CameraDevice):
         self._functions: SimpleNamespace
         self._camera: int | None = None
         self._stream: int | None = None
+        self._chunks: int | None = None
         self._gone = False
 
     def _open(self) -> CameraInfo:
@@ -168,11 +189,31 @@ class AravisCamera(CameraDevice):
                 _text(self._call(f"get_{part}")) or "?"
                 for part in ("vendor_name", "model_name", "device_serial_number")
             )
-            bits = MONO_BITS.get(self._pixel_format(), 8)
+            coordinates = self._coordinates() if self._pixel_format() == CENTRE_LINES else None
+            bits = MONO_BITS.get(self._pixel_format(), 8) if coordinates is None else COORDINATE_BITS
         except BaseException:
             self._close()
             raise
-        return CameraInfo(f"{maker} {model}", serial, width, height, bits)
+        return CameraInfo(f"{maker} {model}", serial, width, height, bits, coordinates)
+
+    def _coordinates(self) -> Coordinates:
+        """What the numbers of a 3D camera mean; HardwareError where they are no pixels."""
+        if self._offers("Scan3dOutputMode"):
+            mode = _text(self._call("get_string", b"Scan3dOutputMode"))
+            require_uncalibrated(mode, self.address)
+        scale, offset, invalid = (
+            self._call("get_float", name.encode()) if self._offers(name) else usual
+            for name, usual in (
+                ("Scan3dCoordinateScale", 1.0),
+                ("Scan3dCoordinateOffset", 0.0),
+                ("Scan3dInvalidDataValue", None),
+            )
+        )
+        marked = self._offers("Scan3dInvalidDataFlag") and self._call("get_boolean", b"Scan3dInvalidDataFlag")
+        return Coordinates(scale, offset, invalid if marked else None)
+
+    def _offers(self, name: str) -> bool:
+        return bool(self._call("is_feature_available", name.encode()))
 
     def _controlled(self) -> bool:
         """Whether the camera obeys this program; one whose program was killed does when it has missed its heartbeat."""
@@ -204,8 +245,8 @@ class AravisCamera(CameraDevice):
         return (fitting[0].address if fitting[0].protocol == "GigEVision" else fitting[0].identifier).encode()
 
     def _close(self) -> None:
-        things = [thing for thing in (self._stream, self._camera) if thing is not None]
-        self._stream = self._camera = None
+        things = [thing for thing in (self._chunks, self._stream, self._camera) if thing is not None]
+        self._chunks = self._stream = self._camera = None
         if self._gone:
             # Aravis asks it again and again to let go, for 10 s, in which a laser may have to be switched off.
             threading.Thread(target=self._let_go, args=(things,), name="aravis-let-go").start()
@@ -219,12 +260,17 @@ class AravisCamera(CameraDevice):
     def _configure(self, wanted: CameraSettings) -> CameraSettings:
         self._call("set_acquisition_mode", 0)
         self._call("clear_triggers")
-        count = c_uint()
-        names = self._call("dup_available_pixel_formats_as_strings", byref(count))
-        offered = [names[index].decode() for index in range(count.value)]
-        self._functions.g_free(names)
-        self._call("set_pixel_format_from_string", self._grey_format(wanted.bits, offered).encode())
         region = wanted.region
+        if self.info.coordinates is None:
+            count = c_uint()
+            names = self._call("dup_available_pixel_formats_as_strings", byref(count))
+            offered = [names[index].decode() for index in range(count.value)]
+            self._functions.g_free(names)
+            self._call("set_pixel_format_from_string", self._grey_format(wanted.bits, offered).encode())
+        else:
+            # One profile a frame.
+            region = replace(region, y_px=0, height_px=1)
+        self._set_chunks()
         self._call("set_region", region.x_px, region.y_px, region.width_px, region.height_px)
         exposure_us = None if wanted.exposure_ms is None else 1e3 * wanted.exposure_ms
         self._set_number("exposure_time", exposure_us, automatic="exposure")
@@ -240,10 +286,17 @@ class AravisCamera(CameraDevice):
             exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
             gain_db=gain,
             region=Region(*self._numbers("get_region", 4)),
-            bits=MONO_BITS[self._pixel_format()],
+            bits=MONO_BITS.get(self._pixel_format(), COORDINATE_BITS),
             trigger=wanted.trigger,
             frame_rate_hz=rate,
         )
+
+    def _set_chunks(self) -> None:
+        """Have the encoder's count sent with every frame, by a camera that has it."""
+        if self._chunks is None and self._offers("ChunkModeActive") and self._offers("ChunkEncoderValue"):
+            self._call("set_chunk_mode", 1)
+            self._call("set_chunk_state", b"EncoderValue", 1)
+            self._chunks = self._call("create_chunk_parser")
 
     def _set_number(self, feature: str, value: float | None, *, automatic: str | None = None) -> None:
         if value is None:
@@ -313,7 +366,20 @@ class AravisCamera(CameraDevice):
             return incomplete
         pixels = (ctypes.c_ubyte * needed).from_address(start)
         image = np.frombuffer(pixels, kind).reshape(height, width).astype(kind.newbyteorder("="))
-        return Delivered(image, number, time_s)
+        seen = image if self.info.coordinates is None else self._profile(image)
+        return Delivered(seen, number, time_s, encoder=self._encoder(buffer))
+
+    def _encoder(self, buffer: int) -> int | None:
+        if self._chunks is None or not self._functions.arv_buffer_has_chunks(buffer):
+            return None
+        error = POINTER(_GError)()
+        count = self._functions.arv_chunk_parser_get_integer_value(
+            self._chunks, buffer, b"ChunkEncoderValue", byref(error)
+        )
+        if error:
+            self._functions.g_error_free(error)
+            return None
+        return count
 
     def _answers(self) -> None:
         self._numbers("get_region", 4)

@@ -19,14 +19,20 @@ from typing import Literal, Self
 
 import numpy as np
 
-from uwlts.model.errors import HardwareError
+from uwlts.model.errors import HardwareError, ImageError
+from uwlts.model.stripe import Coordinates, Stripe
 
 Trigger = Literal["free", "software", "line"]
+
+CENTRE_LINES = "Coord3D_C16"
+"""Pixel format of a 3D camera that finds the stripe itself (GenICam Pixel Format Naming Convention 2.4)."""
 
 BUFFERS = 32
 """Frames that may wait in a driver to be fetched; at 60 frames/s half a second. Later ones are lost."""
 MONO_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
 """Bits of the grey formats. Packed ones are left out: hardly any camera offers them alone, harvesters unpacks none."""
+COORDINATE_BITS = 16
+"""Of the numbers of `CENTRE_LINES`."""
 _WAIT_S = 0.1
 """A wait in a driver's library holds up Ctrl-C, so it lasts no longer."""
 # GigE Vision 1.x counts frames in 16 bits and leaves out 0.
@@ -109,6 +115,15 @@ class FrameCheck:
         self._last_id = self._last_time_s = None
 
 
+def require_uncalibrated(mode: str, address: str) -> None:
+    """HardwareError where a 3D camera's ``Scan3dOutputMode`` gives other than places on the image sensor, in px."""
+    if not mode.startswith("Uncalibrated"):
+        raise HardwareError(
+            f"the 3D camera {address} gives {mode}, which is not in pixels of its image sensor: set its "
+            "Scan3dOutputMode to UncalibratedC; the calibration is made here"
+        )
+
+
 def _advance(last: int, now: int) -> int:
     """Difference of a frame's number to that of the frame before: 1 is the next, 0 the same, negative an older one."""
     wrapped = last <= _COUNTER_16_BIT and last - now > _COUNTER_16_BIT // 2
@@ -136,13 +151,17 @@ class Region:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """Which camera it is: name, serial number, pixels of the whole image sensor, and bits of a grey value."""
+    """Which camera it is: name, serial number, pixels of the whole image sensor, and bits of a grey value.
+
+    ``coordinates`` say what the numbers of a 3D camera mean, which gives centre lines; None where it gives images.
+    """
 
     name: str
     serial: str
     width_px: int
     height_px: int
     bits: int
+    coordinates: Coordinates | None = None
 
 
 @dataclass(frozen=True)
@@ -162,27 +181,40 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class Delivered:
-    """A frame from a driver: image (H, W), None if incomplete, with what the camera reports about it."""
+    """A frame from a driver: image (H, W) or centre line, None if incomplete, with what the camera reports about it."""
 
-    image: np.ndarray | None
+    seen: np.ndarray | Stripe | None
     frame_id: int
     time_s: float | None = None
     exposure_ms: float | None = None
+    encoder: int | None = None
 
 
 @dataclass(frozen=True)
 class GrabbedFrame:
-    """An image (H, W) of uint8 or uint16, complete, with its number and the camera's time stamp in s.
+    """An image (H, W) of uint8 or uint16 or a centre line, complete, with its number and the camera's time stamp in s.
 
-    The camera's clock has an origin of its own. ``exposure_ms`` is None where the camera does not report it.
-    ``status`` is OK, or DROPPED or LATE where such frames are wanted.
+    The camera's clock has an origin of its own. ``exposure_ms`` is None where the camera does not report it, and so is
+    ``encoder``, the count of an encoder that is wired to it. ``status`` is OK, or DROPPED or LATE where such frames are
+    wanted.
     """
 
-    image: np.ndarray
+    seen: np.ndarray | Stripe
     time_s: float
     frame_id: int
     exposure_ms: float | None
     status: FrameStatus
+    encoder: int | None = None
+
+    @property
+    def image(self) -> np.ndarray:
+        """The image (H, W); HardwareError where it is a centre line."""
+        if isinstance(self.seen, Stripe):
+            raise HardwareError(
+                "the camera gives centre lines (Coord3D_C16) where an image is needed: set its PixelFormat to Mono8 "
+                "for targets and exposures"
+            )
+        return self.seen
 
 
 class CameraDevice(ABC):
@@ -253,7 +285,8 @@ class CameraDevice(ABC):
         """Set up the camera, and return what it really set, which may be rounded or limited.
 
         Exposure, gain, bits of a grey value, and frames per second of a free-running camera: None leaves what is set.
-        ``region`` is the part of the image sensor to read out; None for all of it. ``trigger`` is "free": one frame
+        ``region`` is the part of the image sensor to read out; None for all of it. A 3D camera gives one profile a
+        frame, and ``bits`` are its own. ``trigger`` is "free": one frame
         after the other; "software": one for each call of ``trigger``; or "line": one for each pulse at the camera's
         trigger input.
         """
@@ -324,23 +357,24 @@ class CameraDevice(ABC):
                     waiting()
                     continue
                 raise self._no_frame(timeout_s)
-            status = self._check.judge(frame_id=frame.frame_id, time_s=frame.time_s, complete=frame.image is not None)
+            status = self._check.judge(frame_id=frame.frame_id, time_s=frame.time_s, complete=frame.seen is not None)
             usable = status is FrameStatus.OK or (self._skip and status is not FrameStatus.DUPLICATED)
-            if frame.image is not None and usable:
-                return self._grabbed(frame.image, frame, status)
+            if frame.seen is not None and usable:
+                return self._grabbed(frame.seen, frame, status)
             if not self._skip:
                 raise HardwareError(f"frame {frame.frame_id} of the camera {self.address} is {_MEANING[status]}")
 
-    def _grabbed(self, image: np.ndarray, frame: Delivered, status: FrameStatus) -> GrabbedFrame:
+    def _grabbed(self, seen: np.ndarray | Stripe, frame: Delivered, status: FrameStatus) -> GrabbedFrame:
         settings = self.settings
-        if image.shape != (settings.region.height_px, settings.region.width_px):
+        shape = settings.region.height_px, settings.region.width_px
+        if isinstance(seen, np.ndarray) and seen.shape != shape:
             raise HardwareError(
-                f"frame {frame.frame_id} of the camera {self.address} has {image.shape[1]} x {image.shape[0]} px, "
+                f"frame {frame.frame_id} of the camera {self.address} has {seen.shape[1]} x {seen.shape[0]} px, "
                 f"expected {settings.region.width_px} x {settings.region.height_px} px"
             )
         time_s = time.monotonic() if frame.time_s is None else frame.time_s
         exposure_ms = settings.exposure_ms if frame.exposure_ms is None else frame.exposure_ms
-        return GrabbedFrame(image, time_s, frame.frame_id, exposure_ms, status)
+        return GrabbedFrame(seen, time_s, frame.frame_id, exposure_ms, status, frame.encoder)
 
     def _no_frame(self, timeout_s: float) -> HardwareError:
         """The error of a frame that did not come; another HardwareError where the camera is gone altogether."""
@@ -375,6 +409,14 @@ class CameraDevice(ABC):
         if wanted not in offered or wanted not in MONO_BITS:
             raise HardwareError(f"the camera {self.address} does not give {wanted}, only {', '.join(offered)}")
         return wanted
+
+    def _profile(self, numbers: np.ndarray) -> Stripe:
+        """The centre line of a 3D camera's numbers (1, W); HardwareError where they lie beyond the profile lines."""
+        meant = self.info.coordinates or Coordinates()
+        try:
+            return meant.stripe(numbers.ravel(), stripe_along="width", length_px=self.info.height_px)
+        except ImageError as error:
+            raise HardwareError(f"the 3D camera {self.address}: {error}") from error
 
     def _require_running(self) -> None:
         if not self._started:

@@ -7,13 +7,26 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from uwlts.hardware.camera import BUFFERS, MONO_BITS, CameraDevice, CameraInfo, CameraSettings, Delivered, Region
+from uwlts.hardware.camera import (
+    BUFFERS,
+    CENTRE_LINES,
+    COORDINATE_BITS,
+    MONO_BITS,
+    CameraDevice,
+    CameraInfo,
+    CameraSettings,
+    Delivered,
+    Region,
+    require_uncalibrated,
+)
 from uwlts.model.errors import HardwareError, SetupError
+from uwlts.model.stripe import Coordinates
 
 # GenApi's access modes count: not implemented, not available, write only, read only, both.
 _WRITE_ONLY = 2
@@ -72,8 +85,20 @@ class GenicamCamera(CameraDevice):
                 self._acquirer = harvester.create(found.index(fitting[0]))
             self._acquirer.num_buffers = BUFFERS
             width, height = (self._whole(side) for side in ("Width", "Height"))
-            bits = MONO_BITS.get(self._node("PixelFormat").value, 8)
-        return CameraInfo(f"{fitting[0].vendor} {fitting[0].model}", fitting[0].serial_number, width, height, bits)
+            pixels = self._node("PixelFormat").value
+            coordinates = self._coordinates() if pixels == CENTRE_LINES else None
+            bits = MONO_BITS.get(pixels, 8) if coordinates is None else COORDINATE_BITS
+        name = f"{fitting[0].vendor} {fitting[0].model}"
+        return CameraInfo(name, fitting[0].serial_number, width, height, bits, coordinates)
+
+    def _coordinates(self) -> Coordinates:
+        """What the numbers of a 3D camera mean; HardwareError where they are no pixels."""
+        if self._has("Scan3dOutputMode"):
+            require_uncalibrated(self._node("Scan3dOutputMode").value, self.address)
+        scale, offset = (self._number((f"Scan3dCoordinate{name}",)) for name in ("Scale", "Offset"))
+        marked = self._has("Scan3dInvalidDataFlag") and self._node("Scan3dInvalidDataFlag").value
+        invalid = self._number(("Scan3dInvalidDataValue",)) if marked else None
+        return Coordinates(1.0 if scale is None else scale, offset or 0.0, invalid)
 
     @contextmanager
     def _reporting(self, doing: str) -> Iterator[None]:
@@ -95,8 +120,17 @@ class GenicamCamera(CameraDevice):
         with self._reporting("configuring it"):
             self._set_if_there("AcquisitionMode", "Continuous")
             self._set_if_there("TriggerMode", "Off")
-            self._set_if_there("PixelFormat", self._grey_format(wanted.bits, self._node("PixelFormat").symbolics))
-            self._set_region(wanted.region)
+            region = wanted.region
+            if self.info.coordinates is None:
+                offered = self._node("PixelFormat").symbolics
+                self._set_if_there("PixelFormat", self._grey_format(wanted.bits, offered))
+            else:
+                # One profile a frame.
+                region = replace(region, y_px=0, height_px=1)
+            for name, value in (("ModeActive", True), ("Selector", "EncoderValue"), ("Enable", True)):
+                if self._has("ChunkEncoderValue"):
+                    self._set_if_there(f"Chunk{name}", value)
+            self._set_region(region)
             self._set_number(_EXPOSURE_US, wanted.exposure_ms, "exposure", factor=1e3, automatic="ExposureAuto")
             self._set_number(_GAIN, wanted.gain_db, "gain", automatic="GainAuto")
             if wanted.frame_rate_hz is not None:
@@ -117,7 +151,7 @@ class GenicamCamera(CameraDevice):
                 exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
                 gain_db=gain,
                 region=Region(x, y, width, height),
-                bits=MONO_BITS[self._node("PixelFormat").value],
+                bits=MONO_BITS.get(self._node("PixelFormat").value, COORDINATE_BITS),
                 trigger=wanted.trigger,
                 frame_rate_hz=rate,
             )
@@ -198,12 +232,15 @@ class GenicamCamera(CameraDevice):
             time_s = 1e-9 * raw.timestamp_ns
         except self._faults:
             time_s = None
-        image = None
+        image = encoder = None
         if raw.is_complete() and buffer.payload.components:
             part = buffer.payload.components[0]
             kind = np.uint8 if self.settings.bits == 8 else np.uint16
             image = part.data.reshape(part.height, part.width).astype(kind)
-        return Delivered(image, raw.frame_id, time_s)
+            if self._has("ChunkEncoderValue"):
+                encoder = int(self._node("ChunkEncoderValue").value)
+        seen = image if image is None or self.info.coordinates is None else self._profile(image)
+        return Delivered(seen, raw.frame_id, time_s, encoder=encoder)
 
     def _answers(self) -> None:
         with self._reporting("asking it"):

@@ -32,6 +32,7 @@ When the laser goes off:
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Self
 
 from uwlts.hardware.grbl_line import FEED_HOLD, POLL_S, GrblLine, Status, parse_settings
@@ -45,6 +46,15 @@ _MARGIN, _MARGIN_S = 1.5, 2.0
 _REPORTS_TO_OFFSET = 31
 # A limit switch opens this far from where it closes.
 _PIN_MARGIN_MM = 0.5
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """Position in mm that a controller reported between two moments, in s by the clock of `time.monotonic`."""
+
+    asked_s: float
+    answered_s: float
+    position_mm: float
 
 
 class GrblStage:
@@ -133,8 +143,16 @@ class GrblStage:
         # A reset that met a movement leaves an alarm behind.
         self._position_known = self._position_known and self._line.status().state != "Alarm"
 
-    def move_to(self, position_mm: float, *, feed_mm_per_min: float) -> float:
+    def move_to(
+        self,
+        position_mm: float,
+        *,
+        feed_mm_per_min: float,
+        reported: Callable[[StageReport], None] = lambda report: None,
+    ) -> float:
         """Move, wait until the stage rests, and return the position read back in mm.
+
+        ``reported`` is called with every position that the controller reports meanwhile, about ten times a second.
 
         RangeError where the target lies outside the travel, or the feed outside what the stage can do; nothing has
         moved then. HardwareError where the position is not known, and for every fault: alarm, stall, hold, lost steps,
@@ -155,7 +173,14 @@ class GrblStage:
         # Distance at full speed plus a ramp up and one down: never less than the real time, however short the way.
         expected_s = abs(position_mm - start_mm) / feed_mm_s + feed_mm_s / self.settings.acceleration_mm_per_s2
         self._line.command(f"G21G90G94G53G1X{self._origin_mm + position_mm:.4f}F{feed_mm_per_min:.2f}")
-        watch = self._motion_watch(start_mm, feed_mm_s)
+        in_motion = self._motion_watch(start_mm, feed_mm_s)
+
+        def watch(report: Status) -> None:
+            in_motion(report)
+            if report.machine_mm is not None or report.work_mm is not None:
+                line = self._line
+                reported(StageReport(line.asked_s, line.answered_s, self._position_of(report)))
+
         # A dwell is acknowledged when all movements before it are done.
         self._line.command("G4P0.01", timeout_s=_MARGIN * expected_s + _MARGIN_S, watch=watch)
         reached_mm = self._rest()

@@ -248,6 +248,7 @@ class GrblLine:
         self.port = port
         self.fault: str | None = None
         self.offset_mm: float | None = None
+        self.asked_s = self.answered_s = -math.inf
         self._received, self._unacknowledged = bytearray(), 0
         self._serial = _open(port, baud)
         self._guard: Heartbeat | None = None
@@ -373,12 +374,17 @@ class GrblLine:
         return next((text.removeprefix("OPT:").split(",")[0] for text in texts if text.startswith("OPT:")), "")
 
     def status(self) -> Status:
-        """Ask for a status report; HardwareError where none comes, and for every fault."""
+        """Ask for a status report; HardwareError where none comes, and for every fault.
+
+        ``asked_s`` and ``answered_s`` are when that was, by the clock of `time.monotonic`.
+        """
         for _ in range(_QUERIES):
+            self.asked_s = time.monotonic()
             self.realtime(STATUS_QUERY)
             deadline = time.monotonic() + _QUERY_S
             while (reply := self._next_reply(deadline)) is not None:
                 if isinstance(reply, Status):
+                    self.answered_s = time.monotonic()
                     return reply
         raise self.failed(
             f"silence: {_QUERIES} status queries were not answered: the cable is loose or the controller hangs"

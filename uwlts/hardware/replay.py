@@ -1,5 +1,6 @@
-"""A folder of images or a capture, shown like a camera: at a frame rate of its own, or one image for each trigger."""
+"""A folder of images or a capture, shown like a camera: at a frame rate of its own, or one frame for each trigger."""
 
+import math
 import re
 import time
 from dataclasses import replace
@@ -10,6 +11,7 @@ import numpy as np
 from uwlts.hardware.camera import BUFFERS, CameraDevice, CameraInfo, CameraSettings, Delivered
 from uwlts.model.errors import HardwareError, ImageError
 from uwlts.model.input_file import is_regular_file
+from uwlts.model.stripe import Coordinates, Stripe
 from uwlts.storage.capture import Capture
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import SUFFIXES
@@ -50,6 +52,10 @@ class ReplayCamera(CameraDevice):
                 raise HardwareError(f"the capture {self._path} holds no frame")
             sensor = self._capture.header.sensor
             height, width, bits = sensor.camera.height_px, sensor.camera.width_px, sensor.detector.bits
+            if not self._capture.has_image.all():
+                return CameraInfo(
+                    f"replay of {self._path.name}", self._path.name, width, height, bits, coordinates=Coordinates()
+                )
         else:
             raise HardwareError(f"there is no folder of images and no capture at {self._path}")
         return CameraInfo(f"replay of {self._path.name}", self._path.name, width, height, bits)
@@ -111,14 +117,17 @@ class ReplayCamera(CameraDevice):
         if index >= count and not self._repeat:
             raise HardwareError(f"all {count} images of {self._path} have been shown")
         shown = index % count
-        image = _read(self._files[shown]) if capture is None else capture.image(shown)
+        seen = _read(self._files[shown]) if capture is None else capture.seen(shown)
+        exposure_ms = None if capture is None else float(capture.exposure_ms[shown])
+        if isinstance(image := seen, Stripe):
+            known = math.nan if capture is None else float(capture.encoder[shown])
+            return Delivered(seen, index + 1, stamp_s, exposure_ms, int(known) if math.isfinite(known) else None)
         if image.shape != (info.height_px, info.width_px) or image.dtype.itemsize != (1 if info.bits == 8 else 2):
             raise ImageError(
                 f"image {shown} of {self._path} has {image.shape[1]} x {image.shape[0]} px of {image.dtype}, "
                 f"the first one {info.width_px} x {info.height_px} px of {info.bits} bits: give one camera's images"
             )
         part = image[region.y_px : region.y_px + region.height_px, region.x_px : region.x_px + region.width_px]
-        exposure_ms = None if capture is None else float(capture.exposure_ms[shown])
         return Delivered(np.ascontiguousarray(part), index + 1, stamp_s, exposure_ms)
 
     def _answers(self) -> None:

@@ -20,7 +20,7 @@ from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import Light, RigPlan, StageSettings
 from uwlts.model.errors import HardwareError
 from uwlts.model.sensor import Sensor
-from uwlts.storage.capture import CaptureHeader
+from uwlts.storage.capture import CaptureHeader, Seen
 from uwlts.stripe import Stripe, StripeStatus, extract_stripe
 
 BRIGHT_SHARE = 0.98
@@ -46,10 +46,12 @@ _UP = 30.0
 """Largest factor from a dark image, in which noise limits the estimate."""
 
 
-def stripe_of(image: np.ndarray, sensor: Sensor, *, background: np.ndarray | None = None) -> Stripe:
-    """The stripe in an image (H, W) of a sensor, from which a background (H, W) is subtracted."""
+def stripe_of(seen: Seen, sensor: Sensor, *, background: np.ndarray | None = None) -> Stripe:
+    """The stripe in what a sensor saw: a centre line, or an image (H, W) less a background (H, W) if there is one."""
+    if isinstance(seen, Stripe):
+        return seen
     along, full_dn = sensor.camera.stripe_along, sensor.detector.full_scale_dn()
-    return extract_stripe(image, stripe_along=along, saturation=full_dn, background=background)
+    return extract_stripe(seen, stripe_along=along, saturation=full_dn, background=background)
 
 
 def not_few(count: int, lines: int) -> bool:
@@ -81,8 +83,13 @@ class Brightness:
         return self.saturated > _MANY_SHARE * self.counted and not_few(self.saturated, self.lines)
 
 
-def brightness(image: np.ndarray, sensor: Sensor, light: Light) -> Brightness:
-    """Brightness of an image (H, W) in grey values, as the sensor's detector gives them, in a light."""
+def brightness(image: Seen, sensor: Sensor, light: Light) -> Brightness:
+    """Brightness of an image (H, W) in grey values, as the sensor's detector gives them, in a light.
+
+    Of a centre line only the lines are known, the level is NaN.
+    """
+    if isinstance(image, Stripe):
+        return Brightness(len(image.status), len(image.lines), 0, math.nan)
     full, black = sensor.detector.full_scale_dn(), sensor.detector.black_level_dn
     peak = image.max(axis=0 if sensor.camera.stripe_along == "width" else 1).astype(float)
     counts = peak - black > _DIM_SHARE * (peak.max() - black)
@@ -217,7 +224,15 @@ class Rig:
         return self._read_back_mm
 
     def image(self, light: Light, exposure_ms: float) -> tuple[np.ndarray, float]:
-        """Image (H, W) in a light, "lamp" being that without laser, and its exposure in ms as the camera says."""
+        """Image (H, W) in a light, "lamp" being that without laser, and its exposure in ms as the camera says.
+
+        HardwareError where the camera gives centre lines.
+        """
+        frame = self.frame(light, exposure_ms)
+        return frame.image, exposure_ms if frame.exposure_ms is None else frame.exposure_ms
+
+    def frame(self, light: Light, exposure_ms: float) -> GrabbedFrame:
+        """What the camera sees in a light: an image or a centre line."""
         if self._exposure_ms is None or abs(self._exposure_ms / exposure_ms - 1) >= 1e-6:
             self._rest()
             camera, gain_db, bits = self._camera, self._plan.gain_db, self._sensor.detector.bits
@@ -225,8 +240,7 @@ class Rig:
             camera.configure(exposure_ms=exposure_ms, gain_db=gain_db, bits=bits, trigger="software")
             camera.start(faults="raise")
             self._exposure_ms = exposure_ms
-        frame = self._grab(light)
-        return frame.image, exposure_ms if frame.exposure_ms is None else frame.exposure_ms
+        return self._grab(light)
 
     def settled_exposure(self, light: Light, *, start_ms: float) -> float | None:
         """Exposure in ms for what is seen now; None if even the longest is dark."""

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from uwlts.hardware.grbl import GrblStage
 from uwlts.model.artefacts import parse_artefact
@@ -112,6 +112,20 @@ class StagePlan(StageSettings):
         return [self.start_mm + k * self.step_mm for k in range(self.count)]
 
 
+class Continuous(Description):
+    """A scan without stops: the stage travels at a constant speed, and the camera takes a frame a step.
+
+    With ``both_ways`` it travels back as well, which shows the latency between camera and stage; ``latency_ms`` gives
+    that instead: by how much the stage's positions are older than the frames. ``mm_per_count`` places the frames by an
+    encoder that is wired to the camera and sent with them (GenICam's ChunkEncoderValue).
+    """
+
+    speed_mm_per_s: Positive
+    both_ways: bool = True
+    latency_ms: float | None = None
+    mm_per_count: float | None = None
+
+
 class ScanPlan(RigPlan):
     """A scan as read from TOML.
 
@@ -119,7 +133,7 @@ class ScanPlan(RigPlan):
     whatever other light there is. With ``background`` an image without laser is taken before every laser image and
     subtracted from it. Laser images are taken at every multiple of their exposure in ``bracket``, to be fused into one
     that shows bright and dark surfaces (`uwlts.stripe.exposures`). With ``check_steps`` an early position is visited
-    again at the end, to see whether the stage has lost steps.
+    again at the end, to see whether the stage has lost steps. With ``continuous`` the stage does not stop.
     """
 
     medium: str
@@ -130,6 +144,15 @@ class ScanPlan(RigPlan):
     check_steps: bool = True
     target: Table | None = None
     artefact: Table | None = None
+    continuous: Continuous | None = None
+
+    @model_validator(mode="after")
+    def _one_light_in_motion(self) -> "ScanPlan":
+        if self.continuous is not None and (self.images() != [("laser", 1.0)] or self.background):
+            raise ValueError(
+                "a continuous scan takes laser images alone, one a step: leave out lamp, bracket and background"
+            )
+        return self
 
     def images(self) -> list[tuple[Light, float]]:
         """Light, and multiple of its exposure, of each image at a position."""

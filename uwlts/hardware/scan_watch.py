@@ -19,6 +19,7 @@ from uwlts.hardware.rig import Rig, not_few, stripe_of
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.errors import HardwareError
 from uwlts.model.sensor import Sensor
+from uwlts.storage.capture import Seen
 from uwlts.stripe import Stripe, StripeStatus
 
 LOOKS = 9
@@ -39,12 +40,16 @@ def spread(positions_mm: Sequence[float], count: int) -> list[float]:
     return [positions_mm[k] for k in chosen]
 
 
-def shows_laser(lit: np.ndarray, unlit: np.ndarray, sensor: Sensor, *, difference: bool) -> bool:
+def shows_laser(lit: Seen, unlit: Seen, sensor: Sensor, *, difference: bool) -> bool:
     """Whether an image has a stripe that another one (H, W) of the same place without laser does not have.
 
-    ``difference``: the stripe is measured in the difference of both; else it has to be in the image itself,
-    as a lamp that is on while the laser is off leaves a difference of its own.
+    The same of two centre lines. ``difference``: the stripe is measured in the difference of both; else it has to be in
+    the image itself, as a lamp that is on while the laser is off leaves a difference of its own.
     """
+    if isinstance(lit, Stripe) or isinstance(unlit, Stripe):
+        with_laser, without = (centres_of(stripe_of(each, sensor)) for each in (lit, unlit))
+        own = np.isfinite(with_laser) & ~(np.abs(with_laser - without) < _SAME_PX)
+        return not_few(int(own.sum()), len(own))
     full = sensor.detector.full_scale_dn()
     added = stripe_of(lit, sensor, background=unlit)
     shown = added.status == StripeStatus.OK
@@ -79,17 +84,17 @@ class LaserWatch:
         self._without = 0
 
     def see(
-        self, image: np.ndarray, stripe: Stripe, level: float, here: LitPlace, *, unlit: np.ndarray | None, last: bool
+        self, image: Seen, stripe: Stripe, level: float, here: LitPlace, *, unlit: np.ndarray | None, last: bool
     ) -> None:
-        """Judge a laser image (H, W), its stripe and its brightness ``level``, before it is stored; may move the stage.
+        """Judge a laser image (H, W) or centre line, its stripe and its brightness ``level``, before it is stored.
 
-        ``unlit`` is an image without laser beside it, if there is one; ``last``: no further image comes. HardwareError
-        where the laser gives no light.
+        ``unlit`` is an image without laser beside it, if there is one; ``last``: no further image comes. May move the
+        stage. HardwareError where the laser gives no light.
         """
         now = (int((stripe.status != StripeStatus.NO_STRIPE).sum()), level)
         if self._usual is None or any(a < _DROP * b for a, b in zip(now, self._usual, strict=True)):
-            unlit = self._rig.image("lamp", here.exposure_ms)[0] if unlit is None else unlit
-            if not shows_laser(image, unlit, self._sensor, difference=self._difference):
+            dark = self._rig.frame("lamp", here.exposure_ms).seen if unlit is None else unlit
+            if not shows_laser(image, dark, self._sensor, difference=self._difference):
                 self._without += 1
                 if last or self._without % _AGAIN == 1:
                     self._look_elsewhere(here)
@@ -101,7 +106,7 @@ class LaserWatch:
         others = [position for position in spread(self._positions_mm, LOOKS) if position != here.position_mm]
         for place in [self.lit] if self.lit else [LitPlace(position, here.exposure_ms) for position in others]:
             self._rig.move_to(place.position_mm)
-            lit, unlit = (self._rig.image(light, place.exposure_ms)[0] for light in ("laser", "lamp"))
+            lit, unlit = (self._rig.frame(light, place.exposure_ms).seen for light in ("laser", "lamp"))
             if shows_laser(lit, unlit, self._sensor, difference=self._difference):
                 self.lit = place
                 self._rig.move_to(here.position_mm)

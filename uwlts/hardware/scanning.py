@@ -7,7 +7,7 @@ laser is on for its own images only; the stage's driver switches it off however 
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from uwlts.hardware.camera import CameraDevice
 from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.continuous import record_continuously, ways_of
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.page_beside import PageBeside
 from uwlts.hardware.replay import ReplayCamera
@@ -191,8 +192,11 @@ def record_scan(
     )
     sensor = plan.described_sensor()
     check_camera(camera, sensor)
+    lines = camera.info.coordinates is not None
+    if lines:
+        check_lines_plan(plan)
     plan.check(stage)
-    dtype = np.dtype(np.uint16 if plan.background or camera.info.bits > 8 else np.uint8)
+    dtype = np.dtype(np.uint16 if plan.background or (camera.info.bits > 8 and not lines) else np.uint8)
     header = with_provenance(
         plan.header(out.stem),
         plan,
@@ -202,9 +206,38 @@ def record_scan(
         images=len(shots),
         background=plan.background,
     )
+    if plan.continuous is not None:
+        if resume:
+            raise DescriptionError("a continuous scan cannot be resumed: give --overwrite to scan again")
+        ways_of(plan, plan.continuous, stage)
+        rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
+        seen = ScanProgress()
+        taking = _Taking(plan, sensor, rig, seen, warn)
+        report("finding the exposures")
+        taking.settle_exposures(between)
+        report("recording")
+        placed = record_continuously(
+            plan,
+            plan.continuous,
+            out,
+            sensor=sensor,
+            camera=camera,
+            stage=stage,
+            header=header,
+            exposure_ms=seen.exposure_ms["laser"],
+            overwrite=overwrite,
+            progress=progress,
+            report=report,
+            warn=warn,
+            recorded=recorded,
+            counted=taking.count_stripe,
+        )
+        report(f"{placed}")
+        return seen
     known_ms, before_s = left_over(out, [multiple for _, multiple in plan.images()]) if resume else ({}, 0.0)
     seen = ScanProgress(exposure_ms=known_ms)
-    with CaptureWriter(out, header, dtype=dtype, plan=plan.recorded(), overwrite=overwrite, resume=resume) as writer:
+    files = {"overwrite": overwrite, "resume": resume}
+    with CaptureWriter(out, header, dtype=dtype, centre_lines=lines, plan=plan.recorded(), **files) as writer:
         begun = len(writer)
         if begun == len(shots):
             return seen
@@ -216,9 +249,9 @@ def record_scan(
         start_s = time.monotonic() - before_s
         for done, (position_mm, (light, multiple)) in enumerate(shots[begun:], begun + 1):
             between()
-            position, image, exposure_ms = taking.take(position_mm, light, multiple, last=done == len(shots))
-            image = image.astype(dtype, copy=False)
-            frame = Frame(image, position, light == "laser", exposure_ms, time.monotonic() - start_s)
+            taken = taking.take(position_mm, light, multiple, last=done == len(shots))
+            kept = taken.seen if isinstance(taken.seen, Stripe) else taken.seen.astype(dtype, copy=False)
+            frame = replace(taken, seen=kept, time_s=time.monotonic() - start_s)
             writer.append(frame)
             progress(done, len(shots))
             recorded(frame, done - 1)
@@ -251,9 +284,29 @@ def check_camera(camera: CameraDevice, sensor: Sensor) -> None:
             f"the camera has {found.width_px} x {found.height_px} px, the sensor '{sensor.name}' "
             f"{described.width_px} x {described.height_px} px: give the description of this sensor"
         )
+    if found.coordinates is not None and described.stripe_along != "width":
+        raise HardwareError(
+            f"the 3D camera's profile lines are its columns, but the sensor '{sensor.name}' has stripe_along = "
+            f"'{described.stripe_along}': give the description with \"width\""
+        )
     if found.bits < sensor.detector.bits:
         raise HardwareError(
             f"the camera gives {found.bits} bits, the sensor '{sensor.name}' is described with {sensor.detector.bits}"
+        )
+
+
+def check_lines_plan(plan: ScanPlan) -> None:
+    """DescriptionError where a plan needs images of a camera that gives centre lines."""
+    needs = {
+        "lights holds 'lamp'": "lamp" in plan.lights,
+        "background is true": plan.background,
+        "laser_ms is 'auto'": "laser" not in plan.planned_ms(),
+        "bracket has several exposures": len(plan.bracket) > 1,
+    }
+    if wrong := [name for name, found in needs.items() if found]:
+        raise DescriptionError(
+            f"the camera finds the stripe itself and gives no images (Coord3D_C16), but {' and '.join(wrong)}: change "
+            "the plan, or set the camera's PixelFormat to Mono8"
         )
 
 
@@ -306,23 +359,26 @@ class _Taking:
             self._watch.lit = LitPlace(position_mm, exposure_ms)
         exposures[light] = min(exposure_ms, exposures.get(light, exposure_ms))
 
-    def take(self, position_mm: float, light: Light, multiple: float, *, last: bool) -> tuple[float, np.ndarray, float]:
-        """Position read back, image (H, W) as it is stored, and its exposure in ms: a multiple of the light's own.
+    def take(self, position_mm: float, light: Light, multiple: float, *, last: bool) -> Frame:
+        """What is stored, at the position read back, exposed by a multiple of the light's own time; without its time.
 
         Only images at the light's own exposure are watched; longer ones of a bracket are meant to be saturated.
         """
         rig, seen, zero_dn = self._rig, self._seen, self._plan.zero_dn(self._sensor)
         position = rig.move_to(position_mm)
-        image, exposure_ms = rig.image(light, seen.exposure_ms[light] * multiple)
-        bright = brightness(image, self._sensor, light)
+        asked_ms = seen.exposure_ms[light] * multiple
+        frame = rig.frame(light, asked_ms)
+        bright = brightness(frame.seen, self._sensor, light)
         if (
             multiple == 1
             and bright.overexposed
             and light not in self._plan.planned_ms()
             and self._shorten(light, position_mm)
         ):
-            image, exposure_ms = rig.image(light, seen.exposure_ms[light])
-            bright = brightness(image, self._sensor, light)
+            asked_ms = seen.exposure_ms[light]
+            frame = rig.frame(light, asked_ms)
+            bright = brightness(frame.seen, self._sensor, light)
+        image, exposure_ms = frame.seen, asked_ms if frame.exposure_ms is None else frame.exposure_ms
         unlit = rig.image("lamp", exposure_ms)[0] if zero_dn and light == "laser" else None
         if light == "laser" and multiple == 1:
             stripe, place = stripe_of(image, self._sensor, background=unlit), LitPlace(position_mm, exposure_ms)
@@ -330,9 +386,9 @@ class _Taking:
             self._watch.see(image, stripe, bright.level, place, unlit=unlit, last=last)
             self._count(stripe, bright)
         seen.repeated = rig.repeated
-        if zero_dn:
+        if zero_dn and isinstance(image, np.ndarray):
             image = image.astype(np.uint16) if unlit is None else without_background(image, unlit, zero_dn=zero_dn)
-        return position, image, exposure_ms
+        return Frame(image, position, light == "laser", exposure_ms, 0.0, encoder=frame.encoder)
 
     def check_steps(self) -> None:
         """Visit an early place again, if one has relief; HardwareError where the stage stands elsewhere than before."""
@@ -340,7 +396,7 @@ class _Taking:
             return
         place = relief.place
         self._rig.move_to(place.position_mm)
-        image = self._rig.image("laser", place.exposure_ms)[0]
+        image = self._rig.frame("laser", place.exposure_ms).seen
         unlit = self._rig.image("lamp", place.exposure_ms)[0] if self._plan.background else None
         slip_mm, error_mm = relief.slip(centres_of(stripe_of(image, self._sensor, background=unlit)))
         if not np.isfinite(slip_mm):
@@ -369,10 +425,14 @@ class _Taking:
         )
         return True
 
+    def count_stripe(self, stripe: Stripe) -> None:
+        """Count the profile lines with a stripe."""
+        self._seen.lines += len(stripe.status)
+        self._seen.found += int((stripe.status == StripeStatus.OK).sum())
+
     def _count(self, stripe: Stripe, bright: Brightness) -> None:
         seen = self._seen
-        seen.lines += len(stripe.status)
-        seen.found += int((stripe.status == StripeStatus.OK).sum())
+        self.count_stripe(stripe)
         if bright.overexposed:
             seen.saturated += 1
             if seen.saturated == 1:

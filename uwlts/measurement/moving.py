@@ -47,7 +47,9 @@ def platform_poses(
 def carried(capture: Capture, poses: np.ndarray, mount: Mount | None) -> FrameTable:
     """The images of a capture with the poses of the sensor on a platform (N, 4, 4)."""
     of_sensor = poses if mount is None else poses @ mount.transform()
-    return FrameTable(capture.header, capture.path, capture.stage_mm, capture.exposure_ms, of_sensor)
+    return FrameTable(
+        capture.header, capture.path, capture.stage_mm, capture.exposure_ms, of_sensor, capture.speed_mm_per_s
+    )
 
 
 def with_mount(

@@ -18,12 +18,12 @@ from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import StageParameter
+from uwlts.model.stripe import pixels_of
 from uwlts.optics.brightness import BLUR_STD, beside_std
 from uwlts.optics.line_table import LineTable
 from uwlts.storage.capture import Capture, CaptureHeader, FrameTable
 from uwlts.storage.cloud import PAIRS, PointUncertainty
 from uwlts.storage.files import sha256_of
-from uwlts.stripe.result import pixels_of
 
 _BLOCK = 20000
 # Patterns that together move the points by no more than this (root mean square) are left out.

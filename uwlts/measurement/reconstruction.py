@@ -186,7 +186,9 @@ def _points(
     capture: Capture | FrameTable, calibration: AnyCalibration, stripes: FoundStripes, index: float
 ) -> MeasuredPoints:
     """Points in the OCS of stripe centres, by whichever kind of calibration, with the stage's motion added."""
-    stage, direction = capture.stage_mm[stripes.frame], np.array(capture.header.stage_direction)
+    direction = np.array(capture.header.stage_direction)
+    # A rolling shutter exposes each row at its own time, and so at its own place of a stage that moves.
+    stage = capture.stage_mm[stripes.frame] + capture.speed_mm_per_s[stripes.frame] * _row_delay_s(capture, stripes)
     line, centre = stripes.line, stripes.centre_px
     if isinstance(calibration, PolynomialCalibration):
         return reconstruct_by_polynomials(calibration, line, centre, stage_mm=stage, stage_direction=direction)
@@ -194,6 +196,15 @@ def _points(
     if not capture.header.sensor.camera.window.mounted:
         calibration = calibration.model_copy(update={"window": None})
     return reconstruct_profile(calibration, line, centre, medium_index=index, stage_mm=stage, stage_direction=direction)
+
+
+def _row_delay_s(capture: Capture | FrameTable, stripes: FoundStripes) -> np.ndarray | float:
+    """Time (N,) by which the rows of stripe centres are exposed after the middle row."""
+    camera, detector = capture.header.sensor.camera, capture.header.sensor.detector
+    if detector.shutter == "global":
+        return 0.0
+    row = stripes.centre_px if camera.stripe_along == "width" else stripes.line
+    return 1e-6 * detector.line_time_us * (row - (camera.height_px - 1) / 2)
 
 
 def _beside(capture: Capture | FrameTable, calibration: Calibration, stripes: FoundStripes, index: float) -> np.ndarray:

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from uwlts.metrology.fits import fit_line, fit_plane
 from uwlts.metrology.least_squares import DEFAULT_K, MAD_TO_STD, accepted_points, evenly_thinned, principal_axes
 from uwlts.model.errors import EvaluationError
+from uwlts.runtime.compiled import compiled
 
 # Shares of the height: band in which support is counted, error of the described height, limits of a face's band, and
 # the largest standard deviation of a face: a slope that fills the widest band has 0.17.
@@ -127,22 +128,30 @@ def _best_proposal(
     """Normal towards the sensor, level of one face and signed offset of the other, with most points on both."""
     limit, least = _SEARCH_LIMIT * height, max(3, _SMALLEST_FACE * len(points))
     most, best = 0.0, None
+    here, there = np.empty((2, len(points)), np.intp)
     for normal in _proposed_normals(points, rng):
         heights = np.sort(points @ normal)
-
-        def between(low: np.ndarray, high: np.ndarray, heights: np.ndarray = heights) -> np.ndarray:
-            return np.searchsorted(heights, high, side="right") - np.searchsorted(heights, low)
-
-        here = between(heights - limit, heights + limit)
+        _count_within(heights, -limit, limit, here)
         for side in (1.0, -1.0):
-            middle = heights + side * height
-            there = between(middle - _HEIGHT_TOLERANCE * height, middle + _HEIGHT_TOLERANCE * height)
+            _count_within(heights, (side - _HEIGHT_TOLERANCE) * height, (side + _HEIGHT_TOLERANCE) * height, there)
             support = np.where((here >= least) & (there >= least), here + there, 0)
             top = int(np.argmax(support))
             if support[top] > most:
                 most = float(support[top])
                 best = (normal, float(heights[top]), side * height)
     return best
+
+
+@compiled
+def _count_within(heights: np.ndarray, low: float, high: float, counts: np.ndarray) -> None:
+    """How many of some heights (N,) in growing order lie from ``low`` to ``high`` above each of them."""
+    first = last = 0
+    for n in range(len(heights)):
+        while first < len(heights) and heights[first] < heights[n] + low:
+            first += 1
+        while last < len(heights) and heights[last] <= heights[n] + high:
+            last += 1
+        counts[n] = last - first
 
 
 def _proposed_normals(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -468,11 +468,13 @@ class Lamp(Description):
 
 
 class Stage(Description):
-    """Linear stage that moves the sensor."""
+    """Linear stage that moves the sensor; speed and acceleration are the largest that it does."""
 
     travel_mm: Positive
     resolution_mm: Positive
     settling_s: NotNegative = 0.0
+    speed_mm_per_s: Positive = 15.0
+    acceleration_mm_per_s2: Positive = 50.0
 
 
 class Volume(Description):

@@ -85,7 +85,8 @@ def beside_sheet(
     sigma = sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
     # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
     per_px = (points(further_px=_MOVED_PX) - on_sheet) / _MOVED_PX
-    thickest = np.median(width_px) / FWHM_PER_SIGMA * np.abs(per_px[:, 2] / per_mm[:, 2])
+    known = width_px[np.isfinite(width_px)]
+    thickest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA * np.abs(per_px[:, 2] / per_mm[:, 2])
     return per_mm * (slopes / across * np.minimum(sigma, thickest) ** 2)[:, None]
 
 
@@ -94,10 +95,14 @@ def slopes_of_brightness(
 ) -> np.ndarray:
     """Slope (N,) per mm of the stage of the logarithm of a scan's stripe amplitudes; 0 where it is unknown.
 
+    It is unknown everywhere if a 3D camera does not give all amplitudes.
+
     A plane is fitted to the logarithms of all neighbours, so that noise and speckle of the single ones hardly count.
     ``amplitude`` (N,) is positive, ``stage_mm`` and ``exposure_ms`` (F,) are those of every image, in any order; where
     an exposure is not known, all are taken as equal.
     """
+    if not np.isfinite(amplitude).all():
+        return np.zeros(len(frame))
     order = np.argsort(stage_mm, kind="stable")
     used, row = np.unique(np.argsort(order)[frame], return_inverse=True)
     position = stage_mm[order][used]
@@ -146,9 +151,14 @@ def moved_by_blur_px(
 
 
 def sharp_lines(stripes: FoundStripes) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (M,) of the stripe centres that blur hardly moves, and by how much it may, px."""
+    """Numbers (M,) of the stripe centres that blur hardly moves, and by how much it may, px.
+
+    All of them, and 0, if a 3D camera does not give all amplitudes and widths, by which it is known.
+    """
     if len(stripes.line) == 0:
         return np.empty(0, np.intp), np.empty(0)
+    if not (np.isfinite(stripes.amplitude).all() and np.isfinite(stripes.width_px).all()):
+        return np.arange(len(stripes.line)), np.zeros(len(stripes.line))
     moved = moved_by_blur_px(stripes.frame, stripes.line, stripes.centre_px, stripes.amplitude, stripes.width_px)
     sharp = np.flatnonzero(np.abs(moved) < _MOST_BLUR_PX)
     return sharp, moved[sharp]

@@ -12,11 +12,11 @@ from numpy.polynomial import legendre
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import RangeError
 from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.model.stripe import pixels_of
 from uwlts.optics.camera import directions
 from uwlts.optics.line_table import LineTable
 from uwlts.optics.sheet import SheetSurface, sheet_surface
 from uwlts.optics.window import RaysInMedium, RayStatus, trace_window
-from uwlts.stripe.result import pixels_of
 
 # Sine of the angle to the sheet below which a ray counts as parallel to it: some thousand roundings. A ray at this
 # angle would meet a sheet 1 mm away after a million kilometres.

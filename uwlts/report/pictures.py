@@ -11,9 +11,9 @@ from matplotlib.patches import Rectangle
 from uwlts.report import plot
 from uwlts.report.gather import GatheredCampaign
 from uwlts.report.page_toolkit import new_figure, png_of
-from uwlts.storage.capture import Capture
+from uwlts.storage.capture import Capture, picture_of
 from uwlts.storage.files import written_aside
-from uwlts.stripe import Stripe, extract_stripe
+from uwlts.stripe import Stripe, stripe_in
 
 _WIDTH_IN, _TALLEST_IN = 11.2, 4.4
 # An image with fewer stripe centres than this shows no stripe to speak of.
@@ -22,7 +22,7 @@ _LEAST_LINES = 8
 
 @dataclass(frozen=True, eq=False)
 class StripeView:
-    """A laser image (H, W) of a capture, its number, and the stripe found in it."""
+    """A laser image (H, W) of a capture, dark for a centre line, its number, and the stripe found in it."""
 
     frame: int
     image: np.ndarray
@@ -35,10 +35,10 @@ def stripe_view(capture: Capture) -> StripeView | None:
     laser = np.flatnonzero(capture.laser_on)
     for place in np.argsort(np.abs(np.arange(len(laser)) - (len(laser) - 1) / 2), kind="stable"):
         frame = int(laser[place])
-        image = capture.image(frame)
-        stripe = extract_stripe(image, stripe_along=header.sensor.camera.stripe_along, saturation=header.saturation_dn)
+        seen, camera = capture.seen(frame), header.sensor.camera
+        stripe = stripe_in(seen, stripe_along=camera.stripe_along, saturation=header.saturation_dn)
         if len(stripe.lines) >= _LEAST_LINES:
-            return StripeView(frame, image, stripe)
+            return StripeView(frame, picture_of(seen, camera), stripe)
     return None
 
 

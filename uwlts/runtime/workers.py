@@ -9,12 +9,13 @@ and leaves its processes behind where the command is killed.
 import multiprocessing
 import os
 import signal
+import socket
 import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor
 from concurrent.futures import wait as wait_for_futures
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -27,7 +28,9 @@ from typing import Any, Literal, TypeVar, assert_never
 
 from uwlts.model.errors import Error, SetupError
 from uwlts.runtime.interrupts import interrupts_kept
+from uwlts.runtime.unfinished import remove_unfinished
 
+Item = TypeVar("Item")
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 Send = Callable[[Any], None]
@@ -35,7 +38,9 @@ Send = Callable[[Any], None]
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 _GRACE_S = 5.0
-"""Time in which a process may leave its files in order before it is killed."""
+"""Time in which a process that is stopped may leave its files in order; then it removes those that are not complete."""
+_LEAVE_S = 5.0
+"""Further time, on a busy machine, before it is killed."""
 
 _AHEAD = 2
 """Jobs handed to a cluster per worker: one in work, one waiting, so that no worker waits for this process."""
@@ -117,6 +122,24 @@ def work_through(
     return [results[number] for number in range(len(jobs))]
 
 
+def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[tuple[Item, Result]]:
+    """Pairs of an item and ``function(item)``, in their order, from one thread per processor.
+
+    For functions that spend their time outside the interpreter, in OpenCV, NumPy or compiled code. Items are taken in
+    this thread, only shortly before their turn. What a function raises leaves this function.
+    """
+    threads = _processors()
+    with ThreadPoolExecutor(threads) as pool:
+        waiting: deque[tuple[Item, Future[Result]]] = deque()
+        for item in items:
+            waiting.append((item, pool.submit(function, item)))
+            if len(waiting) > threads:
+                done, result = waiting.popleft()
+                yield done, result.result()
+        for done, result in waiting:
+            yield done, result.result()
+
+
 def _processors() -> int:
     return len(os.sched_getaffinity(0))
 
@@ -137,7 +160,7 @@ class _Processes(Workers):
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         for process in self._processes:
             process.stop(at_once=kind is not None)
-        deadline = time.monotonic() + _GRACE_S
+        deadline = time.monotonic() + _GRACE_S + _LEAVE_S
         for process in self._processes:
             process.end(deadline)
 
@@ -291,7 +314,7 @@ def _serve(connection: Connection) -> None:
     work: Callable[[Any, Send], Any] | None = None
     try:
         signal.signal(signal.SIGTERM, stop)
-        threading.Thread(target=_end_with_parent, daemon=True).start()
+        threading.Thread(target=_end_when_stopped, args=(_signals(),), daemon=True).start()
         with interrupts_kept():
             while (given := connection.recv()) is not None:
                 kind, content = given
@@ -308,15 +331,32 @@ def _serve(connection: Connection) -> None:
     finally:
         # Whatever the interrupt has become on its way through a library, there is nothing to say about it.
         if stopped.is_set():
+            remove_unfinished()
             os._exit(1)
 
 
-def _end_with_parent() -> None:
+def _signals() -> socket.socket:
+    """A socket that can be read as soon as a signal comes, also while a library computes, when no handler runs."""
+    reader, writer = socket.socketpair()
+    writer.setblocking(False)
+    # Without a warning where the socket is full: one signal is enough.
+    signal.set_wakeup_fd(writer.detach(), warn_on_full_buffer=False)
+    return reader
+
+
+def _end_when_stopped(signals: socket.socket) -> None:
+    """End the process after a signal, or after the end of the process that has started it."""
     parent = multiprocessing.parent_process()
     assert parent is not None
-    parent.join()
-    os.kill(os.getpid(), signal.SIGTERM)
+    while True:
+        ready = wait([parent.sentinel, signals])
+        if signals in ready and signal.SIGTERM in signals.recv(64):
+            break
+        if parent.sentinel in ready:
+            os.kill(os.getpid(), signal.SIGTERM)
+            break
     time.sleep(_GRACE_S)
+    remove_unfinished()
     os._exit(1)
 
 

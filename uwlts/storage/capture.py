@@ -1,9 +1,17 @@
-"""The capture file: images of a scan with everything known about them, written frame by frame.
+"""The capture file: what a camera saw of a scan, with everything known about it, written frame by frame.
 
 An HDF5 file with ``frames (N, H, W)`` (8 or 16 bit, one chunk per frame, Blosc zstd with bit shuffle, Fletcher-32
 checksum), per frame ``stage_mm``, ``pose`` (4, 4), ``laser_on``, ``exposure_ms`` and ``time_s``, and attributes
 ``format``, ``version`` and ``header``: JSON with sensor, medium, target, artefact and provenance. Nothing in it is ever
 executed, and real and synthetic captures look the same.
+
+The frames of a 3D camera, which finds the stripe itself, are centre lines (version 2): ``centre_lines (N, 4, L)`` has
+the rows centre, amplitude, width and status of a `Stripe`, ``has_image (N,)`` says which frames are images all the
+same, such as those of a target, and ``encoder (N,)`` is the count of an encoder at each frame, NaN where there is none.
+A part of ``frames`` or ``centre_lines`` that a frame does not have takes no space.
+
+Frames of a stage that moves have its ``speed_mm_per_s (N,)`` (version 2 too), positive where positions grow, and the
+capture holds what the stage reported meanwhile: ``stage_reports (M, 2)``, time in s of the frames' clock and position.
 
 While it is being recorded the file is called ``NAME.part`` and every frame is flushed in HDF5's single-writer mode, so
 an interrupted recording keeps all its complete frames; closing it gives it its name.
@@ -27,7 +35,8 @@ from uwlts.model.command_files import note_made, refuse_input
 from uwlts.model.errors import CaptureError, ImageError, OutputError
 from uwlts.model.input_file import require_regular_file
 from uwlts.model.joint_estimate import CaptureSource
-from uwlts.model.sensor import CaptureHeader, Table
+from uwlts.model.sensor import Camera, CaptureHeader, Table
+from uwlts.model.stripe import ROWS, Stripe, StripeStatus, rows_of
 from uwlts.storage.files import refuse_unsuitable, sha256_of
 from uwlts.storage.hdf5_file import (
     UnfinishedFile,
@@ -44,8 +53,11 @@ from uwlts.storage.json_files import differences
 from uwlts.storage.one_writer import one_writer
 
 FORMAT = "uwlts-capture"
-VERSION = 1
+VERSION = 2
+"""Of captures with centre lines or a moving stage; those of images at rest have version 1."""
 _PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (), "time_s": ()}
+_MORE = {"has_image": bool, "encoder": float, "speed_mm_per_s": float}
+"""Columns of version 2."""
 # What h5py raises on a damaged file depends on where the damage is.
 _DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 POSE_ROUNDED = 1e-4
@@ -54,24 +66,54 @@ POSE_ROUNDED = 1e-4
 _MARGIN_BYTES = 2**18
 
 
+Seen = np.ndarray | Stripe
+"""What a camera gives of a moment: an image (H, W) of uint8 or uint16, or of a 3D camera the stripe that it found."""
+
+
+def image_of(seen: Seen, called: str) -> np.ndarray:
+    """What was seen as an image (H, W); ImageError where it is a centre line."""
+    if isinstance(seen, Stripe):
+        raise ImageError(
+            f"{called} is a centre line, as a 3D camera gives it, where an image is needed: take images with its pixel "
+            "format Mono8 for targets and exposures"
+        )
+    return seen
+
+
+def picture_of(seen: Seen, camera: Camera) -> np.ndarray:
+    """What was seen as an image (H, W) to draw on: dark for a centre line."""
+    return np.zeros((camera.height_px, camera.width_px), np.uint8) if isinstance(seen, Stripe) else seen
+
+
 @dataclass(frozen=True)
 class Frame:
-    """One image (H, W) with its stage position, light, exposure, time, and pose ``T_scene_object`` (4, 4) if known."""
+    """What was seen, with its stage position, light, exposure, time, and pose ``T_scene_object`` (4, 4) if known.
 
-    image: np.ndarray
+    ``encoder`` is the count of an encoder at that moment, where there is one. Of a stage that moves, position and time
+    are those in the middle of the exposure, of an image's middle row where the shutter is rolling.
+    """
+
+    seen: Seen
     stage_mm: float
     laser_on: bool
     exposure_ms: float
     time_s: float
     pose: np.ndarray | None = None
+    encoder: float | None = None
+    speed_mm_per_s: float = 0.0
+
+    @property
+    def image(self) -> np.ndarray:
+        """The image (H, W); ImageError where it is a centre line."""
+        return image_of(self.seen, f"the frame at {self.time_s:g} s")
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTable:
     """What is known of each image of a recording besides its pixels, as of a `Capture`.
 
-    ``stage_mm`` and ``exposure_ms`` are (N,), ``pose`` is (N, 4, 4), NaN where an image has none; ``path`` is what the
-    recording is called.
+    ``stage_mm``, ``exposure_ms`` and ``speed_mm_per_s`` are (N,), ``pose`` is (N, 4, 4), NaN where an image has none;
+    ``path`` is what the recording is called.
     """
 
     header: CaptureHeader
@@ -79,6 +121,7 @@ class FrameTable:
     stage_mm: np.ndarray
     exposure_ms: np.ndarray
     pose: np.ndarray
+    speed_mm_per_s: np.ndarray
 
     @classmethod
     def of(cls, header: CaptureHeader, frames: Sequence[Frame]) -> "FrameTable":
@@ -90,6 +133,7 @@ class FrameTable:
             np.array([frame.stage_mm for frame in frames]),
             np.array([frame.exposure_ms for frame in frames]),
             np.array([none if frame.pose is None else frame.pose for frame in frames]).reshape(-1, 4, 4),
+            np.array([frame.speed_mm_per_s for frame in frames]),
         )
 
 
@@ -103,14 +147,16 @@ def _cut_to_used(path: Path) -> None:
     h5py.File(path, "r+", locking=False).close()
 
 
-def _recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None) -> Table:
+def _recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None, *, lines: bool, moving: bool) -> Table:
     """What a recording is to hold, as JSON."""
-    return {"plan": plan, "images": str(dtype), "header": header.model_dump(mode="json")}
+    held = f"{dtype}{' and centre lines' if lines else ''}{', moving' if moving else ''}"
+    return {"plan": plan, "images": held, "header": header.model_dump(mode="json")}
 
 
 def _arrays(file: h5py.File) -> dict[str, h5py.Dataset]:
     """A capture's datasets by their names, in a file of this program's."""
-    return {name: cast(h5py.Dataset, file[name]) for name in ("frames", *_PER_FRAME)}
+    names = ("frames", "centre_lines", "stage_reports", *_MORE, *_PER_FRAME)
+    return {name: cast(h5py.Dataset, file[name]) for name in names if name in file}
 
 
 def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
@@ -123,10 +169,12 @@ def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
 class CaptureWriter(AbstractContextManager["CaptureWriter"]):
     """Records a capture. A context manager: leaving it normally finishes the file, an exception keeps the part.
 
-    ``plan`` says, as JSON, what is to be recorded beyond what the header states; it is kept in the part and not in the
-    finished capture. OutputError where the file exists (give ``overwrite``), is an input of the running command or is
-    being written by another process, a part is left over (give ``resume`` or ``overwrite``), or storage fails;
-    CaptureError for ``resume`` of a part that is damaged, or of another header or plan.
+    ``dtype`` is that of images; with ``centre_lines`` laser frames are centre lines, with ``moving`` frames have a
+    speed, and the stage's reports are added by `place`. ``plan`` says, as JSON, what is to be recorded beyond what the
+    header states; it is kept in the part and not in the finished capture. OutputError where the file exists (give
+    ``overwrite``), is an input of the running command or is being written by another process, a part is left over (give
+    ``resume`` or ``overwrite``), or storage fails; CaptureError for ``resume`` of a part that is damaged, or of another
+    header or plan.
     """
 
     def __init__(
@@ -135,6 +183,8 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         header: CaptureHeader,
         *,
         dtype: np.dtype,
+        centre_lines: bool = False,
+        moving: bool = False,
         plan: Table | None = None,
         overwrite: bool = False,
         resume: bool = False,
@@ -144,6 +194,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         self._part = part_path(self.path)
         camera = header.sensor.camera
         self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
+        self._lines, self._moving = camera.lines() if centre_lines else 0, moving
         if self._dtype not in (np.uint8, np.uint16):
             raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
         with self._storage(), ExitStack() as claimed:
@@ -169,8 +220,11 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             unfinished = Capture(self._part)
         except CaptureError as error:
             raise CaptureError(f"cannot resume: {error}; give --overwrite to start afresh") from error
-        there = _recording_table(unfinished.header, unfinished.dtype, unfinished.plan())
-        if others := differences(there, _recording_table(self.header, self._dtype, self._plan)):
+        held = unfinished.header, unfinished.dtype, unfinished.plan()
+        there = _recording_table(*held, lines=unfinished.holds_lines, moving=unfinished.moving)
+        kinds = {"lines": bool(self._lines), "moving": self._moving}
+        wanted = _recording_table(self.header, self._dtype, self._plan, **kinds)
+        if others := differences(there, wanted):
             unfinished.close()
             raise CaptureError(
                 f"{self._part} belongs to another recording: {others}. Go on with the plan of that one, give "
@@ -188,21 +242,28 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         try:
             with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
                 self._claim_space()
-                write_label(self._file, format=FORMAT, version=VERSION, header=self.header)
+                write_label(self._file, format=FORMAT, version=self._version(), header=self.header)
                 if self._plan is not None:
                     write_plan(self._file, self._plan)
                 # The checksum finds damage that the compression would decode to a different picture.
-                self._file.create_dataset(
-                    "frames",
-                    (0, *self._shape),
-                    self._dtype,
-                    maxshape=(None, *self._shape),
-                    chunks=(1, *self._shape),
-                    fletcher32=True,
-                    **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
-                )
-                for name, shape in _PER_FRAME.items():
-                    kind, chunks = bool if name == "laser_on" else float, (256, *shape)
+                parts = {"frames": (self._shape, self._dtype)}
+                if self._lines:
+                    parts["centre_lines"] = (len(ROWS), self._lines), np.dtype(float)
+                for name, (shape, dtype) in parts.items():
+                    self._file.create_dataset(
+                        name,
+                        (0, *shape),
+                        dtype,
+                        maxshape=(None, *shape),
+                        chunks=(1, *shape),
+                        fletcher32=True,
+                        **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
+                    )
+                columns = _PER_FRAME | (dict.fromkeys(_MORE, ()) if self._version() > 1 else {})
+                if self._moving:
+                    self._file.create_dataset("stage_reports", (0, 2), float, maxshape=(None, 2), chunks=(256, 2))
+                for name, shape in columns.items():
+                    kind, chunks = _MORE.get(name, bool if name == "laser_on" else float), (256, *shape)
                     # No checksum: a kill while 256 rows are rewritten would then lose them all, not only the last one.
                     self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=chunks)
                 self._arrays = _arrays(self._file)
@@ -213,6 +274,9 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         finally:
             fresh.unlink(missing_ok=True)
 
+    def _version(self) -> int:
+        return VERSION if self._lines or self._moving else 1
+
     def __len__(self) -> int:
         """Number of complete frames written."""
         return len(self._arrays["time_s"])
@@ -220,14 +284,14 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
     def append(self, frame: Frame) -> None:
         """Store one frame; once this returns, the frame survives the end of the program.
 
-        ImageError where the image has another size or type than the capture; CaptureError where stage position,
+        ImageError where what was seen has another size or type than the capture, or a laser frame is an image where the
+        capture has centre lines; CaptureError where stage position,
         exposure, time or pose is not finite, the exposure is negative, the time is before the last frame's, or the pose
         is no rotation with a shift (4, 4); OutputError where storage fails, the frames before being kept.
         """
-        if frame.image.shape != self._shape or frame.image.dtype != self._dtype:
-            raise ImageError(
-                f"frame is {frame.image.shape} {frame.image.dtype}, the capture holds {self._shape} {self._dtype}"
-            )
+        self._require_fitting(frame)
+        if frame.speed_mm_per_s and not self._moving:
+            raise CaptureError(f"a frame moves by {frame.speed_mm_per_s:g} mm/s in a capture of a stage at rest")
         if not np.isfinite([frame.stage_mm, frame.exposure_ms, frame.time_s]).all() or frame.exposure_ms < 0:
             raise CaptureError(
                 f"a frame at stage position {frame.stage_mm} mm, exposure {frame.exposure_ms} ms and time "
@@ -244,12 +308,52 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         with self._storage():
             self._store(frame)
 
+    def place(self, stage_mm: np.ndarray, speed_mm_per_s: np.ndarray, reports: np.ndarray) -> None:
+        """Correct positions and speeds (N,) of the frames, once the stage's ``reports`` (M, 2) are complete."""
+        with self._storage():
+            for name, values in (
+                ("stage_mm", stage_mm),
+                ("speed_mm_per_s", speed_mm_per_s),
+                ("stage_reports", reports),
+            ):
+                dataset = self._arrays[name]
+                dataset.resize(len(values), axis=0)
+                dataset[...] = values
+                dataset.flush()
+
+    def _require_fitting(self, frame: Frame) -> None:
+        seen = frame.seen
+        if isinstance(seen, Stripe):
+            if len(seen.centre_px) != self._lines:
+                held = f"centre lines of {self._lines} profile lines" if self._lines else "images"
+                raise ImageError(f"frame is a centre line of {len(seen.centre_px)} lines, the capture holds {held}")
+        elif seen.shape != self._shape or seen.dtype != self._dtype:
+            raise ImageError(f"frame is {seen.shape} {seen.dtype}, the capture holds {self._shape} {self._dtype}")
+        elif self._lines and frame.laser_on:
+            raise ImageError("frame is an image with the laser on, the capture holds centre lines for these")
+
     def _store(self, frame: Frame) -> None:
         self._claim_space()
         pose = np.full((4, 4), np.nan) if frame.pose is None else frame.pose
-        values = {"frames": frame.image, "stage_mm": frame.stage_mm, "pose": pose, "laser_on": frame.laser_on}
+        values: dict[str, object] = {"stage_mm": frame.stage_mm, "pose": pose, "laser_on": frame.laser_on}
+        if self._version() > 1:
+            encoder = np.nan if frame.encoder is None else frame.encoder
+            values |= {"has_image": not isinstance(frame.seen, Stripe), "encoder": encoder}
+            values |= {"speed_mm_per_s": frame.speed_mm_per_s}
+        if isinstance(frame.seen, Stripe):
+            kept, seen = "centre_lines", rows_of(frame.seen)
+        else:
+            kept, seen = "frames", frame.seen
+        # The time comes last: by its number frames are counted.
         values |= {"exposure_ms": frame.exposure_ms, "time_s": frame.time_s}
         count = len(self)
+        # A piece of a dataset that is not written takes no space.
+        for name in ("frames", "centre_lines") if self._lines else ("frames",):
+            dataset = self._arrays[name]
+            dataset.resize(count + 1, axis=0)
+            if name == kept:
+                dataset[count] = seen
+            dataset.flush()
         for name, value in values.items():
             dataset = self._arrays[name]
             dataset.resize(count + 1, axis=0)
@@ -318,6 +422,14 @@ class Capture(AbstractContextManager["Capture"]):
         Whether the laser was on, rather than the lamp.
     pose : (N, 4, 4) float64
         ``T_scene_object`` of the sensor's OCS, a rotation with a shift; all NaN for a frame without one.
+    has_image : (N,) bool
+        Whether a frame is an image, rather than a centre line.
+    encoder : (N,) float64
+        Count of an encoder at each frame; NaN where there is none.
+    speed_mm_per_s : (N,) float64
+        Speed of the stage at each frame, positive where positions grow; 0 at rest.
+    stage_reports : (M, 2) float64
+        What a stage reported while it moved: time in s, as of ``time_s``, and position in mm.
 
     Raises
     ------
@@ -354,10 +466,36 @@ class Capture(AbstractContextManager["Capture"]):
         for name, dataset in columns.items():
             require_small_chunks(dataset, name, path=self.path)
         self._images, self.dtype = images, images.dtype
-        self._count = min(len(images), *map(len, columns.values()))
-        # HDF5 shows chunks that were never stored as zeros.
-        if images.id.get_num_chunks() < self._count:
-            raise CaptureError(f"{self.path} is damaged: it holds {images.id.get_num_chunks()} of {self._count} images")
+        self.holds_lines = "centre_lines" in self.file
+        self.moving = "stage_reports" in self.file
+        more = {
+            name: self._dataset(name, (), "b" if kind is bool else "f")
+            for name, kind in _MORE.items()
+            if name in self.file
+        }
+        counted = [images, *columns.values(), *more.values()]
+        if self.holds_lines:
+            self._lines = self._dataset("centre_lines", (len(ROWS), camera.lines()), "f")
+            if self._lines.chunks != (1, *self._lines.shape[1:]):
+                raise CaptureError(f"{self.path} is damaged: centre lines are in chunks of {self._lines.chunks}")
+            counted.append(self._lines)
+        self._count = min(map(len, counted))
+        for dataset, name in zip(more.values(), more, strict=True):
+            require_small_chunks(dataset, name, path=self.path)
+        known = {name: dataset[: self._count] for name, dataset in more.items()}
+        self.has_image = known.get("has_image", np.ones(self._count, bool))
+        self.encoder = known.get("encoder", np.full(self._count, np.nan))
+        self.speed_mm_per_s = known.get("speed_mm_per_s", np.zeros(self._count))
+        self.stage_reports = np.empty((0, 2))
+        if self.moving:
+            reports = self._dataset("stage_reports", (2,), "f")
+            require_small_chunks(reports, "stage_reports", path=self.path)
+            self.stage_reports = reports[:]
+        if not (np.isfinite(self.speed_mm_per_s).all() and np.isfinite(self.stage_reports).all()):
+            raise CaptureError(f"{self.path} holds speeds or reports of the stage that are not finite")
+        if self.holds_lines:
+            self._require_stored(self._lines, int(np.count_nonzero(~self.has_image)), "centre lines")
+        self._require_stored(images, int(np.count_nonzero(self.has_image)), "images")
         self.stage_mm, self.pose, self.laser_on, self.exposure_ms, self.time_s = (
             dataset[: self._count] for dataset in columns.values()
         )
@@ -373,10 +511,15 @@ class Capture(AbstractContextManager["Capture"]):
         if unfinished and self._count > 1 and self.time_s[-1] < self.time_s[-2]:
             # The writer was killed between making room for its last frame and storing it.
             self._count -= 1
-            for name in _PER_FRAME:
+            for name in (*_PER_FRAME, *_MORE):
                 setattr(self, name, getattr(self, name)[: self._count])
         if (np.diff(self.time_s) < 0).any():
             raise CaptureError(f"{self.path} holds times that run backwards")
+
+    def _require_stored(self, parts: h5py.Dataset, count: int, called: str) -> None:
+        # HDF5 shows chunks that were never stored as zeros.
+        if parts.id.get_num_chunks() < count:
+            raise CaptureError(f"{self.path} is damaged: it holds {parts.id.get_num_chunks()} of {count} {called}")
 
     def _dataset(self, name: str, shape: tuple[int, ...], kind: str) -> h5py.Dataset:
         """A dataset with one row of a shape per frame; CaptureError where it is something else."""
@@ -400,25 +543,47 @@ class Capture(AbstractContextManager["Capture"]):
         """The plan of an unfinished recording; None where it has none."""
         return read_plan(self.file)
 
-    def image(self, index: int) -> np.ndarray:
-        """Image (H, W) of a frame; raises CaptureError where its data are damaged."""
+    def seen(self, index: int) -> Seen:
+        """Image (H, W) or centre line of a frame; raises CaptureError where its data are damaged."""
         if not 0 <= index < self._count:
             raise IndexError(f"frame {index} of {self._count}")
         try:
-            return self._images[index]
+            if self.has_image[index]:
+                return self._images[index]
+            rows = self._lines[index]
         except _DAMAGE as error:
             raise CaptureError(f"frame {index} of {self.path} cannot be read: the file is damaged ({error})") from error
+        return self._stripe(rows, index)
+
+    def _stripe(self, rows: np.ndarray, index: int) -> Stripe:
+        centre, amplitude, width, status = rows
+        along = self.header.sensor.camera.stripe_along
+        length = self._images.shape[1 if along == "width" else 2]
+        good = status == StripeStatus.OK
+        known = np.isin(status, list(StripeStatus)).all() and np.array_equal(good, np.isfinite(centre))
+        if not known or (centre[good] < -0.5).any() or (centre[good] > length - 0.5).any():
+            raise CaptureError(
+                f"frame {index} of {self.path} is damaged: its centre line has places beyond 0 to {length - 1} px, or "
+                "none where its status says that there is one"
+            )
+        return Stripe(centre, amplitude.astype(np.float32), width.astype(np.float32), status.astype(np.uint8), along)
+
+    def image(self, index: int) -> np.ndarray:
+        """Image (H, W) of a frame; ImageError where it is a centre line, CaptureError where its data are damaged."""
+        return image_of(self.seen(index), f"frame {index} of {self.path.name}")
 
     def __getitem__(self, index: int) -> Frame:
         """A frame with everything known about it; raises CaptureError where its data are damaged."""
         index = index + self._count if index < 0 else index
-        image = self.image(index)
+        seen = self.seen(index)
         columns = (self.stage_mm, self.laser_on, self.exposure_ms, self.time_s)
         pose = self.pose[index] if np.isfinite(self.pose[index]).all() else None
-        return Frame(image, *(column[index].item() for column in columns), pose=pose)
+        encoder = self.encoder[index].item() if np.isfinite(self.encoder[index]) else None
+        known = {"pose": pose, "encoder": encoder, "speed_mm_per_s": self.speed_mm_per_s[index].item()}
+        return Frame(seen, *(column[index].item() for column in columns), **known)
 
     def frames(self, *, laser_on: bool | None = None) -> Iterator[tuple[int, np.ndarray]]:
-        """Index and image of all frames, or only of those with the laser on or off."""
+        """Index and image of all frames, or only of those with the laser on or off; ImageError at a centre line."""
         for index in range(self._count):
             if laser_on is None or bool(self.laser_on[index]) == laser_on:
                 yield index, self.image(index)

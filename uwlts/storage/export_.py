@@ -17,11 +17,13 @@ import tomli_w
 
 from uwlts.model.command_files import keeps_inputs
 from uwlts.model.errors import OutputError, SetupError
+from uwlts.model.stripe import rows_of
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud, write_cloud
 from uwlts.storage.files import refuse_unsuitable, require_possible_name, written_aside
 from uwlts.storage.import_.description import NAME
 from uwlts.storage.import_.matching import POSE_COLUMNS
+from uwlts.stripe import Stripe
 
 HEADER, TABLE = "header.json", "frames.csv"
 _COLUMNS = ("file", "light", "stage_mm", "exposure_ms", "time_s")
@@ -84,6 +86,8 @@ def export_capture(
 ) -> None:
     """Write a capture's frames as images of its own depth, without loss, into a new folder; whole or not at all.
 
+    Centre lines become arrays (.npy) of a profile (1, 4, L): centre, amplitude, width and status of every line.
+
     Beside them stand frames.csv (file, light, stage_mm, exposure_ms, time_s, and the pose's elements if any frame has
     one), header.json and import.toml. OutputError where the folder exists, its parent is missing, or storage fails;
     CaptureError where a frame's data are damaged.
@@ -99,20 +103,28 @@ def export_capture(
         rows = []
         for index, frame in enumerate(capture):
             light = "laser" if frame.laser_on else "lamp"
-            name = f"{index:05d}-{light}.{image_format}"
-            _, encoded = cv2.imencode(f".{image_format}", frame.image)
-            (aside / name).write_bytes(encoded.tobytes())
+            if isinstance(frame.seen, Stripe):
+                name = f"{index:05d}-{light}.npy"
+                np.save(aside / name, rows_of(frame.seen)[None])
+            else:
+                name = f"{index:05d}-{light}.{image_format}"
+                _, encoded = cv2.imencode(f".{image_format}", frame.seen)
+                (aside / name).write_bytes(encoded.tobytes())
             pose = [] if frame.pose is None else frame.pose.ravel().tolist()
-            rows.append([name, light, frame.stage_mm, frame.exposure_ms, frame.time_s, *pose])
+            encoder = [] if not capture.holds_lines else ["" if frame.encoder is None else frame.encoder]
+            rows.append([name, light, frame.stage_mm, frame.exposure_ms, frame.time_s, *encoder, *pose])
             progress(index + 1, len(capture))
         # Only captures with a pose have its columns, which stand last.
-        width = max(map(len, rows), default=len(_COLUMNS))
+        columns = (*_COLUMNS, "encoder") if capture.holds_lines else _COLUMNS
+        width = max(map(len, rows), default=len(columns))
         with open(aside / TABLE, "w", newline="", encoding="utf-8") as file:
             table = csv.writer(file, lineterminator="\n")
-            table.writerow((*_COLUMNS, *POSE_COLUMNS)[:width])
+            table.writerow((*columns, *POSE_COLUMNS)[:width])
             table.writerows([*row, *[""] * (width - len(row))] for row in rows)
         (aside / HEADER).write_text(capture.header.model_dump_json(indent=2) + "\n", encoding="utf-8")
         description = {"header": HEADER, "table": TABLE, "repeated": True}
+        if capture.holds_lines:
+            description |= {"centre_lines": {}}
         (aside / NAME).write_text(tomli_w.dumps(description), encoding="utf-8")
         os.rename(aside, folder)
     except OSError as error:

@@ -6,11 +6,13 @@ import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from uwlts.model.command_files import hold_until_end, note_made, refuse_input
 from uwlts.model.errors import OutputError
 from uwlts.model.input_file import opened, shortened
+from uwlts.runtime.unfinished import unfinished
 from uwlts.storage.one_writer import one_writer
 
 _PATIENCE_S = 10.0
@@ -38,24 +40,23 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
 
 def _aside(target: Path, *, overwrite: bool) -> Iterator[Path]:
     aside = target.parent / f".{secrets.token_hex(8)}{target.suffix}"
-    try:
-        # Not tempfile: its files are private (mode 0600), and the finished one would stay so.
-        os.close(os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-    except OSError as error:
-        raise OutputError(_cannot_write(target, error)) from error
-    try:
-        yield aside
-        _flush(aside, os.O_RDWR)
-        _require_suitable(target, overwrite=overwrite)
-        os.replace(aside, target)
-        note_made(target)
-        # Only POSIX systems can open a folder, to make the renaming itself last.
-        if os.name == "posix":
-            _flush(target.parent, os.O_RDONLY)
-    except OSError as error:
-        raise OutputError(_cannot_write(target, error)) from error
-    finally:
-        aside.unlink(missing_ok=True)
+    with unfinished(aside, partial(aside.unlink, missing_ok=True)):
+        try:
+            # Not tempfile: its files are private (mode 0600), and the finished one would stay so.
+            os.close(os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        except OSError as error:
+            raise OutputError(_cannot_write(target, error)) from error
+        try:
+            yield aside
+            _flush(aside, os.O_RDWR)
+            _require_suitable(target, overwrite=overwrite)
+            os.replace(aside, target)
+            note_made(target)
+            # Only POSIX systems can open a folder, to make the renaming itself last.
+            if os.name == "posix":
+                _flush(target.parent, os.O_RDONLY)
+        except OSError as error:
+            raise OutputError(_cannot_write(target, error)) from error
 
 
 def refuse_unsuitable(target: Path, *, overwrite: bool) -> None:

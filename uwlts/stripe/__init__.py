@@ -6,10 +6,11 @@ about several peaks, `peak_window` measures what stands there, `methods` place t
 gives the statuses. `recording` does so for all laser images and says why there is no stripe.
 """
 
-from uwlts.stripe.extract import extract_stripe, warm_up
+from uwlts.model.stripe import Stripe, StripeStatus
+from uwlts.stripe.extract import extract_stripe, stripe_in, warm_up
 from uwlts.stripe.methods import method_names
 from uwlts.stripe.recording import FoundStripes, find_stripes, why_no_stripe
-from uwlts.stripe.result import PeakRule, Stripe, StripeOptions, StripeSettings, StripeStatus
+from uwlts.stripe.result import PeakRule, StripeOptions, StripeSettings
 
 __all__ = [
     "FoundStripes",
@@ -21,6 +22,7 @@ __all__ = [
     "extract_stripe",
     "find_stripes",
     "method_names",
+    "stripe_in",
     "warm_up",
     "why_no_stripe",
 ]

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from uwlts.model.sensor import LEAST_BRACKET_STEP, MOST_IN_BRACKET, CaptureHeader
+from uwlts.model.stripe import Stripe
 
 _SLACK = 0.98
 """Exposures that a camera rounds to its own steps may differ by a little less than planned."""
@@ -35,7 +36,7 @@ _DARK_DN, _DARK_SIGMAS, _SIGMA_PER_MAD = 3.0, 4.0, 1.4826
 
 
 class BracketImages(Protocol):
-    """A sequence of images, numbered, with exposure and place of each, such as an opened capture."""
+    """A sequence of images or centre lines, numbered, with exposure and place of each, such as an opened capture."""
 
     @property
     def path(self) -> Path: ...
@@ -55,6 +56,11 @@ class BracketImages(Protocol):
     @property
     def pose(self) -> np.ndarray: ...
 
+    @property
+    def has_image(self) -> np.ndarray: ...
+
+    def seen(self, index: int) -> np.ndarray | Stripe: ...
+
     def image(self, index: int) -> np.ndarray: ...
 
     def __len__(self) -> int: ...
@@ -65,12 +71,12 @@ def brackets(capture: BracketImages) -> list[np.ndarray]:
 
     Images belong together where they follow each other at one place, with exposures that differ by
     `LEAST_BRACKET_STEP` or more. A recording is in brackets where that holds at each of two places or more, with
-    equally many images; otherwise every image is a bracket of its own. The last place of a recording that goes on may
-    have fewer.
+    equally many images; otherwise every image is a bracket of its own, and so is every centre line. The last place of a
+    recording that goes on may have fewer.
     """
     laser = np.flatnonzero(capture.laser_on)
     alone = [laser[k : k + 1] for k in range(len(laser))]
-    if len(laser) < 4:
+    if len(laser) < 4 or not capture.has_image[laser].all():
         return alone
     stage, pose, exposure = (values[laser] for values in (capture.stage_mm, capture.pose, capture.exposure_ms))
     moved = np.abs(np.diff(stage)) > _SAME_PLACE_MM
@@ -88,17 +94,18 @@ def brackets(capture: BracketImages) -> list[np.ndarray]:
     return [laser[place] for place in places]
 
 
-def fused_images(capture: BracketImages) -> Iterator[tuple[int, np.ndarray, float]]:
+def fused_images(capture: BracketImages) -> Iterator[tuple[int, np.ndarray | Stripe, float]]:
     """Number, image (H, W) and grey value of saturation of each place of a recording that the laser lights.
 
-    A place with one image gives that image. That of a bracket has the number of its longest exposure and is `fused`.
+    A place with one image gives that image, one with a centre line this. The image of a bracket has the number of its
+    longest exposure and is `fused`.
     """
     full_dn = float(capture.header.saturation_dn)
     for numbers in brackets(capture):
-        images = [capture.image(number) for number in numbers.tolist()]
-        if len(images) == 1:
-            yield int(numbers[0]), images[0], full_dn
+        if len(numbers) == 1:
+            yield int(numbers[0]), capture.seen(int(numbers[0])), full_dn
         else:
+            images = [capture.image(number) for number in numbers.tolist()]
             yield int(numbers[-1]), *fused(images, capture.exposure_ms[numbers], full_dn=full_dn)
 
 

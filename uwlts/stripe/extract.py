@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 
 from uwlts.model.errors import ImageError
+from uwlts.model.stripe import Stripe, StripeStatus
 from uwlts.stripe.candidates import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
 from uwlts.stripe.learned import find_learned
 from uwlts.stripe.methods import amplitudes, place_centre
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
-from uwlts.stripe.result import LEARNED, Stripe, StripeOptions, StripeStatus
+from uwlts.stripe.result import LEARNED, StripeOptions
 from uwlts.stripe.search import MARGIN, look_at, search
 
 _LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
@@ -108,6 +109,15 @@ def extract_stripe(
         jump_px = options.half_window_px / 2
         found.discard(_half_lit(good, found.centre, lines=options.end_lines, jump_px=jump_px), _END)
     return Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
+
+
+def stripe_in(
+    seen: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions = StripeOptions(), saturation: float | None
+) -> Stripe:
+    """The stripe of what a camera saw: that of an image as by `extract_stripe`, that of a 3D camera as it is."""
+    if isinstance(seen, Stripe):
+        return seen
+    return extract_stripe(seen, stripe_along=stripe_along, options=options, saturation=saturation)
 
 
 def warm_up(dtype: np.dtype | type = np.uint8, options: StripeOptions = StripeOptions()) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from uwlts.model.errors import DescriptionError, SetupError
 from uwlts.model.input_file import require_regular_file
-from uwlts.stripe.result import StripeStatus
+from uwlts.model.stripe import StripeStatus
 
 PIXELS_MULTIPLE = 16
 """Networks with four levels halve the line three times, and one more may."""

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 
 from uwlts.model.errors import CaptureError, ImageError
+from uwlts.model.stripe import StripeStatus
 from uwlts.stripe.exposures import BracketImages, fused_images
-from uwlts.stripe.extract import extract_stripe
-from uwlts.stripe.result import StripeOptions, StripeSettings, StripeStatus
+from uwlts.stripe.extract import extract_stripe, stripe_in
+from uwlts.stripe.result import StripeOptions, StripeSettings
 
 BLACK = 0.02
 """Share of the full scale that no pixel of a black image reaches: above offset and noise of a covered lens."""
@@ -33,7 +34,8 @@ class FoundStripes:
     Attributes
     ----------
     frame, line : (N,) int; image and profile line of each centre
-    centre_px, amplitude, width_px : (N,); place on the line, height in grey levels and full width at half maximum
+    centre_px, amplitude, width_px : (N,); place on the line, height in grey levels and full width at half maximum; the
+        latter two are NaN where a 3D camera does not give them
     lines_by_status : numbers of the profile lines of all images by the names of `StripeStatus`
     """
 
@@ -58,6 +60,8 @@ def find_stripes(
 ) -> FoundStripes:
     """Find the stripe in all laser images of a recording, such as an opened `uwlts.storage.capture.Capture`.
 
+    Centre lines of a 3D camera are taken as they are.
+
     Images of one place at several exposures are fused (`uwlts.stripe.exposures`); their stripe has the number of the
     longest exposure, and amplitudes are in its grey levels.
 
@@ -68,8 +72,8 @@ def find_stripes(
     chosen = StripeOptions.of(capture.header.sensor, options)
     found: list[tuple[np.ndarray, ...]] = []
     statuses = np.zeros(len(StripeStatus), int)
-    for number, image, saturation in fused_images(capture):
-        stripe = extract_stripe(image, stripe_along=along, options=chosen, saturation=saturation)
+    for number, seen, saturation in fused_images(capture):
+        stripe = stripe_in(seen, stripe_along=along, options=chosen, saturation=saturation)
         statuses += np.bincount(stripe.status, minlength=len(StripeStatus))
         good = stripe.lines
         of_lines = (values[good] for values in (stripe.centre_px, stripe.amplitude, stripe.width_px))
@@ -81,6 +85,11 @@ def find_stripes(
         )
     by_status = {status.name.lower(): int(statuses[status]) for status in StripeStatus}
     if statuses[StripeStatus.OK] == 0:
+        if not capture.has_image[capture.laser_on].all():
+            raise CaptureError(
+                f"no stripe in any of the {len(found)} centre lines of {capture.path.name}: is the laser on, the "
+                "camera's threshold low enough, the object in view?"
+            )
         lit = (capture.image(number) for number in np.flatnonzero(capture.laser_on).tolist())
         reason = why_no_stripe(lit, stripe_along=along, full_dn=full_dn)
         raise CaptureError(f"no stripe in any of the {len(found)} laser images of {capture.path.name}: {reason}")

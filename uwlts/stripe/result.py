@@ -1,10 +1,10 @@
-"""Options and results of stripe extraction."""
+"""Options of stripe extraction."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from enum import IntEnum, StrEnum
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -23,22 +23,6 @@ class PeakRule(StrEnum):
     STRONGEST = "strongest"
     FIRST = "first"
     LAST = "last"
-
-
-class StripeStatus(IntEnum):
-    """Reason why a line has a centre or has none."""
-
-    OK = 0
-    NO_STRIPE = 1
-    """Nothing on the line rises above the threshold, or only things too narrow or too wide for a stripe."""
-    AMBIGUOUS = 2
-    """A second stripe of comparable strength; see `StripeOptions.ambiguous_ratio`."""
-    BORDER = 3
-    """The pixels needed around the centre run over the image border."""
-    SATURATED = 4
-    """The clipped plateau is too wide for the window; moderate clipping is handled and stays OK."""
-    END = 5
-    """Next to a place where the stripe ends or jumps; see `StripeOptions.end_lines`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,44 +132,3 @@ class StripeOptions:
 
 StripeSettings = StripeOptions | Mapping[str, Any] | None
 """How the stripe is found: all options; some, in place of the sensor's own; or None, the sensor's own."""
-
-
-@dataclass(frozen=True)
-class Stripe:
-    """Stripe centres of one image, L profile lines.
-
-    Attributes
-    ----------
-    centre_px : (L,) float64
-        Position along the line, px; pixel 0's centre is 0. NaN where the status is not OK.
-    amplitude : (L,) float32
-        Height above the local background, grey levels, of the Gaussian of the measured width that fits best; less
-        than the true height where the image is saturated. NaN where the status is not OK.
-    width_px : (L,) float32
-        Full width at half maximum, px, with the smoothing across the stripe taken out. NaN where not OK.
-    status : (L,) uint8
-        A `StripeStatus` per line.
-    stripe_along : str
-        ``"height"``: lines are image rows. ``"width"``: lines are image columns.
-    """
-
-    centre_px: np.ndarray
-    amplitude: np.ndarray
-    width_px: np.ndarray
-    status: np.ndarray
-    stripe_along: str
-
-    @property
-    def lines(self) -> np.ndarray:
-        """(M,) int: indices of the lines with a centre."""
-        return np.flatnonzero(self.status == StripeStatus.OK)
-
-    def pixels(self) -> np.ndarray:
-        """(M, 2) float64: image coordinates (u = column, v = row) of the centres of `lines`, px."""
-        return pixels_of(self.lines, self.centre_px[self.lines], stripe_along=self.stripe_along)
-
-
-def pixels_of(lines: np.ndarray, places_px: np.ndarray, *, stripe_along: str) -> np.ndarray:
-    """(N, 2) float64: image coordinates (u = column, v = row) of places (N,) on profile lines (N,), px."""
-    order = (places_px, lines) if stripe_along == "height" else (lines, places_px)
-    return np.column_stack(order).astype(np.float64)

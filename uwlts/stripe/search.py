@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from uwlts.model.stripe import StripeStatus
 from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import (
     FIRST,
@@ -19,7 +20,7 @@ from uwlts.stripe.peak_window import (
     low_pass,
     measured,
 )
-from uwlts.stripe.result import PeakRule, StripeOptions, StripeStatus
+from uwlts.stripe.result import PeakRule, StripeOptions
 
 _LOOKS = 4
 """Places looked at per line: hot pixels in front of the stripe and a second stripe after it."""

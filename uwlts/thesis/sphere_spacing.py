@@ -17,10 +17,10 @@ from uwlts.model.artefacts import SphereStandard
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError
 from uwlts.model.sensor import Medium
+from uwlts.model.stripe import pixels_of
 from uwlts.optics.reconstruction import reconstruct_pixels
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
-from uwlts.stripe.result import pixels_of
 from uwlts.thesis.campaign import STEP_PLACES, CampaignFolder
 from uwlts.thesis.results import WindowChoice, WindowProfile
 

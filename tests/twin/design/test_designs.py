@@ -204,6 +204,34 @@ def test_a_base_that_cannot_work_says_why(study):
         described(study, "near", near)
 
 
+@pytest.mark.parametrize("name", names("studies"))
+def test_many_designs_are_judged_as_each_by_itself(name):
+    study = load_study(name)
+    designs = designs_of(sampled(study, kind="sobol", designs=400), 0, 400)
+    together = judged(study, designs)
+    # Few at a time are judged without compiled formulas, and checked one by one where they differ in words.
+    parts = [judged(study, designs[first : first + 3]) for first in range(0, 60, 3)]
+    for column, values in together.items():
+        apart = np.concatenate([part[column] for part in parts])
+        if values.dtype.kind == "f":
+            # Newton's method ends at rounding errors, which a near end of some 200 mm has in its 13th digit.
+            np.testing.assert_allclose(values[:60], apart, rtol=1e-9, atol=1e-9)
+        else:
+            assert list(values[:60]) == list(apart)
+
+
+def test_a_design_beyond_its_description_s_bounds_fails_alone():
+    ranges = {BASELINE: {"least": 200.0, "most": 400.0}, "volume.near_mm": {"least": 100.0, "most": 500.0}}
+    study = sampled(Study.model_validate({"title": "t", "variables": ranges}), kind="random", designs=64)
+    columns = judged(study, designs_of(study, 0, 64))
+    beyond = columns["volume.near_mm"] >= study.sensor.volume.far_mm
+    assert 0 < beyond.sum() < 64
+    assert all(
+        ("must be smaller than far_mm" in reason) == wrong
+        for reason, wrong in zip(columns["failure"], beyond, strict=True)
+    )
+
+
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 

@@ -14,6 +14,7 @@ import pytest
 from uwlts.model.errors import CaptureError, SetupError
 from uwlts.runtime import workers
 from uwlts.runtime.workers import work_through
+from uwlts.storage.files import written_aside
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -121,6 +122,25 @@ def test_what_does_not_end_is_killed(monkeypatch):
 
     with pytest.raises(KeyboardInterrupt):
         work_through(hold_on, [0], on_message=interrupted)
+
+
+def write_and_hold_on(folder, job, send):
+    """Begin a file, then wait whatever anybody says."""
+    with written_aside(folder / f"{job}.txt"):
+        hold_on(job, send)
+
+
+def test_what_does_not_end_leaves_no_unfinished_files(tmp_path: Path):
+    seen = []
+
+    def interrupted(job: int) -> None:
+        seen.append(sorted(path.suffix for path in tmp_path.iterdir()))
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        work_through(partial(write_and_hold_on, tmp_path), range(2), workers=2, on_message=interrupted)
+    assert ".lock" in seen[0] and ".txt" in seen[0]
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("how", ["interrupt of all", "interrupt of the command", "kill"])

@@ -597,7 +597,7 @@ def never_stored(file: h5py.File) -> None:
 
 
 CONTRADICTIONS = {
-    "newer": (set_attribute("version", 2), "version 2; .*reads up to 1"),
+    "newer": (set_attribute("version", 3), "version 3; .*reads up to 2"),
     "version is text": (set_attribute("version", "1"), "version is no number"),
     "version is a list": (set_attribute("version", [1, 2]), "version is"),
     "no version": (lambda file: file.attrs.__delitem__("version"), "version is no number"),

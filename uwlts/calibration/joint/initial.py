@@ -36,11 +36,11 @@ from uwlts.model.errors import CalibrationError, EvaluationError
 from uwlts.model.parameter_keys import StepHeight
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
+from uwlts.model.stripe import pixels_of
 from uwlts.optics.brightness import BLUR_STD, beside_sheet, beside_std
 from uwlts.optics.camera import directions
 from uwlts.optics.reconstruction import reconstruct_pixels
 from uwlts.optics.window import trace_window
-from uwlts.stripe.result import pixels_of
 
 _LARGEST_MISFIT_PX, _LARGEST_MISFIT = 1.5, 1e-3
 """Pixels, or a share of the focal length: what the stage's errors leave in the images that a start is found from."""

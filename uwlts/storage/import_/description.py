@@ -46,13 +46,29 @@ class StageMotion(Description):
         return self
 
 
+class CentreLines(Description):
+    """Laser files that hold the centre lines of a 3D camera, one number per profile line, in place of images.
+
+    A place in px is ``scale`` times the number plus ``offset``; ``invalid`` is the number of lines without a stripe.
+    ``table`` is a CSV file with a row for each profile: any of stage_mm, exposure_ms, time_s and encoder. With
+    ``mm_per_count`` the encoder gives the stage's positions.
+    """
+
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    offset: float = 0.0
+    invalid: float | None = None
+    table: str | None = None
+    mm_per_count: float | None = None
+
+
 class ImportDescription(Description):
     """Everything that is known about a folder of images.
 
     ``header`` names a capture's header as JSON, in place of everything it holds. Other files are sought beside the
     description, images in their folder. ``sensor`` is a name, the path of a description, or a table of one, which may
     name a ``base``. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; images that are both
-    ``laser`` and ``lamp`` show the laser on the lit target. ``table`` is a CSV file with each image's values.
+    ``laser`` and ``lamp`` show the laser on the lit target. ``table`` is a CSV file with each image's values. With
+    ``centre_lines`` the laser files hold centre lines, with one profile or many.
     """
 
     header: str | None = None
@@ -73,6 +89,7 @@ class ImportDescription(Description):
     exposure_ms: NotNegative | None = None
     lamp_exposure_ms: NotNegative | None = None
     repeated: bool = False
+    centre_lines: CentreLines | None = None
     stage: StageMotion = StageMotion()
     target: Table | None = None
     artefact: Table | None = None
@@ -87,6 +104,8 @@ class ImportDescription(Description):
         twice += ["stage.direction"] if self.stage.direction is not None else []
         if self.header is not None and twice:
             raise ValueError(f"the header gives {', '.join(twice)} already: leave out one of the two")
+        if self.centre_lines is not None and (self.background or self.channel is not None):
+            raise ValueError("centre lines have neither background nor channel: leave these out; lamp_channel may stay")
         return self
 
 

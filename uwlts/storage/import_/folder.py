@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from uwlts.storage.capture import CaptureWriter, Frame, part_path
 from uwlts.storage.files import refuse_unsuitable
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import ImageHeader
+from uwlts.storage.import_.centre_lines import profile_rows
 from uwlts.storage.import_.channels import is_formula, one_channel
 from uwlts.storage.import_.chromatic import chromatic_warnings
 from uwlts.storage.import_.description import (
@@ -27,7 +28,8 @@ from uwlts.storage.import_.description import (
 )
 from uwlts.storage.import_.images import bits_of, grey_values, without_background
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
-from uwlts.stripe.recording import BLACK, WHITE, is_black, shown_stripe, white_share
+from uwlts.stripe import Stripe
+from uwlts.stripe.recording import BLACK, FEWEST_LINES, WHITE, is_black, shown_stripe, white_share
 from uwlts.targets import parse_target
 
 _SIZE_ADVICE = {
@@ -73,6 +75,11 @@ class _Content:
         direction = shown_stripe(image, stripe_along=self.stripe_along)
         self.with_stripe += direction == "along"
         self.sideways += direction == "across"
+
+    def look_at_line(self, stripe: Stripe) -> None:
+        """Take a centre line into account."""
+        self.seen[True] += 1
+        self.with_stripe += len(stripe.lines) >= FEWEST_LINES
 
     def refuse_black(self) -> None:
         """Raise ImageError where all laser images are black, or all lamp images that should show a target."""
@@ -158,9 +165,15 @@ def import_images(
     sensor = described_sensor(given, beside=path.parent)
     rows = None if given.table is None else read_rows(path.parent / given.table)
     matched = match(folder, given, rows)
+    if given.centre_lines is not None:
+        laser = profile_rows(matched.laser, given.centre_lines, sensor.camera, folder=folder)
+        matched = replace(matched, laser=laser)
     frames = planned_frames(given, matched, in_table=rows is not None)
     reader = _Reader(given, sensor, folder)
-    _, bits = reader.image(frames[0].file, laser_on=frames[0].light == "laser")
+    images = [row for row in frames if row.profile is None]
+    bits = sensor.detector.bits
+    if images:
+        _, bits = reader.image(images[0].file, laser_on=images[0].light == "laser")
     zero = _zero_dn(given, frames, bits)
     header = capture_header(
         given,
@@ -171,16 +184,26 @@ def import_images(
         remarks=_remarks(given, frames, folder, bits=bits, zero_dn=zero),
     )
     saturation = header.saturation_dn - zero
-    if saturation > np.iinfo(reader.dtype).max:
+    if images and saturation > np.iinfo(reader.dtype).max:
         raise DescriptionError(f"saturation_dn is {saturation}; images of {reader.dtype} have no such value")
     in_time = _in_time(frames)
     content = _Content(header.sensor.camera.stripe_along, saturation, header.target is not None)
-    dtype = np.dtype(np.uint16) if zero else reader.dtype
-    writer = CaptureWriter(out, header, dtype=dtype, overwrite=overwrite)
+    held = reader.dtype if images else np.dtype(np.uint8)
+    dtype = np.dtype(np.uint16) if zero else held
+    lines = given.centre_lines is not None
+    writer = CaptureWriter(out, header, dtype=dtype, centre_lines=lines, overwrite=overwrite)
     try:
         with writer:
             for number, row in enumerate(frames):
                 laser_on = row.light == "laser"
+                # An unknown exposure or time is stored as 0; the provenance says so.
+                exposure_ms, time_s = np.nan_to_num([row.exposure_ms, row.time_s if in_time else 0.0]).tolist()
+                if row.profile is not None:
+                    content.look_at_line(row.profile)
+                    encoder = None if math.isnan(row.encoder) else row.encoder
+                    writer.append(Frame(row.profile, row.stage_mm, True, exposure_ms, time_s, row.pose, encoder))
+                    progress(number + 1, len(frames))
+                    continue
                 image, _ = reader.image(row.file, laser_on=laser_on)
                 unsigned = np.maximum(image, 0).astype(reader.dtype, copy=False)
                 content.look(unsigned, laser_on=laser_on, name=Path(row.file).name)
@@ -191,8 +214,6 @@ def import_images(
                     image = unsigned
                 if laser_on:
                     content.look_for_stripe(image)
-                # An unknown exposure or time is stored as 0; the provenance says so.
-                exposure_ms, time_s = np.nan_to_num([row.exposure_ms, row.time_s if in_time else 0.0]).tolist()
                 image = image.astype(dtype, copy=False)
                 writer.append(Frame(image, row.stage_mm, laser_on, exposure_ms, time_s, row.pose))
                 progress(number + 1, len(frames))

@@ -18,21 +18,22 @@ from uwlts.model.input_file import is_regular_file, read_text
 from uwlts.storage.capture import POSE_ROUNDED
 from uwlts.storage.image_header import SUFFIXES
 from uwlts.storage.import_.description import ImportDescription, Patterns
+from uwlts.stripe import Stripe
 
 POSE_COLUMNS = tuple(f"pose_{row}{column}" for row in range(4) for column in range(4))
 """Elements of ``T_scene_object``, row by row."""
 
-_NUMBERS = ("stage_mm", "exposure_ms", "time_s")
+_NUMBERS = ("stage_mm", "exposure_ms", "time_s", "encoder")
 _COLUMNS = ("file", "light", "background", *_NUMBERS, *POSE_COLUMNS)
 _MOST_TABLE_BYTES = 8 * 2**20
 _LONGEST_LINE = 10_000
-"""Characters of a line; 22 columns have a few hundred."""
+"""Characters of a line; 23 columns have a few hundred."""
 _LIGHTS = ("laser", "lamp", "both", "ignore")
 
 
 @dataclass(frozen=True, eq=False)
 class ImageRow:
-    """One image: paths below the folder, NaN and None for what is not known; ``number`` gives the order."""
+    """One image or ``profile``: paths below the folder, NaN and None for what is not known; ``number`` is the order."""
 
     file: str
     number: int = 0
@@ -42,6 +43,8 @@ class ImageRow:
     exposure_ms: float = math.nan
     time_s: float = math.nan
     pose: np.ndarray | None = None
+    encoder: float = math.nan
+    profile: Stripe | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +62,8 @@ def natural_key(name: str) -> list[str | int]:
 
 
 def read_rows(path: Path) -> list[ImageRow]:
-    """Rows of a CSV table with the column ``file`` and any of light, background, stage_mm, exposure_ms, time_s, pose_00
-    to pose_33; separated by commas or semicolons.
+    """Rows of a CSV table with the column ``file`` and any of light, background, stage_mm, exposure_ms, time_s,
+    encoder, pose_00 to pose_33; separated by commas or semicolons.
 
     DescriptionError where the table is missing, empty, has an unknown column, a file twice, an unknown light, or a cell
     that is no number.
@@ -76,7 +79,7 @@ def read_rows(path: Path) -> list[ImageRow]:
     if not {"file"} <= set(columns) <= set(_COLUMNS) or len(set(columns)) < len(columns):
         raise DescriptionError(
             f"{path} has the columns {', '.join(columns)}; expected file and any of "
-            f"{', '.join(_COLUMNS[1:6])}, pose_00 to pose_33, each once"
+            f"{', '.join(_COLUMNS[1:7])}, pose_00 to pose_33, each once"
         )
     try:
         rows = [_row(number, cells, f"{path}, line {reader.line_num}") for number, cells in enumerate(reader)]
@@ -131,12 +134,16 @@ def _refuse_any(names: list[str], before: str, after: str) -> None:
         raise DescriptionError(f"{before}{', '.join(names[:3])}{after}")
 
 
-def image_files(folder: Path) -> list[str]:
-    """Paths of the images in a folder and below it, in natural order; ImageError where there are none."""
-    found = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES]
+def image_files(folder: Path, *, more: tuple[str, ...] = ()) -> list[str]:
+    """Paths of the images in a folder and below it, in natural order; ImageError where there are none.
+
+    Files with ``more`` endings count as well.
+    """
+    wanted = (*SUFFIXES, *more)
+    found = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in wanted]
     files = [name.as_posix() for name in found if not any(part.startswith(".") for part in name.parts)]
     if not files:
-        raise ImageError(f"{folder} holds no image: expected files that end with {', '.join(SUFFIXES)}")
+        raise ImageError(f"{folder} holds no image: expected files that end with {', '.join(wanted)}")
     for name in files:
         note_input(folder / name)
     return sorted(files, key=natural_key)
@@ -148,7 +155,7 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
     ImageError where the folder holds no image. DescriptionError where no image is known to be anything, one is two
     things, a named file is missing, or it is open which background belongs to which image.
     """
-    files = image_files(folder)
+    files = image_files(folder, more=(".csv", ".npy") if given.centre_lines else ())
     known = [ImageRow(name) for name in files] if rows is None else rows
     missing = [row.file for row in known if not is_regular_file(folder / row.file)]
     _refuse_any(missing, "the table names ", f", which {folder} does not hold")
@@ -184,6 +191,7 @@ def match(folder: Path, given: ImportDescription, rows: list[ImageRow] | None) -
         laser,
     )
     described = {name for row in (*laser, *lamp, *ignored) for name in (row.file, row.background)}
+    described |= {given.table, given.centre_lines.table if given.centre_lines else None}
     unmatched = [name for name in files if name not in described and not _matches(name, given.ignore)]
     return Matched(laser, lamp, unmatched)
 

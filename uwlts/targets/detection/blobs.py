@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from uwlts.model.errors import ImageError
+from uwlts.runtime.compiled import compiled
 
 # Sides of the square window over which the two local grey levels are taken. A window serves blobs from about a tenth
 # to three quarters of its side, so factors of four cover 4 px to 380 px with overlap.
@@ -62,7 +63,7 @@ def noise_level(grey):
     return float(np.quantile(response, 0.2) / (6 * lower_fifth_of_unit_normal))
 
 
-def find_blobs(image):
+def find_blobs(grey, noise):
     """Find the most numerous family of ellipse-like blobs, whatever its polarity and size.
 
     Each window of `WINDOWS_PX` gives a threshold half-way between the mean levels of the local bright and dark pixels
@@ -71,12 +72,10 @@ def find_blobs(image):
     polarity with most blobs of about the same size win, of as many the smaller ones: what is bright around each dark
     circle is a blob too.
 
-    The image is (H, W) of uint8 or uint16, ImageError for others; the result may be empty.
+    ``grey`` is the image (H, W) in float32, ``noise`` the standard deviation of a pixel; the result may be empty.
     """
-    grey = checked_grey(image).astype(np.float32)
     low, high = np.quantile(grey[::4, ::4], (0.001, 0.999))
-    # Half a grey level covers an image without noise, whose only disturbance is its rounding.
-    floor = max(CONTRAST_OVER_NOISE * max(noise_level(grey), 0.5), CONTRAST_OVER_RANGE * (high - low))
+    floor = max(CONTRAST_OVER_NOISE * noise, CONTRAST_OVER_RANGE * (high - low))
     smooth = cv2.medianBlur(grey, 3)
     small = _reduced(smooth)
     best, best_score = Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), True), (0, 0.0)
@@ -102,13 +101,24 @@ def _local_levels(smooth, small, window):
     """
     mean = _local_mean(small, window)
     threshold, bright, dark = _enlarged(mean, smooth.shape), mean, mean
+    above, grey_above = np.empty_like(smooth), np.empty_like(smooth)
     for _ in range(2):
-        above = np.greater(smooth, threshold).astype(np.float32)
+        _split(smooth, threshold, above, grey_above)
         share = np.clip(_local_mean(_reduced(above), window), 1e-4, 1 - 1e-4)
-        above_sum = _local_mean(_reduced(above * smooth), window)
+        above_sum = _local_mean(_reduced(grey_above), window)
         bright, dark = above_sum / share, (mean - above_sum) / (1 - share)
         threshold = _enlarged((bright + dark) / 2, smooth.shape)
     return threshold, _enlarged(bright - dark, smooth.shape)
+
+
+@compiled
+def _split(smooth, threshold, above, grey_above):
+    """1 and the grey level where an image is above its threshold, 0 elsewhere."""
+    height, width = smooth.shape
+    for v in range(height):
+        for u in range(width):
+            is_above = np.float32(smooth[v, u] > threshold[v, u])
+            above[v, u], grey_above[v, u] = is_above, is_above * smooth[v, u]
 
 
 def _reduced(values):
@@ -128,30 +138,27 @@ def _ellipse_like(mask, *, bright):
     """Blobs of a 0/1 mask whose outline encloses the area of the ellipse with the same moments."""
     height, width = mask.shape
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    centres, shapes = [], []
     is_outline = hierarchy.reshape(-1, 4)[:, 3] < 0 if contours else ()
+    found = []
     # The outline of the largest circle that fits into the image has less than four times its shorter side.
     for contour, outline in zip(contours, is_outline, strict=True):
-        if not outline or not 8 <= len(contour) <= 4 * min(height, width):
-            continue
-        u, v, du, dv = cv2.boundingRect(contour)
-        if u <= 1 or v <= 1 or u + du >= width - 1 or v + dv >= height - 1:
-            continue
-        moments = cv2.moments(contour)
-        area = moments["m00"]
-        # The outline runs through pixel centres: it leaves out half a pixel all around, and all of a line of pixels.
-        if area <= 0 or area + len(contour) / 2 < MIN_AREA_PX:
-            continue
-        covariance = np.array([[moments["mu20"], moments["mu11"]], [moments["mu11"], moments["mu02"]]]) / area
-        determinant = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
-        # The uniform disc of radius r has the variance r^2 / 4, so an ellipse has area 4 pi sqrt(det covariance).
-        if determinant <= 0 or abs(area / (4 * np.pi * np.sqrt(determinant)) - 1) > 0.12:
-            continue
-        centres.append((moments["m10"] / area, moments["m01"] / area))
-        shapes.append(covariance)
-    values, vectors = np.linalg.eigh(np.array(shapes).reshape(-1, 2, 2))
+        if outline and 8 <= (length := len(contour)) <= 4 * min(height, width):
+            u, v, du, dv = cv2.boundingRect(contour)
+            if u > 1 and v > 1 and u + du < width - 1 and v + dv < height - 1:
+                moments = cv2.moments(contour)
+                found.append((length, *(moments[name] for name in ("m00", "m10", "m01", "mu20", "mu11", "mu02"))))
+    found = np.array(found).reshape(-1, 7)
+    # The outline runs through pixel centres: it leaves out half a pixel all around, and all of a line of pixels.
+    found = found[(found[:, 1] > 0) & (found[:, 1] + found[:, 0] / 2 >= MIN_AREA_PX)]
+    area, covariances = found[:, 1], found[:, 4:] / found[:, 1:2]
+    determinant = covariances[:, 0] * covariances[:, 2] - covariances[:, 1] ** 2
+    # The uniform disc of radius r has the variance r^2 / 4, so an ellipse has area 4 pi sqrt(det covariance).
+    expected = 4 * np.pi * np.sqrt(np.maximum(determinant, 0))
+    like = np.abs(area - expected) <= 0.12 * expected
+    centres, shapes = found[like, 2:4] / area[like, None], covariances[like][:, [0, 1, 1, 2]]
+    values, vectors = np.linalg.eigh(shapes.reshape(-1, 2, 2))
     semi_axes = 2 * np.sqrt(values) + 0.5
-    return Blobs(np.array(centres).reshape(-1, 2), (vectors * semi_axes[:, None, :]) @ vectors.swapaxes(1, 2), bright)
+    return Blobs(centres, (vectors * semi_axes[:, None, :]) @ vectors.swapaxes(1, 2), bright)
 
 
 def _largest_family(radii):

@@ -53,7 +53,7 @@ def _ellipse_centres(points):
         raise RangeError(f"{np.count_nonzero(scale == 0)} circles are imaged onto a single point; expected ellipses")
     x, y = np.moveaxis((points - middle) / scale, 2, 0)
     design = np.stack([x * x, x * y, y * y, x, y, np.ones_like(x)], 2)
-    a, b, c, d, e, _ = np.linalg.svd(design, full_matrices=False)[2][:, -1].T
+    a, b, c, d, e, _ = np.linalg.eigh(design.swapaxes(1, 2) @ design)[1][:, :, 0].T
     determinant = 4 * a * c - b * b
     if not (determinant > 0).all():
         raise RangeError(

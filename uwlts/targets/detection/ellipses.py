@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from uwlts.runtime.compiled import compiled
-from uwlts.targets.detection.blobs import Blobs, find_blobs, noise_level
+from uwlts.targets.detection.blobs import Blobs, checked_grey, find_blobs, noise_level
 
 PASSES = 2
 # The edge of Gaussian blur s has the slope 0.4 / s over its contrast; 1.2 / slope is therefore three s.
@@ -184,7 +184,7 @@ class Ellipses(Blobs):
         return Ellipses(**{name: value if name == "bright" else value[select] for name, value in own})
 
 
-def fit_ellipses(image, blobs):
+def fit_ellipses(grey, blobs, noise):
     """Fit ellipses to the edges of blobs and keep those that are ellipses.
 
     The edge is where the grey level passes half-way between inside and outside, sampled along normals of the current
@@ -194,10 +194,8 @@ def fit_ellipses(image, blobs):
     an uneven contrast and are left out; nothing is downweighted. Where the image is out of focus, the edge is sampled
     over a longer distance.
 
-    The image is (H, W) of uint8 or uint16; possibly no ellipse is accepted.
+    ``grey`` is the image (H, W) in float32, ``noise`` that of a pixel; possibly no ellipse is accepted.
     """
-    grey = image.astype(np.float32)
-    noise = max(noise_level(grey), 0.5)
     best = _fitted(grey, blobs, REACHES_PX[0], noise)
     for reach in REACHES_PX[1:]:
         if len(best) >= (1 - MISSED_SHARE) * len(blobs):
@@ -240,9 +238,8 @@ def _moved(grey, ellipses, longest, noise):
     """Ellipses moved to the edges around them by least squares, and whether (N,) the edges are whole."""
     rim, normals = _rims(ellipses.shapes)
     reach = np.minimum(longest, REACH_OVER_MINOR_AXIS * np.linalg.eigvalsh(ellipses.shapes)[:, 0])
-    steps = reach[:, None] * np.linspace(-1, 1, SAMPLES)
-    along = normals[:, :, None] * steps[:, None, :, None]
-    profiles = sample(grey, (ellipses.centres[:, None] + rim)[:, :, None] + along)
+    profiles = np.empty((len(ellipses), PROFILES, SAMPLES), np.float32)
+    _sample_profiles(grey, ellipses.centres[:, None] + rim, normals, reach, profiles)
     if not ellipses.bright:
         profiles = -profiles
     inner, outer = profiles[:, :, :2].mean(2), profiles[:, :, -2:].mean(2)
@@ -291,14 +288,31 @@ def sample(grey, points):
 
 
 @compiled
+def _sample_profiles(grey, middles, normals, reach, profiles):
+    """Grey values (N, P, S) from minus to plus ``reach`` (N,) along normals (N, P, 2) about middles (N, P, 2)."""
+    count, around, samples = profiles.shape
+    for n in range(count):
+        for p in range(around):
+            for s in range(samples):
+                step = reach[n] * (2 * s / (samples - 1) - 1)
+                u, v = middles[n, p, 0] + step * normals[n, p, 0], middles[n, p, 1] + step * normals[n, p, 1]
+                profiles[n, p, s] = _bilinear(grey, u, v)
+
+
+@compiled
 def _interpolate(grey, points, values):
-    height, width = grey.shape
     for n in range(len(points)):
-        u, v = min(max(int(points[n, 0]), 0), width - 2), min(max(int(points[n, 1]), 0), height - 2)
-        du, dv = np.float32(points[n, 0] - u), np.float32(points[n, 1] - v)
-        top = grey[v, u] * (1 - du) + grey[v, u + 1] * du
-        bottom = grey[v + 1, u] * (1 - du) + grey[v + 1, u + 1] * du
-        values[n] = top * (1 - dv) + bottom * dv
+        values[n] = _bilinear(grey, points[n, 0], points[n, 1])
+
+
+@compiled
+def _bilinear(grey, u, v):
+    height, width = grey.shape
+    left, top = min(max(int(u), 0), width - 2), min(max(int(v), 0), height - 2)
+    du, dv = np.float32(u - left), np.float32(v - top)
+    upper = grey[top, left] * (1 - du) + grey[top, left + 1] * du
+    lower = grey[top + 1, left] * (1 - du) + grey[top + 1, left + 1] * du
+    return upper * (1 - dv) + lower * dv
 
 
 def find_circles(image):
@@ -310,8 +324,11 @@ def find_circles(image):
     The image is (H, W) of uint8 or uint16, ImageError for others. Centres are centroids of the covered area, in px
     (u, v); possibly none are found.
     """
-    ellipses = fit_ellipses(image, find_blobs(image))
-    centres, agree = area_centroids(image.astype(np.float32), ellipses)
+    grey = checked_grey(image).astype(np.float32)
+    # Half a grey level covers an image without noise, whose only disturbance is its rounding.
+    noise = max(noise_level(grey), 0.5)
+    ellipses = fit_ellipses(grey, find_blobs(grey, noise), noise)
+    centres, agree = area_centroids(grey, ellipses)
     return replace(ellipses, centres=centres)[agree]
 
 

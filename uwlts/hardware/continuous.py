@@ -1,0 +1,336 @@
+"""Continuous recording: the stage travels at a constant speed while the camera takes frames at its own rate.
+
+Frames are placed by time: the camera stamps them, the stage reports its position some ten times a second, and a line
+through the reports of a pass gives the position at any time of it. Or an encoder that is wired to the camera gives a
+count with every frame. What the clocks differ by shows in a pass back over the same surface (`measure_latency`).
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from uwlts.hardware.camera import CameraDevice, GrabbedFrame
+from uwlts.hardware.grbl import GrblStage, StageReport
+from uwlts.hardware.scan_plan import Continuous, ScanPlan
+from uwlts.measurement.latency import measure_latency
+from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.model.errors import EvaluationError, HardwareError, RangeError
+from uwlts.model.sensor import CaptureHeader, Sensor
+from uwlts.model.stripe import Stripe
+from uwlts.storage.capture import CaptureWriter, Frame
+from uwlts.stripe import stripe_in
+
+_SPARE_MM, _SPARE_S = 1.0, 0.3
+"""Way and time of constant speed before and after the frames that are kept, in which the stage reports too."""
+_TRIGGERS = 8
+"""Triggered frames by which the camera's clock is compared; the one that is answered fastest counts."""
+_PATIENCE_S = 3.0
+"""Longest wait for a frame beyond its exposure."""
+_SLOW_REPORT = 2.0
+"""Reports that took so many times as long as the fastest say less exactly when they were made."""
+_FEWEST_REPORTS = 3
+_OUTLIER = 5.0
+_BUSY = 0.9
+"""Share of the time between frames that an exposure may take."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How the frames of a continuous scan were placed.
+
+    ``latency_s`` with its standard uncertainty, None where it was given; ``scatter_s`` is that of the reports about
+    their line; ``speeds_mm_per_s`` are those of the passes.
+    """
+
+    latency_s: float
+    latency_std_s: float | None
+    scatter_s: float
+    speeds_mm_per_s: tuple[float, ...]
+
+    def __str__(self) -> str:
+        known = "as given" if self.latency_std_s is None else f"measured, std {1e3 * self.latency_std_s:.3f} ms"
+        speeds = ", ".join(f"{speed:+.3f}" for speed in self.speeds_mm_per_s)
+        return (
+            f"latency of the stage {1e3 * self.latency_s:+.3f} ms ({known}); its reports scatter by "
+            f"{1e3 * self.scatter_s:.2f} ms; speed {speeds} mm/s"
+        )
+
+
+def ways_of(plan: ScanPlan, continuous: Continuous, stage: GrblStage) -> list[tuple[float, float]]:
+    """Where each pass begins and ends in mm, with the ramps of the speed; RangeError where the stage cannot do it."""
+    speed, settings = continuous.speed_mm_per_s, stage.settings
+    if 60 * speed > settings.max_feed_mm_per_min:
+        raise RangeError(
+            f"speed_mm_per_s is {speed:g}, the stage does at most {settings.max_feed_mm_per_min / 60:g} mm/s ($110)"
+        )
+    positions = plan.stage.positions_mm()
+    ahead = 1.0 if positions[-1] >= positions[0] else -1.0
+    ramp = _ramp_mm(speed, stage) + _SPARE_MM + _SPARE_S * speed
+    first, last = positions[0] - ahead * ramp, positions[-1] + ahead * ramp
+    low, high = stage.limits_mm
+    if min(first, last) < low or max(first, last) > high:
+        raise RangeError(
+            f"with {ramp:.1f} mm to reach {speed:g} mm/s the stage would go from {min(first, last):.1f} to "
+            f"{max(first, last):.1f} mm, its travel is {low:g} to {high:g} mm: travel more slowly, or scan less"
+        )
+    return [(first, last), (last, first)] if continuous.both_ways else [(first, last)]
+
+
+def _ramp_mm(speed: float, stage: GrblStage) -> float:
+    """Way from rest to a speed in mm/s."""
+    return speed**2 / (2 * stage.settings.acceleration_mm_per_s2)
+
+
+def record_continuously(
+    plan: ScanPlan,
+    continuous: Continuous,
+    out: Path,
+    *,
+    sensor: Sensor,
+    camera: CameraDevice,
+    stage: GrblStage,
+    header: CaptureHeader,
+    exposure_ms: float,
+    overwrite: bool,
+    progress: Callable[[int, int], None],
+    report: Callable[[str], None],
+    warn: Callable[[str], None],
+    recorded: Callable[[Frame, int], None],
+    counted: Callable[[Stripe], None],
+) -> Placement:
+    """Record the passes of a plan; ``counted`` is called with the stripe of every frame. Errors as of `scan`."""
+    positions, ways = plan.stage.positions_mm(), ways_of(plan, continuous, stage)
+    rate_hz = continuous.speed_mm_per_s / abs(plan.stage.step_mm)
+    if 1e-3 * exposure_ms * rate_hz > _BUSY:
+        raise RangeError(
+            f"at {continuous.speed_mm_per_s:g} mm/s the camera has {1e3 / rate_hz:.3g} ms for a step of "
+            f"{abs(plan.stage.step_mm):g} mm, less than an exposure of {exposure_ms:.3g} ms needs: travel more slowly"
+        )
+    expected, lines = len(positions) * len(ways), camera.info.coordinates is not None
+    dtype = np.dtype(np.uint16 if camera.info.bits > 8 and not lines else np.uint8)
+    settings = {"exposure_ms": exposure_ms, "gain_db": plan.gain_db, "bits": sensor.detector.bits}
+    camera.stop()
+    stage.move_to(ways[0][0], feed_mm_per_min=plan.stage.feed_mm_per_min)
+    camera.configure(**settings, trigger="software")
+    camera.start(faults="skip")
+    clock = _compared(camera, exposure_ms)
+    at_rest_mm = stage.position_mm()
+    camera.stop()
+    rate_set = camera.configure(**settings, frame_rate_hz=rate_hz).frame_rate_hz
+    if rate_set is None or abs(rate_set / rate_hz - 1) > 0.01:
+        warn(f"the camera takes {rate_set} frames/s where the plan needs {rate_hz:.4g}: steps differ from the plan's")
+    kinds = {"centre_lines": lines, "moving": True}
+    with CaptureWriter(out, header, dtype=dtype, **kinds, plan=plan.recorded(), overwrite=overwrite) as writer:
+        reading = _Reading(camera, writer, clock, positions, exposure_ms, sensor, header.saturation_dn)
+        reading.hears = lambda frame, stripe, number: (
+            counted(stripe),
+            progress(min(number + 1, expected), expected),
+            recorded(frame, number),
+        )
+        camera.start(faults="skip")
+        thread = threading.Thread(target=reading.run, name="continuous-frames", daemon=True)
+        try:
+            thread.start()
+            stage.laser(True, power=plan.laser_power)
+            for _, end in ways:
+                reading.begin_pass()
+                stage.move_to(end, feed_mm_per_min=60 * continuous.speed_mm_per_s, reported=reading.report)
+            reading.end_s = time.monotonic()
+            stage.laser(False)
+            report("waiting for the last frames")
+            thread.join()
+        finally:
+            reading.ending.set()
+            with suppress(RuntimeError):  # it was not started
+                thread.join()
+            camera.stop()
+        if reading.error is not None:
+            raise reading.error
+        if lost := camera.counts.dropped + camera.counts.short:
+            warn(f"{lost} frames were lost on their way from the camera: the steps there are longer")
+        ends = sorted(ways[0])
+        ramp = _ramp_mm(continuous.speed_mm_per_s, stage)
+        return reading.place(continuous, (ends[0] + ramp, ends[1] - ramp), at_rest_mm, warn)
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """What to add to the camera's time stamps for the clock of `time.monotonic`, s; and an encoder's count at rest."""
+
+    offset_s: float
+    encoder: int | None
+
+
+def _compared(camera: CameraDevice, exposure_ms: float) -> _Clock:
+    offsets, encoder = [], None
+    for _ in range(_TRIGGERS):
+        asked_s = time.monotonic()
+        camera.trigger()
+        frame = camera.grab(_PATIENCE_S + 1e-3 * exposure_ms)
+        offsets.append(asked_s - frame.time_s)
+        encoder = frame.encoder
+    # The stamp of a frame that came late after its trigger lies late: the difference is too small, never too large.
+    return _Clock(max(offsets), encoder)
+
+
+class _Reading:
+    """Takes frames from the camera in a thread of its own and stores those within the plan's positions."""
+
+    def __init__(
+        self,
+        camera: CameraDevice,
+        writer: CaptureWriter,
+        clock: _Clock,
+        positions: list[float],
+        exposure_ms: float,
+        sensor: Sensor,
+        full_dn: int,
+    ):
+        self._camera, self._writer, self._clock = camera, writer, clock
+        self._low, self._high = min(positions), max(positions)
+        self._exposure_ms, self._sensor, self._full_dn = exposure_ms, sensor, full_dn
+        self.hears: Callable[[Frame, Stripe, int], object] = lambda frame, stripe, number: None
+        self._passes: list[list[StageReport]] = []
+        self._pending: deque[tuple[GrabbedFrame, float]] = deque()
+        self._stripes: list[np.ndarray] = []
+        self._times: list[float] = []
+        self._encoders: list[float] = []
+        self._began_s = time.monotonic()
+        self.end_s: float | None = None
+        self.ending = threading.Event()
+        self.error: Exception | None = None
+
+    def begin_pass(self) -> None:
+        """The reports from here on belong to another pass."""
+        self._passes.append([])
+
+    def report(self, report: StageReport) -> None:
+        """Hear of the stage's position; raises what has ended the reading."""
+        self._passes[-1].append(report)
+        if self.error is not None:
+            raise self.error
+
+    def run(self) -> None:
+        """Read frames until one was taken after the end of the last pass."""
+        try:
+            while not self.ending.is_set():
+                frame = self._camera.grab(_PATIENCE_S + 1e-3 * self._exposure_ms)
+                middle_s = frame.time_s + self._clock.offset_s + 0.5e-3 * self._exposure_ms
+                self._pending.append((frame, middle_s))
+                self._store_what_is_known()
+                if self.end_s is not None and middle_s > self.end_s:
+                    return
+        except Exception as error:
+            self.error = error
+
+    def _store_what_is_known(self) -> None:
+        """Store the frames that were taken before the latest report, at the positions between reports."""
+        known = [each for one in list(self._passes) for each in list(one)]
+        if not known:
+            return
+        times, places = np.array([_time_of(each) for each in known]), [each.position_mm for each in known]
+        while self._pending and (self._pending[0][1] < times[-1] or self.end_s is not None):
+            frame, middle_s = self._pending.popleft()
+            place = float(np.interp(middle_s, times, places))
+            if not (self._low <= place <= self._high and times[0] <= middle_s <= times[-1]):
+                continue
+            encoder = None if frame.encoder is None else float(frame.encoder)
+            exposure_ms = self._exposure_ms if frame.exposure_ms is None else frame.exposure_ms
+            stored = Frame(frame.seen, place, True, exposure_ms, middle_s - self._began_s, encoder=encoder)
+            self._writer.append(stored)
+            along = self._sensor.camera.stripe_along
+            stripe = stripe_in(frame.seen, stripe_along=along, saturation=self._full_dn)
+            self._stripes.append(stripe.centre_px)
+            self._times.append(middle_s)
+            self._encoders.append(np.nan if encoder is None else encoder)
+            self.hears(stored, stripe, len(self._times) - 1)
+
+    def place(
+        self, continuous: Continuous, even: tuple[float, float], at_rest_mm: float, warn: Callable[[str], None]
+    ) -> Placement:
+        """Give all frames their places; HardwareError where no stripe was seen, or the stage's reports do not fit.
+
+        Between the positions ``even`` the speed is constant.
+        """
+        times, centres = np.array(self._times), np.array(self._stripes)
+        if not len(times) or not np.isfinite(centres).any():
+            raise HardwareError(
+                f"no stripe in any of {len(times)} frames: is the laser lit (supply, key, interlock), the exposure "
+                "long enough, the object in the volume?"
+            )
+        stage, speed, scatters, speeds = np.full(len(times), np.nan), np.zeros(len(times)), [], []
+        for one in self._passes:
+            own = (times >= _time_of(one[0])) & (times <= _time_of(one[-1])) if one else np.zeros(len(times), bool)
+            if not own.any():
+                continue
+            fitted = _line_through([each for each in one if even[0] <= each.position_mm <= even[1]])
+            stage[own], speed[own] = fitted.at(times[own]), fitted.speed
+            scatters.append(fitted.scatter_s)
+            speeds.append(fitted.speed)
+        if continuous.mm_per_count is not None:
+            stage = self._by_encoder(continuous.mm_per_count, at_rest_mm)
+        latency_s, std_s = 1e-3 * (continuous.latency_ms or 0.0), None
+        if continuous.latency_ms is None and continuous.mm_per_count is None:
+            if len(speeds) < 2:
+                warn("the latency of the stage is not known and taken as 0: both_ways = true measures it")
+            else:
+                try:
+                    found = measure_latency(centres, stage, speed)
+                    latency_s, std_s = found.latency_s, found.std_s
+                except EvaluationError as error:
+                    warn(f"the latency of the stage is taken as 0: {error}")
+        stage = stage + speed * latency_s
+        reports = [(_time_of(each) - self._began_s, each.position_mm) for one in self._passes for each in one]
+        self._writer.place(stage, speed, np.array(reports))
+        return Placement(latency_s, std_s, max(scatters), tuple(speeds))
+
+    def _by_encoder(self, mm_per_count: float, at_rest_mm: float) -> np.ndarray:
+        counts = np.array(self._encoders)
+        if self._clock.encoder is None or not np.isfinite(counts).all():
+            raise HardwareError(
+                "mm_per_count is given, but the camera sends no ChunkEncoderValue with its frames: wire the encoder to "
+                "it and set its EncoderSource, or leave mm_per_count out"
+            )
+        return at_rest_mm + mm_per_count * (counts - self._clock.encoder)
+
+
+def _time_of(report: StageReport) -> float:
+    return 0.5 * (report.asked_s + report.answered_s)
+
+
+@dataclass(frozen=True)
+class _Line:
+    """A position over time, with how far in time the reports lie beside it."""
+
+    start_s: float
+    start_mm: float
+    speed: float
+    scatter_s: float
+
+    def at(self, times: np.ndarray) -> np.ndarray:
+        return self.start_mm + self.speed * (times - self.start_s)
+
+
+def _line_through(reports: list[StageReport]) -> _Line:
+    """The line through reports of a pass at constant speed, late ones left out; HardwareError where it is not."""
+    quick = min((each.answered_s - each.asked_s for each in reports), default=0.0)
+    used = [each for each in reports if each.answered_s - each.asked_s <= _SLOW_REPORT * quick + 1e-3]
+    if len(used) < _FEWEST_REPORTS:
+        raise HardwareError(
+            f"the stage reported {len(used)} positions within a pass, {_FEWEST_REPORTS} are needed: travel more "
+            "slowly, or scan a longer way"
+        )
+    times, places = np.array([_time_of(each) for each in used]), np.array([each.position_mm for each in used])
+    middle, kept = times.mean(), np.ones(len(used), bool)
+    for _ in range(3):
+        speed, start = np.polyfit(times[kept] - middle, places[kept], 1)
+        away = places - (start + speed * (times - middle))
+        scatter = max(MAD_TO_STD * float(np.median(np.abs(away))), 1e-6)
+        kept = np.abs(away) <= _OUTLIER * scatter
+    return _Line(float(middle), float(start), float(speed), float(np.std(away[kept]) / abs(speed)))

@@ -1,0 +1,112 @@
+"""Files of a 3D camera's centre lines: tables (CSV), arrays (NPY) and images of 16 bit (PNG, TIFF), a profile a row."""
+
+import csv
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from uwlts.model.errors import DescriptionError, ImageError
+from uwlts.model.input_file import read_bytes, read_text
+from uwlts.model.sensor import Camera
+from uwlts.model.stripe import ROWS, Coordinates
+from uwlts.storage.image_file import read_image
+from uwlts.storage.import_.description import CentreLines
+from uwlts.storage.import_.matching import ImageRow
+
+_MOST_BYTES = 2**28
+_OF_PROFILES = ("stage_mm", "exposure_ms", "time_s", "encoder")
+
+
+def read_profiles(path: Path, lines: int) -> np.ndarray:
+    """Numbers (K, C, L) of K profiles of L lines, C of them of each line (`ROWS`); ImageError where there are others.
+
+    A CSV file and an image have K rows of L numbers, in a CSV file nothing or nan where there is no stripe; an array is
+    (L,), (K, L) or (K, C, L).
+    """
+    match path.suffix.lower():
+        case ".npy":
+            content = read_bytes(path, most_bytes=_MOST_BYTES, error=ImageError, called="array")
+            try:
+                numbers = np.load(io.BytesIO(content), allow_pickle=False)
+            except (ValueError, EOFError, OSError) as error:
+                raise ImageError(f"{path} is no NPY array, or is truncated: {error}") from error
+            if not isinstance(numbers, np.ndarray) or numbers.dtype.kind not in "iuf":
+                raise ImageError(f"{path} holds no numbers: expected an array of centre lines")
+        case ".csv":
+            text = read_text(path, most_bytes=_MOST_BYTES, error=ImageError, called="table")
+            separator = ";" if ";" in text.partition("\n")[0] else ","
+            try:
+                rows = [
+                    [float(cell) if cell.strip() else np.nan for cell in line.split(separator)]
+                    for line in text.splitlines()
+                    if line.strip()
+                ]
+                numbers = np.array(rows, float)
+            except ValueError as error:
+                raise ImageError(
+                    f"{path} is no table of centre lines: {error}; expected a row of {lines} numbers for each profile"
+                ) from error
+        case _:
+            numbers = read_image(path)
+            if numbers.ndim != 2:
+                raise ImageError(f"{path} is a colour image; expected one number per profile line, in grey")
+    numbers = np.atleast_2d(numbers)
+    numbers = numbers[:, None] if numbers.ndim == 2 else numbers
+    if numbers.ndim != 3 or numbers.shape[2] != lines or not 1 <= numbers.shape[1] <= len(ROWS):
+        turned = "; it is turned: its columns seem to be the profiles" if numbers.shape[0] == lines else ""
+        raise ImageError(
+            f"{path} has the shape {numbers.shape}; expected profiles in rows, with {lines} lines as the sensor "
+            f"has{turned}"
+        )
+    return numbers
+
+
+def profile_rows(rows: list[ImageRow], given: CentreLines, camera: Camera, *, folder: Path) -> list[ImageRow]:
+    """A row for each profile in the laser files, in order; stage positions by the encoder where it gives them.
+
+    ImageError where a file or a centre line is not as the sensor is described; DescriptionError where the table of
+    profiles has another length, or wrong columns.
+    """
+    meant = Coordinates(given.scale, given.offset, given.invalid)
+    length = camera.height_px if camera.stripe_along == "width" else camera.width_px
+    found = []
+    for row in rows:
+        for numbers in read_profiles(folder / row.file, camera.lines()):
+            try:
+                profile = meant.stripe(numbers, stripe_along=camera.stripe_along, length_px=length)
+            except ImageError as error:
+                raise ImageError(f"{row.file}: {error}") from error
+            found.append(replace(row, profile=profile))
+    if given.table is None:
+        return found
+    known = _read_table(folder / given.table)
+    if len(known) != len(found):
+        raise DescriptionError(f"{given.table} has {len(known)} rows, the laser files {len(found)} profiles")
+    placed = []
+    for row, values in zip(found, known, strict=True):
+        if given.mm_per_count is not None:
+            if "encoder" not in values or "stage_mm" in values:
+                raise DescriptionError(f"mm_per_count needs a column encoder in {given.table}, and no stage_mm")
+            values = values | {"stage_mm": given.mm_per_count * values["encoder"]}
+        placed.append(replace(row, **values))
+    return placed
+
+
+def _read_table(path: Path) -> list[dict[str, float]]:
+    text = read_text(path, most_bytes=_MOST_BYTES, error=DescriptionError, called="table of profiles")
+    reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
+    columns = [name.strip() for name in reader.fieldnames or ()]
+    if not columns or not set(columns) <= set(_OF_PROFILES) or len(set(columns)) < len(columns):
+        raise DescriptionError(
+            f"{path} has the columns {', '.join(columns)}; expected any of {', '.join(_OF_PROFILES)}"
+        )
+    reader.fieldnames = columns
+    try:
+        table = [{name: float(cell) for name, cell in row.items()} for row in reader]
+    except (TypeError, ValueError) as error:
+        raise DescriptionError(f"{path}, line {reader.line_num}: expected a number in every column") from error
+    if not all(np.isfinite(list(row.values())).all() for row in table):
+        raise DescriptionError(f"{path} holds values that are not finite")
+    return table
