@@ -3,8 +3,9 @@
 A laser frame is made in three passes. Rays through the nodes of a coarse grid find the pixels near the lit stripe and
 the haze of the sheet; the stripe's pixels are rendered with many samples over pixel, pupil and exposure; random walks
 add the light that came on longer ways, which is smooth: cell by cell within the stripe's pixels, in large cells
-elsewhere, whose outliers are spread with their energy kept. The windows stand still before the camera, so the nodes' rays behind the window are traced once; the objects
-stand still in the scene, so nothing is rebuilt or recompiled between frames.
+elsewhere, whose outliers are spread with their energy kept. The windows stand still before the camera, so the nodes'
+rays behind the window are traced once; the objects stand still in the scene, so nothing is rebuilt or recompiled
+between frames.
 """
 
 from __future__ import annotations
