@@ -36,6 +36,8 @@ from twin.scene.objects import Objects
 
 _STEPS = 64
 """No walk is longer; in the most turbid waters fewer than one in 10^4 would be."""
+_FEW = 2**15
+"""So many walks or fewer are followed to their end in one kernel, which costs less than a launch for every stretch."""
 _TOWARDS_LASER = 0.15
 """Share of directions drawn about the direction to the laser."""
 _TOWARDS_SHEET = 0.3
@@ -108,12 +110,16 @@ class Walker:
             dr.full(mi.Bool, False, width),
         )
         for step in range(_STEPS):
-            walks, found, alive = self._step(walks, dr.opaque(mi.UInt32, (seed * _STEPS + step) % 2**32))
+            number = dr.opaque(mi.UInt32, (seed * _STEPS + step) % 2**32)
+            if last := step > 0 and dr.width(walks.cell) <= _FEW:
+                walks, found, alive = self._to_their_end(walks, number, _STEPS - step)
+            else:
+                walks, found, alive = self._step(walks, number)
             dr.eval(found, alive, *vars(walks).values())
             # Dr.Jit's threads would add in any order, which rounds differently every time.
             total += np.bincount(walks.cell.numpy(), found.numpy(), cells)
-            kept = cast(Any, dr.compress(alive))
-            if dr.width(kept) == 0:
+            kept = cast(Any, None if last else dr.compress(alive))
+            if last or dr.width(kept) == 0:
                 break
             if dr.width(kept) == 1:
                 # Arrays of one entry would take a kernel of their own: two halves do for the whole.
@@ -121,6 +127,23 @@ class Walker:
                 walks.weight *= 0.5
             walks = walks.of(kept)
         return total
+
+    def _to_their_end(self, walks: _Walks, seed: UInt32, steps: int) -> tuple[_Walks, Float, Bool]:
+        """As `_step`, but all further stretches of the walks at once, ``steps`` at most."""
+
+        def following(walks: _Walks, found: Float, alive: Bool, seed: UInt32, left: UInt32):
+            walks, more, alive = self._step(walks, seed)
+            return walks, found + more, alive, seed + 1, left - 1
+
+        width = dr.width(walks.cell)
+        walks, found, alive, _, _ = dr.while_loop(
+            (walks, dr.zeros(mi.Float, width), dr.full(mi.Bool, True, width), seed, dr.opaque(mi.UInt32, steps)),
+            lambda walks, found, alive, seed, left: alive & (left > 0),
+            following,
+            mode="symbolic",
+            label="walks",
+        )
+        return walks, found, alive
 
     def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Float, Bool]:
         """The next stretch of all walks: they as they go on, the light found, and which of them go on."""
