@@ -58,6 +58,8 @@ _WALKS_PER_SAMPLE = 0.15
 _WALKS_BESIDE_STRIPE = 8
 _CELLS_BESIDE_STRIPE = 2
 """So many times more walks are taken in so many cells beside the stripe, where light is bright and steep."""
+_WALKS_IN_STRIPE = 4
+"""The same in the small cells of the stripe's pixels."""
 _SPOT_ASIDE = 0.25
 """Slope of an uneven lamp's axis against the camera's over that of the view's corner: the lamp is mounted beside it."""
 _TRAVEL_STEP_MM = 0.2
@@ -259,18 +261,22 @@ class Renderer:
         camera = self.sensor.camera
         rows, columns = -(-camera.height_px // WALK_CELL_PX), -(-camera.width_px // WALK_CELL_PX)
         beside = self._beside_stripe(lit, rows, columns)
-        cell = np.arange(rows * columns)
-        cell = np.concatenate([cell, np.repeat(np.flatnonzero(beside), _WALKS_BESIDE_STRIPE - 1)])
-        each = self._walked(walker, cell // columns, cell % columns, WALK_CELL_PX, seed=2 * seed, walks=walks)
-        large = (np.bincount(cell, each) / np.bincount(cell)).reshape(rows, columns)
-        large = without_outliers(large, ~beside)
+        lit_cells = np.flatnonzero(lit)
+        large = np.arange(rows * columns)
+        large = np.concatenate([large, np.repeat(np.flatnonzero(beside), _WALKS_BESIDE_STRIPE - 1)])
+        small = np.repeat(lit_cells, _WALKS_IN_STRIPE)
+        row = np.concatenate([large // columns * WALK_CELL_PX, small // lit.shape[1] * NODE_SPACING_PX])
+        column = np.concatenate([large % columns * WALK_CELL_PX, small % lit.shape[1] * NODE_SPACING_PX])
+        side = np.repeat([WALK_CELL_PX, NODE_SPACING_PX], [len(large), len(small)])
+        each = self._walked(walker, row, column, side, seed=seed, walks=walks)
+        in_large = (np.bincount(large, each[: len(large)]) / np.bincount(large)).reshape(rows, columns)
+        in_large = without_outliers(in_large, ~beside)
         size = columns * WALK_CELL_PX, rows * WALK_CELL_PX
-        smooth = cv2.resize(large, size, interpolation=cv2.INTER_LINEAR)[: camera.height_px, : camera.width_px]
-        row, column = np.nonzero(lit)
-        if len(row):
-            small = np.zeros(lit.shape, np.float32)
-            small[row, column] = self._walked(walker, row, column, NODE_SPACING_PX, seed=2 * seed + 1, walks=4 * walks)
-            smooth = np.where(self._repeated(lit), self._repeated(small), smooth)
+        smooth = cv2.resize(in_large, size, interpolation=cv2.INTER_LINEAR)[: camera.height_px, : camera.width_px]
+        if len(lit_cells):
+            in_small = np.zeros(lit.shape, np.float32)
+            in_small[lit] = each[len(large) :].reshape(-1, _WALKS_IN_STRIPE).mean(axis=1)
+            smooth = np.where(self._repeated(lit), self._repeated(in_small), smooth)
         image += smooth
 
     def _beside_stripe(self, lit: np.ndarray, rows: int, columns: int) -> np.ndarray:
@@ -282,11 +288,14 @@ class Renderer:
         return cv2.dilate(on_stripe, np.ones((across, across), np.uint8)) > 0
 
     def _walked(
-        self, walker: Walker, rows: np.ndarray, columns: np.ndarray, size_px: int, *, seed: int, walks: int
+        self, walker: Walker, rows: np.ndarray, columns: np.ndarray, sides: np.ndarray, *, seed: int, walks: int
     ) -> np.ndarray:
-        """Mean irradiance (C,) of light on longer ways over square cells, from ``walks`` random walks in each."""
-        x, y = (to_jit(mi.Float, place * size_px) for place in (columns, rows))
-        total, side = np.zeros(len(rows)), opaque(size_px)
+        """Mean irradiance (C,) of light on longer ways over square cells of pixels, from ``walks`` walks in each.
+
+        ``rows`` and ``columns`` (C,) name each cell's first pixel, ``sides`` (C,) its sides in pixels.
+        """
+        x, y, side = (to_jit(mi.Float, values) for values in (columns - 0.5, rows - 0.5, sides))
+        total = np.zeros(len(rows))
         most = max(1, WALKS_AT_ONCE // len(rows))
         for part, first in enumerate(range(0, walks, most)):
             some = min(most, walks - first)
@@ -295,8 +304,8 @@ class Renderer:
             place: Any = dr.arange(mi.UInt32, count)
             keys: list[Any] = [dr.opaque(mi.UInt32, (place_seed + k) % 2**32) for k in (0, 1)]
             u, v = (mi.sample_tea_float32(place, key) for key in keys)
-            column, row = dr.gather(mi.Float, x, cell), dr.gather(mi.Float, y, cell)
-            bundle = self.view.bundle(column + u * side - 0.5, row + v * side - 0.5)
+            left, above, width = (dr.gather(mi.Float, values, cell) for values in (x, y, side))
+            bundle = self.view.bundle(left + u * width, above + v * width)
             total += walker.radiance(bundle, cell, len(rows), seed=seed + 1013 * part)
         return total / walks
 
