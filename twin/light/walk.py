@@ -109,27 +109,27 @@ class Walker:
             dr.full(mi.Bool, False, width),
             dr.full(mi.Bool, False, width),
         )
-        for step in range(_STEPS):
+        step, stretches = 0, 1
+        while True:
             number = dr.opaque(mi.UInt32, (seed * _STEPS + step) % 2**32)
-            if last := step > 0 and dr.width(walks.cell) <= _FEW:
-                walks, found, alive = self._to_their_end(walks, number, _STEPS - step)
-            else:
-                walks, found, alive = self._step(walks, number)
+            # The camera's own rays take a kernel of their own: most of what is known of them is constant.
+            walks, found, alive = self._steps(walks, number, stretches) if step else self._step(walks, number)
             dr.eval(found, alive, *vars(walks).values())
             # Dr.Jit's threads would add in any order, which rounds differently every time.
             total += np.bincount(walks.cell.numpy(), found.numpy(), cells)
-            kept = cast(Any, None if last else dr.compress(alive))
-            if last or dr.width(kept) == 0:
-                break
+            step += stretches
+            kept = cast(Any, dr.compress(alive))
+            if dr.width(kept) == 0 or step >= _STEPS:
+                return total
             if dr.width(kept) == 1:
                 # Arrays of one entry would take a kernel of their own: two halves do for the whole.
                 kept = mi.UInt32([kept[0], kept[0]])
                 walks.weight *= 0.5
             walks = walks.of(kept)
-        return total
+            stretches = 1 if dr.width(kept) > _FEW else _STEPS - step
 
-    def _to_their_end(self, walks: _Walks, seed: UInt32, steps: int) -> tuple[_Walks, Float, Bool]:
-        """As `_step`, but all further stretches of the walks at once, ``steps`` at most."""
+    def _steps(self, walks: _Walks, seed: UInt32, stretches: int) -> tuple[_Walks, Float, Bool]:
+        """As `_step`, but so many stretches of the walks in one kernel, which is the same for any number."""
 
         def following(walks: _Walks, found: Float, alive: Bool, seed: UInt32, left: UInt32):
             walks, more, alive = self._step(walks, seed)
@@ -137,7 +137,7 @@ class Walker:
 
         width = dr.width(walks.cell)
         walks, found, alive, _, _ = dr.while_loop(
-            (walks, dr.zeros(mi.Float, width), dr.full(mi.Bool, True, width), seed, dr.opaque(mi.UInt32, steps)),
+            (walks, dr.zeros(mi.Float, width), dr.full(mi.Bool, True, width), seed, dr.opaque(mi.UInt32, stretches)),
             lambda walks, found, alive, seed, left: alive & (left > 0),
             following,
             mode="symbolic",
