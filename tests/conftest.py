@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from tests.browser import find_chromium, open_chromium
-from twin.options import use_variant
+from twin.options import CPU, use_variant
 from uwlts.model.errors import SetupError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 ROOT = Path(__file__).resolve().parent.parent
 
-use_variant()
+use_variant(os.environ.get("TWIN_TEST_VARIANT", CPU))
 
 # Processes that tests start in other folders find the packages as this one does.
 os.environ["PYTHONPATH"] = str(ROOT)

@@ -34,7 +34,7 @@ def stripe_noise(images: np.ndarray, truth: np.ndarray) -> float:
 
 def recorded_frame(water: str) -> float:
     """Median seconds from one recorded frame of two spheres to the next: all effects, detector, truth and disk."""
-    sensor = _in_named_water(water)
+    sensor = in_named_water(water)
     motion = {"start_mm": -0.5 * SEEDS, "step_mm": 1.0, "count": SEEDS + 2}
     moments: list[float] = []
     with tempfile.TemporaryDirectory() as folder:
@@ -48,7 +48,7 @@ def recorded_frame(water: str) -> float:
     return float(np.median(np.diff(moments)[1:]))
 
 
-def _in_named_water(water: str) -> Sensor:
+def in_named_water(water: str) -> Sensor:
     sensor = load_sensor("thesis-as-built")
     table = sensor.media["water"].model_dump(include={"kind", "temperature_c"})
     return sensor.model_copy(
@@ -61,7 +61,7 @@ def rendered_light(water: str) -> tuple[float, float]:
 
     The truth is the mean of all frames, so the error is a little understated and then corrected for it.
     """
-    sensor = _in_named_water(water)
+    sensor = in_named_water(water)
     renderer = Renderer(sensor, sensor.media["water"], load_scene("spheres"))
     images, seconds = [], []
     for seed in range(SEEDS + 2):

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Bool, Float, Point3f, Vector3f, opaque, opaque_transform
+from twin.backend.arrays import Bool, Float, Point2f, Point3f, Vector3f, opaque, opaque_transform
 from twin.light.pose import Rays, SensorPose
 from twin.light.sheet import Sheet, SheetLight
+from twin.light.water import AngleTable
 from twin.scene.objects import MirrorFace
 
 _CLEAR_MM = 1e-2
 """Rays towards the laser start this far from the surface they leave."""
+_LARGEST_SLOPE = 0.7
+"""Farther from the sheet than this part of the way to the window, it fills no narrow range of directions."""
 
 
 class Light:
@@ -124,6 +127,17 @@ class Light:
         slope = _away_from_zero(dr.dot(d, light.normal))
         return light, slope, t - light.distance_mm / slope
 
+    def near_crossing(self, origin: Point3f, direction: Vector3f, length: Float) -> tuple[Float, Float]:
+        """Where rays of the sensor's OCS, up to ``length``, come nearest to the sheet, and how near, in mm along them.
+
+        Within the sheet, its standard deviation counts as the distance.
+        """
+        o, d = self.in_own_frame(origin, direction)
+        _, _, middle = self._middle_near(o, d, dr.clip(-o.x / _away_from_zero(d.x), 0.0, length))
+        light, slope, middle = self._middle_near(o, d, dr.clip(middle, 0.0, length))
+        t = dr.clip(middle, 0.0, length)
+        return t, dr.abs(middle - t) + light.sigma_mm / dr.abs(slope)
+
     def pick_in_sheet(self, origin: Point3f, direction: Vector3f, length: Float, u: Float) -> tuple[Float, Float]:
         """A place on rays of the sensor's OCS, drawn like the sheet's Gaussian across them, and its density in 1/mm.
 
@@ -142,6 +156,74 @@ class Light:
         share = 0.5 * (high - low)
         density = dr.exp(-dr.square((x - middle) / spread)) / (math.sqrt(math.pi) * spread * share)
         return x, dr.select((share > 1e-5) & dr.isfinite(density), density, 0.0)
+
+
+@dataclass(frozen=True)
+class SheetLobe:
+    """Directions from points into which the sheet nearby scatters light, drawn as it does so.
+
+    Seen from a point, the sheet is a plane at the distance x, whose light arrives from ``towards``. The direction at an
+    angle a from there and with the azimuth f, counted from the sheet's side, crosses the plane at a slope sin a cos f,
+    so that the sheet scatters p(a) / (sin a cos f) into it, p being the phase function. In that proportion directions
+    are drawn down to the slope ``least``, half the x / Z at which they leave the light, which has come the way Z.
+    """
+
+    towards: Vector3f
+    side: Vector3f
+    least: Float
+    share_on_side: Float
+    angles: AngleTable
+
+    @classmethod
+    def at(cls, light: SheetLight, angles: AngleTable) -> SheetLobe:
+        """The lobe at points of which the sheet's light is given; ``angles`` is in proportion to p(a) / sin a."""
+        towards, across = -light.direction, dr.abs(light.distance_mm)
+        side = -dr.mulsign(mi.Vector3f(light.normal), light.distance_mm)
+        side = mi.Vector3f(dr.normalize(side - towards * dr.dot(side, towards)))
+        # Within the sheet, light comes from both sides.
+        share = 0.5 + 0.5 * dr.erf(across / (math.sqrt(2) * light.sigma_mm))
+        away = dr.sqrt(dr.square(across) + dr.square(light.sigma_mm))
+        return cls(towards, side, 0.5 * away / dr.maximum(light.exit_mm, 1e-3), share, angles)
+
+    def present(self) -> Bool:
+        """Whether any direction is drawn."""
+        return self.least < _LARGEST_SLOPE
+
+    def draw(self, u: Point2f) -> tuple[Vector3f, Bool]:
+        """Directions, and whether they are valid; u.x draws the angle and u.y the azimuth."""
+        below = self._share_left_out()
+        before, after = self.angles.heights(dr.lerp(below, 1.0, u.x))
+        sine = dr.sqrt(before * after)
+        reach = self._reach(sine)
+        on_side = u.y < self.share_on_side
+        v = dr.select(on_side, u.y / self.share_on_side, (1 - u.y) / (1 - self.share_on_side))
+        # The azimuth is the Gudermannian of an even number, whose sine is tanh and whose cosine is 1 / cosh.
+        tanh, cosh = dr.tanh((2 * v - 1) * reach), dr.cosh((2 * v - 1) * reach)
+        x = dr.select(on_side, sine / cosh, -sine / cosh)
+        beside = dr.cross(self.towards, self.side)
+        drawn = self.towards * (1 - before) + self.side * x + beside * (sine * tanh)
+        return dr.normalize(mi.Vector3f(drawn)), self.present() & (sine > self.least)
+
+    def density(self, direction: Vector3f) -> Float:
+        """Density in 1/sr with which `draw` chooses directions."""
+        before = 0.5 * dr.squared_norm(direction - self.towards)
+        sine = dr.sqrt(dr.maximum(before * (2 - before), 0.0))
+        slope = dr.dot(direction, self.side)
+        share = dr.select(slope > 0, self.share_on_side, 1 - self.share_on_side) / (1 - self._share_left_out())
+        slope = dr.abs(slope)
+        drawn = self.present() & (sine > self.least) & (slope > (1 - 1e-3) * self.least)
+        density = share * self.angles.density(before) * math.pi * sine / (slope * self._reach(sine))
+        return dr.select(drawn, density, 0.0)
+
+    def _share_left_out(self) -> Float:
+        """Share of the angles so small that all directions are flatter than ``least``."""
+        squared = dr.square(dr.minimum(self.least, _LARGEST_SLOPE))
+        return self.angles.share_below(squared / (1 + dr.sqrt(1 - squared)))
+
+    def _reach(self, sine: Float) -> Float:
+        """The inverse Gudermannian of the largest azimuth: arcosh(sin a / least)."""
+        ratio = dr.maximum(sine / self.least, 1 + 1e-6)
+        return dr.log(ratio + dr.sqrt(dr.square(ratio) - 1))
 
 
 def lights(

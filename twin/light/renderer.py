@@ -3,8 +3,9 @@
 A laser frame is made in three passes. Rays through the nodes of a coarse grid find the pixels near the lit stripe and
 the haze of the sheet; the stripe's pixels are rendered with many samples over pixel, pupil and exposure; random walks
 add the light that came on longer ways, which is smooth: cell by cell within the stripe's pixels, in large cells
-elsewhere. The windows stand still before the camera, so the nodes' rays behind the window are traced once; the objects
-stand still in the scene, so nothing is rebuilt or recompiled between frames.
+elsewhere, whose outliers are spread with their energy kept. The windows stand still before the camera, so the nodes'
+rays behind the window are traced once; the objects stand still in the scene, so nothing is rebuilt or recompiled
+between frames.
 """
 
 from __future__ import annotations
@@ -22,7 +23,15 @@ import numpy as np
 from twin.backend.arrays import Float, Point3f, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, ray_segments
 from twin.light.illumination import Light, lights
-from twin.light.image_sampling import NODE_SPACING_PX, lattice, near_sheet, over_corners, pupil_shifts, widened
+from twin.light.image_sampling import (
+    NODE_SPACING_PX,
+    lattice,
+    near_sheet,
+    over_corners,
+    pupil_shifts,
+    widened,
+    without_outliers,
+)
 from twin.light.particles import Body, spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet
@@ -47,6 +56,11 @@ _MIRRORS = 2
 """Largest number of mirrors that the camera looks into one after the other."""
 _WALKS_PER_SAMPLE = 0.15
 """Random walks per cell and sample of a lit pixel in clear water; turbid water takes more."""
+_WALKS_BESIDE_STRIPE = 8
+_CELLS_BESIDE_STRIPE = 2
+"""So many times more walks are taken in so many cells beside the stripe, where light is bright and steep."""
+_WALKS_IN_STRIPE = 4
+"""The same in the small cells of the stripe's pixels."""
 _SPOT_ASIDE = 0.25
 """Slope of an uneven lamp's axis against the camera's over that of the view's corner: the lamp is mounted beside it."""
 _DRIFTING_STREAM = 7
@@ -290,23 +304,42 @@ class Renderer:
         """Add multiply scattered and secondary light to an image (H, W), in large cells but for those in ``lit``."""
         camera = self.sensor.camera
         rows, columns = -(-camera.height_px // WALK_CELL_PX), -(-camera.width_px // WALK_CELL_PX)
-        row, column = (g.ravel() for g in np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij"))
-        large = self._walked(walker, row, column, WALK_CELL_PX, seed=2 * seed, walks=walks).reshape(rows, columns)
+        beside = self._beside_stripe(lit, rows, columns)
+        lit_cells = np.flatnonzero(lit)
+        large = np.arange(rows * columns)
+        large = np.concatenate([large, np.repeat(np.flatnonzero(beside), _WALKS_BESIDE_STRIPE - 1)])
+        small = np.repeat(lit_cells, _WALKS_IN_STRIPE)
+        row = np.concatenate([large // columns * WALK_CELL_PX, small // lit.shape[1] * NODE_SPACING_PX])
+        column = np.concatenate([large % columns * WALK_CELL_PX, small % lit.shape[1] * NODE_SPACING_PX])
+        side = np.repeat([WALK_CELL_PX, NODE_SPACING_PX], [len(large), len(small)])
+        each = self._walked(walker, row, column, side, seed=seed, walks=walks)
+        in_large = (np.bincount(large, each[: len(large)]) / np.bincount(large)).reshape(rows, columns)
+        in_large = without_outliers(in_large, ~beside)
         size = columns * WALK_CELL_PX, rows * WALK_CELL_PX
-        smooth = cv2.resize(large, size, interpolation=cv2.INTER_LINEAR)[: camera.height_px, : camera.width_px]
-        row, column = np.nonzero(lit)
-        if len(row):
-            small = np.zeros(lit.shape, np.float32)
-            small[row, column] = self._walked(walker, row, column, NODE_SPACING_PX, seed=2 * seed + 1, walks=4 * walks)
-            smooth = np.where(self._repeated(lit), self._repeated(small), smooth)
+        smooth = cv2.resize(in_large, size, interpolation=cv2.INTER_LINEAR)[: camera.height_px, : camera.width_px]
+        if len(lit_cells):
+            in_small = np.zeros(lit.shape, np.float32)
+            in_small[lit] = each[len(large) :].reshape(-1, _WALKS_IN_STRIPE).mean(axis=1)
+            smooth = np.where(self._repeated(lit), self._repeated(in_small), smooth)
         image += smooth
 
+    def _beside_stripe(self, lit: np.ndarray, rows: int, columns: int) -> np.ndarray:
+        """Large cells (rows, columns) on the stripe, whose small cells are ``lit``, and next to it."""
+        on_stripe = np.zeros((rows, columns), np.uint8)
+        row, column = np.nonzero(lit)
+        on_stripe[row * NODE_SPACING_PX // WALK_CELL_PX, column * NODE_SPACING_PX // WALK_CELL_PX] = 1
+        across = 2 * _CELLS_BESIDE_STRIPE + 1
+        return cv2.dilate(on_stripe, np.ones((across, across), np.uint8)) > 0
+
     def _walked(
-        self, walker: Walker, rows: np.ndarray, columns: np.ndarray, size_px: int, *, seed: int, walks: int
+        self, walker: Walker, rows: np.ndarray, columns: np.ndarray, sides: np.ndarray, *, seed: int, walks: int
     ) -> np.ndarray:
-        """Mean irradiance (C,) of light on longer ways over square cells, from ``walks`` random walks in each."""
-        x, y = (to_jit(mi.Float, place * size_px) for place in (columns, rows))
-        total, side = np.zeros(len(rows)), opaque(size_px)
+        """Mean irradiance (C,) of light on longer ways over square cells of pixels, from ``walks`` walks in each.
+
+        ``rows`` and ``columns`` (C,) name each cell's first pixel, ``sides`` (C,) its sides in pixels.
+        """
+        x, y, side = (to_jit(mi.Float, values) for values in (columns - 0.5, rows - 0.5, sides))
+        total = np.zeros(len(rows))
         most = max(1, WALKS_AT_ONCE // len(rows))
         for part, first in enumerate(range(0, walks, most)):
             some = min(most, walks - first)
@@ -315,8 +348,8 @@ class Renderer:
             place: Any = dr.arange(mi.UInt32, count)
             keys: list[Any] = [dr.opaque(mi.UInt32, (place_seed + k) % 2**32) for k in (0, 1)]
             u, v = (mi.sample_tea_float32(place, key) for key in keys)
-            column, row = dr.gather(mi.Float, x, cell), dr.gather(mi.Float, y, cell)
-            bundle = self.view.bundle(column + u * side - 0.5, row + v * side - 0.5)
+            left, above, width = (dr.gather(mi.Float, values, cell) for values in (x, y, side))
+            bundle = self.view.bundle(left + u * width, above + v * width)
             total += walker.radiance(bundle, cell, len(rows), seed=seed + 1013 * part)
         return total / walks
 

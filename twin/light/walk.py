@@ -10,7 +10,8 @@ Every place that it comes to collects three parts of the laser's light:
 The last two count the same light; each is weighted by how probable the other one was (the balance heuristic of Veach
 1997, Eq. 9.8), which leaves no rare bright samples: a stripe close by is found by the walk itself, a distant one by
 connecting. Directions are drawn from the surface's or the water's own scattering, and in scattering water also from
-forward scattering about the direction to the laser, from which most scattered light arrives.
+forward scattering about the direction to the laser, from which most scattered light arrives, and into the sheet nearby
+in proportion to what it scatters from there (`SheetLobe`).
 
 Left out: light that went by way of a mirror and was scattered or reflected by something else before or after.
 """
@@ -26,7 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import PCG32, Bool, BSDFPtr, Float, Point3f, SurfaceInteraction3f, UInt32, Vector3f
-from twin.light.illumination import Light
+from twin.light.illumination import Light, SheetLobe
 from twin.light.pose import Rays, SensorPose
 from twin.light.sheet import SheetLight
 from twin.light.water import Scattering
@@ -35,8 +36,14 @@ from twin.scene.objects import Objects
 
 _STEPS = 64
 """No walk is longer; in the most turbid waters fewer than one in 10^4 would be."""
-_TOWARDS_LASER = 0.3
+_FEW = 2**15
+"""So many walks or fewer are followed to their end in one kernel, which costs less than a launch for every stretch."""
+_TOWARDS_LASER = 0.15
 """Share of directions drawn about the direction to the laser."""
+_TOWARDS_SHEET = 0.3
+"""Share of directions drawn as the sheet nearby shines."""
+_NEAR_SHEET = 0.5
+"""Share of scattered walks' distances drawn about the place where the sheet is nearest."""
 _SURVIVES_FROM = 0.25
 """Walks that carry less than this share of the light they began with are ended or strengthened at random."""
 _CLEAR_MM = 1e-2
@@ -102,20 +109,41 @@ class Walker:
             dr.full(mi.Bool, False, width),
             dr.full(mi.Bool, False, width),
         )
-        for step in range(_STEPS):
-            walks, found, alive = self._step(walks, dr.opaque(mi.UInt32, (seed * _STEPS + step) % 2**32))
+        step, stretches = 0, 1
+        while True:
+            number = dr.opaque(mi.UInt32, (seed * _STEPS + step) % 2**32)
+            # The camera's own rays take a kernel of their own: most of what is known of them is constant.
+            walks, found, alive = self._steps(walks, number, stretches) if step else self._step(walks, number)
             dr.eval(found, alive, *vars(walks).values())
             # Dr.Jit's threads would add in any order, which rounds differently every time.
             total += np.bincount(walks.cell.numpy(), found.numpy(), cells)
+            step += stretches
             kept = cast(Any, dr.compress(alive))
-            if dr.width(kept) == 0:
-                break
+            if dr.width(kept) == 0 or step >= _STEPS:
+                return total
             if dr.width(kept) == 1:
                 # Arrays of one entry would take a kernel of their own: two halves do for the whole.
                 kept = mi.UInt32([kept[0], kept[0]])
                 walks.weight *= 0.5
             walks = walks.of(kept)
-        return total
+            stretches = 1 if dr.width(kept) > _FEW else _STEPS - step
+
+    def _steps(self, walks: _Walks, seed: UInt32, stretches: int) -> tuple[_Walks, Float, Bool]:
+        """As `_step`, but so many stretches of the walks in one kernel, which is the same for any number."""
+
+        def following(walks: _Walks, found: Float, alive: Bool, seed: UInt32, left: UInt32):
+            walks, more, alive = self._step(walks, seed)
+            return walks, found + more, alive, seed + 1, left - 1
+
+        width = dr.width(walks.cell)
+        walks, found, alive, _, _ = dr.while_loop(
+            (walks, dr.zeros(mi.Float, width), dr.full(mi.Bool, True, width), seed, dr.opaque(mi.UInt32, stretches)),
+            lambda walks, found, alive, seed, left: alive & (left > 0),
+            following,
+            mode="symbolic",
+            label="walks",
+        )
+        return walks, found, alive
 
     def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Float, Bool]:
         """The next stretch of all walks: they as they go on, the light found, and which of them go on."""
@@ -138,10 +166,12 @@ class Walker:
             found += dr.exp(-c * length) * self._lit_end(light, walks, si, bsdf, end, hit)
 
         # The walk is scattered on its way or ends on the surface, and goes on if it still promises enough.
-        in_water, distance, passed = self._free_path(length, hit, rng)
+        in_water, distance, passed = self._free_path(o, d, length, hit, rng)
         vertex = mi.Point3f(o + d * distance)
         reflected = cast(Bool, walks.reflected | ~in_water)
-        towards_laser = [-light.at(vertex).direction for light in self.lights]
+        here = [light.at(vertex) for light in self.lights]
+        towards_laser = [-each.direction for each in here]
+        sheets = [SheetLobe.at(each, self.scattering.over_sine) for each in here]
         found *= walks.strength
         strength = walks.strength * passed
         # It may find more light than one in any direction: scattered on, it may run towards the laser.
@@ -153,7 +183,8 @@ class Walker:
         alive = (strength > 0) & (rng.next_float32() < survival)
         strength = dr.select(alive, strength / survival, 0.0)
 
-        lobes = _TOWARDS_LASER / len(self.lights) if self._scatters else 0.0
+        whole = dr.select(in_water, 1.0, 1 - mirror)
+        of_laser, of_sheet = _TOWARDS_LASER / len(self.lights), _TOWARDS_SHEET / len(self.lights)
 
         def scattered(onward: Vector3f) -> tuple[Float, Float]:
             """Light that the vertex scatters from ``onward`` into the walk, per sr, and the density there."""
@@ -161,10 +192,10 @@ class Walker:
             value = dr.select(in_water, self.scattering.phase(_one_minus_cosine(d, onward)), reflectance[0])
             density = dr.select(in_water, value, density * (1 - mirror))
             if self._scatters:
-                density *= 1 - _TOWARDS_LASER
-                for towards in towards_laser:
-                    share = lobes * dr.select(in_water, 1, 1 - mirror)
-                    density += share * self.scattering.phase(_one_minus_cosine(towards, onward))
+                density *= 1 - _TOWARDS_LASER - _TOWARDS_SHEET
+                for towards, sheet in zip(towards_laser, sheets, strict=True):
+                    density += whole * of_laser * self.scattering.narrow.density(_one_minus_cosine(towards, onward))
+                    density += whole * of_sheet * sheet.density(onward)
             return value, density
 
         may_connect = alive if self.effects.secondary_light else alive & ~reflected
@@ -181,9 +212,16 @@ class Walker:
         own = dr.select(in_water, self.scattering.sample(d, u2)[0], self.pose.object_direction(si.to_world(sample.wo)))
         onward = own
         if self._scatters:
-            for k, towards in enumerate(towards_laser):
-                chosen = (which >= k * lobes) & (which < (k + 1) * lobes)
-                onward = dr.select(chosen, self.scattering.sample(towards, u2)[0], onward)
+            first = 0.0
+            for towards, sheet in zip(towards_laser, sheets, strict=True):
+                about = self.scattering.narrow.turned(towards, u2)
+                onward = dr.select((which >= first) & (which < first + of_laser), about, onward)
+                first += of_laser
+                chosen = (which >= first) & (which < first + of_sheet)
+                first += of_sheet
+                drawn, valid = sheet.draw(u2)
+                onward = dr.select(chosen & valid, drawn, onward)
+                strength = dr.select(chosen & ~valid & ~specular, 0.0, strength)
         onward = dr.select(specular, self.pose.object_direction(si.to_world(mi.reflect(si.wi))), onward)
         value, density = scattered(onward)
         gain = dr.select(specular, 1.0, dr.select(density > 0, value / density, 0.0))
@@ -259,13 +297,14 @@ class Walker:
         light_there = light.power_w * sent * dr.exp(-self.scattering.c * way) / dr.square(distance)
         return dr.select(active & (by_light > 0), value * light_there * by_light / (by_light + by_walk), 0.0)
 
-    def _free_path(self, length: Float, hit: Bool, rng: PCG32) -> tuple[Bool, Float, Float]:
+    def _free_path(self, o: Point3f, d: Vector3f, length: Float, hit: Bool, rng: PCG32) -> tuple[Bool, Float, Float]:
         """Whether walks are scattered before the surface, how far along they then are, and the share of light left.
 
         Scattering is drawn as often as it promises light compared with the surface, whatever the water's clarity;
-        distances fall off by at least one reach, so that in clear water they are not drawn far behind the scene.
+        distances fall off by at least one reach, so that in clear water they are not drawn far behind the scene, or
+        they are drawn in inverse proportion to that from the nearest place in the sheet, whose light falls off so.
         """
-        choice, u = rng.next_float32(), rng.next_float32()
+        choice, near, u = rng.next_float32(), rng.next_float32(), rng.next_float32()
         c = self.scattering.c
         through = dr.exp(-c * length)
         if not self._scatters:
@@ -276,7 +315,17 @@ class Walker:
         likely = dr.select(hit, dr.clip(promised / (promised + 0.5 * through), 0.3, 0.7), 1.0)
         in_water = choice < likely
         distance = -dr.log(1 - u * share) / fall
-        scattered = promised * dr.exp((fall - c) * distance) / likely
+        each = _NEAR_SHEET / len(self.lights)
+        crossings = [light.near_crossing(o, d, length) for light in self.lights]
+        spans = [(dr.log(1 + t / apart), dr.log(1 + (length - t) / apart)) for t, apart in crossings]
+        for k, ((t, apart), (before, after)) in enumerate(zip(crossings, spans, strict=True)):
+            place = u * (before + after) - before
+            drawn = t + dr.mulsign(apart * (dr.exp(dr.abs(place)) - 1), place)
+            distance = dr.select((near >= k * each) & (near < (k + 1) * each), dr.clip(drawn, 0.0, length), distance)
+        density = (1 - _NEAR_SHEET) * fall * dr.exp(-fall * distance) / share
+        for (t, apart), (before, after) in zip(crossings, spans, strict=True):
+            density += each / ((dr.abs(distance - t) + apart) * (before + after))
+        scattered = self.scattering.b * dr.exp(-c * distance) / (density * likely)
         return in_water, dr.select(in_water, distance, length), dr.select(in_water, scattered, through / (1 - likely))
 
 

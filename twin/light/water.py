@@ -92,8 +92,9 @@ class Scattering:
 
     ``coefficient`` is b, ``absorption`` a and ``extinction`` c = a + b; ``b`` and ``c`` are the same as kernels take
     them. ``backward_share`` is the share of b that scatters by more than 90 deg. The phase function of all that
-    scatters lies in a table, read by the same kernels whatever the medium. RangeError where the medium's tables do not
-    reach the wavelength.
+    scatters lies in a table, read by the same kernels whatever the medium; ``over_sine`` is the density in proportion
+    to the phase function over the sine of the angle, ``narrow`` the mean of both. RangeError where the medium's tables
+    do not reach the wavelength.
     """
 
     def __init__(self, medium: Medium, wavelength_nm: float):
@@ -103,9 +104,12 @@ class Scattering:
         self.b, self.c = opaque(self.coefficient), opaque(self.extinction)
         table = tabulated(medium.scatterers(wavelength_nm))
         self.backward_share = 1 - float(np.interp(math.pi / 2, node_angles(), table.cumulative))
-        self._log_density = to_jit(mi.Float, table.log_density)
-        self._forward = opaque(table.cumulative[0] / FORWARD_SR)
-        self._cumulative = to_jit(mi.Float, table.cumulative)
+        self._angles = AngleTable(table)
+        sine = np.sin(node_angles())
+        narrow = _normalised(table.log_density - np.log(sine), float(table.cumulative[0] / sine[0]))
+        self.over_sine = AngleTable(narrow)
+        halves = np.log(0.5 * (np.exp(table.log_density) + np.exp(narrow.log_density)))
+        self.narrow = AngleTable(_normalised(halves, float(table.cumulative[0] + narrow.cumulative[0]) / 2))
 
     def phase(self, one_minus_cosine: Float) -> Float:
         """Phase function in 1/sr at 1 - cos of the scattering angle.
@@ -113,26 +117,39 @@ class Scattering:
         Compute it as |w1 - w2|^2 / 2 from the unit directions before and after: 1 minus their product loses small
         angles to the rounding of 32 bits.
         """
-        before = dr.clip(one_minus_cosine, FORWARD_END, 2 - BACKWARD_END)
-        place = (dr.log(before / (2 - before)) - FIRST_PLACE) / STEP
-        cell = dr.minimum(mi.UInt32(dr.maximum(place, 0.0)), NODES - 2)
-        low, high = self._ends(cell)
-        density = dr.exp(dr.fma(high - low, place - mi.Float(cell), low)) / (math.pi * before * (2 - before))
-        return dr.select(one_minus_cosine < FORWARD_END, self._forward, density)
+        return self._angles.density(one_minus_cosine)
 
     def sample(self, direction: Vector3f, u: Point2f) -> tuple[Vector3f, Float]:
         """A direction after scattering and its density in 1/sr, which is the phase function there.
 
         The scattering angle grows with ``u.x``, the azimuth with ``u.y``.
         """
-        before, after = self._heights(u.x)
-        sine = dr.sqrt(before * after)
-        sin_azimuth, cos_azimuth = dr.sincos(2 * math.pi * u.y)
-        turned = mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - before)
-        return dr.normalize(mi.Frame3f(direction).to_world(turned)), self.phase(before)
+        turned = self._angles.turned(direction, u)
+        return turned, self.phase(0.5 * dr.squared_norm(turned - direction))
 
-    def _heights(self, u: Float) -> tuple[Float, Float]:
-        """1 - cos and 1 + cos of the scattering angle below which the share ``u`` is scattered."""
+
+class AngleTable:
+    """A `PhaseTable` as kernels read it: the density of directions about an axis, evaluated and drawn from."""
+
+    def __init__(self, table: PhaseTable):
+        self._log_density = to_jit(mi.Float, table.log_density)
+        self._forward = opaque(table.cumulative[0] / FORWARD_SR)
+        self._cumulative = to_jit(mi.Float, table.cumulative)
+
+    def density(self, one_minus_cosine: Float) -> Float:
+        """Density in 1/sr at 1 - cos of the angle from the axis, the same at all azimuths."""
+        before = dr.clip(one_minus_cosine, FORWARD_END, 2 - BACKWARD_END)
+        cell, share = self._cell(before)
+        low, high = self._ends(cell)
+        density = dr.exp(dr.fma(high - low, share, low)) / (math.pi * before * (2 - before))
+        return dr.select(one_minus_cosine < FORWARD_END, self._forward, density)
+
+    def share_below(self, one_minus_cosine: Float) -> Float:
+        """Share of directions before the table's node at or below 1 - cos of an angle."""
+        return dr.gather(mi.Float, self._cumulative, self._cell(dr.maximum(one_minus_cosine, FORWARD_END))[0])
+
+    def heights(self, u: Float) -> tuple[Float, Float]:
+        """1 - cos and 1 + cos of the angle below which the share ``u`` of directions lies."""
         node = mi.UInt32(0)
         step = NODES // 2
         while step:
@@ -154,6 +171,20 @@ class Scattering:
         before = dr.select(forward, FORWARD_END * u / first, before)
         after = dr.select(backward, BACKWARD_END * (1 - u) / (1 - last), after)
         return dr.select(backward, 2 - after, before), dr.select(forward, 2 - before, after)
+
+    def turned(self, axis: Vector3f, u: Point2f) -> Vector3f:
+        """Directions about an axis: the angle grows with ``u.x``, the azimuth with ``u.y``."""
+        before, after = self.heights(u.x)
+        sine = dr.sqrt(before * after)
+        sin_azimuth, cos_azimuth = dr.sincos(2 * math.pi * u.y)
+        turned = mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - before)
+        return dr.normalize(mi.Frame3f(axis).to_world(turned))
+
+    def _cell(self, before: Float) -> tuple[UInt32, Float]:
+        """Cell of 1 - cos, which is within the table, and the place in the cell from 0 to 1."""
+        place = (dr.log(before / (2 - before)) - FIRST_PLACE) / STEP
+        cell = dr.minimum(mi.UInt32(dr.maximum(place, 0.0)), NODES - 2)
+        return cell, place - mi.Float(cell)
 
     def _ends(self, cell: UInt32) -> tuple[Float, Float]:
         """Logarithm of the density at both ends of a cell of the table."""

@@ -30,7 +30,7 @@ class _Shape(Description):
         return getattr(self, "point_mm", None) is None
 
 
-class Plane(_Shape):
+class IdealPlane(_Shape):
     """A plane through a point with a normal; distances are positive where the normal points."""
 
     kind: Literal["plane"] = "plane"
@@ -38,7 +38,7 @@ class Plane(_Shape):
     normal: Vector | None = None
 
     @model_validator(mode="after")
-    def _placed_or_not(self) -> Plane:
+    def _placed_or_not(self) -> IdealPlane:
         if (self.point_mm is None) != (self.normal is None):
             raise ValueError("a plane has point_mm and normal, or neither and is fitted")
         if self.normal is not None and not any(self.normal):
@@ -46,7 +46,7 @@ class Plane(_Shape):
         return self
 
 
-class Sphere(_Shape):
+class IdealSphere(_Shape):
     """A sphere; fitted with a free or known diameter unless its centre ``point_mm`` is given, too."""
 
     kind: Literal["sphere"] = "sphere"
@@ -54,13 +54,13 @@ class Sphere(_Shape):
     point_mm: Vector | None = None
 
     @model_validator(mode="after")
-    def _placed_with_a_size(self) -> Sphere:
+    def _placed_with_a_size(self) -> IdealSphere:
         if self.point_mm is not None and self.diameter_mm is None:
             raise ValueError("a sphere with a given centre needs its diameter_mm")
         return self
 
 
-class Cylinder(_Shape):
+class IdealCylinder(_Shape):
     """A cylinder; fitted with a free or known diameter unless ``point_mm`` on its axis and ``axis`` are given, too."""
 
     kind: Literal["cylinder"] = "cylinder"
@@ -69,7 +69,7 @@ class Cylinder(_Shape):
     axis: Vector | None = None
 
     @model_validator(mode="after")
-    def _placed_with_a_size(self) -> Cylinder:
+    def _placed_with_a_size(self) -> IdealCylinder:
         if (self.point_mm is None) != (self.axis is None):
             raise ValueError("a cylinder has point_mm and axis, or neither and is fitted")
         if self.point_mm is not None and self.diameter_mm is None:
@@ -79,9 +79,9 @@ class Cylinder(_Shape):
         return self
 
 
-IdealShape = Plane | Sphere | Cylinder
+IdealShape = IdealPlane | IdealSphere | IdealCylinder
 
-KINDS: dict[str, IdealShape] = {"plane": Plane(), "sphere": Sphere(), "cylinder": Cylinder()}
+KINDS: dict[str, IdealShape] = {"plane": IdealPlane(), "sphere": IdealSphere(), "cylinder": IdealCylinder()}
 """Shapes that are fitted with all their sizes, by name."""
 
 
@@ -154,14 +154,14 @@ def place_shape(
     chosen = np.arange(len(points_mm))[:: -(-len(points_mm) // _MOST_FITTED)]
     points = points_mm[chosen]
     match shape:
-        case Plane():
+        case IdealPlane():
             robust = fit_robustly(lambda p: fit_plane(p, towards=TOWARDS_SENSOR), points)
             placed = PlacedShape("plane", robust.fit.point_mm, robust.fit.normal, 0.0)
-        case Sphere():
+        case IdealSphere():
             known = None if shape.diameter_mm is None else shape.diameter_mm / 2
             robust = fit_robustly(lambda p: fit_sphere(p, radius_mm=known), points)
             placed = PlacedShape("sphere", robust.fit.centre_mm, None, robust.fit.radius_mm)
-        case Cylinder():
+        case IdealCylinder():
             known = None if shape.diameter_mm is None else shape.diameter_mm / 2
             start = fit_cylinder(evenly_thinned(points, 2000), radius_mm=known).axis
             robust = fit_robustly(lambda p: fit_cylinder(p, radius_mm=known, axis_start=start), points)
@@ -172,7 +172,7 @@ def place_shape(
     registration = fitted_shape(
         points_mm[used],
         placed.nearest(points_mm[used]),
-        sized=not isinstance(shape, Plane) and shape.diameter_mm is None,
+        sized=not isinstance(shape, IdealPlane) and shape.diameter_mm is None,
         uncertainty=None if uncertainty is None else uncertainty[used],
         frame=None if frame is None else frame[used],
     )
@@ -182,12 +182,12 @@ def place_shape(
 def _given(shape: IdealShape) -> PlacedShape:
     point = np.array(shape.point_mm, float)
     match shape:
-        case Plane():
+        case IdealPlane():
             normal = np.array(shape.normal, float)
             return PlacedShape("plane", point, normal / np.linalg.norm(normal), 0.0)
-        case Sphere():
+        case IdealSphere():
             return PlacedShape("sphere", point, None, (shape.diameter_mm or 0.0) / 2)
-        case Cylinder():
+        case IdealCylinder():
             axis = np.array(shape.axis, float)
             return PlacedShape("cylinder", point, axis / np.linalg.norm(axis), (shape.diameter_mm or 0.0) / 2)
         case _:

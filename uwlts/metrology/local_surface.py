@@ -69,7 +69,7 @@ class SurfacePoints:
 
 
 @dataclass(frozen=True, eq=False)
-class Patches:
+class LocalPatches:
     """Patches at P places.
 
     Attributes
@@ -116,7 +116,7 @@ class LocalSurface:
         self._patterns = np.ascontiguousarray(surface.patterns_mm[:, grid.order].T)
         self._scan = np.ascontiguousarray(surface.scan[grid.order])
 
-    def patches(self, places_mm: np.ndarray, *, with_uncertainty: bool = False) -> Patches:
+    def patches(self, places_mm: np.ndarray, *, with_uncertainty: bool = False) -> LocalPatches:
         """Patches at places (P, 3), each on the side of a wall on which its nearest point lies."""
         places, grid = np.ascontiguousarray(places_mm, dtype=np.float64), self._grid
         height, found = np.zeros(len(places)), np.zeros(len(places), np.bool_)
@@ -139,7 +139,7 @@ class LocalSurface:
             found,
             variance,
         )
-        return Patches(height, normals, found, np.sqrt(variance[:, 0]), np.sqrt(variance[:, 1]))
+        return LocalPatches(height, normals, found, np.sqrt(variance[:, 0]), np.sqrt(variance[:, 1]))
 
 
 @compiled

@@ -43,7 +43,7 @@ class Nearest:
     index: np.ndarray
 
 
-class Surface(Protocol):
+class ReferenceSurface(Protocol):
     """What a cloud can be registered to; ``uncertainty`` is of the points that `Nearest.index` counts."""
 
     @property
@@ -123,7 +123,7 @@ class Registration:
 
 def register_to_surface(
     points_mm: np.ndarray,
-    surface: Surface,
+    surface: ReferenceSurface,
     *,
     reach_mm: float,
     uncertainty: PointUncertainty | None = None,

@@ -1,0 +1,85 @@
+"""Figures of the renderer on a CUDA device: ``python -m tests.bench.gpu``; without one it says so and measures nothing.
+
+Frames of two spheres in clear and in coastal water, with all effects: the light's time for one frame after the other
+with parts of several sizes, and frames/s of one and of several processes that share the device. The statistical tests
+run there with ``TWIN_TEST_VARIANT=cuda_ad_mono make test-full``.
+"""
+
+import statistics
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+
+import numpy as np
+
+from twin.options import GPU, use_variant
+from uwlts.model.errors import SetupError
+
+FRAMES = 40
+WARM_UP = 3
+WATERS = ("clear", "coastal")
+SAMPLES_AT_ONCE = (2**21, 2**23, 2**25)
+PROCESSES = (1, 2, 4, 8)
+
+
+def frame_seconds(water: str, samples_at_once: int) -> float:
+    """Median seconds of the light of one frame, rendered in parts of at most so many samples."""
+    use_variant(GPU)
+    from tests.bench.light import in_named_water
+    from twin.light import renderer as module
+    from twin.options import Options
+    from twin.scene.description import load_scene
+
+    module.SAMPLES_AT_ONCE = samples_at_once
+    sensor, seconds = in_named_water(water), []
+    renderer = module.Renderer(sensor, sensor.media["water"], load_scene("spheres"))
+    for seed in range(WARM_UP + FRAMES):
+        start = time.perf_counter()
+        renderer.irradiance("laser", np.eye(4), spp=Options().spp, seed=seed)
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds[WARM_UP:])
+
+
+def frames_per_second(water: str, processes: int) -> float:
+    """Frames/s of several processes, from the first frame after each one's warm-up to the last frame of all."""
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        spans = list(pool.map(_rendered, [water] * processes))
+    return processes * FRAMES / (max(end for _, end in spans) - min(start for start, _ in spans))
+
+
+def _rendered(water: str) -> tuple[float, float]:
+    """Begin and end of `FRAMES` frames."""
+    use_variant(GPU)
+    from tests.bench.light import in_named_water
+    from twin.light.renderer import Renderer
+    from twin.options import Options
+    from twin.scene.description import load_scene
+
+    sensor = in_named_water(water)
+    renderer = Renderer(sensor, sensor.media["water"], load_scene("spheres"))
+    for seed in range(WARM_UP):
+        renderer.irradiance("laser", np.eye(4), spp=Options().spp, seed=seed)
+    start = time.time()
+    for seed in range(FRAMES):
+        renderer.irradiance("laser", np.eye(4), spp=Options().spp, seed=WARM_UP + seed)
+    return start, time.time()
+
+
+def main() -> int:
+    """Measure and print; exit code 0 without a device, too, as nothing was asked of it."""
+    try:
+        use_variant(GPU)
+    except SetupError as error:
+        print(f"not measured: no CUDA device ({error})")
+        return 0
+    for water in WATERS:
+        for samples in SAMPLES_AT_ONCE:
+            print(f"{water} water, {samples} samples at once: {1e3 * frame_seconds(water, samples):.1f} ms a frame")
+        for processes in PROCESSES:
+            print(f"{water} water, {processes} in flight: {frames_per_second(water, processes):.0f} frames/s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
