@@ -153,14 +153,15 @@ def test_a_way_too_long_for_its_ramps_and_a_dark_laser_are_errors(hill, tmp_path
 
 def test_the_latency_of_drawn_passes_and_what_does_not_show_it():
     rng, speed, latency = np.random.default_rng(8), 80.0, -0.0123
-    places = np.concatenate([np.arange(120, 181.0), np.arange(180.4, 119, -1.0)])
-    signed = np.where(np.arange(len(places)) < 61, speed, -speed)
+    # The hill stands amid flat ground, which fits itself at any shift.
+    places = np.concatenate([np.arange(90, 211.0), np.arange(210.4, 89, -1.0)])
+    signed = np.where(np.arange(len(places)) < 121, speed, -speed)
     truth = places + signed * latency
     centres = np.array([surface(place) for place in truth]) + rng.normal(0, 0.05, (len(places), WIDTH_PX))
     found = measure_latency(centres, places, signed)
-    # 0.05 px of noise on some 60 x 96 points with slopes of up to 8 px/mm.
+    # 0.05 px of noise on some 40 x 96 points of the hill with slopes of up to 8 px/mm.
     assert found.std_s < 1e-5 and abs(found.latency_s - latency) < max(5 * found.std_s, 2e-6)
     with pytest.raises(EvaluationError, match="one way and 0 the other"):
         measure_latency(centres, places, np.abs(signed))
-    with pytest.raises(EvaluationError, match="too little relief"):
+    with pytest.raises(EvaluationError, match="relief"):
         measure_latency(np.full_like(centres, 200.0), places, signed)
