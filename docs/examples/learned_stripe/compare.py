@@ -2,9 +2,9 @@
 
     python compare.py stripe.onnx runs/clean runs/turbid runs/shiny --real FOLDER
 
-Lines count whose stripe is visible and could be known to a pixel by its Cramer-Rao bound. A line is found where a method
-gives a centre within `NEAR_PX` of the true one, and false where it gives one farther away or where no stripe is. Errors
-are those of the found lines; the bound is that of detector noise without speckle. On real images, whose truth
+Lines count whose stripe is visible and could be known to a pixel by its Cramer-Rao bound. A line is found where a
+method gives a centre within `NEAR_PX` of the true one, and false where it gives one farther away or where no stripe is.
+Errors are those of the found lines; the bound is that of detector noise without speckle. On real images, whose truth
 nobody knows, the scatter of the centres about a smooth stripe is given instead.
 """
 
