@@ -246,6 +246,27 @@ def test_ctrl_c_leaves_complete_shards_only(tmp_path):
 
 
 @pytest.mark.slow
+def test_memory_does_not_grow_with_the_number_of_frames(tmp_path):
+    half = 'base = "thesis"\nname = "half"\n[camera]\nwidth_px = 320\nheight_px = 256\npixel_size_um = 21.2\n'
+    (tmp_path / "half.toml").write_text(half, encoding="utf-8")
+    text = 'title = "many"\nsensor = "half.toml"\nscene = "spheres"\nlabels = ["masks", "light"]\n'
+    text += 'without = ["multiple-scattering", "secondary-light"]\nspp = 4\n[motion]\ncount = 4\n'
+    (tmp_path / "many.toml").write_text(text, encoding="utf-8")
+    program = (
+        "import resource, sys, twin\n"
+        "twin.dataset(sys.argv[1], out=sys.argv[2], scenes=int(sys.argv[3]), workers=1)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    )
+    used_mb = []
+    for scenes in (2, 12):
+        line = [sys.executable, "-c", program, str(tmp_path / "many.toml"), str(tmp_path / f"of {scenes}"), str(scenes)]
+        used_mb.append(int(subprocess.run(line, check=True, capture_output=True, text=True).stdout) / 1024)
+    # The light of a frame, five numbers of 4 bytes for each pixel, is 1.6 MB, and half of it as a label: 40 more frames
+    # would need 100 MB.
+    assert used_mb[1] - used_mb[0] < 50
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["stripe-turbid", "stripe-shiny", "pipe-inspection", "calibration-boards"])
 def test_presets_are_rendered(name, tmp_path):
     samples = twin.load_dataset(twin.dataset(name, out=tmp_path / name, scenes=2, workers=1))
