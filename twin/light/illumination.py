@@ -203,7 +203,7 @@ class SheetLobe:
         return dr.lerp(self._share_left_out(), 1.0, u)
 
     def at_angles(self, heights: tuple[Float, Float], u: Float) -> tuple[Vector3f, Bool]:
-        """Directions at angles of which 1 - cos and 1 + cos are given, and whether they are valid; u draws the azimuth."""
+        """Directions at angles given by 1 - cos and 1 + cos, and whether they are valid; ``u`` draws the azimuth."""
         before, after = heights
         sine = dr.sqrt(before * after)
         reach = self._reach(sine)
