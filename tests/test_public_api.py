@@ -49,6 +49,13 @@ PAIRS: dict[str, tuple[str, set[str], set[str]]] = {
     ),
     "uwlts evaluate": ("uwlts.evaluate", WRITES | {"coloured"}, {"source"}),
     "uwlts compare": ("uwlts.compare_clouds", WRITES | {"coloured"}, set()),
+    "uwlts mesh": ("uwlts.mesh", WRITES, set()),
+    "uwlts inspect": ("uwlts.inspect", WRITES | {"coloured"}, set()),
+    "uwlts findings-report": ("uwlts.write_findings", set(), set()),
+    # The trajectory is read by read_trajectory.
+    "uwlts align": ("uwlts.align_trajectory", WRITES | {"aligned", "pose_format", "pose_unit"}, set()),
+    # The poses are read by read_poses.
+    "uwlts register": ("uwlts.register", WRITES | {"page", "poses_out", "pose_format", "pose_unit"}, set()),
     "uwlts gauge": ("uwlts.gauge_study", WRITES, set()),
     "uwlts report": ("uwlts.write_report", set(), set()),
     "uwlts thesis": ("uwlts.evaluate_thesis", set(), set()),

@@ -54,6 +54,8 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> object:
+    if name == "datasets":
+        return import_module("twin.datasets")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value = getattr(import_module(_MODULES[name]), name)

@@ -71,6 +71,14 @@ class Flaws:
     """Relative loss of light at the image's farthest corner, beyond that by the cosine's fourth power."""
     uneven_lamp: float = _flaw(off=0.0, typical=0.6, least=0.0, most=0.99)
     """Relative loss of the lamp's light half the view's diagonal away from its spot, which lies beside the middle."""
+    particles: float = _flaw(off=0.0, typical=1000.0, least=0.0, most=1e5)
+    """Grains of marine snow larger than 0.1 mm in a litre, each seen on its own in the laser's sheet."""
+    bubbles: float = _flaw(off=0.0, typical=200.0, least=0.0, most=1e5)
+    """Air bubbles larger than 0.1 mm in diameter in a litre, which glint in the sheet."""
+    caustics: float = _flaw(off=0.0, typical=0.3, least=0.0, most=1.0)
+    """Strength of the pattern that a wavy water surface makes of the daylight on surfaces."""
+    dirt: float = _flaw(off=0.0, typical=0.1, least=0.0, most=0.9)
+    """Share of the camera's window that is covered with spots, which take light in blurred patches of the image."""
     lamp_and_laser: bool = False
     """Lamp and laser on in every image: stripe and board in one."""
     pixel_aspect: float = _flaw(off=1.0, typical=1.002, least=0.9, most=1.1)

@@ -23,7 +23,12 @@ if TYPE_CHECKING:
     from uwlts.measurement.reconstruction import ScanCloud, reconstruct
     from uwlts.measurement.verification import Verification, verify
     from uwlts.metrology.change import SurfaceChange, compare_clouds
+    from uwlts.metrology.features import Inspection
     from uwlts.metrology.gauge import GaugeStudy, gauge_study
+    from uwlts.metrology.inspection import inspect
+    from uwlts.metrology.scan_registration import RegisteredScans, register
+    from uwlts.metrology.surface_mesh import mesh
+    from uwlts.metrology.trajectory_alignment import AlignedTrajectory, align_trajectory
     from uwlts.model.calibration import Calibration
     from uwlts.model.errors import Error
     from uwlts.model.library import load_sensor
@@ -38,15 +43,18 @@ if TYPE_CHECKING:
     from uwlts.report.certificate import check_certificate
     from uwlts.report.certificate_page import write_certificate
     from uwlts.report.change_page import write_change
+    from uwlts.report.findings_page import write_findings
     from uwlts.report.inventory import describe, design
     from uwlts.report.model_comparison import write_models
+    from uwlts.report.registration_page import write_registration
     from uwlts.storage.calibration_file import load_calibration, write_calibration
     from uwlts.storage.capture import Capture, Frame, open_capture
     from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
     from uwlts.storage.export_ import export
     from uwlts.storage.import_ import Imported, import_images
+    from uwlts.storage.mesh_file import SurfaceMesh, write_mesh
     from uwlts.storage.mount_files import read_mount, write_mount
-    from uwlts.storage.pose_files import read_trajectory
+    from uwlts.storage.pose_files import read_poses, read_trajectory, write_poses, write_trajectory
     from uwlts.storage.truth import Truth, read_truth
     from uwlts.stripe import StripeOptions
     from uwlts.thesis.report import ThesisReport, evaluate_thesis
@@ -54,6 +62,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "AlignedTrajectory",
     "Calibration",
     "CameraCalibration",
     "Capture",
@@ -65,20 +74,24 @@ __all__ = [
     "GaugeStudy",
     "GuidedRecording",
     "Imported",
+    "Inspection",
     "Mount",
     "PointCloud",
     "PolynomialCalibration",
     "PolynomialResult",
     "Refreshed",
+    "RegisteredScans",
     "Report",
     "ScanCloud",
     "Sensor",
     "StripeOptions",
     "SurfaceChange",
+    "SurfaceMesh",
     "ThesisReport",
     "Trajectory",
     "Truth",
     "Verification",
+    "align_trajectory",
     "calibrate",
     "calibrate_camera",
     "calibrate_mount",
@@ -94,18 +107,22 @@ __all__ = [
     "export",
     "gauge_study",
     "import_images",
+    "inspect",
     "load_calibration",
     "load_sensor",
+    "mesh",
     "nominal",
     "open_capture",
     "plot",
     "read_cloud",
     "read_mount",
+    "read_poses",
     "read_trajectory",
     "read_truth",
     "reconstruct",
     "record_guided",
     "refresh",
+    "register",
     "scan",
     "serve_desk",
     "verify",
@@ -117,12 +134,18 @@ __all__ = [
     "write_change",
     "write_cloud",
     "write_evaluation",
+    "write_findings",
+    "write_mesh",
     "write_models",
     "write_mount",
+    "write_poses",
+    "write_registration",
     "write_report",
+    "write_trajectory",
 ]
 
 _MODULES = {
+    "AlignedTrajectory": "uwlts.metrology.trajectory_alignment",
     "Calibration": "uwlts.model.calibration",
     "CameraCalibration": "uwlts.calibration.photographs",
     "Capture": "uwlts.storage.capture",
@@ -134,20 +157,24 @@ _MODULES = {
     "GaugeStudy": "uwlts.metrology.gauge",
     "GuidedRecording": "uwlts.hardware.guided.recording",
     "Imported": "uwlts.storage.import_",
+    "Inspection": "uwlts.metrology.features",
     "Mount": "uwlts.model.mount",
     "PointCloud": "uwlts.storage.cloud",
     "PolynomialCalibration": "uwlts.model.polynomial_calibration",
     "PolynomialResult": "uwlts.calibration.polynomial",
     "Refreshed": "uwlts.calibration.joint.refresh",
+    "RegisteredScans": "uwlts.metrology.scan_registration",
     "Report": "uwlts.report.campaign_page",
     "ScanCloud": "uwlts.measurement.reconstruction",
     "Sensor": "uwlts.model.sensor",
     "StripeOptions": "uwlts.stripe",
     "SurfaceChange": "uwlts.metrology.change",
+    "SurfaceMesh": "uwlts.storage.mesh_file",
     "ThesisReport": "uwlts.thesis.report",
     "Trajectory": "uwlts.model.trajectory",
     "Truth": "uwlts.storage.truth",
     "Verification": "uwlts.measurement.verification",
+    "align_trajectory": "uwlts.metrology.trajectory_alignment",
     "calibrate": "uwlts.calibration.calibrate",
     "calibrate_camera": "uwlts.calibration.photographs",
     "calibrate_mount": "uwlts.calibration.mount",
@@ -163,18 +190,22 @@ _MODULES = {
     "export": "uwlts.storage.export_",
     "gauge_study": "uwlts.metrology.gauge",
     "import_images": "uwlts.storage.import_",
+    "inspect": "uwlts.metrology.inspection",
     "load_calibration": "uwlts.storage.calibration_file",
     "load_sensor": "uwlts.model.library",
+    "mesh": "uwlts.metrology.surface_mesh",
     "nominal": "uwlts.optics.nominal",
     "open_capture": "uwlts.storage.capture",
     "plot": "uwlts.report.plot",
     "read_cloud": "uwlts.storage.cloud",
     "read_mount": "uwlts.storage.mount_files",
+    "read_poses": "uwlts.storage.pose_files",
     "read_trajectory": "uwlts.storage.pose_files",
     "read_truth": "uwlts.storage.truth",
     "reconstruct": "uwlts.measurement.reconstruction",
     "record_guided": "uwlts.desk.guided",
     "refresh": "uwlts.calibration.joint.refresh",
+    "register": "uwlts.metrology.scan_registration",
     "scan": "uwlts.hardware.scanning",
     "serve_desk": "uwlts.desk.operator_page",
     "verify": "uwlts.measurement.verification",
@@ -186,9 +217,14 @@ _MODULES = {
     "write_change": "uwlts.report.change_page",
     "write_cloud": "uwlts.storage.cloud",
     "write_evaluation": "uwlts.measurement.evaluation",
+    "write_findings": "uwlts.report.findings_page",
+    "write_mesh": "uwlts.storage.mesh_file",
     "write_models": "uwlts.report.model_comparison",
     "write_mount": "uwlts.storage.mount_files",
+    "write_poses": "uwlts.storage.pose_files",
+    "write_registration": "uwlts.report.registration_page",
     "write_report": "uwlts.report.campaign_page",
+    "write_trajectory": "uwlts.storage.pose_files",
 }
 
 

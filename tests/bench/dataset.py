@@ -10,15 +10,16 @@ FEW, MANY = 32, 96
 """Scenes of two runs: the difference leaves out the start of the processes."""
 
 
-def rate_hz() -> float:
-    """Frames per second of the preset `stripe-clean` with two workers."""
+def rate_hz(*, workers: int) -> float:
+    """Frames per second of the preset `stripe-clean`."""
     with tempfile.TemporaryDirectory() as name:
-        seconds, frames = zip(*(_made(Path(name, str(scenes)), scenes) for scenes in (FEW, MANY)), strict=True)
+        runs = [_made(Path(name, str(scenes)), scenes, workers) for scenes in (FEW, MANY)]
+    seconds, frames = zip(*runs, strict=True)
     return (frames[1] - frames[0]) / (seconds[1] - seconds[0])
 
 
-def _made(folder: Path, scenes: int) -> tuple[float, int]:
+def _made(folder: Path, scenes: int, workers: int) -> tuple[float, int]:
     """Seconds that so many scenes take, and their frames."""
     start = time.perf_counter()
-    twin.dataset("stripe-clean", out=folder, scenes=scenes, workers=2)
+    twin.dataset("stripe-clean", out=folder, scenes=scenes, workers=workers)
     return time.perf_counter() - start, len(twin.load_dataset(folder))

@@ -13,7 +13,7 @@ import uwlts
 from tests.virtual_sensors import altered, cropped, plate, scene_of
 from twin.options import Flaws, Options
 from twin.recording.studio import Studio
-from twin.scene.description import Shot
+from twin.scene.motion import Shot
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 from uwlts.stripe import extract_stripe

@@ -14,6 +14,7 @@ from markupsafe import Markup
 from pydantic import JsonValue
 
 import uwlts
+from twin.datasets.coco import write_coco
 from twin.datasets.description import (
     SPLITS,
     Constant,
@@ -41,6 +42,7 @@ _GAMMA = 0.5
 _OVERLAY = {
     Mask.HAZE: (70, 110, 200),
     Mask.SECONDARY: (230, 150, 40),
+    Mask.PARTICLES: (200, 90, 210),
     Mask.STRIPE: (60, 180, 90),
     Mask.SATURATED: (230, 40, 60),
 }
@@ -56,8 +58,8 @@ MEANINGS = {
     "object": "(lines,) int16: number of the object there, -1 for none",
     "target_px": "(points, 2) float32: where the points of the calibration target are seen; NaN where they are not",
     "mask": "(height, width) uint8: sum of " + ", ".join(f"{one.value} {str(one.name).lower()}" for one in Mask),
-    "light_e": "(4, height, width) float16: mean photo-electrons of light straight from the lit surface, scattered "
-    "once, on longer ways, and of lamp and day; without speckle and noise",
+    "light_e": "(5, height, width) float16: mean photo-electrons of light straight from the lit surface, scattered "
+    "once, on longer ways, by grains and bubbles, and of lamp and day; without speckle and noise",
     "depth_mm": "(height, width) float32: depth in the camera frame of what each pixel's middle sees; NaN for nothing",
     "object_map": "(height, width) uint8: number of the object that each pixel's middle sees, 255 for none",
 }
@@ -78,7 +80,10 @@ class _Collected:
 def write_card(
     folder: Path, description: DataSetDescription, shards: Sequence[tuple[Path, Split, int]], plan: dict[str, JsonValue]
 ) -> DataCard:
-    """Write the card of a data set whose shards (path, split and number of frames) are complete, in all three forms."""
+    """Write the card of a data set whose shards (path, split and number of frames) are complete, in all three forms.
+
+    Masks are written as COCO annotations too.
+    """
     per_scene, versions = description.frames_per_scene(), plan["versions"]
     frames: dict[Split, int] = {split: sum(count for _, own, count in shards if own == split) for split in SPLITS}
     card = DataCard(
@@ -116,6 +121,8 @@ def write_card(
         aside.write_text(_markdown(card, description), encoding="utf-8")
     everything = DataSet(folder, card, None, ("image", "mask", "centre_px", "info"))
     write_page(folder / PAGE, _page(card, description, found, everything), overwrite=True)
+    if "mask" in names:
+        write_coco(folder, card)
     # The last file: with it the data set is complete.
     write_model(folder / CARD, card, format=CARD_FORMAT, version=CARD_VERSION, overwrite=True)
     return card

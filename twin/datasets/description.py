@@ -12,7 +12,7 @@ from pydantic import Field, PrivateAttr, ValidationInfo, field_validator, model_
 from scipy.special import ndtr, ndtri
 
 from twin.options import Effects, Flaws, Options
-from twin.scene.description import Motion, Printed, Scene, load_scene
+from twin.scene.description import AnyMotion, Printed, Scene, load_scene
 from twin.scene.paths import Value, value_at
 from uwlts.model.errors import DescriptionError
 from uwlts.model.input_file import is_regular_file
@@ -58,6 +58,8 @@ class Mask(IntFlag):
     """Light that the water scattered once exceeds the standard deviation of the pixel's noise."""
     SECONDARY = 8
     """Light on longer ways exceeds it: from one surface to another, or scattered more often."""
+    PARTICLES = 16
+    """Light of grains and bubbles in the sheet exceeds it."""
 
 
 FAINT_BELOW = 3.0
@@ -219,7 +221,7 @@ class DataSetDescription(Description):
     licence: str = "not stated"
     sensor: Sensor = Field(default="thesis", validate_default=True)
     as_built: Sensor | None = None
-    motion: Motion | None = None
+    motion: AnyMotion | None = None
     scene: Scene
     seed: Annotated[int, Field(ge=0)] = 0
     scenes: Annotated[int, Field(ge=1, le=1_000_000)] = 100
@@ -270,14 +272,14 @@ class DataSetDescription(Description):
             varied = {path.rpartition(".")[2] for path in self.vary}
             if any(getattr(one, error) for one in printed for error in _PRINT_ERRORS) or varied & set(_PRINT_ERRORS):
                 raise ValueError("the label 'target' knows no errors of print, plate and detection: leave them out")
-        if EXPOSURE in self.vary and self.scene.motion.speed_mm_per_s > 0:
+        if EXPOSURE in self.vary and self.scene.motion.moves():
             raise ValueError(f"{EXPOSURE} leaves a moving stage's blur as it is: vary sensor.exposure.laser_ms instead")
         self._whole = frozenset(whole)
         return self
 
     def frames_per_scene(self) -> int:
         """Images of each scene's motion."""
-        return self.scene.motion.count * len(self.scene.motion.lights)
+        return self.scene.motion.images()
 
     def options(self, *, seed: int, strengths: dict[str, Value] | None = None) -> Options:
         """Options of rendering a scene; ``strengths`` are those drawn of effects to add, by their names."""

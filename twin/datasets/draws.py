@@ -78,7 +78,7 @@ def draw_scene(description: DataSetDescription, scene: int, *, attempt: int = 0)
         text = ", ".join(f"{path} = {value}" for path, value in values.items())
         raise type(error)(f"{error}\n  drawn were {text}: narrow what vary says of them") from error
     motion = drawn.motion
-    exposures = (1.0,) * (motion.count * len(motion.lights))
+    exposures = (1.0,) * motion.images()
     if EXPOSURE in description.vary:
         exposures = tuple(float(description.drawn(EXPOSURE, share(EXPOSURE, k))) for k in range(len(exposures)))
     return DrawnScene(

@@ -7,9 +7,11 @@ shard.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,16 +31,18 @@ from uwlts.model.errors import DescriptionError, DesignError, OutputError
 from uwlts.model.placement import camera_from_object
 from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import work_through
-from uwlts.storage.one_writer import one_writer
+from uwlts.storage.one_writer import lock_path, one_writer
 
 if TYPE_CHECKING:
     from twin.recording.studio import Exposed, Studio
-    from twin.scene.description import Shot
+    from twin.scene.motion import Shot
 
 MOST_ATTEMPTS = 20
 """A scene that the sensor cannot measure is drawn anew; where so many in a row are, the description is at fault."""
+_PATIENCE_S = 30.0
+"""Other runs hold the plan for a moment at their beginning."""
 _OUTPUT = re.compile(
-    rf"({'|'.join(SPLITS)})-\d{{6}}\.(tar|h5)|{re.escape(CARD)}|{re.escape(README)}|{re.escape(PAGE)}|{re.escape(PLAN)}"
+    rf"({'|'.join(SPLITS)})-\d{{6}}\.(tar|h5)|coco-({'|'.join(SPLITS)})\.json|{re.escape(CARD)}|{re.escape(README)}|{re.escape(PAGE)}|{re.escape(PLAN)}"
 )
 _UNFINISHED = re.compile(r"\.[0-9a-f]{16}\.(tar|h5|json|md|html)")
 
@@ -57,7 +61,9 @@ def dataset(
 ) -> Path:
     """Render a data set of images with labels, for training and testing, from a description of what varies and how.
 
-    Run again, it goes on where it was interrupted. The folder is returned; `load_dataset` reads it.
+    Run again, it goes on where it was interrupted; run at the same time, also on other machines that share the folder,
+    each run takes shards that no other one is writing, and ends when all are there. The folder is returned;
+    `load_dataset` reads it.
 
     Parameters
     ----------
@@ -104,11 +110,9 @@ def dataset(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
-    with one_writer(folder / PLAN), progress_bar(described.title, shown=show_progress) as progress:
-        _clear(folder, all_of_it=overwrite and (folder / PLAN).is_file())
-        files = {job.path for job in jobs}
-        pattern = f"*{SUFFIXES[described.format]}"
-        keep_to_plan(folder, plan, files, recorded=pattern, called="a data set", overwrite=overwrite)
+    with one_writer(folder / PLAN, patience_s=_PATIENCE_S):
+        _prepare(folder, jobs, plan, overwrite=overwrite)
+    with progress_bar(described.title, shown=show_progress) as progress:
         waiting = [job for job in jobs if not job.path.is_file()]
         total = sum(job.frames for job in jobs)
         done = total - sum(job.frames for job in waiting)
@@ -119,9 +123,13 @@ def dataset(
             done += 1
             progress(done, total)
 
-        if waiting or not (folder / CARD).is_file():
-            work_through(_render_shard, waiting, workers=workers, on_message=count)
-            write_card(folder, described, [(job.path, job.split, job.frames) for job in jobs], plan)
+        # What others are writing is left to them at first, and then waited for: should they fail, it is done here.
+        for patience_s in (0.0, math.inf):
+            waiting = [job for job in waiting if not job.path.is_file()]
+            work_through(partial(_render_shard, patience_s), waiting, workers=workers, on_message=count)
+        with one_writer(folder / CARD, patience_s=math.inf):
+            if not (folder / CARD).is_file():
+                write_card(folder, described, [(job.path, job.split, job.frames) for job in jobs], plan)
     return folder
 
 
@@ -166,6 +174,23 @@ def _plan(description: DataSetDescription, variant: str) -> dict[str, JsonValue]
     return {"description": description.model_dump(mode="json"), "variant": variant, "versions": versions}
 
 
+def _prepare(folder: Path, jobs: list[_Job], plan: dict[str, JsonValue], *, overwrite: bool) -> None:
+    """Make the folder ready for a plan; OutputError where another run is at work in what is to be replaced."""
+    try:
+        for job in jobs:
+            if lock_path(job.path).exists():
+                with one_writer(job.path):
+                    pass
+    except OutputError:
+        if overwrite:
+            raise
+    else:
+        _clear(folder, all_of_it=overwrite and (folder / PLAN).is_file())
+    files = {job.path for job in jobs}
+    pattern = f"*{SUFFIXES[jobs[0].description.format]}"
+    keep_to_plan(folder, plan, files, recorded=pattern, called="a data set", overwrite=overwrite)
+
+
 def _clear(folder: Path, *, all_of_it: bool) -> None:
     """Remove what a killed run has left unfinished, and with ``all_of_it`` the data set itself; other files stay."""
     for path in folder.iterdir():
@@ -173,8 +198,26 @@ def _clear(folder: Path, *, all_of_it: bool) -> None:
             path.unlink()
 
 
-def _render_shard(job: _Job, report: Callable[[None], None]) -> None:
-    """Render the scenes of a shard into its file; calls ``report`` after every frame."""
+def _render_shard(patience_s: float, job: _Job, report: Callable[[None], None]) -> None:
+    """Render the scenes of a shard into its file; calls ``report`` after every frame.
+
+    A shard that another process is still writing after ``patience_s`` is left to it.
+    """
+    try:
+        with one_writer(job.path, patience_s=patience_s):
+            if not job.path.is_file():
+                _render(job, report)
+                return
+    except OutputError:
+        if not lock_path(job.path).exists():
+            raise
+        return
+    # Another process has written it meanwhile.
+    for _ in range(job.frames):
+        report(None)
+
+
+def _render(job: _Job, report: Callable[[None], None]) -> None:
     use_variant(job.variant)
     import drjit as dr
     import mitsuba as mi

@@ -15,8 +15,9 @@ normal          (L, 3)       points    unit normal of the surface there
 object          (L,) int16   points    number of the object there, -1 for none
 target_px       (N, 2)       target    where the target's points are seen (x, y), in the order of its description
 mask            (H, W) uint8 masks     bits of `Mask`
-light_e         (4, H, W)    light     mean photo-electrons in float16: of light straight from the lit surface,
-                                       scattered once, on longer ways, and of lamp and day; without speckle
+light_e         (5, H, W)    light     mean photo-electrons in float16: of light straight from the lit surface,
+                                       scattered once, on longer ways, by grains and bubbles, and of lamp and day;
+                                       without speckle
 depth_mm        (H, W)       depth     depth in the camera frame of what the pixel's middle sees
 object_map      (H, W) uint8 depth     number of the object that the pixel's middle sees, 255 for none
 =============== ============ ========= ===============================================================================
@@ -38,7 +39,7 @@ from uwlts.model.sensor import Detector
 
 if TYPE_CHECKING:
     from twin.recording.studio import Exposed, Studio
-    from twin.scene.description import Shot
+    from twin.scene.motion import Shot
 
 _WINDOW_PX = 96
 """Pixels to either side of a centre in which its stripe is looked for; wider ones are cut off there."""
@@ -66,7 +67,7 @@ def labelled(studio: Studio, shot: Shot, taken: Exposed, wanted: tuple[Label, ..
             along_width=studio.sensor.camera.stripe_along == "width",
         )
     if "light" in wanted:
-        light = np.stack([taken.direct, taken.scattered_once, taken.longer_ways, taken.even])
+        light = np.stack([taken.direct, taken.scattered_once, taken.longer_ways, taken.particles, taken.even])
         arrays["light_e"] = np.minimum(light, _LARGEST_HALF).astype(np.float16)
     if "target" in wanted:
         arrays["target_px"] = _target_points(studio, shot)
@@ -84,7 +85,7 @@ def _line_labels(studio: Studio, shot: Shot, taken: Exposed, noise: np.ndarray) 
     count, truth, number = camera.lines(), no_stripe(camera.lines()), np.full(camera.lines(), -1, np.int16)
     status = np.full(count, LineStatus.LASER_OFF, np.uint8)
     if studio.shows(shot, "laser"):
-        found = crossings(studio.renderer, studio.pose(shot), travel=studio.travel(shot.light))
+        found = crossings(studio.renderer, studio.pose(shot), travel=studio.travel(shot))
         truth, order = brightest(found, count), lit_dimmest_first(found)
         number[found.line[order]] = found.thing[order]
         status[:] = LineStatus.NOT_CROSSED
@@ -199,5 +200,6 @@ def mask_of(taken: Exposed, noise: np.ndarray, *, saturation: int, along_width: 
         Mask.SATURATED: taken.image >= saturation,
         Mask.HAZE: taken.scattered_once > noise,
         Mask.SECONDARY: taken.longer_ways > noise,
+        Mask.PARTICLES: taken.particles > noise,
     }
     return sum((np.uint8(bit) * held for bit, held in bits.items()), np.zeros(noise.shape, np.uint8))

@@ -133,7 +133,7 @@ _Shot = tuple[np.ndarray, int, int | None]
 
 
 @dataclass(frozen=True)
-class Exposed:
+class ExposedFrame:
     """An exposure: its middle in s of the monotonic clock, the encoder's count then, and what makes its image.
 
     ``image(exposure_ms)`` returns the whole image (H, W) of uint8.
@@ -183,7 +183,7 @@ class GigeCamera:
         first_number: int = 1,
         scan3d: Scan3d | None = None,
         encoder: Callable[[], int] | None = None,
-        expose: Callable[[], Exposed] | None = None,
+        expose: Callable[[], ExposedFrame] | None = None,
     ):
         if not serial.isascii() or not 0 < len(serial) < _SERIAL_BYTES:
             raise HardwareError(f"serial is '{serial}': it must have 1 to {_SERIAL_BYTES - 1} ASCII characters")
@@ -328,7 +328,7 @@ class GigeCamera:
         if shot is not None:
             self._send(shot)
 
-    def _develop(self, exposed: Exposed, exposure_ms: float) -> None:
+    def _develop(self, exposed: ExposedFrame, exposure_ms: float) -> None:
         """Make the image of an exposure in memory and send it; called in the second thread, in turn."""
         with self._lock:
             if self._server is None or not self._read(_Register.ACQUISITION):

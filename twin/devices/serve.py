@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from twin.devices.gige_camera import Exposed, GigeCamera
+from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
 from twin.options import CPU, Options, Variant, use_variant
 from twin.recording.recording import AnyScene, AnySensor, choose_scene, choose_sensors
-from twin.scene.description import Light, Motion, Shot, altered
+from twin.scene.description import altered
+from twin.scene.motion import Light, Motion, Shot
 from uwlts.model.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
 
@@ -351,13 +352,16 @@ def serve(
         raise DescriptionError("lamp-and-laser cannot be served, as the controller switches the laser: leave it out")
     if not speed_up > 0:
         raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
+    motion = described.motion
+    if not isinstance(motion, Motion):
+        raise DescriptionError(f"{described.title} moves on a {motion.kind}; a stage is served: give steps of a stage")
     _, built = choose_sensors(sensor, as_built)
     faults = [parse_fault(text) for text in fault]
     use_variant(variant)
     from twin.recording.studio import Studio
 
-    track = Track.on(built.stage, described.motion, start_mm=stage_start)
-    lamp = "lamp" in described.motion.lights if lamp is None else lamp
+    track = Track.on(built.stage, motion, start_mm=stage_start)
+    lamp = "lamp" in motion.lights if lamp is None else lamp
     # The controller moves the stage, and a frame may ask for any light.
     at_rest = {"lights": ("lamp", "laser") if lamp else ("laser",), "speed_mm_per_s": 0.0}
     studio = Studio(built, altered(described, motion=at_rest), options)
@@ -384,11 +388,10 @@ def serve(
         inject(number + 1, ahead=True)
         return image
 
-    size = {"width_px": built.camera.width_px, "height_px": built.camera.height_px}
     if studio.peak_finder is not None and built.camera.stripe_along != "width":
         raise DesignError("a 3D camera's profile lines are its columns: take a sensor with stripe_along = 'width'")
 
-    def expose() -> Exposed:
+    def expose() -> ExposedFrame:
         state = controller.state()
 
         def image(exposure_ms: float) -> np.ndarray:
@@ -396,9 +399,16 @@ def serve(
             inject(number, ahead=False)
             return bench.frame(exposure_ms, state)
 
-        return Exposed(state.time_s, controller.steps(state), image)
+        return ExposedFrame(state.time_s, controller.steps(state), image)
 
-    camera = GigeCamera(frame, **size, scan3d=studio.peak_finder, encoder=controller.steps, expose=expose)
+    camera = GigeCamera(
+        frame,
+        width_px=built.camera.width_px,
+        height_px=built.camera.height_px,
+        scan3d=studio.peak_finder,
+        encoder=controller.steps,
+        expose=expose,
+    )
     inject(1, ahead=True)
     with controller, camera:
         yield ServedTwin(controller, camera, track, studio.exposure_ms, lambda: bench.rates)

@@ -264,12 +264,12 @@ class RaySegment:
 
 
 def ray_segments(
-    objects: Objects, extinction: Float, pose: SensorPose, bundle: Rays, travel_mm: Float | None, *, mirrors: int
+    objects: Objects, extinction: Float, pose: SensorPose, bundle: Rays, after_s: Float | None, *, mirrors: int
 ) -> Iterator[RaySegment]:
     """The first segment of camera rays, then one for each of up to ``mirrors`` mirrors that they meet in turn."""
     o, d, weight, length_before = bundle.origin, bundle.direction, bundle.weight, mi.Float(0.0)
     for met in range(mirrors + 1):
-        si = objects.scene.ray_intersect(pose.ray(o, d, travel_mm), weight > 0)
+        si = objects.scene.ray_intersect(pose.ray(o, d, after_s), weight > 0)
         valid = si.is_valid() & (weight > 0)
         yield RaySegment(o, d, weight, length_before, si, valid)
         if met < mirrors:
@@ -277,6 +277,6 @@ def ray_segments(
             length = dr.select(valid, si.t, 0.0)
             weight = weight * dr.select(front, objects.mirror_share(si), 0.0) * dr.exp(-extinction * length)
             length_before = length_before + length
-            d_reflected = pose.object_direction(si.to_world(mi.reflect(si.wi)))
+            d_reflected = pose.object_direction(si.to_world(mi.reflect(si.wi)), after_s)
             o = mi.Point3f(o + d * length + d_reflected * _CLEAR_MM)
             d = dr.select(front, d_reflected, d)

@@ -47,46 +47,48 @@ class Light:
             return origin, direction
         return self._to_own @ mi.Point3f(origin), self._to_own @ mi.Vector3f(direction)
 
-    def at(self, p: Point3f, travel_mm: Float | None = None) -> SheetLight:
+    def at(self, p: Point3f, after_s: Float | None = None) -> SheetLight:
         """The sheet's light at points of the sensor's OCS, shadows aside; nothing where the mirror does not send it."""
         if self._mirror is None:
             return self._unfolded(p)
-        p = self._at_rest(p, travel_mm)
-        light = self._unfolded(self._reflection @ p, travel_mm)
-        light = replace(light, direction=self._reflection @ light.direction, normal=self._reflection @ light.normal)
-        _, meets = self._on_mirror(p, -light.direction)
-        return replace(light, irradiance=dr.select(meets, light.irradiance * self._share, 0.0))
+        # Mirrors stand still in the scene.
+        resting = self._pose.at_rest(p, after_s)
+        light = self._unfolded(self._pose.moving(self._reflection @ resting, after_s))
+        direction = self._reflection @ self._pose.direction_at_rest(light.direction, after_s)
+        normal = self._reflection @ self._pose.direction_at_rest(light.normal, after_s)
+        _, meets = self._on_mirror(resting, -direction)
+        return replace(
+            light,
+            direction=self._pose.moving_direction(direction, after_s),
+            normal=self._pose.moving_direction(normal, after_s),
+            irradiance=dr.select(meets, light.irradiance * self._share, 0.0),
+        )
 
-    def _unfolded(self, p: Point3f, travel_mm: Float | None = None) -> SheetLight:
-        """The sheet's light at points of the OCS, given where they stand while the sensor rests."""
-        if travel_mm is not None:
-            p = mi.Point3f(p - self._pose.object_travel(travel_mm))
+    def _unfolded(self, p: Point3f) -> SheetLight:
+        """The sheet's light at points of the OCS, seen without mirrors."""
         if self._to_own is None:
             return self.sheet.at(p)
         light = self.sheet.at(self._to_own @ mi.Point3f(p))
         return replace(light, direction=self._from_own @ light.direction, normal=self._from_own @ light.normal)
-
-    def _at_rest(self, p: Point3f, travel_mm: Float | None) -> Point3f:
-        """Points of the travelling OCS, in which a mirror moves, in the OCS of the resting sensor."""
-        return mi.Point3f(p if travel_mm is None else p + self._pose.object_travel(travel_mm))
 
     def may_reach(self, p: Point3f, light: SheetLight) -> Bool:
         """Region the sheet may light: everywhere, but by way of a mirror only where that sends it."""
         everywhere = dr.full(mi.Bool, True, dr.width(p))
         return everywhere if self._mirror is None else self._on_mirror(p, -light.direction)[1]
 
-    def reaches(self, objects: mi.Scene, p: Point3f, light: SheetLight, travel_mm: Float | None, active: Bool):
+    def reaches(self, objects: mi.Scene, p: Point3f, light: SheetLight, after_s: Float | None, active: Bool):
         """Whether nothing stands between points of the sensor's OCS and the laser's window."""
         towards = -light.direction
         if self._mirror is None:
-            return active & ~self._blocked(objects, p, towards, light.exit_mm, travel_mm, active)
-        t, meets = self._on_mirror(self._at_rest(p, travel_mm), towards)
-        active = active & meets & ~self._blocked(objects, p, towards, t, travel_mm, active & meets)
-        folded = self._to_face @ towards
+            return active & ~self._blocked(objects, p, towards, light.exit_mm, after_s, active)
+        resting = self._pose.direction_at_rest(towards, after_s)
+        t, meets = self._on_mirror(self._pose.at_rest(p, after_s), resting)
+        active = active & meets & ~self._blocked(objects, p, towards, t, after_s, active & meets)
+        folded = self._to_face @ resting
         folded.z = -folded.z
-        onward = self._from_face @ folded
+        onward = self._pose.moving_direction(self._from_face @ folded, after_s)
         turn = mi.Point3f(p + towards * t)
-        return active & ~self._blocked(objects, turn, onward, light.exit_mm - t, travel_mm, active)
+        return active & ~self._blocked(objects, turn, onward, light.exit_mm - t, after_s, active)
 
     def _on_mirror(self, p: Point3f, direction: Vector3f) -> tuple[Float, Bool]:
         """Distances that rays run to the mirror's face, and whether they meet its front."""
@@ -96,9 +98,9 @@ class Light:
         return t, (start.z > 0) & (along.z < 0) & inside
 
     def _blocked(
-        self, objects: mi.Scene, p: Point3f, towards: Vector3f, length: Float, travel_mm: Float | None, active: Bool
+        self, objects: mi.Scene, p: Point3f, towards: Vector3f, length: Float, after_s: Float | None, active: Bool
     ) -> Bool:
-        ray = self._pose.ray(p + towards * _CLEAR_MM, towards, travel_mm)
+        ray = self._pose.ray(p + towards * _CLEAR_MM, towards, after_s)
         ray.maxt = length - 2 * _CLEAR_MM
         return objects.ray_test(ray, active & (length > 2 * _CLEAR_MM))
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from twin.backend.arrays import Float, Point3f, Vector3f, opaque, opaque_point, opaque_transform
 
@@ -24,27 +26,34 @@ class Rays:
 
 @dataclass(frozen=True)
 class Travel:
-    """Travel of the sensor along ``direction`` (3,) of the scene, counted from the pose of the frame.
+    """Motion of the sensor during an exposure: its OCS goes at a velocity and turns about its origin at a rate.
 
-    An image row is exposed from -``exposure_mm`` / 2 to +``exposure_mm`` / 2 about its own middle, which a rolling
-    shutter shifts by ``row_mm`` from row to row; the frame's pose is that of ``middle_row``.
+    ``velocity_mm_s`` (3,) and ``turn_rad_s`` (3,), a rotation vector per second, are in the scene; both are constant.
+    Time counts from the pose of the frame, that of ``middle_row``. An image row is exposed from -``exposure_s`` / 2 to
+    +``exposure_s`` / 2 about its own middle, which a rolling shutter shifts by ``row_s`` from row to row.
     """
 
-    direction: np.ndarray
-    exposure_mm: float
-    row_mm: float
-    middle_row: float
+    velocity_mm_s: np.ndarray
+    exposure_s: float
+    turn_rad_s: np.ndarray | None = None
+    row_s: float = 0.0
+    middle_row: float = 0.0
 
     def at(self, row: Float, moment: Float | float) -> Float:
-        """Travel in mm of image rows at a moment of their exposure, from 0 to 1."""
-        exposure, per_row = opaque(self.exposure_mm), opaque(self.row_mm)
+        """Time in s of image rows at a moment of their exposure, from 0 to 1."""
+        exposure, per_row = opaque(self.exposure_s), opaque(self.row_s)
         return (row - opaque(self.middle_row)) * per_row + (moment - 0.5) * exposure
 
     def ends(self, rows: int) -> tuple[float, float]:
-        """Smallest and largest travel in mm within a frame of ``rows`` rows."""
-        at_edges = [(row - self.middle_row) * self.row_mm for row in (0, rows - 1)]
-        half = abs(self.exposure_mm) / 2
+        """First and last time in s within a frame of ``rows`` rows."""
+        at_edges = [(row - self.middle_row) * self.row_s for row in (0, rows - 1)]
+        half = self.exposure_s / 2
         return min(at_edges) - half, max(at_edges) + half
+
+    def fastest_mm_s(self, reach_mm: float) -> float:
+        """Largest speed in mm/s of points up to so far from the OCS's origin."""
+        turn = 0.0 if self.turn_rad_s is None else float(np.linalg.norm(self.turn_rad_s))
+        return float(np.linalg.norm(self.velocity_mm_s)) + turn * reach_mm
 
 
 class SensorPose:
@@ -54,33 +63,64 @@ class SensorPose:
         self.scene_from_object, self.travel = np.asarray(scene_from_object, float), travel
         self._to_scene = opaque_transform(self.scene_from_object)
         self._to_object = opaque_transform(np.linalg.inv(self.scene_from_object))
+        self._axis, self._rate = None, 0.0
         if travel is not None:
-            self._direction = mi.Vector3f(opaque_point(travel.direction))
+            # Everything that moves does so in the OCS of the resting sensor.
+            into = self.scene_from_object[:3, :3].T
+            self._velocity = mi.Vector3f(opaque_point(into @ travel.velocity_mm_s))
+            turn = np.zeros(3) if travel.turn_rad_s is None else into @ travel.turn_rad_s
+            if rate := float(np.linalg.norm(turn)):
+                self._axis, self._rate = mi.Vector3f(opaque_point(turn / rate)), opaque(rate)
 
-    def moved(self, travel_mm: float) -> SensorPose:
-        """The pose after a travel, standing still."""
+    def moved(self, after_s: float) -> SensorPose:
+        """The pose after a time, standing still."""
         assert self.travel is not None
         transform = self.scene_from_object.copy()
-        transform[:3, 3] += travel_mm * self.travel.direction
+        transform[:3, 3] += after_s * self.travel.velocity_mm_s
+        if self.travel.turn_rad_s is not None:
+            turned = Rotation.from_rotvec(after_s * self.travel.turn_rad_s).as_matrix()
+            transform[:3, :3] = turned @ transform[:3, :3]
         return SensorPose(transform)
 
-    def ray(self, origin: Point3f, direction: Vector3f, travel_mm: Float | None = None) -> mi.Ray3f:
-        """A ray of the OCS in the scene, where the sensor has travelled by ``travel_mm``."""
-        # A point plus a vector is a vector to Dr.Jit, and vectors are not moved.
-        start = self._to_scene @ mi.Point3f(origin)
-        if travel_mm is not None:
-            start += self._direction * travel_mm
-        return mi.Ray3f(mi.Point3f(start), self.direction(direction))
+    def at_rest(self, point: Point3f, after_s: Float | None) -> Point3f:
+        """Points of the moving OCS after a time, in the OCS of the resting sensor."""
+        if after_s is None:
+            return mi.Point3f(point)
+        return mi.Point3f(self.direction_at_rest(mi.Vector3f(point), after_s) + self._velocity * after_s)
 
-    def direction(self, direction: Vector3f) -> Vector3f:
+    def moving(self, point: Point3f, after_s: Float | None) -> Point3f:
+        """Points of the OCS of the resting sensor, in the moving OCS after a time."""
+        if after_s is None:
+            return mi.Point3f(point)
+        return mi.Point3f(self.moving_direction(mi.Vector3f(point) - self._velocity * after_s, after_s))
+
+    def direction_at_rest(self, direction: Vector3f, after_s: Float | None) -> Vector3f:
+        """Directions of the moving OCS after a time, in the OCS of the resting sensor."""
+        return self._turned(direction, after_s, sign=1.0)
+
+    def moving_direction(self, direction: Vector3f, after_s: Float | None) -> Vector3f:
+        """Directions of the OCS of the resting sensor, in the moving OCS after a time."""
+        return self._turned(direction, after_s, sign=-1.0)
+
+    def _turned(self, vector: Vector3f, after_s: Float | None, *, sign: float) -> Vector3f:
+        """Vectors turned by as much as the sensor turns within a time (Rodrigues)."""
+        if after_s is None or self._axis is None:
+            return mi.Vector3f(vector)
+        sine, cosine = dr.sincos(sign * self._rate * after_s)
+        along = self._axis * dr.dot(self._axis, vector)
+        return along + (vector - along) * cosine + dr.cross(self._axis, vector) * sine
+
+    def ray(self, origin: Point3f, direction: Vector3f, after_s: Float | None = None) -> mi.Ray3f:
+        """A ray of the OCS in the scene, as the sensor stands after a time."""
+        # A point plus a vector is a vector to Dr.Jit, and vectors are not moved.
+        start = self._to_scene @ self.at_rest(origin, after_s)
+        return mi.Ray3f(mi.Point3f(start), self.direction(direction, after_s))
+
+    def direction(self, direction: Vector3f, after_s: Float | None = None) -> Vector3f:
         """A direction of the OCS in the scene."""
         # The difference of two points is a point to Dr.Jit, which a transform would also shift.
-        return self._to_scene @ mi.Vector3f(direction)
+        return self._to_scene @ self.direction_at_rest(mi.Vector3f(direction), after_s)
 
-    def object_travel(self, travel_mm: Float) -> Vector3f:
-        """The sensor's travel as a vector of the OCS."""
-        return self.object_direction(self._direction) * travel_mm
-
-    def object_direction(self, direction: Vector3f) -> Vector3f:
+    def object_direction(self, direction: Vector3f, after_s: Float | None = None) -> Vector3f:
         """A direction of the scene in the OCS."""
-        return self._to_object @ mi.Vector3f(direction)
+        return self.moving_direction(self._to_object @ mi.Vector3f(direction), after_s)

@@ -11,7 +11,7 @@ between frames.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, opaque, to_jit
+from twin.backend.arrays import Float, Point3f, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, ray_segments
 from twin.light.illumination import Light, lights
 from twin.light.image_sampling import (
@@ -32,13 +32,14 @@ from twin.light.image_sampling import (
     widened,
     without_outliers,
 )
+from twin.light.particles import Body, spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet
 from twin.light.walk import Walker
 from twin.light.water import Scattering, single_scattering
 from twin.options import ALL, Effects
-from twin.scene.description import Light as LightName
 from twin.scene.description import Scene
+from twin.scene.motion import Light as LightName
 from twin.scene.objects import build_objects
 from uwlts.model.placement import camera_from_object, check_design
 from uwlts.model.sensor import Medium, Sensor
@@ -62,8 +63,14 @@ _WALKS_IN_STRIPE = 4
 """The same in the small cells of the stripe's pixels."""
 _SPOT_ASIDE = 0.25
 """Slope of an uneven lamp's axis against the camera's over that of the view's corner: the lamp is mounted beside it."""
+_DRIFTING_STREAM = 7
+"""Keeps the random numbers of grains and bubbles apart from those of walks and noise."""
+_CAUSTIC_WAVES, _CAUSTIC_MM = 10, (20.0, 120.0)
+"""Waves of the surface that throw caustics, and their wavelengths in mm where they fall: a rippled tank or harbour."""
 _TRAVEL_STEP_MM = 0.2
 """While the sensor travels, the lit pixels are looked for at places this far apart."""
+_REACH_SHARE = 1.5
+"""Distance of what is seen from the OCS's origin, at most about, over the stand-off."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +78,14 @@ class LaserFrame:
     """Irradiance on the image sensor in W/mm2: (H, W) of the scattered light, and the stripe's pixels on their own.
 
     ``scattered`` is all light on longer ways, ``haze`` (H, W) the part of it that the water scattered once out of the
-    sheet into the camera's rays. ``rows`` and ``columns`` (P,) name the stripe's pixels, ``stripe`` (P,) is the light
+    sheet into the camera's rays, ``particles`` (H, W) that of grains and bubbles in the sheet, which is not among it.
+    ``rows`` and ``columns`` (P,) name the stripe's pixels, ``stripe`` (P,) is the light
     that came straight from the lit surface; ``polarisation`` and ``roughness_um`` (P,) are that surface's, for speckle.
     """
 
     scattered: np.ndarray
     haze: np.ndarray
+    particles: np.ndarray
     rows: np.ndarray
     columns: np.ndarray
     stripe: np.ndarray
@@ -85,7 +94,7 @@ class LaserFrame:
 
     def irradiance(self, factors: np.ndarray | float = 1.0) -> np.ndarray:
         """All light (H, W), the stripe's multiplied by ``factors`` (P,)."""
-        image = self.scattered.copy()
+        image = self.scattered + self.particles
         image[self.rows, self.columns] += self.stripe * factors
         return image
 
@@ -99,15 +108,25 @@ class LaserFrame:
 class Renderer:
     """One sensor in one medium before one scene.
 
-    ``uneven_lamp`` is the relative loss of the lamp's light away from its spot (`Flaws.uneven_lamp`).
+    ``uneven_lamp`` is the relative loss of the lamp's light away from its spot, ``caustics`` the contrast of the day's
+    on surfaces, ``drifting`` how many bodies of each kind drift in a litre (`twin.options.Flaws`).
     DesignError or DescriptionError where the sensor cannot work in the medium, or an object cannot be built.
     """
 
     def __init__(
-        self, sensor: Sensor, medium: Medium, scene: Scene, *, effects: Effects = ALL, uneven_lamp: float = 0.0
+        self,
+        sensor: Sensor,
+        medium: Medium,
+        scene: Scene,
+        *,
+        effects: Effects = ALL,
+        uneven_lamp: float = 0.0,
+        caustics: float = 0.0,
+        drifting: Mapping[Body, float] | None = None,
     ):
         self.design, self._uneven_lamp = check_design(sensor, medium), uneven_lamp
         self.sensor, self.medium, self.effects = sensor, medium, effects
+        self._caustics, self._drifting = caustics, drifting or {}
         wavelength = sensor.laser.wavelength_nm
         self.objects = build_objects(
             scene, medium_index=medium.refractive_index(wavelength), wavelength_nm=wavelength, gloss=effects.gloss
@@ -156,7 +175,31 @@ class Renderer:
         ]
         stripe, polarised, rough = np.concatenate([np.zeros((3, 0), np.float32), *facts], axis=1)
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
-        return LaserFrame(image, haze, rows, columns, stripe, np.clip(polarised / bright, 0, 1), rough / bright)
+        particles, polarisation = self._particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
+        return LaserFrame(image, haze, particles, rows, columns, stripe, polarisation, rough / bright)
+
+    def _particles(self, direct: list[Light], pose: SensorPose, *, seed: int) -> np.ndarray:
+        """Irradiance (H, W) in W/mm2 of grains and bubbles in the sheets."""
+        camera = self.sensor.camera
+        image = np.zeros((camera.height_px, camera.width_px), np.float32)
+        rng = np.random.default_rng([seed, _DRIFTING_STREAM])
+        for body, per_litre in self._drifting.items():
+            for light in direct if per_litre > 0 else ():
+                seen = spots(
+                    self.view,
+                    light,
+                    self.objects,
+                    pose,
+                    body=body,
+                    per_litre=per_litre,
+                    extinction=self.scattering.c,
+                    wavelength_nm=self.sensor.laser.wavelength_nm,
+                    defocus=self.effects.defocus,
+                    sparkle=self.effects.speckle,
+                    rng=rng,
+                )
+                image += seen.drawn(camera.height_px, camera.width_px)
+        return image
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the pixels whose chief rays meet the first laser's own stripe."""
@@ -169,30 +212,30 @@ class Renderer:
         rows, columns = np.nonzero(self._repeated(np.any(near, axis=0)))
         return rows, columns
 
-    def laser(self, pose: SensorPose, bundle: Rays, travel_mm: Float | None = None) -> Float:
+    def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> Float:
         """Irradiance of the first laser's light per ray in W/mm2: the lit surface seen straight, nothing around it."""
         direct, _ = lights(self._sheets[:1], pose)
-        segment = next(self._segments(pose, bundle, travel_mm))
-        return segment.weight * self._radiance(pose, segment, direct, travel_mm)
+        segment = next(self._segments(pose, bundle, after_s))
+        return segment.weight * self._radiance(pose, segment, direct, after_s)
 
     # --- the lit surface ----------------------------------------------------------------------------------------------
 
-    def _segments(self, pose: SensorPose, bundle: Rays, travel_mm: Float | None) -> Iterator[RaySegment]:
+    def _segments(self, pose: SensorPose, bundle: Rays, after_s: Float | None) -> Iterator[RaySegment]:
         mirrors = _MIRRORS if self._mirrors else 0
-        return ray_segments(self.objects, self.scattering.c, pose, bundle, travel_mm, mirrors=mirrors)
+        return ray_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=mirrors)
 
     def _sigmas(self, light: Light, segment: RaySegment) -> Float:
         """The light's distance across at segments' ends in standard deviations; infinity where there is no surface."""
         here = light.at(segment.end())
         return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
 
-    def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], travel_mm: Float | None) -> Float:
+    def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None) -> Float:
         """Radiance in W/mm2/sr that lit surfaces send back along segments, as it arrives at their beginning."""
         radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
-            here = light.at(end, travel_mm)
-            lit = light.reaches(self.objects.scene, end, here, travel_mm, segment.valid & (here.irradiance > 0))
-            towards = segment.si.to_local(pose.direction(-here.direction))
+            here = light.at(end, after_s)
+            lit = light.reaches(self.objects.scene, end, here, after_s, segment.valid & (here.irradiance > 0))
+            towards = segment.si.to_local(pose.direction(-here.direction, after_s))
             radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), segment.si, towards, lit)[0] * here.irradiance, 0.0)
         return radiance * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
 
@@ -233,8 +276,9 @@ class Renderer:
         yield pose, sources
         if pose.travel is not None:
             first, last = pose.travel.ends(self.sensor.camera.height_px)
-            for travel_mm in np.linspace(first, last, 2 + int((last - first) / _TRAVEL_STEP_MM)):
-                moved = pose.moved(float(travel_mm))
+            way_mm = (last - first) * pose.travel.fastest_mm_s(_REACH_SHARE * self.design.standoff_mm)
+            for after_s in np.linspace(first, last, 2 + int(way_mm / _TRAVEL_STEP_MM)):
+                moved = pose.moved(float(after_s))
                 direct, mirrored = lights(self._sheets, moved, self._mirrors)
                 yield moved, direct + mirrored
 
@@ -333,7 +377,7 @@ class Renderer:
             image[rows, columns] = fine[0]
         return image
 
-    def _evenly_lit(self, pose: SensorPose, bundle: Rays, travel_mm: Float | None, ambient: bool) -> tuple[Float]:
+    def _evenly_lit(self, pose: SensorPose, bundle: Rays, after_s: Float | None, ambient: bool) -> tuple[Float]:
         """Irradiance per ray in W/mm2 where every surface is evenly lit, seen through the water and its veil.
 
         A surface of albedo A that receives E sends back the radiance A E / pi. Daylight comes from all around, so the
@@ -341,17 +385,40 @@ class Renderer:
         is scattered backwards returns. Up to the distance t that veil is E / pi times the scattered share of the
         extinction, times 1 - exp(-c t) (Duntley 1963, Eq. 4, for an even light field).
         """
-        segment = next(self._segments(pose, bundle, travel_mm))
+        segment = next(self._segments(pose, bundle, after_s))
         lamp = self.sensor.lamp
         level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
         left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
         radiance = dr.select(segment.valid, self.objects.albedo(segment.si) * left, 0.0)
+        if self._caustics and ambient:
+            radiance *= self._caustic(segment.si.p)
         if self.effects.haze and self.scattering.coefficient > 0:
             scattered = self.scattering.coefficient * (1 if ambient else self.scattering.backward_share)
             radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
         if self._uneven_lamp and not ambient:
             radiance *= self._lamp_share(segment)
         return (segment.weight * level * radiance,)
+
+    def _caustic(self, p: Point3f) -> Float:
+        """Factor of the day's light on surfaces at points of the scene, focused by waves; about 1 in the mean.
+
+        Rays of a wavy surface of the height h are displaced by the slopes times a length L, so that the irradiance goes
+        as 1 / |det(1 - L H)|, H being h's second derivatives (Lock and Andrews, Am. J. Phys. 60, 397, 1992). Waves of
+        all directions give the trace of L H the standard deviation ``caustics``; folds are cut off.
+        """
+        rng = np.random.default_rng(_DRIFTING_STREAM)
+        angle, phase = rng.uniform(0, 2 * math.pi, (2, _CAUSTIC_WAVES))
+        number = 2 * math.pi / np.geomspace(*_CAUSTIC_MM, _CAUSTIC_WAVES)
+        xx, xy, yy = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
+        for k, a, start in zip(number.tolist(), angle.tolist(), phase.tolist(), strict=True):
+            x, y = math.cos(a), math.sin(a)
+            bend = math.sqrt(2 / _CAUSTIC_WAVES) * dr.cos(k * (x * p.x + y * p.y) + start)
+            xx, xy, yy = xx + x * x * bend, xy + x * y * bend, yy + y * y * bend
+        size = opaque(self._caustics)
+        determinant = (1 - size * xx) * (1 - size * yy) - dr.square(size * xy)
+        # Of a normal trace t the mean of 1 / (1 - t) is 1 + std^2 + 3 std^4 and so on.
+        mean = 1 + dr.square(size) + 3 * dr.square(dr.square(size))
+        return 1 / (dr.clip(dr.abs(determinant), 0.15, 10.0) * mean)
 
     def _lamp_share(self, segment: RaySegment) -> Float:
         """Share of the lamp's light where camera rays end: a round Gaussian spot about the lamp's axis.
@@ -367,12 +434,12 @@ class Renderer:
     # --- pixels -------------------------------------------------------------------------------------------------------
 
     def _stripe_sums(
-        self, pose: SensorPose, bundle: Rays, travel_mm: Float | None, sources: list[Light]
+        self, pose: SensorPose, bundle: Rays, after_s: Float | None, sources: list[Light]
     ) -> tuple[Float, Float, Float]:
         """Irradiance per ray of lit surfaces seen straight or in a mirror, and it times what speckle depends on."""
         total, polarised, rough = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
-        for segment in self._segments(pose, bundle, travel_mm):
-            value = segment.weight * self._radiance(pose, segment, sources, travel_mm)
+        for segment in self._segments(pose, bundle, after_s):
+            value = segment.weight * self._radiance(pose, segment, sources, after_s)
             total += value
             polarised += value * self.objects.polarisation(segment.si)
             rough += value * self.objects.roughness_um(segment.si)
@@ -408,9 +475,9 @@ class Renderer:
                 u, v = u + dr.gather(mi.Float, shift_u, pixel), v + dr.gather(mi.Float, shift_v, pixel)
                 u, v = u - dr.floor(u), v - dr.floor(v)
             pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
-        travel_mm = None if pose.travel is None else pose.travel.at(row, places[-1])
+        after_s = None if pose.travel is None else pose.travel.at(row, places[-1])
         bundle = self.view.bundle(dr.gather(mi.Float, x, pixel) + places[0] - 0.5, row + places[1] - 0.5, pupil)
-        values = light(pose, bundle, travel_mm, *rest)
+        values = light(pose, bundle, after_s, *rest)
         dr.eval(values)  # together: each sum on its own would trace the rays anew
         return np.stack([dr.block_sum(value, spp).numpy() / spp for value in values])
 

@@ -107,7 +107,7 @@ def render(
     return Recording(
         np.stack([frame.image for frame in taken]),
         *(np.array([getattr(frame, name) for frame in taken]) for name in FRAME_DATA),
-        truth=truth_of_recording(studio, truths, first=shots[0][1]),
+        truth=truth_of_recording(studio, truths, shots=[shot for _, shot in shots]),
         sensor=studio.sensor,
         medium=studio.medium,
         scene=described,
@@ -161,7 +161,8 @@ def simulate(
         or a turbidity from 0 (pure) over 1 (clear) and 2 (coastal) to 3 (harbour).
     effects
         Effects of real images to add, NAME of typical strength or NAME=STRENGTH: glare=0.02, vignetting=0.4,
-        uneven-lamp=0.6, lamp-and-laser, pixel-aspect=1.002, tangential=0.001, rolling-shutter=10 (us per row),
+        uneven-lamp=0.6, particles=1000 and bubbles=200 (per litre), caustics=0.3, dirt=0.1, lamp-and-laser,
+        pixel-aspect=1.002, tangential=0.001, rolling-shutter=10 (us per row),
         jpeg=90, colour-filter, camera-3d=16 (steps per px; laser images become centre lines).
     without
         Effects to leave out: defocus, haze, multiple-scattering, secondary-light, gloss, motion, ambient, speckle,

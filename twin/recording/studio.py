@@ -6,6 +6,7 @@ The truth of a frame is the true stripe centres of all profile lines, the points
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -17,10 +18,12 @@ from twin.backend.arrays import Float, to_jit, to_numpy
 from twin.light.pose import SensorPose, Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.options import Options
-from twin.scene.description import Light, Printed, Scene, Shot, altered
+from twin.scene.description import Printed, Scene, altered
 from twin.scene.finish import shift_points
+from twin.scene.motion import Light, Shot
+from twin.scene.platforms import Platform
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
-from twin.sensor.flaws import as_built, delivered, laser_shares, veiled, vignette
+from twin.sensor.flaws import as_built, delivered, dirt, laser_shares, veiled, vignette
 from twin.sensor.peak_finder import INVALID, PeakFinder
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.model.errors import DesignError, OutputError
@@ -28,7 +31,9 @@ from uwlts.model.library import validated
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium, Sensor, Table
 from uwlts.model.stripe import Coordinates
+from uwlts.model.trajectory import Trajectory
 from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame, Seen
+from uwlts.storage.pose_files import trajectory_path, write_trajectory
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, truth_path, write_truth
 
 Progress = Callable[[int, int], None]
@@ -65,14 +70,26 @@ def with_window(sensor: Sensor, *, mounted: bool) -> Sensor:
     return altered(sensor, camera={"window": {"mounted": mounted}})
 
 
+def true_pose(scene: Scene, shot: Shot) -> np.ndarray:
+    """``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
+    if isinstance(scene.motion, Platform):
+        assert shot.time_s is not None
+        return scene.motion.course().poses(np.array([shot.time_s]))[0]
+    transform = np.eye(4)
+    transform[:3, 3] = shot.travelled_mm * scene.motion.unit_direction()
+    return transform
+
+
 def check_scene(renderer: Renderer, scene: Scene) -> None:
     """DesignError where objects lie outside the measuring volume's depth, or no scan brings the sheet to them."""
     volume, axis = renderer.sensor.volume, camera_from_object(renderer.sensor)[:3, 2]
     # The sheet's middle line runs along Z, which the camera sees at depth standoff + Z axis_z outside the window.
     nearest, farthest = ((edge - renderer.design.standoff_mm) / axis[2] for edge in (volume.near_mm, volume.far_mm))
     box = renderer.objects.scene.bbox()
-    offsets = np.array([shot.travelled_mm * scene.motion.unit_direction() for shot in scene.motion.shots()])
-    low, high = (np.array(corner) - offsets for corner in (box.min, box.max))
+    corners = np.array(list(product(*zip(box.min, box.max, strict=True))))
+    inverse = np.linalg.inv([true_pose(scene, shot) for shot in scene.motion.shots()])
+    seen = np.einsum("sij,cj->sci", inverse[:, :3, :3], corners) + inverse[:, None, :3, 3]
+    low, high = seen.min(axis=1), seen.max(axis=1)
     if not ((low[:, 2] <= farthest) & (high[:, 2] >= nearest)).any():
         raise DesignError(
             f"the objects lie from Z = {low[:, 2].min():.1f} to {high[:, 2].max():.1f} mm about the stand-off, "
@@ -91,8 +108,8 @@ class Exposed:
 
     ``image`` (H, W) holds grey values. The others are (H, W), float32, without speckle and noise: ``direct`` is the
     laser's light straight from the lit surfaces; ``scattered_once`` what the water scattered out of the sheet into the
-    camera's rays; ``longer_ways`` what was scattered more often or went from one surface to another; ``even`` that of
-    lamp and day.
+    camera's rays; ``longer_ways`` what was scattered more often or went from one surface to another; ``particles`` that
+    of grains and bubbles in the sheet; ``even`` that of lamp and day.
     """
 
     image: np.ndarray
@@ -100,11 +117,12 @@ class Exposed:
     direct: np.ndarray
     scattered_once: np.ndarray
     longer_ways: np.ndarray
+    particles: np.ndarray
     even: np.ndarray
 
     def total(self) -> np.ndarray:
         """All of them together (H, W)."""
-        return self.direct + self.scattered_once + self.longer_ways + self.even
+        return self.direct + self.scattered_once + self.longer_ways + self.particles + self.even
 
 
 class Studio:
@@ -120,12 +138,20 @@ class Studio:
         self.scene, self.options = scene, options
         self.medium = medium_of(sensor, scene)
         self.renderer = Renderer(
-            self.sensor, self.medium, scene, effects=options.effects, uneven_lamp=flaws.uneven_lamp
+            self.sensor,
+            self.medium,
+            scene,
+            effects=options.effects,
+            uneven_lamp=flaws.uneven_lamp,
+            caustics=flaws.caustics,
+            drifting={"particles": flaws.particles, "bubbles": flaws.bubbles},
         )
         check_scene(self.renderer, scene)
         camera, laser = self.sensor.camera, self.sensor.laser
         self._speckle = Speckle(camera, wavelength_nm=laser.wavelength_nm, seed=options.seed)
         self._vignette = vignette(camera, flaws.vignetting) if flaws.vignetting else 1.0
+        if flaws.dirt and mounted:
+            self._vignette = self._vignette * dirt(camera, flaws.dirt, seed=options.seed)
         self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else 1.0
         self.peak_finder = None
         if flaws.camera_3d:
@@ -135,45 +161,68 @@ class Studio:
             self._pattern = fixed_pattern(self.sensor.detector, height=camera.height_px, width=camera.width_px)
         self.exposure_ms = {light: self._exposure(light, probe) for light in dict.fromkeys(scene.motion.lights)}
         longest_ms = max(self.exposure_ms[shot.light] * shot.exposure for shot in scene.motion.shots())
-        shortest_s = max(1e-3 * longest_ms, 1 / self.sensor.detector.frame_rate_hz)
-        motion = scene.motion
-        # Time from one shot to the next: the stage moves or settles, and the camera exposes and reads out.
-        moving = motion.speed_mm_per_s > 0
-        self.period_s = (
-            abs(motion.step_mm) / motion.speed_mm_per_s if moving else self.sensor.stage.settling_s + shortest_s
-        )
-        if moving and motion.count > 1 and self.period_s < shortest_s * (1 - 1e-9):
+        self.period_s = self._period_s(max(1e-3 * longest_ms, 1 / self.sensor.detector.frame_rate_hz))
+
+    def _period_s(self, shortest_s: float) -> float:
+        """Time from one shot to the next: the platform moves or settles, and the camera exposes and reads out.
+
+        DesignError where a platform in motion leaves the camera less time than it needs.
+        """
+        motion = self.scene.motion
+        if not motion.moves():
+            return self.sensor.stage.settling_s + shortest_s
+        if isinstance(motion, Platform):
+            assert motion.frame_rate_hz is not None
+            period_s = 1 / motion.frame_rate_hz
+            way = f"at {motion.frame_rate_hz:g} images/s the next one comes"
+            advice = "take fewer images per second"
+        else:
+            period_s = abs(motion.step_mm) / motion.speed_mm_per_s
+            way = f"at {motion.speed_mm_per_s:g} mm/s the next position {abs(motion.step_mm):g} mm on is reached"
+            advice = "travel more slowly, in longer steps"
+        if motion.images() > 1 and period_s < shortest_s * (1 - 1e-9):
             raise DesignError(
-                f"at {motion.speed_mm_per_s:g} mm/s the next position {abs(motion.step_mm):g} mm on is reached after "
-                f"{1e3 * self.period_s:.3g} ms, but the camera needs {1e3 * shortest_s:.3g} ms from frame to frame: "
-                "travel more slowly, in longer steps, or with shorter exposures"
+                f"{way} after {1e3 * period_s:.3g} ms, but the camera needs {1e3 * shortest_s:.3g} ms from frame to "
+                f"frame: {advice}, or with shorter exposures"
             )
+        return period_s
 
     def pose(self, shot: Shot) -> np.ndarray:
         """``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
-        transform = np.eye(4)
-        transform[:3, 3] = shot.travelled_mm * self.scene.motion.unit_direction()
-        return transform
+        return true_pose(self.scene, shot)
 
     def speed_mm_per_s(self) -> float:
-        """Speed of the stage along its positions while an image is exposed."""
+        """Speed of the stage along its positions while an image is exposed; 0 on other platforms."""
         motion = self.scene.motion
+        if isinstance(motion, Platform):
+            return 0.0
         return motion.speed_mm_per_s * (1 if motion.step_mm >= 0 else -1)
 
-    def travel(self, light: Light) -> Travel | None:
-        """Movement of the sensor during an exposure; None if it stands still."""
-        return self.travel_at(self.speed_mm_per_s(), exposure_ms=self.exposure_ms.get(light, 0.0))
+    def travel(self, shot: Shot) -> Travel | None:
+        """Motion of the sensor during the exposure of a shot; None if it stands still."""
+        exposure_ms = self.exposure_ms.get(shot.light, 0.0) * shot.exposure
+        motion = self.scene.motion
+        if not isinstance(motion, Platform):
+            return self.travel_at(self.speed_mm_per_s(), exposure_ms=exposure_ms)
+        if not (motion.moves() and self.options.effects.motion):
+            return None
+        velocity, turn = motion.course().twist(shot, exposure_s=1e-3 * exposure_ms)
+        return self._travel(velocity, turn, exposure_ms)
 
     def travel_at(self, speed: float, *, exposure_ms: float) -> Travel | None:
-        """Movement of the sensor during an exposure at a speed in mm/s; None if it stands still."""
-        detector = self.sensor.detector
-        if speed == 0 or not self.options.effects.motion:
+        """Movement of the sensor during an exposure at a speed of the stage in mm/s; None if it stands still."""
+        motion = self.scene.motion
+        if speed == 0 or not self.options.effects.motion or isinstance(motion, Platform):
             return None
-        row_s = 1e-6 * detector.line_time_us if detector.shutter == "rolling" else 0.0
+        return self._travel(speed * motion.unit_direction(), None, exposure_ms)
+
+    def _travel(self, velocity: np.ndarray, turn: np.ndarray | None, exposure_ms: float) -> Travel:
+        detector = self.sensor.detector
         return Travel(
-            direction=self.scene.motion.unit_direction(),
-            exposure_mm=speed * 1e-3 * exposure_ms,
-            row_mm=speed * row_s,
+            velocity_mm_s=velocity,
+            turn_rad_s=turn,
+            exposure_s=1e-3 * exposure_ms,
+            row_s=1e-6 * detector.line_time_us if detector.shutter == "rolling" else 0.0,
             middle_row=(self.sensor.camera.height_px - 1) / 2,
         )
 
@@ -231,12 +280,20 @@ class Studio:
 
     def frame(self, shot: Shot, index: int) -> Frame:
         """Image number ``index`` of the scan with what a capture records of it."""
+        pose = covariance = None
+        if isinstance(self.scene.motion, Platform):
+            course = self.scene.motion.course()
+            number = course.numbers[shot]
+            pose = course.reported[number]
+            covariance = None if course.covariance is None else course.covariance[number]
         return Frame(
             self.seen(shot, index),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
             exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
-            time_s=index * self.period_s,
+            time_s=index * self.period_s if shot.time_s is None else shot.time_s,
+            pose=pose,
+            pose_covariance=covariance,
             speed_mm_per_s=self.speed_mm_per_s(),
         )
 
@@ -260,7 +317,9 @@ class Studio:
         even, laser = self._light_of(shot, index)
         exposure_ms = exposure * self.exposure_ms[shot.light] * shot.exposure
         nothing = np.zeros_like(even)
-        parts = [nothing] * 3 if laser is None else [laser.direct(), laser.haze, laser.scattered - laser.haze]
+        parts = [nothing] * 4
+        if laser is not None:
+            parts = [laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles]
         parts = [self._laser_shares * self._through_lens(part) if part.any() else nothing for part in parts]
         parts = [exposure_ms * self._to_electrons(part) for part in (*parts, self._through_lens(even))]
         image = self._taken(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)
@@ -270,7 +329,7 @@ class Studio:
         """The light of image number ``index`` before the lens, as `_light` returns it."""
         self._shift_points(shot, index)
         seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
-        return self._light(shot, spp=self.options.spp, seed=seed, travel=self.travel(shot.light))
+        return self._light(shot, spp=self.options.spp, seed=seed, travel=self.travel(shot))
 
     def _taken(self, electrons_per_ms: np.ndarray, index: int, *, exposure_ms: float) -> np.ndarray:
         noise_seed = [self.options.seed, index]
@@ -286,7 +345,7 @@ class Studio:
         """Ground truth of every profile line of a shot."""
         if not self.shows(shot, "laser"):
             return no_stripe(self.sensor.camera.lines())
-        return true_stripe(self.renderer, self.pose(shot), travel=self.travel(shot.light))
+        return true_stripe(self.renderer, self.pose(shot), travel=self.travel(shot))
 
     def _shift_points(self, shot: Shot, index: int) -> None:
         """Move the points of a target with errors of detection to where this image shows them."""
@@ -501,10 +560,11 @@ def image_points(renderer: Renderer, scene_from_object: np.ndarray, points_mm: n
     return np.where(found[:, None], pixels, np.nan)
 
 
-def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], *, first: Shot) -> Truth:
-    """The truths of a recording's frames as one, with the depth map of its ``first`` shot."""
+def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], shots: Sequence[Shot]) -> Truth:
+    """The truths of a recording's frames as one, with the depth map of the first of its ``shots``."""
     stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
-    return Truth(**stacked, depth_mm=depth_map(studio.renderer, studio.pose(first)))
+    poses = np.stack([studio.pose(shot) for shot in shots])
+    return Truth(**stacked, depth_mm=depth_map(studio.renderer, poses[0]), pose=poses)
 
 
 def record_scene(
@@ -528,6 +588,10 @@ def record_scene(
     path = Path(path)
     if truth_path(path).exists() and not (overwrite or resume):
         raise OutputError(f"{truth_path(path)} exists already; give another name, or --overwrite to replace it")
+    motion = scene.motion
+    report = motion.course().report if isinstance(motion, Platform) else None
+    if report is not None and trajectory_path(path).exists() and not (overwrite or resume):
+        raise OutputError(f"{trajectory_path(path)} exists already; give another name, or --overwrite to replace it")
     studio = Studio(as_built or sensor, scene, options)
     # What an operator would note: nominal values only.
     header = CaptureHeader(
@@ -535,7 +599,8 @@ def record_scene(
         sensor=with_window(sensor, mounted=studio.sensor.camera.window.mounted),
         medium_name=scene.medium,
         medium=medium_of(sensor, scene),
-        stage_direction=scene.motion.recorded_direction(),
+        stage_direction=(1.0, 0.0, 0.0) if isinstance(motion, Platform) else motion.recorded_direction(),
+        T_platform_sensor=tuple(map(tuple, motion.mount.matrix().tolist())) if isinstance(motion, Platform) else None,
         saturation_dn=sensor.detector.full_scale_dn(),
         target=scene.target,
         artefact=scene.artefact,
@@ -558,8 +623,9 @@ def record_scene(
         "seed": studio.options.seed,
         "spp": studio.options.spp,
     }
+    known = isinstance(motion, Platform) and motion.states_covariance
     lines = studio.peak_finder is not None
-    kinds = {"centre_lines": lines, "moving": studio.speed_mm_per_s() != 0}
+    kinds = {"centre_lines": lines, "moving": studio.speed_mm_per_s() != 0, "covariances": known}
     files = {"overwrite": overwrite, "resume": resume}
     with CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer:
         done = len(writer)
@@ -569,6 +635,8 @@ def record_scene(
                 writer.append(studio.frame(shot, index))
             if progress is not None:
                 progress(index + 1, len(shots))
+        if report is not None:
+            write_trajectory(trajectory_path(path), Trajectory(*report), overwrite=overwrite or resume)
         described = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))
-        truth = truth_of_recording(studio, truths, first=shots[0])
+        truth = truth_of_recording(studio, truths, shots)
         write_truth(truth_path(path), described, truth, overwrite=overwrite or resume)

@@ -8,7 +8,9 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from twin.scene.description import Block, Motion, Printed, Scene, altered, load_scene
+from twin.scene.description import Block, Printed, Scene, altered, load_scene
+from twin.scene.motion import Motion
+from twin.scene.platforms import Platform
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, load_sensor, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Sensor
@@ -124,9 +126,9 @@ def _take(recording: CampaignRecording, place: str | None, medium: str | None, d
         turned = {"stripe_along": recording.stripe_along}
         sensor, built = altered(sensor, camera=turned), altered(built, camera=turned)
     # A calibration keeps all its images, and a scan at least a few profiles.
-    scan = scene.target is None and scene.motion.count >= 5 * every
-    if scan and every > 1:
-        scene = _with_motion(scene, step_mm=scene.motion.step_mm * every, count=-(-scene.motion.count // every))
+    stage = scene.motion
+    if isinstance(stage, Motion) and scene.target is None and stage.count >= 5 * every and every > 1:
+        scene = _with_motion(scene, step_mm=stage.step_mm * every, count=-(-stage.count // every))
     rng = np.random.default_rng([drawn.seed, *name.encode()])
     if not recording.as_described:
         scene = drawn.as_it_really_is(scene, rng)
@@ -135,7 +137,7 @@ def _take(recording: CampaignRecording, place: str | None, medium: str | None, d
 
 
 def _with_motion(scene: Scene, **changes: object) -> Scene:
-    motion = validated(Motion, scene.motion.model_dump() | changes, scene.title)
+    motion = validated(type(scene.motion), scene.motion.model_dump() | changes, scene.title)
     return scene.model_copy(update={"motion": motion})
 
 
@@ -180,6 +182,10 @@ class _Drawn:
             number = _lower_block(scene)
             x, y, z = objects[number].position_mm
             objects[number] = altered(objects[number], position_mm=(x, y, z + self._lower_step))
+        scene = altered(scene, objects=tuple(objects))
+        if isinstance(motion, Platform):
+            # Platforms know their own errors.
+            return _with_motion(scene, errors_seed=int(rng.integers(2**31)))
         positions = np.array([motion.start_mm + index * motion.step_mm for index in range(motion.count)])
         errors = self._lead * positions + size.stage_position_std_mm * rng.standard_normal(motion.count)
         angles = self._scan_angles
@@ -187,7 +193,7 @@ class _Drawn:
             # The sensor is mounted anew before the target.
             angles = size.stage_misalignment_std_deg * rng.standard_normal(2)
         return _with_motion(
-            altered(scene, objects=tuple(objects)),
+            scene,
             direction=_turned_slightly(motion.unit_direction(), angles),
             nominal_direction=motion.recorded_direction(),
             position_errors_mm=tuple(errors.tolist()),

@@ -1,33 +1,27 @@
-"""Description of a virtual scene: objects, their poses, and the motion of the stage that scans them.
+"""Description of a virtual scene: objects and their poses, and the motion of the sensor that scans them.
 
 Scene coordinates are the sensor's object coordinate system (OCS) at stage position 0: X normal to the sheet, the
 direction of a scan; Y along the stripe; Z along the laser's axis away from the sensor; the origin is the stand-off.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
-from scipy.spatial.transform import Rotation
+from pydantic import BeforeValidator, Discriminator, Field, SerializeAsAny, Tag, model_validator
 
+from twin.scene.forms import AnyForm
+from twin.scene.motion import Motion
+from twin.scene.placed import Flat, Placed, Pose, Reflectance
+from twin.scene.platforms import IdealPath, LinearGuide, Platform, Robot, RotaryTable, Vehicle
 from uwlts.model.errors import DescriptionError
 from uwlts.model.library import find, read_table, validated
-from uwlts.model.sensor import Bracket, Description, NotNegative, Positive, Table, Vector
+from uwlts.model.sensor import Description, NotNegative, Positive, Table
 from uwlts.targets import CircleTarget, Target, parse_target
 
 Kind = TypeVar("Kind", bound=Description)
-Reflectance = Annotated[float, Field(ge=0, le=1)]
-Light = Literal["lamp", "laser", "day"]
-Finish = Literal["diffuse", "painted", "pvc", "metal"]
-
-TYPICAL_ALPHA = {"diffuse": 1.0, "painted": 0.3, "pvc": 0.15, "metal": 0.3}
-"""GGX roughness: a satin paint, an extruded pipe, ground steel."""
-TYPICAL_ROUGHNESS_UM = {"diffuse": 5.0, "painted": 5.0, "pvc": 5.0, "metal": 1.0}
-"""Rms heights in um. Light out of a diffuse body has run through some um of it, whatever its surface."""
 
 
 def altered(described: Kind, **changes: object) -> Kind:
@@ -41,84 +35,6 @@ def altered(described: Kind, **changes: object) -> Kind:
             for name, change in changes.items()
         }
     )
-
-
-class Pose(Description):
-    """Placement of an object: rotated about the scene's X, then Y, then Z axis, then moved."""
-
-    position_mm: Vector = (0.0, 0.0, 0.0)
-    rotation_deg: Vector = (0.0, 0.0, 0.0)
-
-    def matrix(self) -> np.ndarray:
-        """Rigid transform (4, 4) from the object's own frame to the parent's."""
-        transform = np.eye(4)
-        transform[:3, :3] = Rotation.from_euler("xyz", self.rotation_deg, degrees=True).as_matrix()
-        transform[:3, 3] = self.position_mm
-        return transform
-
-
-class Placed(Pose):
-    """Base of all objects: a pose and a finish.
-
-    ``finish`` says how the surface reflects: "diffuse" as Lambert's law says; "painted" and "pvc" as a diffuse body
-    under a clear, slightly rough coat; "metal" as rough steel. ``reflectance`` is the diffuse reflectance, that of the
-    body under a coat, and scales the reflection of a metal. The grey values (0 to 1) of picture ``texture`` multiply
-    it, laid out by the shape's own uv coordinates with the picture's last row at v = 0; a relative path starts at the
-    scene's folder. ``alpha`` is the GGX roughness of coat or metal (Walter et al. 2007), ``roughness_um`` the surface's
-    rms height.
-    """
-
-    reflectance: Reflectance = 0.8
-    finish: Finish = "diffuse"
-    alpha: Annotated[float, Field(ge=0.02, le=1)] | None = None
-    roughness_um: NotNegative | None = None
-    texture: str | None = None
-
-    _no_texture: ClassVar[str] = ""
-    """Reason for which objects of a class have no texture."""
-
-    @model_validator(mode="after")
-    def _has_what_its_finish_and_shape_take(self) -> Self:
-        if self.texture is not None and self._no_texture:
-            raise ValueError(f"texture {self.texture} {self._no_texture}")
-        if self.finish == "diffuse" and self.alpha is not None:
-            raise ValueError(f"alpha {self.alpha:g} roughens a gloss, but finish 'diffuse' has none: leave alpha out")
-        return self
-
-    def gloss_alpha(self) -> float:
-        """GGX roughness, the finish's usual one unless given."""
-        return TYPICAL_ALPHA[self.finish] if self.alpha is None else self.alpha
-
-    def rms_height_um(self) -> float:
-        """Rms height of the surface in um, the finish's usual one unless given."""
-        return TYPICAL_ROUGHNESS_UM[self.finish] if self.roughness_um is None else self.roughness_um
-
-    def mirror_share(self) -> float:
-        """Share of light that is reflected as by a plane mirror."""
-        return getattr(self, "mirror", 0.0)
-
-    def polarisation(self) -> float:
-        """Degree of polarisation of scattered laser light: 1 from a metal or mirror, 0 out of a diffuse body."""
-        return 1.0 if self.finish == "metal" or self.mirror_share() > 0 else 0.0
-
-
-class Flat(Placed):
-    """Base of objects with flat faces, which may be mirrors.
-
-    ``mirror`` is the share of light that the faces reflect as plane mirrors do, beside what they scatter: the weak
-    stripe on a mirror comes from a small ``reflectance``.
-    """
-
-    mirror: Reflectance = 0.0
-
-    @model_validator(mode="after")
-    def _reflects_at_most_all(self) -> "Flat":
-        if self.reflectance + self.mirror > 1:
-            both = f"reflectance {self.reflectance:g} and mirror {self.mirror:g}"
-            raise ValueError(f"{both} add up to more than all light: lower one of them")
-        if self.mirror > 0 and self.finish in ("painted", "pvc"):
-            raise ValueError(f"mirror {self.mirror:g} under a coat: a mirror's finish is 'diffuse' or 'metal'")
-        return self
 
 
 class Sphere(Placed):
@@ -157,105 +73,6 @@ class Mesh(Placed):
     kind: Literal["mesh"]
     path: str
     scale: Positive = 1.0
-
-
-class FreeForm(Placed):
-    """Base of free-form surfaces of a shape of their own. They have no uv coordinates for a texture."""
-
-    _no_texture: ClassVar[str] = "on a surface without uv coordinates: leave it out, or use a mesh"
-
-
-class Head(FreeForm):
-    """A dummy head with the stub of its neck, about its own origin; its face looks along -z, its crown lies at +y.
-
-    ``height_mm`` runs from the neck's cut to the crown.
-    """
-
-    kind: Literal["head"]
-    height_mm: Positive = 160.0
-
-
-class Weld(FreeForm):
-    """Rippled weld beads on the front of a plate in its own x-y plane, facing -z (towards the sensor).
-
-    The beads run along the plate's x or y axis (``along``), side by side, ``spacing_mm`` from middle to middle;
-    ``length_mm``, ``width_mm`` and ``height_mm`` are those of one bead, ``ripple_height_mm`` is that from trough to
-    crest. ``irregularity`` is how much width and height change on the way, as a share of them, and how far the path
-    and the ripples' places wander, in widths and pitches; ``seed`` chooses how. Grooves of ``undercut_depth_mm`` and
-    ``undercut_width_mm`` run along both toes of each bead.
-    """
-
-    kind: Literal["weld"]
-    plate_mm: tuple[Positive, Positive] = (80.0, 120.0)
-    beads: Annotated[int, Field(ge=1, le=100)] = 3
-    spacing_mm: Positive = 18.0
-    along: Literal["x", "y"] = "x"
-    length_mm: Positive = 56.0
-    width_mm: Positive = 10.0
-    height_mm: Positive = 2.0
-    ripple_pitch_mm: Positive = 3.0
-    ripple_height_mm: NotNegative = 0.25
-    irregularity: Annotated[float, Field(ge=0, le=0.3)] = 0.06
-    undercut_depth_mm: NotNegative = 0.0
-    undercut_width_mm: Positive = 1.5
-    seed: Annotated[int, Field(ge=0)] = 0
-
-    def bead_reach_mm(self) -> float:
-        """Largest distance that a bead reaches sideways from its straight middle line, irregularities included."""
-        groove = 0.5 * self.undercut_width_mm if self.undercut_depth_mm else 0.0
-        return self.width_mm * (0.5 + 1.5 * self.irregularity) + groove
-
-    @model_validator(mode="after")
-    def _beads_have_room(self) -> "Weld":
-        plate = self.plate_mm if self.along == "x" else self.plate_mm[::-1]
-        wide = (self.beads - 1) * self.spacing_mm + 2 * self.bead_reach_mm()
-        if self.length_mm < self.width_mm:
-            raise ValueError(f"a bead of length_mm {self.length_mm:g} is shorter than its width_mm {self.width_mm:g}")
-        if self.beads > 1 and self.spacing_mm < 2 * self.bead_reach_mm():
-            touching = f"lets beads touch that may be {2 * self.bead_reach_mm():g} mm wide"
-            raise ValueError(f"spacing_mm {self.spacing_mm:g} {touching}")
-        if self.length_mm > plate[0] or wide > plate[1]:
-            raise ValueError(
-                f"beads of {self.length_mm:g} mm along {self.along} and {wide:g} mm together across it do not fit on "
-                f"plate_mm {self.plate_mm[0]:g} x {self.plate_mm[1]:g}"
-            )
-        if self.ripple_height_mm > 2 * (1 - self.irregularity) * self.height_mm:
-            raise ValueError(
-                f"ripple_height_mm {self.ripple_height_mm:g} lets troughs dip into the plate under a bead of height_mm "
-                f"{self.height_mm:g}"
-            )
-        return self
-
-
-class PittedPipe(FreeForm):
-    """The outside of a corroded pipe, not quite round; its axis is its own x axis, its middle its origin.
-
-    The diameter along z is the largest, that square to it the smallest: ``ovality`` is their difference over
-    ``diameter_mm``, their mean. ``pits`` pits of ``pit_diameter_mm`` and ``pit_depth_mm`` lie within 60 deg of -z;
-    ``seed`` chooses where (`twin.scene.shapes.pit_places`).
-    """
-
-    kind: Literal["pitted_pipe"]
-    diameter_mm: Positive = 100.0
-    length_mm: Positive = 120.0
-    ovality: Annotated[float, Field(ge=0, le=0.2)] = 0.0
-    pits: Annotated[int, Field(ge=0, le=1000)] = 12
-    pit_diameter_mm: Positive = 10.0
-    pit_depth_mm: NotNegative = 2.0
-    seed: Annotated[int, Field(ge=0)] = 0
-
-    @model_validator(mode="after")
-    def _has_room_for_pits(self) -> Self:
-        if self.pit_diameter_mm > min(self.length_mm, self.diameter_mm / 2):
-            raise ValueError(
-                f"pit_diameter_mm {self.pit_diameter_mm:g} is more than length_mm {self.length_mm:g}, or than half of "
-                f"diameter_mm {self.diameter_mm:g}"
-            )
-        if self.pit_depth_mm > self.diameter_mm / 4:
-            raise ValueError(
-                f"pit_depth_mm {self.pit_depth_mm:g} is more than a quarter of diameter_mm {self.diameter_mm:g}"
-            )
-        return self
 
 
 class Printed(Placed, ABC):
@@ -367,83 +184,24 @@ class TargetPlate(Printed):
 
 
 AnyObject = Annotated[
-    Sphere | Plate | Block | Pipe | Mesh | Head | Weld | PittedPipe | CirclePlate | TargetPlate,
-    Field(discriminator="kind"),
+    Sphere | Plate | Block | Pipe | Mesh | CirclePlate | TargetPlate | AnyForm, Field(discriminator="kind")
 ]
 
 
-class Motion(Description):
-    """Stage positions of a scan: ``count`` of them from ``start_mm`` in steps of ``step_mm`` along ``direction``.
-
-    ``direction`` is where the stage truly carries the sensor; the capture records ``nominal_direction``. At every
-    position the images in ``lights`` are taken in turn, those with the laser at every multiple of its exposure in
-    ``bracket``. ``position_errors_mm`` is how much farther than recorded the stage truly stands at each position, 0
-    unless given. ``speed_mm_per_s`` is how fast the stage moves along
-    ``direction`` while an image is exposed; at 0 it stands still.
-    """
-
-    start_mm: float = 0.0
-    step_mm: float = 1.0
-    count: Annotated[int, Field(ge=1, le=100000)] = 1
-    direction: Vector = (1.0, 0.0, 0.0)
-    nominal_direction: Vector | None = None
-    position_errors_mm: tuple[float, ...] = ()
-    lights: tuple[Literal["lamp", "laser"], ...] = ("laser",)
-    bracket: Bracket = (1.0,)
-    speed_mm_per_s: NotNegative = 0.0
-
-    @model_validator(mode="after")
-    def _has_direction(self) -> "Motion":
-        for vector in (self.direction, self.nominal_direction):
-            if vector is not None and np.linalg.norm(vector) < 1e-9:
-                raise ValueError(f"direction {vector} has no length")
-        if self.position_errors_mm and len(self.position_errors_mm) != self.count:
-            raise ValueError(f"position_errors_mm has {len(self.position_errors_mm)} values for {self.count} positions")
-        if not self.lights:
-            raise ValueError("lights is empty: name 'lamp', 'laser' or both")
-        if self.speed_mm_per_s > 0 and self.images() > self.count:
-            raise ValueError(
-                "a moving stage takes one image at each position: name one light and no bracket, or stop with speed 0"
-            )
-        return self
-
-    def unit_direction(self) -> np.ndarray:
-        """True unit direction (3,) of the sensor's travel in the scene."""
-        return np.array(self.direction) / np.linalg.norm(self.direction)
-
-    def recorded_direction(self) -> tuple[float, float, float]:
-        """Unit direction that the capture states."""
-        vector = np.array(self.nominal_direction or self.direction)
-        x, y, z = (vector / np.linalg.norm(vector)).tolist()
-        return x, y, z
-
-    def shots(self) -> Iterator["Shot"]:
-        """Every image of the scan in its order."""
-        for index in range(self.count):
-            stage_mm = self.start_mm + index * self.step_mm
-            error = self.position_errors_mm[index] if self.position_errors_mm else 0.0
-            for light in self.lights:
-                for exposure in self.bracket if light == "laser" else (1.0,):
-                    yield Shot(stage_mm=stage_mm, travelled_mm=stage_mm + error, light=light, exposure=exposure)
-
-    def images(self) -> int:
-        """Number of images of the scan."""
-        laser = self.lights.count("laser")
-        return self.count * (len(self.lights) + laser * (len(self.bracket) - 1))
+def _kind_of_motion(motion: object) -> str:
+    return str(motion.get("kind", "") if isinstance(motion, Mapping) else getattr(motion, "kind", ""))
 
 
-@dataclass(frozen=True)
-class Shot:
-    """One image to take.
-
-    Recorded and true position of the stage in mm, the light that is on beside the day's, and the multiple of its
-    exposure.
-    """
-
-    stage_mm: float
-    travelled_mm: float
-    light: Light
-    exposure: float = 1.0
+AnyMotion = Annotated[
+    Annotated[Motion, Tag("")]
+    | Annotated[IdealPath, Tag("path")]
+    | Annotated[LinearGuide, Tag("linear_guide")]
+    | Annotated[RotaryTable, Tag("rotary_table")]
+    | Annotated[Robot, Tag("robot")]
+    | Annotated[Vehicle, Tag("vehicle")],
+    Discriminator(_kind_of_motion),
+]
+"""A stage's steps, or a platform that ``kind`` names."""
 
 
 class Scene(Description):
@@ -459,7 +217,7 @@ class Scene(Description):
     title: str
     medium: str = "water"
     water: str | Annotated[float, Field(ge=0, le=3)] | None = None
-    motion: Motion = Motion()
+    motion: AnyMotion = Motion()
     objects: Annotated[tuple[AnyObject, ...], Field(min_length=1)]
     placements: dict[str, Pose] = {"standoff": Pose()}
     placement: str = "standoff"
@@ -500,17 +258,19 @@ def load_scene(
     placement: str | None = None,
     medium: str | None = None,
     water: str | float | None = None,
-    motion: Motion | Mapping[str, object] | None = None,
+    motion: Motion | Platform | Mapping[str, object] | None = None,
 ) -> Scene:
     """Scene by name (``spheres``) or path, with what is given in place of its own; a motion may be a table."""
     path = find(name_or_path)
     table: dict[str, object] = dict(read_table(path))
-    motion = motion.model_dump() if isinstance(motion, Motion) else motion
+    motion = motion.model_dump() if isinstance(motion, Description) else motion
     given = {"placement": placement, "medium": medium, "water": water, "motion": motion}
     table |= {key: value for key, value in given.items() if value is not None}
     objects = table.get("objects", [])
     if not isinstance(objects, list) or not all(isinstance(thing, dict) for thing in objects):
         raise DescriptionError(f"{path}: objects must be written as [[objects]] tables")
+    if isinstance(moved := table.get("motion"), Mapping) and isinstance(moved.get("trajectory"), str):
+        table["motion"] = {**moved, "trajectory": str(path.parent / str(moved["trajectory"]))}
     table["objects"] = [_with_paths_from(path.parent, thing) for thing in objects]
     return validated(Scene, table, path)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, assert_never, cast
 
@@ -12,23 +12,10 @@ import numpy as np
 import trimesh
 
 from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
-from twin.scene.description import (
-    AnyObject,
-    Block,
-    CirclePlate,
-    FreeForm,
-    Head,
-    Mesh,
-    Pipe,
-    PittedPipe,
-    Plate,
-    Scene,
-    Sphere,
-    TargetPlate,
-    Weld,
-)
+from twin.scene.description import AnyObject, Block, CirclePlate, Mesh, Pipe, Plate, Scene, Sphere, TargetPlate
 from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, square_on
-from twin.scene.shapes import bowed_plate, head_surface, pitted_surface, weld_surface
+from twin.scene.forms.triangles import bowed_plate
+from twin.scene.placed import FreeForm
 from uwlts.model.errors import DescriptionError
 from uwlts.model.input_file import require_regular_file
 
@@ -182,7 +169,7 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
             matrix = _FACING_SENSOR @ _scaled(*(last - first) / 2, 1)
             matrix[:2, 3] = (first + last) / 2
             matrix, kind = pose @ matrix, "rectangle"
-        case Mesh() | Head() | Weld() | PittedPipe():
+        case Mesh() | FreeForm():
             return _mesh(thing, pose, mi.load_dict({"type": "twosided", "bsdf": bsdf}))
         case Plate():
             matrix, kind = pose @ _FACING_SENSOR @ _scaled(thing.width_mm / 2, thing.height_mm / 2, 1), "rectangle"
@@ -191,15 +178,13 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
     return mi.load_dict({"type": kind, "to_world": scalar_transform(matrix), "bsdf": bsdf})
 
 
-def _mesh(
-    thing: Mesh | Head | Weld | PittedPipe | CirclePlate | TargetPlate, pose: np.ndarray, bsdf: mi.BSDF
-) -> mi.Mesh:
+def _mesh(thing: Mesh | FreeForm | CirclePlate | TargetPlate, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
     """A surface of triangles with its vertices already in scene coordinates."""
     vertices, faces, uv = _surface(thing)
     vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
     properties = mi.Properties()
     properties["bsdf"] = bsdf
-    mesh = mi.Mesh(thing.kind, len(vertices), len(faces), properties, has_vertex_texcoords=uv is not None)
+    mesh = mi.Mesh(type(thing).__name__, len(vertices), len(faces), properties, has_vertex_texcoords=uv is not None)
     parameters = mi.traverse(mesh)
     parameters["vertex_positions"] = np.ravel(vertices).astype(np.float32)
     parameters["faces"] = np.ravel(faces).astype(np.uint32)
@@ -209,18 +194,11 @@ def _mesh(
     return mesh
 
 
-def _surface(
-    thing: Mesh | Head | Weld | PittedPipe | CirclePlate | TargetPlate,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _surface(thing: Mesh | FreeForm | CirclePlate | TargetPlate) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Vertices (V, 3) in the object's own frame, faces (F, 3) and, if it has them, texture coordinates (V, 2)."""
     match thing:
-        case Head():
-            return *head_surface(height_mm=thing.height_mm), None
-        case Weld():
-            # Frozen models are hashable, which type checkers do not see.
-            return *weld_surface(cast(Hashable, thing)), None
-        case PittedPipe():
-            return *pitted_surface(cast(Hashable, thing)), None
+        case FreeForm():
+            return *thing.surface(), None
         case CirclePlate() | TargetPlate():
             return bowed_plate(*thing.bounds_mm(), bow_mm=thing.bow_mm)
         case Mesh():
@@ -288,7 +266,7 @@ def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:
         case Plate():
             half = np.array([thing.width_mm, thing.height_mm]) / 2
             yield MirrorFace(pose @ _FACING_SENSOR, half, thing.mirror_share())
-        case Sphere() | Pipe() | Mesh() | Head() | Weld() | PittedPipe() | CirclePlate() | TargetPlate():
+        case Sphere() | Pipe() | Mesh() | CirclePlate() | TargetPlate() | FreeForm():
             raise NotImplementedError(f"a {thing.kind} has no flat face that could be a mirror")
         case _:
             assert_never(thing)

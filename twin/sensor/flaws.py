@@ -18,6 +18,11 @@ from uwlts.model.sensor import Camera, Sensor
 
 GLARE_REACH = 0.15
 """Distance over which glare falls to 1 / e, as a share of the image's width: assumed, as wide as a veil looks."""
+_SPOT_MM = 0.2, 3.0
+"""Diameters of spots on the window: silt and films that begin to foul, up to drops and fingerprints."""
+_CELLS_PER_SPOT = 4
+_DIRT_STREAM = 41
+"""Keeps the spots' random numbers apart from others of the same seed."""
 _CELLS_PER_REACH = 16
 """The veil is as smooth as its kernel: cells of a sixteenth of its reach show it to some 1e-3 of itself."""
 LASER_SHARES = {"red": 1.0, "green": 0.083, "blue": 0.008}
@@ -50,6 +55,46 @@ def vignette(camera: Camera, loss: float) -> np.ndarray:
     y, x = np.ogrid[: camera.height_px, : camera.width_px]
     squared = (x - cx) ** 2 + (y - cy) ** 2
     return (1 - loss * squared / squared.max()).astype(np.float32)
+
+
+def dirt(camera: Camera, share: float, *, seed: int) -> np.ndarray:
+    """Shares (H, W), float32, of the light that passes dirt on the window.
+
+    Opaque spots of 0.2 to 3 mm, as many of each size as cover the same area, cover a ``share`` of the window at random.
+    A pixel looks through a disc of the window, the pupil shrunk by the way to the focused plane, and loses the part of
+    it that is covered: 1 - share in the mean.
+    """
+    inner = camera.window.distance_mm
+    px_per_mm = camera.focal_length_px() / inner
+    focus = camera.focus_distance_mm
+    working = camera.f_number * (1 + camera.focal_length_mm / (focus - camera.focal_length_mm))
+    blur_px = 0.5 * camera.focal_length_mm / working * (1 - inner / focus) * px_per_mm
+    largest_px = 0.5 * _SPOT_MM[1] * px_per_mm
+    margin = math.ceil(blur_px + largest_px)
+    # Cells of which the smallest spot's radius has at least `_CELLS_PER_SPOT`.
+    fine = max(1, math.ceil(_CELLS_PER_SPOT / (0.5 * _SPOT_MM[0] * px_per_mm)))
+    height, width = (side + 2 * margin for side in (camera.height_px, camera.width_px))
+    rng = np.random.default_rng([seed, _DIRT_STREAM])
+    free = np.ones((height * fine, width * fine), np.float32)
+    # Random discs leave exp(-covered area / area) free (Chiu et al., Stochastic Geometry, 2013, Eq. 3.6).
+    left = -math.log1p(-share) * free.size
+    while left > 0:
+        radius = 0.5 * math.exp(rng.uniform(*np.log(_SPOT_MM))) * px_per_mm * fine
+        area = math.pi * radius**2
+        # Each logarithmic interval of sizes covers the same area; of the last spot so much as is left, in the mean.
+        for _ in range(rng.poisson((largest_px * fine / radius) ** 2)):
+            if left < rng.random() * area:
+                left = 0.0
+                break
+            centre = [round(16 * rng.uniform(-radius, side + radius)) for side in free.shape[::-1]]
+            # OpenCV fills the cells that a circle touches, half a cell beyond it.
+            cv2.circle(free, centre, max(1, round(16 * (radius - 0.5))), 0.0, -1, shift=4)
+            left -= area * free.size / math.prod(side + 2 * radius for side in free.shape)
+    free = cv2.resize(free, (width, height), interpolation=cv2.INTER_AREA)
+    reach = np.arange(-math.ceil(blur_px), math.ceil(blur_px) + 1)
+    disc = (np.hypot(reach[:, None], reach) <= max(blur_px, 0.5)).astype(np.float32)
+    free = fftconvolve(free, disc / disc.sum(), mode="same").astype(np.float32)
+    return np.clip(free[margin : margin + camera.height_px, margin : margin + camera.width_px], 0, 1)
 
 
 def veiled(light: np.ndarray, share: float) -> np.ndarray:

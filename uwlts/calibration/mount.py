@@ -13,15 +13,18 @@ from uwlts.calibration.mount_board import mount_by_board
 from uwlts.calibration.mount_model import Motion, MountState, Problem, Scatter
 from uwlts.calibration.mount_next_pose import axis_words, missing_turns, next_pose
 from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLine, find_arc, find_line
-from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere
+from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere, start_on_table
+from uwlts.model.any_calibration import check_fits
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound
 from uwlts.model.trajectory import Trajectory
+from uwlts.optics.reconstruction import reconstruct_profile
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture
-from uwlts.storage.mount_files import MountEvidence, read_mount_evidence
+from uwlts.storage.mount_files import SENSOR_AXES, MountEvidence, SensorAxis, read_mount_evidence
 from uwlts.storage.pose_files import PoseFormat, Unit, read_poses
+from uwlts.stripe import find_stripes
 
 _FEWEST_POSES = {"sphere": 5, "plane": 8}
 """Poses whose profiles have more numbers (three each, or two) than there are unknowns (nine or ten), with some over."""
@@ -50,6 +53,7 @@ def calibrate_mount(
     pose_format: PoseFormat = "matrix",
     profile_unit: Unit = "mm",
     pose_unit: Unit = "mm",
+    axis: SensorAxis | None = None,
     scale: bool = False,
     time: bool = False,
     profile_times_s: np.ndarray | None = None,
@@ -68,15 +72,20 @@ def calibrate_mount(
         One array for each pose: (N, 2) with x along the profile and z, or (N, 3) with x, y, z in the sensor's frame, in
         the order along the profile, mm, NaN where nothing was seen. Or a file or folder: a description (.toml) of
         everything, a folder of CSV files, or one CSV file with a column ``pose``, or a cloud of `uwlts.reconstruct`
-        whose frames are the poses. Or, with a ``calibration``, a capture whose images with the laser off show a target.
+        whose frames are the poses. Or, with a ``calibration``, a capture: of a target that its images with the laser
+        off show, else of an artefact that its laser images show.
     poses
         ``T_base_platform`` (P, 4, 4), mm, or a CSV file with one pose a line; not needed for a capture that holds them.
     artefact, radius_mm
         What is seen; the radius of the sphere where it is known.
     calibration
-        Of the sensor whose images of a target give the mount (`uwlts.calibration.mount_board`), held fixed.
+        Of the sensor that took the capture, held fixed. A target's images go to `uwlts.calibration.mount_board`.
     pose_format, profile_unit, pose_unit
         How files are to be read; see `uwlts.storage.pose_files.read_poses`.
+    axis
+        The platform is a rotary table whose axis is not known, and which turns the sphere: the direction of the
+        sensor's frame that is nearest to the axis about which its angles turn counter-clockwise. The mount then leads
+        to a frame whose z axis is the table's (`uwlts.storage.pose_files.read_poses`, format ``angle-deg``).
     scale
         Estimate by which factor the robot's lengths are too short.
     time
@@ -98,18 +107,22 @@ def calibrate_mount(
     >>> mount.transform(), mount.std()
     """
     if calibration is not None:
-        if not isinstance(profiles, str | Path) or radius_mm is not None or scale or time:
-            raise DescriptionError(
-                "a calibration goes with a capture that shows a target: give the capture's path, and no radius, scale "
-                "or time"
-            )
+        if not isinstance(profiles, str | Path):
+            raise DescriptionError("a calibration goes with a capture: give the capture's path")
         known = loaded_calibration(calibration)
         if not isinstance(known, Calibration):
             raise DescriptionError("a calibration by polynomials does not place a target: give one with a camera")
-        path = isinstance(poses, str | Path)
-        table = read_poses(poses, pose_format=pose_format, unit=pose_unit)[0] if path else poses
+        table, times = poses, pose_times_s
+        if isinstance(poses, str | Path):
+            table, times = read_poses(poses, pose_format=pose_format, unit=pose_unit)
+        assert not isinstance(table, str | Path)
         with Capture(profiles) as capture:
-            return mount_by_board([capture], known, table)
+            if capture.header.target is not None and not capture.laser_on.all():
+                if radius_mm is not None or scale or time or axis is not None:
+                    raise DescriptionError("the capture shows a target: give no radius, axis, scale or time")
+                return mount_by_board([capture], known, table)
+            profiles, table, profile_times_s, pose_times_s = profiles_of(capture, known, table, times)
+        poses = table
     evidence = read_mount_evidence(
         profiles,
         poses,
@@ -118,6 +131,7 @@ def calibrate_mount(
         pose_format=pose_format,
         profile_unit=profile_unit,
         pose_unit=pose_unit,
+        axis=axis,
         scale=scale,
         time=time,
         profile_times_s=profile_times_s,
@@ -127,6 +141,38 @@ def calibrate_mount(
         return _Calibration(evidence).result()
     except _NoFit as error:
         raise CalibrationError(f"{error}. {_advice(evidence)}") from error
+
+
+def profiles_of(
+    capture: Capture, calibration: Calibration, poses: np.ndarray | None, pose_times_s: np.ndarray | None
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray | None]:
+    """Profiles (N, 3) in the sensor's frame of all laser images, poses, and the times of both.
+
+    The poses are those given, else the capture's own.
+    """
+    check_fits(capture.header, calibration, source=capture.path.name)
+    if not capture.header.sensor.camera.window.mounted:
+        calibration = calibration.model_copy(update={"window": None})
+    stripes, laser = find_stripes(capture), np.flatnonzero(capture.laser_on)
+    points = reconstruct_profile(
+        calibration,
+        stripes.line,
+        stripes.centre_px,
+        medium_index=calibration.index_of(capture.header.medium),
+        stage_mm=0.0,
+        stage_direction=np.array([1.0, 0.0, 0.0]),
+    ).points_mm
+    profiles = [points[stripes.frame == frame] for frame in laser]
+    times = capture.time_s[laser]
+    if poses is not None:
+        return profiles, poses, times, pose_times_s
+    own = capture.pose[laser]
+    if missing := int(np.count_nonzero(~np.isfinite(own).all(axis=(1, 2)))):
+        raise DescriptionError(
+            f"{missing} of {len(laser)} laser images of {capture.path.name} have no pose of the platform: give a table "
+            "of poses, or import them"
+        )
+    return profiles, own, times, times
 
 
 class _NoFit(CalibrationError):
@@ -189,15 +235,17 @@ class _Calibration:
             self.evidence.radius_mm,
             self.evidence.scale,
             self.evidence.time,
+            self.evidence.axis is not None,
         )
         problem = whole.selected(kept, [p[m] for p, m in zip(self.profiles, members, strict=True)])
         arcs = [shape for shape in shapes if isinstance(shape, ProfileArc)]
         lines = [shape for shape in shapes if isinstance(shape, ProfileLine)]
-        state = (
-            start_of_sphere(problem, arcs, self.sheet, self.rng)
-            if self.sphere
-            else start_of_plane(problem, lines, self.sheet, self.rng)
-        )
+        if self.evidence.axis is not None:
+            state = start_on_table(problem, arcs, self.sheet, SENSOR_AXES[self.evidence.axis])
+        elif self.sphere:
+            state = start_of_sphere(problem, arcs, self.sheet, self.rng)
+        else:
+            state = start_of_plane(problem, lines, self.sheet, self.rng)
         misfit = misfits(problem, state)
         noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
         good = misfit < max(_LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
@@ -269,7 +317,7 @@ class _Calibration:
 
     def _summary(self, used: Problem, state: MountState, scatter: Scatter, members: list[np.ndarray]) -> Mount:
         information = used.information(state, scatter)
-        covariance = _inverse(information.sum(axis=0))
+        covariance = used.of_all(_inverse(information.sum(axis=0)))
         self._require_determined(used, state, scatter, covariance)
         held = _held_out(used, state, scatter, information)
         own, numbers = misfits(used, state), [n for n in range(len(members)) if n not in self.reasons]
@@ -315,6 +363,7 @@ class _Calibration:
             held_out_rms_mm=float(np.sqrt(weights @ held**2)),
             poses=tuple(poses),
             weaknesses=tuple(_weaknesses(used, state, covariance)),
+            table=used.table,
             next_pose=next_pose(used, state, scatter, self.sheet, [self.evidence.names[n] for n in numbers]),
             inputs=self.evidence.digests,
         )
@@ -446,7 +495,8 @@ def _coverage_factor(problem: Problem, state: MountState, scatter: Scatter, cova
     The share of the variances that the points' noise makes is known from very many points, the rest from the poses.
     """
     by_points = _inverse(problem.information(state, Scatter(scatter.point_mm, 0.0)).sum(axis=0))
-    share = min(float(np.mean(np.diag(by_points)[:6] / np.diag(covariance)[:6])), 1.0)
+    known = np.diag(covariance)[:6] > 0
+    share = min(float(np.mean(np.diag(problem.of_all(by_points))[:6][known] / np.diag(covariance)[:6][known])), 1.0)
     of_poses = max(problem.per_pose * len(problem.points) - problem.size, 1)
     of_points = max(int(problem.counts.sum()) - problem.per_pose * len(problem.points), 1)
     return float(t.ppf(0.975, 1 / (share**2 / of_points + (1 - share) ** 2 / of_poses)))
@@ -456,18 +506,20 @@ def _weaknesses(problem: Problem, state: MountState, covariance: np.ndarray) -> 
     """Directions that are known badly, and motions that are missing, in words."""
     lines = []
     variances, axes = np.linalg.eigh(covariance[:3, :3])
-    stds = np.sqrt(variances)
+    stds = np.sqrt(np.maximum(variances, 0.0))
     for std, axis in zip(stds, axes.T, strict=True):
-        if std > min(_WEAK * stds[0], _OPEN_MM) and std > 0.01:
+        if std > min(_WEAK * stds[int(problem.table)], _OPEN_MM) and std > 0.01:
             lines.append(f"the shift along {axis_words(axis)} is {_known(std, _OPEN_MM, 'mm')}")
     variances, axes = np.linalg.eigh(covariance[3:6, 3:6])
-    turns = np.sqrt(variances)
+    turns = np.sqrt(np.maximum(variances, 0.0))
     for std, axis in zip(turns, axes.T, strict=True):
-        if std > min(_WEAK * turns[0], _OPEN_RAD) and std > np.radians(0.005):
+        if std > min(_WEAK * turns[int(problem.table)], _OPEN_RAD) and std > np.radians(0.005):
             lines.append(
                 f"the turn about {axis_words(axis)} is {_known(np.degrees(std), np.degrees(_OPEN_RAD), 'deg')}: the "
                 "artefact stays at nearly the same place of the profile"
             )
+    if problem.table:
+        return lines
     return lines + missing_turns(Rotation.from_matrix(problem.motion(state.offset_s)[0]))
 
 

@@ -55,6 +55,9 @@ class Problem:
     radius_mm: float | None
     scale: bool = False
     time: bool = False
+    table: bool = False
+    """Whether the platform turns about its own z axis only, as a rotary table: shift along it and turn about it change
+    nothing, and are no parameters."""
 
     @cached_property
     def counts(self) -> np.ndarray:
@@ -72,7 +75,17 @@ class Problem:
     @property
     def size(self) -> int:
         """Number of parameters."""
-        return 9 + (self.sphere and self.radius_mm is None) + self.scale + self.time
+        return self.free.shape[1]
+
+    @cached_property
+    def free(self) -> np.ndarray:
+        """Steps (K, size) of all K values by the parameters."""
+        every = np.eye(9 + (self.sphere and self.radius_mm is None) + self.scale + self.time)
+        return np.delete(every, (2, 5), axis=1) if self.table else every
+
+    def of_all(self, covariance: np.ndarray) -> np.ndarray:
+        """Covariance (K, K) of all values from that of the parameters: 0 for what is none."""
+        return self.free @ covariance @ self.free.T
 
     @property
     def per_pose(self) -> int:
@@ -95,6 +108,7 @@ class Problem:
 
     def stepped(self, state: MountState, step: np.ndarray) -> MountState:
         """The state after a step of the parameters."""
+        step = self.free @ step
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ state.rotation
         if self.sphere:
             radius = state.artefact[3] + (step[9] if self.radius_mm is None else 0.0)
@@ -137,6 +151,10 @@ class Problem:
 
     def derivatives(self, state: MountState) -> np.ndarray:
         """Derivatives (N, size) of the distances at a state by the parameters."""
+        return self._derivatives(state) @ self.free
+
+    def _derivatives(self, state: MountState) -> np.ndarray:
+        """Derivatives (N, K) by all values."""
         rotations, positions = self.motion(state.offset_s)
         turned, base = self._all @ state.rotation.T, self._base(state)
         if self.sphere:
@@ -222,9 +240,9 @@ class Problem:
         whitened = self.whitening(state, scatter)
 
         def jacobian(step: np.ndarray) -> np.ndarray:
-            derivatives = self.derivatives(self.stepped(state, step))
-            derivatives[:, 3:6] = derivatives[:, 3:6] @ _left_jacobian(step[3:6])
-            return whitened(derivatives)
+            derivatives = self._derivatives(self.stepped(state, step))
+            derivatives[:, 3:6] = derivatives[:, 3:6] @ _left_jacobian((self.free @ step)[3:6])
+            return whitened(derivatives @ self.free)
 
         def misfit(step: np.ndarray) -> np.ndarray:
             off = self.distances(state, step)

@@ -23,9 +23,12 @@ def next_pose(
 ) -> NextPose | None:
     """The best of turns by 30 deg about each axis of the platform, with the artefact at several places of the profile.
 
-    None where the plane would be too steep in all of them. Judged by the standard uncertainty of a point in the middle
-    of all points seen. ``sheet`` (4, 4) maps the sheet's frame to the sensor's; ``names`` are those of the poses.
+    None on a rotary table, or where the plane would be too steep in all of them. Judged by the standard uncertainty of
+    a point in the middle of all points seen. ``sheet`` (4, 4) maps the sheet's frame to the sensor's; ``names`` are
+    those of the poses.
     """
+    if problem.table:
+        return None
     rotations, positions = problem.motion(state.offset_s)
     every = Rotation.from_matrix(rotations)
     nearest = int(np.argmin((every.mean().inv() * every).magnitude()))

@@ -1,5 +1,7 @@
 """Start values of a mount: in closed form from the circles of a sphere, or by search from the lines of a plane."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -14,6 +16,7 @@ _TURNS, _TURNS_TRIED = 5000, 10
 """Rotations tried for a plane, some 12 deg apart, and how many of the best are refined."""
 _RADII = (1.02, 1.15, 1.5)
 """Radius of an unknown sphere over that of its largest section."""
+_REWEIGHTED = 10
 _ROUGH = Scatter(point_mm=0.1, pose_mm=0.3, turn_rad=3e-3)
 """Scatter for the weights of the search, whose robust loss begins beyond it."""
 
@@ -44,6 +47,46 @@ def start_of_sphere(
     found.sort(key=lambda each: each[0])
     rough = problem.thinned(_THINNED)
     return _best(rough, [_in_sensor_frame(state, sheet) for _, state in found[:_TRIED]])
+
+
+def start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, towards: np.ndarray) -> MountState:
+    """State near the solution from the arcs of a sphere on a rotary table; ``sheet`` as in `start_of_sphere`.
+
+    At angle h the sphere's centre is q + a cos h + b sin h in the sensor's frame, linear in the six coordinates in the
+    sheet. As a and b have the same length and are square to each other, their parts across it are the complex root
+    a_y + i b_y = +-sqrt(|b|^2 - |a|^2 - 2 i a.b), with both lengths and the product those in the sheet. The two
+    solutions mirror each other in the sheet and fit profiles alike: that one is taken whose axis, about which the
+    sphere turns by the angles, points along ``towards`` (3,) of the sensor's frame.
+    """
+    rotations, positions = problem.motion(0.0)
+    angles = -Rotation.from_matrix(rotations[0].T @ rotations).as_rotvec()[:, 2]
+    centres, radii = np.array([arc.centre_mm for arc in arcs]), np.array([arc.radius_mm for arc in arcs])
+    design = np.column_stack([np.ones(len(arcs)), np.cos(angles), np.sin(angles)])
+    weights, flat = np.ones(len(arcs)), np.zeros((3, 2))
+    for _ in range(_REWEIGHTED):
+        flat = np.linalg.lstsq(design * weights[:, None], centres * weights[:, None], rcond=None)[0]
+        off = np.linalg.norm(centres - design @ flat, axis=1)
+        # Cauchy's weights.
+        weights = 1 / np.sqrt(1 + (off / max(2 * float(np.median(off)), 1e-6)) ** 2)
+    largest, states = float(np.quantile(radii, 0.9)), []
+    root = np.sqrt(complex(flat[2] @ flat[2] - flat[1] @ flat[1], -2 * flat[1] @ flat[2]))
+    for radius in [problem.radius_mm] if problem.radius_mm else [share * largest for share in _RADII]:
+        depth = np.sqrt(np.maximum(radius**2 - radii**2, 0))
+        for across in (root, -root):
+            moving = np.cos(angles) * across.real + np.sin(angles) * across.imag
+            tried = np.concatenate([depth - moving, -depth - moving])
+            middle = tried[np.argmin(np.median(np.abs(np.abs(tried[:, None] + moving) - depth), axis=1))]
+            q, a, b = (np.array([u, y, w]) for (u, w), y in zip(flat, (middle, across.real, across.imag), strict=True))
+            axis = np.cross(a, b)
+            if axis @ (sheet[:3, :3].T @ towards) <= 0:
+                continue
+            turn = Rotation.align_vectors([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [a, b, axis / np.linalg.norm(a)])[0]
+            rotation = turn.as_matrix()
+            height, reach = float(rotation[2] @ q), float(np.sqrt(np.linalg.norm(axis)))
+            translation = np.array([0.0, 0.0, height]) - rotation @ q
+            place = rotations[0] @ np.array([reach, 0.0, height]) + positions[0]
+            states.append(MountState(rotation, translation, np.append(place, radius)))
+    return _best(problem.thinned(_THINNED), [_in_sensor_frame(state, sheet) for state in states])
 
 
 def _linear_solutions(
@@ -134,7 +177,7 @@ def _in_space(flat: np.ndarray) -> np.ndarray:
 
 def _best(rough: Problem, states: list[MountState]) -> MountState:
     """The state of smallest median distance after a robust refinement from each, scale and time left as they are."""
-    fixed = Problem(rough.points, rough.motion, rough.across, rough.sphere, rough.radius_mm)
+    fixed = replace(rough, scale=False, time=False)
     refined = [fixed.solved(state, _ROUGH, loss="cauchy") for state in states]
     return min(refined, key=lambda state: float(np.median(misfits(fixed, state))))
 

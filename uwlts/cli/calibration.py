@@ -201,12 +201,13 @@ def mount(
     pose_format: str = "matrix",
     profile_unit: Literal["mm", "m"] = "mm",
     pose_unit: Literal["mm", "m"] = "mm",
+    axis: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
     scale: Flag = False,
     time: Flag = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Calibrate the mount of any laser profiler on a robot or stage, from its profiles of a sphere or plane; or that of
-    a calibrated sensor, from its images of a target.
+    a calibrated sensor, from a capture of one of them or of a target; or the axis of a rotary table.
 
     The artefact stands still at an unknown place. Prints the transform from the sensor to the platform with its
     uncertainty, the poses that were left out, what the motions determine badly, and the pose to add next.
@@ -216,17 +217,19 @@ def mount(
     Args:
         profiles: Folder with one CSV file (columns x and z) for each pose, one CSV file with a column pose, a cloud
             whose frames are the poses, or a description of everything (.toml; docs/how-to/calibrate-a-mount.md). With
-            a calibration, a capture whose images with the laser off show a target.
+            a calibration, a capture of the artefact, or of a target that images with the laser off show.
         poses: CSV file with the pose of the platform in the base frame for each profile, or image of the target;
             those of the capture unless given.
         out: Mount to write (JSON).
         artefact: What the profiles show.
         radius_mm: Radius of the sphere; estimated unless given.
-        calibration: Calibration of the sensor whose images of a target give the mount.
+        calibration: Calibration of the sensor that took the capture.
         pose_format: matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about the moved
-            axes), euler-zyx-deg (about the fixed axes) or another order, -rad for radians.
+            axes), euler-zyx-deg (about the fixed axes) or another order, -rad for radians; angle-deg of a rotary table.
         profile_unit: Unit of the profiles.
         pose_unit: Unit of the positions.
+        axis: The sphere stands on a rotary table whose axis is not known: direction in the sensor's frame nearest to
+            the axis about which angles turn it counter-clockwise.
         scale: Estimate the robot's scale too.
         time: Estimate the offset to add to the profiles' times (columns time_s; the poses are a trajectory).
     """
@@ -242,6 +245,7 @@ def mount(
         pose_format=pose_format,
         profile_unit=profile_unit,
         pose_unit=pose_unit,
+        axis=axis,
         scale=scale,
         time=time,
     )

@@ -1,12 +1,16 @@
 """Commands that record and measure, from scans to evaluated point clouds, and commands about sensors and files."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
 
 import uwlts
 from uwlts.cli.options import (
     CalibrationOut,
+    Files,
     Flag,
     Index,
     Method,
@@ -19,8 +23,12 @@ from uwlts.cli.options import (
     stripe_settings,
     warn,
 )
+from uwlts.model.errors import OutputError
 from uwlts.runtime.console import progress_bar
 from uwlts.storage.files import refuse_unsuitable, written_aside
+
+Direction = tuple[float, float, float]
+Box = tuple[Direction, Direction]
 
 
 @app.command
@@ -147,10 +155,11 @@ def reconstruct(
     pose_format: str = "matrix",
     pose_unit: Literal["mm", "m"] = "mm",
     clock_offset_s: float | None = None,
+    pose_correlation_s: float | None = None,
     index: Index = None,
     method: Method = None,
     stripe: Stripe = (),
-    peak: Literal["strongest", "first", "last"] | None = None,
+    peak: Literal["direct", "strongest", "first", "last"] | None = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Turn a capture into a point cloud.
@@ -162,8 +171,8 @@ def reconstruct(
         calibration: Calibration of the sensor, or one by polynomials.
         out: Cloud to write, PLY or by its ending HDF5 (.h5), with intensity, frame and line of every point, and from a
             joint calibration its uncertainty.
-        mount: Where the sensor is on its platform (uwlts mount). Poses are the platform's then, and points are given in
-            the frame of the poses.
+        mount: Where the sensor is on its platform (uwlts mount), in place of what the capture states. Poses are the
+            platform's then, and points are given in the frame of the poses.
         trajectory: CSV file or ROS bag with times and poses of the platform (of the sensor without a mount), which
             replace poses in the capture and the stage.
         pose_format: Format of the trajectory: matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg,
@@ -172,7 +181,9 @@ def reconstruct(
         pose_unit: Unit of the trajectory's positions.
         clock_offset_s: What to add to the times of the images for those of the trajectory; as the mount says unless
             given.
-        peak: Which of several stripes on a line counts; the strongest, or as the sensor's table [stripe] says.
+        pose_correlation_s: Time over which errors of poses stay alike, inf where all err together. Unless given, poses
+            in the capture err each by itself, and those of a trajectory as a navigation filter's of its covariances.
+        peak: Which of several stripes on a line counts; the direct one, or as the sensor's table [stripe] says.
     """
     refuse_unsuitable(out, overwrite=overwrite)
     known = uwlts.load_calibration(calibration)
@@ -184,6 +195,7 @@ def reconstruct(
             mount=mount,
             trajectory=path,
             clock_offset_s=clock_offset_s,
+            pose_correlation_s=pose_correlation_s,
             stripe=stripe_settings(stripe, method, peak),
             index=index,
             progress=progress,
@@ -239,26 +251,29 @@ def evaluate(
 @app.command
 def compare(
     cloud: Path,
-    reference: Path,
+    reference: str,
     *,
     out: Path,
     coloured: Path | None = None,
     register: Flag = False,
+    datums: Path | None = None,
     disc_mm: float | None = None,
     deep_mm: float | None = None,
     unit: Literal["mm", "m"] = "mm",
     overwrite: Overwrite = False,
 ) -> None:
-    """Find where a surface differs from an earlier cloud or a mesh by more than the uncertainty.
+    """Find where a surface differs from an earlier cloud, a mesh or an ideal shape by more than the uncertainty.
 
     Example: uwlts compare after.ply before.ply --out change.html
 
     Args:
         cloud: Cloud of the surface (.ply or .h5).
-        reference: Earlier cloud, or a mesh (.stl, .obj, .off, or .ply with faces).
+        reference: Earlier cloud; a mesh (.stl, .obj, .off, or .ply with faces); or an ideal shape: plane, sphere or
+            cylinder to fit one, or a TOML file with its kind and what is known of it (docs/how-to/compare-scans.md).
         out: Page to write, with the figures as JSON beside it.
-        coloured: Also write the places with distance, level of detection and significance to this PLY file.
+        coloured: Also write the places with distance, level of detection and significance to this PLY or LAZ file.
         register: Move the cloud onto the reference first; else both have one frame.
+        datums: TOML file with spheres that hold what has not changed; only points in them count for the registration.
         disc_mm: Diameter over which points are averaged; about 30 points unless given.
         deep_mm: Largest distance that is looked for; three diameters unless given.
         unit: Unit of the reference.
@@ -268,11 +283,262 @@ def compare(
     refuse_unsuitable_page(out, example="change.html", overwrite=overwrite)
     if coloured:
         refuse_unsuitable(coloured, overwrite=overwrite)
-    change = uwlts.compare_clouds(cloud, reference, register=register, disc_mm=disc_mm, deep_mm=deep_mm, unit=unit)
+    change = uwlts.compare_clouds(
+        cloud, reference, register=register, datums=datums, disc_mm=disc_mm, deep_mm=deep_mm, unit=unit
+    )
     show(change.lines())
-    title = f"{cloud.name} against {reference.name}"
+    title = f"{cloud.name} against {Path(reference).name}"
     uwlts.write_change(out, change, title=title, coloured=coloured, overwrite=overwrite)
     print(f"wrote {out} and {out.with_suffix('.json').name}")
+
+
+@app.command
+def mesh(
+    *clouds: Path,
+    out: Path,
+    cube_mm: float | None = None,
+    radius_mm: float | None = None,
+    towards: Annotated[tuple[Direction, ...] | None, Parameter(negative="")] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Make a mesh from one or several clouds of one frame, open where nothing was seen, with uncertainty.
+
+    Example: uwlts mesh left.ply right.ply --out pipe.glb
+
+    Args:
+        clouds: Clouds (.ply or .h5); the scans of a merged cloud count on their own.
+        out: Mesh to write: .ply (with the uncertainty of every vertex), .glb (glTF, m) or .stl.
+        cube_mm: Edge of the cubes; walls need to be thicker. A third of the radius, or two thirds of the thinnest wall,
+            unless given.
+        radius_mm: Radius over which points are averaged; holes that are much smaller are closed. For some thirty points
+            and three images unless given.
+        towards: Direction x y z from the surface to the sensor, once for each cloud; -Z of its scan unless given.
+    """
+    from uwlts.storage.mesh_file import MESH_FORMATS
+
+    if out.suffix.lower() not in MESH_FORMATS:
+        raise OutputError(f"{out} ends with none of {', '.join(MESH_FORMATS)}, which name the format of a mesh")
+    refuse_unsuitable(out, overwrite=overwrite)
+    with progress_bar("meshing") as progress:
+        surface = uwlts.mesh(*clouds, cube_mm=cube_mm, radius_mm=radius_mm, towards=towards, progress=progress)
+    show(surface.lines())
+    uwlts.write_mesh(out, surface, overwrite=overwrite)
+    print(f"wrote {out}")
+
+
+@app.command
+def inspect(
+    cloud: Path,
+    kind: Literal["pipe", "weld", "step", "flange", "gap"] = "pipe",
+    *,
+    out: Path | None = None,
+    coloured: Path | None = None,
+    section_mm: float | None = None,
+    wall_mm: float | None = None,
+    false_alarm: float = 0.05,
+    datum: Path | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Find the features of a pipe, weld, step, flange or gap in a cloud and measure them, with uncertainty.
+
+    Example: uwlts inspect pipe.ply --wall-mm 9.5 --out pipe.json
+
+    Args:
+        cloud: Cloud of the object (.ply or .h5).
+        kind: What the cloud shows.
+        out: Findings to write (JSON), each value with its definition and its source.
+        coloured: Also write the cloud with each point's distance from the undamaged surface to this file.
+        section_mm: Length of a section along a pipe (up to twelve unless given) or a weld.
+        wall_mm: Thickness of a pipe's undamaged wall, for the wall that remains.
+        false_alarm: Probability that anything is found on the whole of a pipe's surface where nothing is.
+        datum: Cloud of another face in the same frame, to which a flange's face is to be parallel.
+    """
+    from uwlts.storage.json_files import json_text
+
+    for path in (out, coloured):
+        if path:
+            refuse_unsuitable(path, overwrite=overwrite)
+    measured = uwlts.read_cloud(cloud)
+    found = uwlts.inspect(measured, kind, section_mm=section_mm, wall_mm=wall_mm, false_alarm=false_alarm, datum=datum)
+    show(found.lines())
+    if coloured:
+        uwlts.write_cloud(coloured, replace(measured, deviation_mm=found.deviation_mm), overwrite=overwrite)
+        print(f"wrote {coloured}")
+    if out:
+        with written_aside(out, overwrite=overwrite) as aside:
+            aside.write_text(json_text(found.record(), indent=1), encoding="utf-8")
+        print(f"wrote {out}")
+
+
+@app.command
+def findings_report(
+    cloud: Path,
+    kind: Literal["pipe", "weld", "step", "flange", "gap"] = "pipe",
+    *,
+    out: Path,
+    pdf: Flag = False,
+    title: str | None = None,
+    captures: Files = (),
+    calibration: Path | None = None,
+    certificate: Path | None = None,
+    section_mm: float | None = None,
+    wall_mm: float | None = None,
+    false_alarm: float = 0.05,
+    datum: Path | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Inspect a cloud and write the report for the object's owner: a page, the same as JSON, and as PDF.
+
+    Example: uwlts findings-report pipe.ply --wall-mm 9.5 --calibration water.json --out pipe.html --pdf
+
+    Args:
+        cloud: Cloud of the object.
+        kind: What the cloud shows.
+        out: Page to write, with the findings as JSON beside it.
+        pdf: Also print the page to a PDF beside it, with the Chromium or Chrome that is installed.
+        title: Title of the report.
+        captures: Captures that the cloud was reconstructed from, for the traceability.
+        calibration: Calibration of the sensor, the one that the cloud names.
+        certificate: Its certificate (JSON), whose seal is checked.
+        section_mm: Length of a section along a pipe (up to twelve unless given) or a weld.
+        wall_mm: Thickness of a pipe's undamaged wall, for the wall that remains.
+        false_alarm: Probability that anything is found on the whole of a pipe's surface where nothing is.
+        datum: Cloud of another face in the same frame, to which a flange's face is to be parallel.
+    """
+    found = uwlts.write_findings(
+        cloud,
+        kind,
+        out=out,
+        pdf=pdf,
+        title=title,
+        captures=captures,
+        calibration=calibration,
+        certificate=certificate,
+        section_mm=section_mm,
+        wall_mm=wall_mm,
+        false_alarm=false_alarm,
+        datum=datum,
+        overwrite=overwrite,
+    )
+    show(found.lines())
+    beside = [out.with_suffix(suffix).name for suffix in ((".json", ".pdf") if pdf else (".json",))]
+    print(f"wrote {out}, {', '.join(beside)}")
+
+
+@app.command
+def register(
+    *clouds: Path,
+    out: Path,
+    page: Path | None = None,
+    poses_out: Path | None = None,
+    poses: Path | None = None,
+    pose_format: str = "matrix",
+    pose_unit: Literal["mm", "m"] = "mm",
+    start_std_mm: float | None = None,
+    start_std_deg: float | None = None,
+    search: Flag = False,
+    sphere_mm: float | None = None,
+    reach_mm: float | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Bring scans that overlap into the frame of the first, and merge them into one cloud with its uncertainty.
+
+    Example: uwlts register top.ply left.ply right.ply --out pipe.ply --page pipe.html
+
+    Args:
+        clouds: Two or more clouds (.ply or .h5), in any order.
+        out: Merged cloud to write (.ply or .h5).
+        page: Page to write, with all figures, poses and their covariance as JSON beside it.
+        poses_out: Poses of the scans to write (CSV, matrix, mm).
+        poses: CSV file with the pose of every scan at the start, in the order of the clouds; the scans' frames are
+            taken as one unless given.
+        pose_format: Format of the poses: matrix, quaternion-xyzw, euler-ZYX-deg and others, as for uwlts reconstruct.
+        pose_unit: Unit of the poses' positions.
+        start_std_mm: Standard uncertainty of the start along each axis: it counts as evidence then.
+        start_std_deg: The same of its turns.
+        search: Search the start by the shape of the surfaces, or by spheres.
+        sphere_mm: Diameter of spheres in the scene that tie scans together.
+        reach_mm: How far overlapping surfaces lie apart at the start, at most; a 20th of a scan's size unless given.
+    """
+    from uwlts.report.page_toolkit import refuse_unsuitable_page
+
+    for path in (out, poses_out):
+        if path:
+            refuse_unsuitable(path, overwrite=overwrite)
+    if page:
+        refuse_unsuitable_page(page, example="registration.html", overwrite=overwrite)
+    start = None if poses is None else uwlts.read_poses(poses, pose_format=pose_format, unit=pose_unit)[0]
+    with progress_bar(f"registering {len(clouds)} scans") as progress:
+        found = uwlts.register(
+            clouds,
+            poses=start,
+            start_std_mm=start_std_mm,
+            start_std_deg=start_std_deg,
+            search=search,
+            sphere_mm=sphere_mm,
+            reach_mm=reach_mm,
+            progress=progress,
+        )
+    show(found.lines())
+    uwlts.write_cloud(out, found.cloud, overwrite=overwrite)
+    if poses_out:
+        uwlts.write_poses(poses_out, found.poses, overwrite=overwrite)
+    if page:
+        uwlts.write_registration(page, found, overwrite=overwrite)
+    written = [str(path) for path in (out, poses_out, page) if path]
+    print(f"wrote {', '.join(written)}")
+
+
+@app.command
+def align(
+    cloud: Path,
+    *,
+    trajectory: Path,
+    out: Path,
+    aligned: Path | None = None,
+    pose_format: str = "quaternion-xyzw",
+    pose_unit: Literal["mm", "m"] = "mm",
+    clock_offset_s: float = 0.0,
+    drift_mm: float | None = None,
+    drift_deg: float | None = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Correct a trajectory so that surfaces which the scan shows twice agree.
+
+    Reconstruct the scan along the corrected trajectory afterwards: its points then have the uncertainty that is left.
+
+    Example: uwlts align pass.ply --trajectory pass.trajectory.csv --drift-mm 300 --drift-deg 1 --out corrected.csv
+
+    Args:
+        cloud: Cloud along the trajectory with the times of its points (uwlts reconstruct --trajectory).
+        trajectory: CSV file or ROS bag with times and poses, as the cloud was reconstructed with.
+        out: Corrected trajectory to write, with the covariance of each pose (CSV), and the crossings as JSON beside it.
+        aligned: Also write the cloud along the corrected trajectory.
+        pose_format: Format of the trajectory, as for uwlts reconstruct.
+        pose_unit: Unit of the trajectory's positions.
+        clock_offset_s: What to add to the times of the points for those of the trajectory.
+        drift_mm: Standard uncertainty of the navigation at the end, along each axis; as the trajectory's covariance
+            says unless given.
+        drift_deg: The same of its turns.
+    """
+    from uwlts.storage.json_files import json_text
+
+    beside = out.with_suffix(".json")
+    for path in (out, beside, aligned):
+        if path:
+            refuse_unsuitable(path, overwrite=overwrite)
+    path = uwlts.read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
+    with progress_bar(f"aligning {cloud.name}") as progress:
+        found = uwlts.align_trajectory(
+            cloud, path, clock_offset_s=clock_offset_s, drift_mm=drift_mm, drift_deg=drift_deg, progress=progress
+        )
+    show(found.lines())
+    uwlts.write_trajectory(out, found.trajectory, overwrite=overwrite)
+    with written_aside(beside, overwrite=overwrite) as aside:
+        aside.write_text(json_text(found.record(), indent=1), encoding="utf-8")
+    if aligned:
+        uwlts.write_cloud(aligned, found.cloud, overwrite=overwrite)
+    print(f"wrote {out} and {beside.name}" + (f", {aligned}" if aligned else ""))
 
 
 @app.command
@@ -439,18 +705,30 @@ def import_images(folder: Path, *, out: Path, description: Path | None = None, o
 
 
 @app.command
-def export(file: Path, *, out: Path, images: Literal["png", "tiff"] = "png", overwrite: Flag = False) -> None:
+def export(
+    file: Path,
+    *,
+    out: Path,
+    images: Literal["png", "tiff"] = "png",
+    region_mm: Box | None = None,
+    at_most: int | None = None,
+    overwrite: Flag = False,
+) -> None:
     """Write a capture as a folder of images that `uwlts import` reads back, or a cloud in another format.
 
     Example: uwlts export scan.ply --out scan.laz
 
     Args:
-        file: Capture (.h5) or cloud (.ply or .h5).
-        out: New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz or
-            .e57.
+        file: Capture (.h5) or cloud (.ply, .h5 or .copc.laz).
+        out: New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
+            .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers, written a part at a time).
         images: Format of a capture's images; both keep all bits.
+        region_mm: Only the points in a box: x y z of one corner, x y z of the other.
+        at_most: Only an even sample of about so many points.
         overwrite: Replace an existing cloud.
     """
     with progress_bar(f"exporting {file.name}") as progress:
-        written = uwlts.export(file, out, images=images, overwrite=overwrite, progress=progress)
+        written = uwlts.export(
+            file, out, images=images, region_mm=region_mm, at_most=at_most, overwrite=overwrite, progress=progress
+        )
     print(f"wrote {written} images and import.toml to {out}" if out.is_dir() else f"wrote {out} with {written} points")

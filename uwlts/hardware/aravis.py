@@ -201,16 +201,13 @@ class AravisCamera(CameraDevice):
         if self._offers("Scan3dOutputMode"):
             mode = _text(self._call("get_string", b"Scan3dOutputMode"))
             require_uncalibrated(mode, self.address)
-        scale, offset, invalid = (
-            self._call("get_float", name.encode()) if self._offers(name) else usual
-            for name, usual in (
-                ("Scan3dCoordinateScale", 1.0),
-                ("Scan3dCoordinateOffset", 0.0),
-                ("Scan3dInvalidDataValue", None),
-            )
-        )
+
+        def number(name: str, usual: float) -> float:
+            return self._call("get_float", name.encode()) if self._offers(name) else usual
+
         marked = self._offers("Scan3dInvalidDataFlag") and self._call("get_boolean", b"Scan3dInvalidDataFlag")
-        return Coordinates(scale, offset, invalid if marked else None)
+        scale, offset = number("Scan3dCoordinateScale", 1.0), number("Scan3dCoordinateOffset", 0.0)
+        return Coordinates(scale, offset, number("Scan3dInvalidDataValue", 0.0) if marked else None)
 
     def _offers(self, name: str) -> bool:
         return bool(self._call("is_feature_available", name.encode()))

@@ -34,14 +34,14 @@ _PATIENCE_S = 3.0
 """Longest wait for a frame beyond its exposure."""
 _SLOW_REPORT = 2.0
 """Reports that took so many times as long as the fastest say less exactly when they were made."""
-_FEWEST_REPORTS = 3
+_FEWEST_REPORTS = 4
 _OUTLIER = 5.0
 _BUSY = 0.9
 """Share of the time between frames that an exposure may take."""
 
 
 @dataclass(frozen=True)
-class Placement:
+class FramePlaces:
     """How the frames of a continuous scan were placed.
 
     ``latency_s`` with its standard uncertainty, None where it was given; ``scatter_s`` is that of the reports about
@@ -103,7 +103,7 @@ def record_continuously(
     warn: Callable[[str], None],
     recorded: Callable[[Frame, int], None],
     counted: Callable[[Stripe], None],
-) -> Placement:
+) -> FramePlaces:
     """Record the passes of a plan; ``counted`` is called with the stripe of every frame. Errors as of `scan`."""
     positions, ways = plan.stage.positions_mm(), ways_of(plan, continuous, stage)
     rate_hz = continuous.speed_mm_per_s / abs(plan.stage.step_mm)
@@ -253,7 +253,7 @@ class _Reading:
 
     def place(
         self, continuous: Continuous, even: tuple[float, float], at_rest_mm: float, warn: Callable[[str], None]
-    ) -> Placement:
+    ) -> FramePlaces:
         """Give all frames their places; HardwareError where no stripe was seen, or the stage's reports do not fit.
 
         Between the positions ``even`` the speed is constant.
@@ -288,7 +288,7 @@ class _Reading:
         stage = stage + speed * latency_s
         reports = [(_time_of(each) - self._began_s, each.position_mm) for one in self._passes for each in one]
         self._writer.place(stage, speed, np.array(reports))
-        return Placement(latency_s, std_s, max(scatters), tuple(speeds))
+        return FramePlaces(latency_s, std_s, max(scatters), tuple(speeds))
 
     def _by_encoder(self, mm_per_count: float, at_rest_mm: float) -> np.ndarray:
         counts = np.array(self._encoders)
@@ -319,18 +319,27 @@ class _Line:
 
 def _line_through(reports: list[StageReport]) -> _Line:
     """The line through reports of a pass at constant speed, late ones left out; HardwareError where it is not."""
-    quick = min((each.answered_s - each.asked_s for each in reports), default=0.0)
-    used = [each for each in reports if each.answered_s - each.asked_s <= _SLOW_REPORT * quick + 1e-3]
-    if len(used) < _FEWEST_REPORTS:
+    if len(reports) < _FEWEST_REPORTS:
         raise HardwareError(
-            f"the stage reported {len(used)} positions within a pass, {_FEWEST_REPORTS} are needed: travel more "
-            "slowly, or scan a longer way"
+            f"the stage reported {len(reports)} positions at constant speed within a pass, {_FEWEST_REPORTS} are "
+            "needed: travel more slowly, or scan a longer way"
         )
+    # The fastest half counts in any case.
+    took = np.sort([each.answered_s - each.asked_s for each in reports])
+    longest = max(_SLOW_REPORT * took[0], took[max(len(reports) // 2, _FEWEST_REPORTS - 1)])
+    used = [each for each in reports if each.answered_s - each.asked_s <= longest]
     times, places = np.array([_time_of(each) for each in used]), np.array([each.position_mm for each in used])
     middle, kept = times.mean(), np.ones(len(used), bool)
-    for _ in range(3):
+
+    def fitted() -> tuple[float, float, np.ndarray]:
         speed, start = np.polyfit(times[kept] - middle, places[kept], 1)
-        away = places - (start + speed * (times - middle))
+        return float(speed), float(start), places - (start + speed * (times - middle))
+
+    speed, start, away = fitted()
+    for _ in range(2):
         scatter = max(MAD_TO_STD * float(np.median(np.abs(away))), 1e-6)
         kept = np.abs(away) <= _OUTLIER * scatter
-    return _Line(float(middle), float(start), float(speed), float(np.std(away[kept]) / abs(speed)))
+        speed, start, away = fitted()
+    # Two of the degrees of freedom are the line's.
+    scatter = float(np.sqrt((away[kept] ** 2).sum() / max(np.count_nonzero(kept) - 2, 1)))
+    return _Line(float(middle), start, speed, scatter / abs(speed))

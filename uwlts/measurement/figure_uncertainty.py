@@ -37,15 +37,23 @@ def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> d
     systematic = [changed(pattern) for pattern in uncertainty.patterns_mm]
     rng, along = np.random.default_rng(_SEED), noise_mm(uncertainty)
     images, image = np.unique(cloud.frame, return_inverse=True)
-    drawn = []
+    by_image, drawn = uncertainty.by_image_mm(), []
     for _ in range(_DRAWS if spheres is None else _QUICK_DRAWS):
-        position = rng.standard_normal((len(images), 1))[image] * uncertainty.position_mm
-        drawn.append(changed(rng.standard_normal((len(cloud), 1)) * along + position))
+        together = drawn_by_image(rng, by_image, image, len(images))
+        drawn.append(changed(rng.standard_normal((len(cloud), 1)) * along + together))
     by_calibration = np.sqrt(np.sum(np.square(systematic), axis=0))
     by_noise = np.std(drawn, axis=0, ddof=1)
     return {
         name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(plain, by_noise, by_calibration, strict=True)
     }
+
+
+def drawn_by_image(rng: np.random.Generator, by_image_mm: np.ndarray, image: np.ndarray, images: int) -> np.ndarray:
+    """Moves (N, 3) of the points of ``image`` (N,) by parts (K, N, 3) that are drawn anew for each of the images."""
+    moved = np.zeros(by_image_mm.shape[1:])
+    for part in by_image_mm:
+        moved += rng.standard_normal((images, 1))[image] * part
+    return moved
 
 
 def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
@@ -58,8 +66,10 @@ def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
     count = np.count_nonzero(used)
     together = uncertainty.patterns_mm[:, used].sum(axis=1)
     image = np.unique(cloud.frame[used], return_inverse=True)[1]
-    by_image = np.stack([np.bincount(image, moves) for moves in uncertainty.position_mm[used].T], axis=1)
-    moved = np.vstack([together, by_image, noise_mm(uncertainty)[used]])
+    by_image = [
+        np.stack([np.bincount(image, moves) for moves in part[used].T], axis=1) for part in uncertainty.by_image_mm()
+    ]
+    moved = np.vstack([together, *by_image, noise_mm(uncertainty)[used]])
     return np.sqrt(np.sum(moved**2, axis=0)) / count
 
 

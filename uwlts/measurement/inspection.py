@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from uwlts.measurement.figure_uncertainty import noise_mm
+from uwlts.measurement.figure_uncertainty import drawn_by_image, noise_mm
 from uwlts.metrology.evaluation import FigureUncertainty
 from uwlts.metrology.fits import CylinderFit, FlatFit, SphereFit, fit_cylinder, fit_plane, fit_sphere
 from uwlts.metrology.least_squares import fit_robustly
@@ -70,11 +70,11 @@ def length_between(cloud: PointCloud, first: int, second: int) -> Inspected:
     if (known := cloud.uncertainty) is not None:
         together = (known.patterns_mm[:, second] - known.patterns_mm[:, first]) @ unit
         ends = np.array([first, second])
-        position = known.position_mm[ends] @ unit
+        by_image = known[ends].by_image_mm() @ unit
         if cloud.frame[first] == cloud.frame[second]:
-            position = np.diff(position)
+            by_image = np.diff(by_image, axis=1)
         noise = noise_mm(known[ends]) @ unit
-        random = float(np.sqrt(noise @ noise + position @ position))
+        random = float(np.sqrt(noise @ noise + np.sum(by_image**2)))
         stated["distance"] = FigureUncertainty(random, float(np.linalg.norm(together)))
     return Inspected("length", {"distance": length}, stated, 2, 0)
 
@@ -106,10 +106,10 @@ def shape_near(cloud: PointCloud, place_mm: np.ndarray, radius_mm: float, shape:
         by_pattern = [changed(pattern) for pattern in known.patterns_mm]
         rng, along = np.random.default_rng(_SEED), noise_mm(known)
         images, image = np.unique(cloud.frame[used], return_inverse=True)
-        drawn = []
+        by_image, drawn = known.by_image_mm(), []
         for _ in range(_DRAWS):
-            position = rng.standard_normal((len(images), 1))[image] * known.position_mm
-            drawn.append(changed(rng.standard_normal((len(used), 1)) * along + position))
+            together = drawn_by_image(rng, by_image, image, len(images))
+            drawn.append(changed(rng.standard_normal((len(used), 1)) * along + together))
         systematic = np.sqrt(np.sum(np.square(by_pattern), axis=0))
         random = np.std(drawn, axis=0, ddof=1)
         stated = {

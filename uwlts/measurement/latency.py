@@ -20,6 +20,10 @@ _FEWEST = 200
 """Pairs of stripe centres with relief from which the latency is estimated."""
 _GRAIN = 2.0
 """Neighbouring lines share their speckle, so that the scatter of their mean is so many times as large."""
+_LEAST_RELIEF = 0.5
+"""Passes are compared where they share so much of the most relief that they share at any shift."""
+_FAR_PX = 20.0
+"""Distances beyond are those of something else."""
 _ROUNDS, _OUTLIER = 8, 4.0
 
 
@@ -58,10 +62,16 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
     reach = int(np.ceil(2 * speed * _LARGEST_S / step))
     ways = step * np.arange(-reach, reach + 1)
     ways = ways[np.argsort(np.abs(ways), kind="stable")]
-    costs = np.array([_cost(surface, position, seen, way) for way in ways])
-    if not np.isfinite(costs).any():
-        raise EvaluationError("the passes there and back hardly see the same lines: was the surface in view both ways?")
-    shift = float(ways[np.nanargmin(costs)])
+    costs, relief = np.array([_cost(surface, position, seen, way) for way in ways]).T
+    # Flat ground beside the relief fits flat ground, whatever the shift.
+    comparable = relief >= _LEAST_RELIEF * relief.max()
+    if not relief.max() > 0:
+        raise EvaluationError(
+            "the passes there and back hardly see the same lines, or no relief on them: was a surface with slopes in "
+            "view both ways?"
+        )
+    shift = float(ways[np.argmin(np.where(comparable, costs, np.inf))])
+    away = slope = np.empty(0)
     for _ in range(_ROUNDS):
         away, slope = surface.at(position - shift, seen)
         scatter = MAD_TO_STD * np.median(np.abs(away - np.median(away))) if len(away) else 0.0
@@ -81,11 +91,12 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
     return Latency(shift / (2 * speed), std / (2 * speed))
 
 
-def _cost(surface: "_Surface", position: np.ndarray, seen: np.ndarray, shift: float) -> float:
-    """Mean distance in px of what is seen on the way back; NaN where hardly anything is seen on both ways."""
-    away, _ = surface.at(position - shift, seen)
-    enough = len(away) >= max(_FEWEST, 0.3 * np.isfinite(seen).sum())
-    return float(np.mean(np.minimum(np.abs(away), 20.0))) if enough else np.nan
+def _cost(surface: "_Surface", position: np.ndarray, seen: np.ndarray, shift: float) -> tuple[float, float]:
+    """Mean distance in px of what is seen on the way back, and the sum of the slopes squared where it is compared."""
+    away, slope = surface.at(position - shift, seen)
+    if len(away) < _FEWEST:
+        return np.inf, 0.0
+    return float(np.mean(np.minimum(np.abs(away), _FAR_PX))), float((slope**2).sum())
 
 
 @dataclass(frozen=True, eq=False)

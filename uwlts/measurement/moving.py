@@ -1,6 +1,13 @@
-"""Scans by a moving platform: the sensor's poses from a mount and a trajectory, and what the mount leaves open."""
+"""Scans by a moving platform: the sensor's poses from a mount and a trajectory, and what both leave open.
 
-from dataclasses import replace
+Errors of poses move all points of an image together. Where each pose errs by itself they are independent from image to
+image. The errors of a navigation go along the path: those of a filter in its estimates before and after a step of time,
+or before and after a measurement, are correlated by the root of the smaller over the larger variance (a prediction adds
+independent noise; for an update Cov(e+, e-) = P+, J. A. Farrell, Aided Navigation, 2008, section 5.4), and over many
+steps by the product. So the correlation of any two moments follows from the stated covariances.
+"""
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,11 +19,33 @@ from uwlts.model.trajectory import Trajectory
 from uwlts.storage.capture import Capture, FrameTable
 from uwlts.storage.cloud import PointUncertainty
 
+_MOST_SHAPES = 8
+"""Shapes in time of errors along a path; faster ones are taken as independent from image to image."""
+_LEFT = 0.01
+"""Share of the variance that may be left to these."""
+_LEAST = 1e-6
+"""Of the largest variance: where a path begins exactly known, nothing is correlated with it."""
 
-def platform_poses(
+
+@dataclass(frozen=True, eq=False)
+class Ride:
+    """Poses of a platform at the N images of a capture.
+
+    ``poses`` (N, 4, 4) are ``T_base_platform``, mm, NaN for images without one. ``covariance`` (N, 6, 6), as of a
+    `Trajectory`, is that of each, or None; ``times_s`` (N,) are the images'. ``rates`` (N, 6) are velocity in mm/s and
+    turn in rad/s in the base frame, or None where the poses are not from a trajectory.
+    """
+
+    poses: np.ndarray
+    covariance: np.ndarray | None
+    times_s: np.ndarray
+    rates: np.ndarray | None = None
+
+
+def platform_ride(
     capture: Capture, trajectory: Trajectory | None, *, mount: Mount | None, clock_offset_s: float | None
-) -> np.ndarray:
-    """``T_base_platform`` (N, 4, 4) of all images, by the trajectory at their times or as the capture holds them, mm.
+) -> Ride:
+    """Poses of the platform at all images, by the trajectory at their times or as the capture holds them.
 
     Raises
     ------
@@ -25,6 +54,7 @@ def platform_poses(
     DescriptionError
         Images were taken before or after the trajectory.
     """
+    scale = 1.0 if mount is None or mount.robot_scale is None else mount.robot_scale
     if trajectory is None:
         if clock_offset_s is not None:
             raise DescriptionError("an offset of the clocks was given without a trajectory")
@@ -34,37 +64,115 @@ def platform_poses(
                 f"{missing} of {int(capture.laser_on.sum())} laser images have no pose: a mount needs that of the "
                 "platform for each. Give a trajectory, or import the images with poses"
             )
-    else:
-        found = mount.time_offset_s if mount is not None else None
-        offset = clock_offset_s if clock_offset_s is not None else found or 0.0
-        poses = np.full((len(capture.time_s), 4, 4), np.nan)
-        poses[capture.laser_on] = trajectory.poses_at(capture.time_s[capture.laser_on] + offset)
-    if mount is not None and mount.robot_scale is not None:
-        poses[:, :3, 3] *= mount.robot_scale
-    return poses
+        poses[:, :3, 3] *= scale
+        return Ride(poses, capture.pose_covariance, capture.time_s)
+    found = mount.time_offset_s if mount is not None else None
+    offset, laser = clock_offset_s if clock_offset_s is not None else found or 0.0, capture.laser_on
+    times = capture.time_s[laser] + offset
+    poses, rates = np.full((len(laser), 4, 4), np.nan), np.full((len(laser), 6), np.nan)
+    poses[laser], rates[laser] = trajectory.poses_at(times), trajectory.rates_at(times)
+    covariance, stated = None, trajectory.covariance_at(times)
+    if stated is not None:
+        covariance = np.full((len(laser), 6, 6), np.nan)
+        covariance[laser] = stated
+    poses[:, :3, 3] *= scale
+    rates[:, :3] *= scale
+    return Ride(poses, covariance, capture.time_s, rates)
 
 
-def carried(capture: Capture, poses: np.ndarray, mount: Mount | None) -> FrameTable:
-    """The images of a capture with the poses of the sensor on a platform (N, 4, 4)."""
-    of_sensor = poses if mount is None else poses @ mount.transform()
-    return FrameTable(
-        capture.header, capture.path, capture.stage_mm, capture.exposure_ms, of_sensor, capture.speed_mm_per_s
-    )
+def carried(capture: Capture, ride: Ride, mount: Mount | None) -> FrameTable:
+    """The images of a capture with the poses of the sensor on a platform."""
+    header = capture.header
+    if mount is not None:
+        header = header.model_copy(update={"T_platform_sensor": tuple(map(tuple, mount.transform().tolist()))})
+    known = capture.stage_mm, capture.exposure_ms, ride.poses, capture.speed_mm_per_s
+    return FrameTable(header, capture.path, *known)
 
 
-def with_mount(
-    uncertainty: PointUncertainty, points_mm: np.ndarray, poses: np.ndarray, mount: Mount
+def with_platform(
+    uncertainty: PointUncertainty,
+    points_mm: np.ndarray,
+    frame: np.ndarray,
+    ride: Ride,
+    mount: Mount | None,
+    *,
+    correlation_s: float | None = None,
 ) -> PointUncertainty:
-    """The uncertainty of points (N, 3) in the base frame with that of the mount, which moves all points together.
+    """The uncertainty of points (N, 3) of images (N,) in the base frame with those of mount, time offset and poses.
+
+    ``correlation_s`` is the time over which errors of poses stay alike, 0 where each errs by itself; by default 0
+    without and as of a navigation filter with a trajectory. Images without a covariance have none of their pose.
+    """
+    together, poses_mm = [uncertainty.patterns_mm], uncertainty.poses_mm
+    if mount is not None:
+        together.append(_by_mount(points_mm, ride.poses[frame], mount))
+        if ride.rates is not None and mount.time_offset_std_s:
+            moved = _moved(ride.rates[frame] * mount.time_offset_std_s, points_mm, ride.poses[frame])
+            together.append(moved[None])
+    if ride.covariance is not None:
+        used, image = np.unique(frame, return_inverse=True)
+        roots = _roots(ride.covariance[used])
+        apart = np.ones(len(used))
+        if correlation_s is None:
+            correlation_s = 0.0 if ride.rates is None else None
+        if correlation_s != 0:
+            shapes, apart = _shapes(_alike(ride.covariance[used], ride.times_s[used], correlation_s))
+            for shape in shapes:
+                for part in range(6):
+                    errors = roots[:, :, part] * shape[:, None]
+                    together.append(_moved(errors[image], points_mm, ride.poses[frame])[None])
+        own = [_moved((roots[:, :, k] * apart[:, None])[image], points_mm, ride.poses[frame]) for k in range(6)]
+        poses_mm = np.array(own, dtype=np.float32)
+    patterns = together[0] if len(together) == 1 else independent_patterns(np.concatenate(together))
+    return replace(uncertainty, patterns_mm=patterns, poses_mm=poses_mm)
+
+
+def _by_mount(points_mm: np.ndarray, poses: np.ndarray, mount: Mount) -> np.ndarray:
+    """How points (N, 3) move (6, N, 3) by independent parts of the mount's error; ``poses`` are the platform's of each.
 
     A shift d and a turn w of the mount, both in the platform's frame, move a point p of the platform by
-    d + w x (p - t), t being the sensor's place there. ``poses`` (N, 4, 4) are the platform's of each point. Errors of
-    the poses themselves are not added.
+    d + w x (p - t), t being the sensor's place there.
     """
     rotations = poses[:, :3, :3]
     from_sensor = np.einsum("nji,nj->ni", rotations, points_mm - poses[:, :3, 3]) - mount.transform()[:3, 3]
     moved = []
     for shift, turn in covariance_root(np.array(mount.covariance)).T.reshape(-1, 2, 3):
         moved.append(np.einsum("nij,nj->ni", rotations, shift + np.cross(turn, from_sensor)))
-    together = np.concatenate([uncertainty.patterns_mm, np.array(moved)])
-    return replace(uncertainty, patterns_mm=independent_patterns(together))
+    return np.array(moved)
+
+
+def _moved(errors: np.ndarray, points_mm: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """How points (N, 3) move by errors (N, 6) of their poses: shift, and rotation about the base's axes."""
+    return errors[:, :3] + np.cross(errors[:, 3:], points_mm - poses[:, :3, 3])
+
+
+def _roots(covariances: np.ndarray) -> np.ndarray:
+    """Symmetric roots (F, 6, 6), which change as slowly along a path as the covariances do; 0 where one is NaN."""
+    known = np.where(np.isfinite(covariances).all(axis=(1, 2), keepdims=True), covariances, 0.0)
+    # Rotations are far smaller numbers than shifts: scaled, so that none is lost.
+    sizes = np.sqrt(np.maximum(np.einsum("nii->ni", known), 1e-30))
+    values, vectors = np.linalg.eigh(known / (sizes[:, :, None] * sizes[:, None]))
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
+    return sizes[:, :, None] * root
+
+
+def _alike(covariances: np.ndarray, times_s: np.ndarray, correlation_s: float | None) -> np.ndarray:
+    """Correlation (F, F) of the errors of poses at times."""
+    if correlation_s is not None:
+        return np.exp(-np.abs(times_s[:, None] - times_s) / correlation_s)
+    variances = np.einsum("nii->ni", np.nan_to_num(covariances))
+    largest = variances.max(axis=0)
+    size = (variances / np.where(largest > 0, largest, 1.0)).sum(axis=1)
+    steps = np.abs(np.diff(np.log(np.maximum(size, _LEAST * size.max() or 1.0))))
+    way = 0.5 * np.append(0.0, np.cumsum(steps))
+    return np.exp(-np.abs(way[:, None] - way))
+
+
+def _shapes(alike: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Shapes (K, F) in time whose squares add up to the correlations, and the part (F,) of each moment left over."""
+    values, vectors = np.linalg.eigh(alike)
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    share = 1 - np.cumsum(values) / values.sum()
+    count = min(1 + int(np.argmax(share <= _LEFT)), _MOST_SHAPES, len(values))
+    shapes = (vectors[:, :count] * np.sqrt(values[:count])).T
+    return shapes, np.sqrt(np.maximum(1 - np.sum(shapes**2, axis=0), 0.0))

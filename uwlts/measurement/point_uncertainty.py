@@ -7,6 +7,7 @@ follows, correlations included, from calculating it again with each pattern adde
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -21,14 +22,17 @@ from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.stripe import pixels_of
 from uwlts.optics.brightness import BLUR_STD, beside_std
 from uwlts.optics.line_table import LineTable
-from uwlts.storage.capture import Capture, CaptureHeader, FrameTable
-from uwlts.storage.cloud import PAIRS, PointUncertainty
+from uwlts.runtime.compiled import compiled
+from uwlts.storage.capture import Capture, CaptureHeader, FrameTable, sensor_poses
+from uwlts.storage.cloud import PointUncertainty
 from uwlts.storage.files import sha256_of
 
 _BLOCK = 20000
 # Patterns that together move the points by no more than this (root mean square) are left out.
 _NEGLIGIBLE_MM = 5e-5
 _FEWEST_NEIGHBOURS = 10
+# Parts of the parameters that move no point by more than this (root sum of squares over places) are joined with others.
+_NOTHING_MM, _PLACES, _FEWEST_POINTS = 1e-7, 10, 2000
 _TABLE_TOLERANCE_MM = 1e-6
 
 
@@ -39,8 +43,10 @@ def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) 
     smooth; edges and outliers do not count, as half the lines would have to hold some. Images with few lines take the
     value of all.
     """
-    order = np.lexsort((line, frame))
-    f, at, c = frame[order], line[order], centre_px[order].astype(np.float64)
+    f, at, c = frame, line, centre_px.astype(np.float64)
+    if np.any((f[1:] < f[:-1]) | ((f[1:] == f[:-1]) & (at[1:] < at[:-1]))):
+        order = np.lexsort((line, frame))
+        f, at, c = frame[order], line[order], c[order]
     beside = (f[2:] == f[:-2]) & (at[2:] - at[:-2] == 2)
     off, image = np.abs(c[1:-1] - 0.5 * (c[2:] + c[:-2]))[beside], f[1:-1][beside]
     if len(off) < _FEWEST_NEIGHBOURS:
@@ -67,10 +73,10 @@ def point_uncertainty(
     """Uncertainty of the points that stripe centres (N,) of a capture give by a joint calibration.
 
     In the OCS, or in the scene where the frames carry poses. What the stage does by its positions, scale and direction
-    is part of it, about the middle of its positions; what poses add is not. The water may have drifted since the
-    calibration, unless that was made from this very capture. ``blur_px`` (N,), how far blur may move the centres, and
-    ``beside_mm`` (N, 3), how far points were moved to where their light comes from (`uwlts.optics.brightness`), are
-    each wrong by some share, the same for all points.
+    is part of it, about the middle of its positions; what poses add is not (`uwlts.measurement.moving`). The water may
+    have drifted since the calibration, unless that was made from this very capture. ``blur_px`` (N,), how far blur may
+    move the centres, and ``beside_mm`` (N, 3), how far points were moved to where their light comes from
+    (`uwlts.optics.brightness`), are each wrong by some share, the same for all points.
 
     Raises
     ------
@@ -86,82 +92,135 @@ def point_uncertainty(
     # Neighbours err together, so that they show only a part of the noise.
     shared = require_joint(calibration).shared_variance.get(STRIPE, 1.0)
     noise = stripe_noise_px(frame, line, centre_px) * float(np.sqrt(shared))
-    pose = capture.pose[:, :3, :3]
-    posed = np.all(np.isfinite(capture.pose), axis=(1, 2), keepdims=True)
+    of_sensor = sensor_poses(capture)
+    pose = of_sensor[:, :3, :3]
+    posed = np.all(np.isfinite(of_sensor), axis=(1, 2), keepdims=True)
     into_object = calibration.object_transform()[:3, :3].T
-    into_scene = np.where(posed, pose, np.eye(3)) @ into_object
+    pose_of = np.where(posed, pose, np.eye(3))
     root = covariance_root(known.covariance)
-    stage = np.where(posed[:, 0, 0], 0.0, capture.stage_mm - np.mean(capture.stage_mm))
+    by_stage_alone = ~posed[:, 0, 0]
+    middle = np.mean(capture.stage_mm[by_stage_alone]) if by_stage_alone.any() else 0.0
+    stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
     by_stage = stage_root(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
-    beside = beside_std(header.sensor.uncertainty)
-    derivatives = _derivatives(known, root, line, centre_px, stripe_along=calibration.stripe_along)
-    random, moved = [], []
+    exact = partial(_derivatives, known, stripe_along=calibration.stripe_along, turn=into_object)
+    root, by_stage = _fewest_parts(exact, root, by_stage, line, centre_px, reach_mm=np.abs(stage).max(initial=0.0))
+    table = LineTable.about(
+        lambda *where: exact(root, *where).reshape(len(where[0]), -1), line, centre_px, tolerance=_TABLE_TOLERANCE_MM
+    )
+    nothing = np.zeros((len(line), 3))
+    beside = nothing if beside_mm is None else beside_std(header.sensor.uncertainty) * beside_mm
+    blur = nothing[:, 0] if blur_px is None else BLUR_STD * blur_px
+    random, moved = np.empty((len(line), 6), np.float32), np.empty((len(line), 3, 2 + root.shape[1]))
     for start in range(0, len(line), _BLOCK):
         here = slice(start, start + _BLOCK)
-        by_pixel, by_root = derivatives(line[here], centre_px[here])
-        if posed.any():
-            turned = into_scene[frame[here]]
-            by_pixel, by_root = np.einsum("nij,nj->ni", turned, by_pixel), np.einsum("nij,rnj->rni", turned, by_root)
+        parts, where = moved[here], (line[here], centre_px[here])
+        if table is None:
+            parts[:] = exact(root, *where)
         else:
-            by_pixel, by_root = by_pixel @ into_object.T, by_root @ into_object.T
-        by_root += by_stage[:, None] * stage[frame[here], None]
-        step = by_pixel * noise[here, None]
-        random.append(np.stack([step[:, i] * step[:, j] for i, j in PAIRS], axis=1))
-        if blur_px is not None:
-            by_root = np.concatenate([by_root, [BLUR_STD * by_pixel * blur_px[here, None]]])
-        if beside_mm is not None:
-            by_root = np.concatenate([by_root, [beside * beside_mm[here]]])
-        moved.append(by_root)
+            table.values(*where, out=parts.reshape(len(parts), -1))
+        if posed.any():
+            parts[:] = pose_of[frame[here]] @ parts
+        _add_parts(parts, noise[here], stage[frame[here]], by_stage, blur[here], beside[here], random[here])
+    if not np.isfinite(random).all():
+        raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
     along = np.array(header.stage_direction)
     position = np.where(posed[frame, :, 0], 0.0, header.sensor.uncertainty.stage_position_mm * along)
-    return PointUncertainty(
-        np.vstack(random).astype(np.float32),
-        position.astype(np.float32),
-        independent_patterns(np.concatenate(moved, axis=1)),
-    )
+    return PointUncertainty(random, position.astype(np.float32), _patterns(moved.reshape(-1, moved.shape[2]).T))
+
+
+@compiled
+def _add_parts(
+    parts: np.ndarray,
+    noise: np.ndarray,
+    stage: np.ndarray,
+    by_stage: np.ndarray,
+    blur: np.ndarray,
+    beside: np.ndarray,
+    random: np.ndarray,
+) -> None:
+    """Add to ``parts`` (N, 3, 2 + R) what stage, blur and brightness beside the sheet do; fill ``random`` (N, 6).
+
+    The first two parts, derivatives by the pixel across the stripe and room, become those of blur and brightness.
+    """
+    # In the order of `PAIRS`.
+    for n in range(parts.shape[0]):
+        x, y, z = parts[n, 0, 0] * noise[n], parts[n, 1, 0] * noise[n], parts[n, 2, 0] * noise[n]
+        random[n, 0], random[n, 1], random[n, 2] = x * x, x * y, x * z
+        random[n, 3], random[n, 4], random[n, 5] = y * y, y * z, z * z
+        for axis in range(3):
+            parts[n, axis, 0] *= blur[n]
+            parts[n, axis, 1] = beside[n, axis]
+            for r in range(by_stage.shape[0]):
+                parts[n, axis, 2 + r] += by_stage[r, axis] * stage[n]
+
+
+def _fewest_parts(
+    exact: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    root: np.ndarray,
+    by_stage: np.ndarray,
+    line: np.ndarray,
+    centre_px: np.ndarray,
+    *,
+    reach_mm: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Independent parts ``root`` (P, R) and ``by_stage`` (R, 3) as few as move points the same, to `_NOTHING_MM`.
+
+    Points move smoothly over the image, so that what some hundred places over all of it show holds for all of them.
+    """
+    if len(line) < _FEWEST_POINTS:
+        return root, by_stage
+    lines, places = (np.linspace(values.min(), values.max(), _PLACES) for values in (line, centre_px))
+    at = np.meshgrid(lines, places)
+    moved = exact(root, at[0].ravel(), at[1].ravel())[:, :, 2:]
+    if not np.isfinite(moved).all():
+        return root, by_stage
+    together = np.vstack([moved.reshape(-1, root.shape[1]), reach_mm * by_stage.T])
+    _, values, parts = np.linalg.svd(together, full_matrices=False)
+    kept = parts[values > _NOTHING_MM].T
+    return root @ kept, kept.T @ by_stage
 
 
 def _derivatives(
-    known: StoredEstimate, root: np.ndarray, line: np.ndarray, centre_px: np.ndarray, *, stripe_along: str
-) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Function of lines and centres like those given, for derivatives of their points in the camera frame.
+    known: StoredEstimate,
+    root: np.ndarray,
+    line: np.ndarray,
+    centre_px: np.ndarray,
+    *,
+    stripe_along: str,
+    turn: np.ndarray,
+) -> np.ndarray:
+    """Derivatives (N, 3, 2 + R) of points by the pixel across the stripe, 0, and independent parts of all parameters.
 
-    These are (N, 3) by the pixel across the stripe and (R, N, 3) by independent parts of all parameters.
+    ``turn`` (3, 3) turns them from the camera's frame; they are NaN where a centre has no point.
     """
     column = COLUMNS.index("v" if stripe_along == "width" else "u")
-
-    def exact(line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
-        pixels = pixels_of(line, centre_px, stripe_along=stripe_along)
-        points = known.parameters.on_sheet(known.values, known.view, pixels)
-        if points is None:
-            return np.full((len(line), 3 + 3 * root.shape[1]), np.nan)
-        by_global = [
-            known.parameters.by_global(points.by_rays[:, axis], known.view, points.by_sheet[:, axis]) @ root
-            for axis in range(3)
-        ]
-        return np.hstack([points.by_rays[column].T, np.stack(by_global, axis=2).reshape(len(line), -1)])
-
-    table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE_MM)
-
-    def derivatives(line: np.ndarray, centre_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        values = exact(line, centre_px) if table is None else table.values(line, centre_px)
-        if not np.isfinite(values).all():
-            raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
-        return values[:, :3], values[:, 3:].reshape(len(line), -1, 3).transpose(1, 0, 2)
-
-    return derivatives
+    pixels = pixels_of(line, centre_px, stripe_along=stripe_along)
+    points = known.parameters.on_sheet(known.values, known.view, pixels)
+    result = np.zeros((len(line), 3, 2 + root.shape[1]))
+    if points is None:
+        result[:] = np.nan
+        return result
+    result[:, :, 0] = points.by_rays[column].T
+    for axis in range(3):
+        by_global = known.parameters.by_global(points.by_rays[:, axis], known.view, points.by_sheet[:, axis])
+        result[:, axis, 2:] = by_global @ root
+    return np.einsum("ij,njr->nir", turn, result)
 
 
 def independent_patterns(moved: np.ndarray) -> np.ndarray:
     """Patterns (M, N, 3), orthogonal over the points, from any (R, N, 3) that together have their covariance."""
-    flat = moved.reshape(len(moved), -1)
+    return _patterns(moved.reshape(len(moved), -1))
+
+
+def _patterns(flat: np.ndarray) -> np.ndarray:
+    """Patterns (M, N, 3) as of `independent_patterns` from any (R, 3 N), in any order of memory."""
     values, vectors = np.linalg.eigh(flat @ flat.T)
     order = np.argsort(values)[::-1]
     values, vectors = np.maximum(values[order], 0.0), vectors[:, order]
-    left = np.append(np.cumsum(values[::-1])[::-1][1:], 0.0) / moved.shape[1]
+    left = 3.0 * np.append(np.cumsum(values[::-1])[::-1][1:], 0.0) / flat.shape[1]
     count = 1 + int(np.argmax(left <= _NEGLIGIBLE_MM**2))
-    return (vectors[:, :count].T @ flat).reshape(count, *moved.shape[1:]).astype(np.float32)
+    return (vectors[:, :count].T @ flat).astype(np.float32).reshape(count, -1, 3)
 
 
 def stage_root(known: StoredEstimate, calibration: Calibration, header: CaptureHeader, root: np.ndarray) -> np.ndarray:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.measurement.moving import carried, platform_poses, with_mount
+from uwlts.measurement.moving import carried, platform_ride, with_platform
 from uwlts.measurement.point_uncertainty import point_uncertainty
 from uwlts.model.any_calibration import AnyCalibration, calibration_digest, check_fits
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CalibrationError
+from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.trajectory import Trajectory
@@ -18,7 +18,7 @@ from uwlts.optics.brightness import beside_sheet, sharp_lines, slopes_of_brightn
 from uwlts.optics.reconstruction import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.storage.calibration_file import loaded_calibration
-from uwlts.storage.capture import Capture, FrameTable, opened_capture
+from uwlts.storage.capture import Capture, FrameTable, opened_capture, sensor_poses
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.mount_files import read_mount
 from uwlts.stripe import FoundStripes, StripeSettings, find_stripes
@@ -53,6 +53,7 @@ def reconstruct(
     mount: Mount | str | Path | None = None,
     trajectory: Trajectory | None = None,
     clock_offset_s: float | None = None,
+    pose_correlation_s: float | None = None,
     stripe: StripeSettings = None,
     index: float | None = None,
     with_uncertainty: bool | None = None,
@@ -65,11 +66,16 @@ def reconstruct(
     capture : Capture or path
     calibration : Calibration, PolynomialCalibration or path
     mount : Mount or path, optional
-        Where the sensor is on its platform. The poses of the capture's images are then the platform's.
+        Where the sensor is on its platform. The poses of the capture's images are then the platform's. Where a capture
+        states a mount, that of the drawing, it is used unless this is given.
     trajectory : Trajectory, optional
         Path of the platform (of the sensor without a mount), in place of poses in the capture and of the stage.
     clock_offset_s : float, optional
         What to add to the times of the images for those of the trajectory; by default as the mount says, or nothing.
+    pose_correlation_s : float, optional
+        Time over which errors of poses stay alike: 0 where each pose errs by itself, infinity where all err together.
+        By default 0 for poses in the capture, and for a trajectory as the errors of a navigation filter that states
+        these covariances (`uwlts.measurement.moving`).
     stripe : StripeOptions or dict, optional
         How stripes are found: all options, or settings in place of those in the sensor's table [stripe].
     index : float, optional
@@ -83,7 +89,8 @@ def reconstruct(
     -------
     ScanCloud
         ``points_mm`` (N, 3) in the object coordinate system, or in the frame in which poses or trajectory are given;
-        ``covariance_mm2`` (N, 3, 3) or None, to which a mount adds its own. Errors of poses are not part of it.
+        ``covariance_mm2`` (N, 3, 3) or None, to which mount, time offset and poses of known covariance add theirs.
+        ``time_s`` (N,) is each point's time of scans by a platform.
 
     Raises
     ------
@@ -92,22 +99,28 @@ def reconstruct(
     DescriptionError
         Images were taken before or after the trajectory.
     """
+    if pose_correlation_s is not None and not pose_correlation_s >= 0:
+        raise DescriptionError(f"pose_correlation_s is {pose_correlation_s:g}; it must not be negative")
     calibration = loaded_calibration(calibration)
     with opened_capture(capture) as scan:
         check_fits(scan.header, calibration, source=scan.path.name)
         known = calibration.joint is not None if with_uncertainty is None else with_uncertainty
-        if mount is None and trajectory is None and clock_offset_s is None:
+        alone = scan.header.T_platform_sensor is None and scan.pose_covariance is None
+        if alone and mount is None and trajectory is None and clock_offset_s is None:
             stripes = find_stripes(scan, options=stripe, progress=progress)
             return reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known)
         mount = read_mount(mount) if isinstance(mount, str | Path) else mount
-        poses = platform_poses(scan, trajectory, mount=mount, clock_offset_s=clock_offset_s)
+        ride = platform_ride(scan, trajectory, mount=mount, clock_offset_s=clock_offset_s)
         stripes = find_stripes(scan, options=stripe, progress=progress)
-        table = carried(scan, poses, mount)
+        table = carried(scan, ride, mount)
         cloud = reconstruct_stripes(table, stripes, calibration, index=index, with_uncertainty=known)
-        if cloud.uncertainty is None or mount is None:
-            return cloud
-        own = with_mount(cloud.uncertainty, cloud.points_mm, poses[cloud.frame], mount)
-        return replace(cloud, uncertainty=own)
+        warnings = cloud.warnings
+        if mount is None and scan.header.T_platform_sensor is not None:
+            warnings = [*warnings, "the mount is that of the drawing: calibrate it (uwlts mount) and give --mount"]
+        own = cloud.uncertainty
+        if own is not None:
+            own = with_platform(own, cloud.points_mm, cloud.frame, ride, mount, correlation_s=pose_correlation_s)
+        return replace(cloud, uncertainty=own, warnings=warnings, time_s=scan.time_s[cloud.frame])
 
 
 def reconstruct_stripes(
@@ -219,9 +232,13 @@ def _beside(capture: Capture | FrameTable, calibration: Calibration, stripes: Fo
 
 def _posed(points: np.ndarray, capture: Capture | FrameTable, frame: np.ndarray) -> np.ndarray:
     """Points of frames that carry a full pose ``T_scene_object`` are placed by it instead of by the stage."""
+    poses = sensor_poses(capture)
+    posed = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    if not posed.any():
+        return points
+    own = np.ones(len(points), bool) if posed[frame].all() else posed[frame]
+    at, direction = frame[own], np.array(capture.header.stage_direction)
+    by_sensor = points[own] - capture.stage_mm[at, None] * direction
     points = points.copy()
-    for number in np.flatnonzero(np.isfinite(capture.pose).all(axis=(1, 2))):
-        own, pose = frame == number, capture.pose[number]
-        at_stage = capture.stage_mm[number] * np.array(capture.header.stage_direction)
-        points[own] = (points[own] - at_stage) @ pose[:3, :3].T + pose[:3, 3]
+    points[own] = np.einsum("nij,nj->ni", poses[at, :3, :3], by_sensor) + poses[at, :3, 3]
     return points

@@ -1,38 +1,62 @@
-"""Change of a surface between two clouds, or from a mesh: distances, and whether they are more than the uncertainty."""
+"""Change of a surface against an earlier cloud, a mesh or an ideal shape, and where it is more than the uncertainty."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from uwlts.metrology.registration import Registration, register_to_surface
-from uwlts.model.errors import CaptureError, EvaluationError
-from uwlts.model.input_file import require_regular_file
+from uwlts.metrology.change_reference import (
+    Reference,
+    ReferencePoints,
+    local_normals,
+    read_datums,
+    read_reference,
+    require_enough,
+    require_same_unit,
+)
+from uwlts.metrology.ideal_shapes import IdealShape, place_shape
+from uwlts.metrology.local_means import TWO_SIDED, LocalMeans, local_means
+from uwlts.metrology.point_spacing import disc_of
+from uwlts.metrology.registration import Registration, SampledSurface, register_to_surface
+from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty, read_cloud
-from uwlts.storage.pose_files import MM_PER_UNIT, Unit, checked_unit
+from uwlts.storage.pose_files import Unit
 
-_POINTS_PER_DISC = 30
-"""Neighbours in the disc over which points are averaged unless its size is given: their mean's noise is a fifth."""
-_FEWEST = 5
-"""Points in a disc of each side; with fewer the roughness is not known."""
 _MOST_PLACES = 20_000
 _DEEP = 3.0
 """Times the disc's diameter: how far along the normal the other surface is looked for unless that is given."""
-_TWO_SIDED = 1.96
-"""Standard normal quantile of 97.5 %."""
-_PAIRS_AT_A_TIME = 2_000_000
-_SAMPLES_PER_DISC = 60
-_MOST_SAMPLES = 3_000_000
-_OTHER_UNIT = 50.0
-"""Ratio of sizes from which two things are given in other units; a metre is a thousand millimetres."""
+_AREA_NEIGHBOURS = 12
+_FEWEST_OF_REGION = 4
+"""Places of a region that is listed; discs of neighbouring places overlap, so that chance also makes pairs."""
+_MOST_REGIONS = 20
+
+
+@dataclass(frozen=True)
+class ChangedRegion:
+    """Neighbouring places that all rose or all sank significantly.
+
+    Distances are signed, the level of detection is the median of the places', the extent the longest.
+    """
+
+    centre_mm: tuple[float, float, float]
+    places: int
+    area_mm2: float
+    mean_mm: float
+    largest_mm: float
+    level_mm: float
+    volume_mm3: float
+    extent_mm: float
+
+    def record(self) -> Table:
+        """As JSON."""
+        return {**asdict(self), "centre_mm": list(self.centre_mm)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,24 +66,30 @@ class SurfaceChange:
     Attributes
     ----------
     points_mm, normals : (P, 3) float64
-        Places in the reference's frame, and unit normals of the reference there, towards the sensor (-Z) or outwards of
-        a mesh.
+        Places in the reference's frame, and unit normals of the reference there, towards the sensor (-Z), or outwards
+        of a mesh, a sphere or a cylinder.
     distance_mm : (P,) float64
         Mean of the cloud less that of the reference along the normal; NaN where either has fewer than five points.
     level_mm : (P,) float64
         Level of detection: 1.96 times the standard uncertainty of the distance.
+    area_mm2 : (P,) float64
+        Area of the surface that each place stands for.
     disc_mm, deep_mm : float
         Diameter of the disc of which points are averaged, and how far along the normal they are looked for.
     registration : Registration or None
+    reference : str
+        What the cloud was compared with, in words.
     """
 
     points_mm: np.ndarray
     normals: np.ndarray
     distance_mm: np.ndarray
     level_mm: np.ndarray
+    area_mm2: np.ndarray
     disc_mm: float
     deep_mm: float
     registration: Registration | None
+    reference: str
 
     @property
     def compared(self) -> np.ndarray:
@@ -71,22 +101,56 @@ class SurfaceChange:
         """(P,) bool: where the distance exceeds its level of detection."""
         return np.abs(self.distance_mm) > self.level_mm
 
+    def regions(self) -> list[ChangedRegion]:
+        """Regions of significant change of at least four places, the largest volumes first, at most twenty."""
+        found = []
+        for sign in (-1, 1):
+            chosen = np.flatnonzero(self.significant & (np.sign(self.distance_mm) == sign))
+            if not len(chosen):
+                continue
+            # Places stand about half a disc apart.
+            pairs = KDTree(self.points_mm[chosen]).query_pairs(self.disc_mm, output_type="ndarray")
+            links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(chosen),) * 2)
+            owner = connected_components(links, directed=False)[1]
+            for number in np.flatnonzero(np.bincount(owner) >= _FEWEST_OF_REGION):
+                found.append(self._region(chosen[owner == number]))
+        return sorted(found, key=lambda region: -abs(region.volume_mm3))[:_MOST_REGIONS]
+
+    def _region(self, own: np.ndarray) -> ChangedRegion:
+        distance, area, points = self.distance_mm[own], self.area_mm2[own], self.points_mm[own]
+        centre = np.average(points, axis=0, weights=area)
+        extent = np.ptp((points - centre) @ np.linalg.svd(points - centre, full_matrices=False)[2][0])
+        return ChangedRegion(
+            (float(centre[0]), float(centre[1]), float(centre[2])),
+            len(own),
+            float(area.sum()),
+            float(np.average(distance, weights=area)),
+            float(distance[np.argmax(np.abs(distance))]),
+            float(np.median(self.level_mm[own])),
+            float(distance @ area),
+            float(extent),
+        )
+
     def record(self) -> Table:
         """All but the places as JSON."""
         distance, level = self.distance_mm[self.compared], self.level_mm[self.compared]
+        area = self.area_mm2[self.compared]
         changed = distance[np.abs(distance) > level]
         found = self.registration
         return {
+            "reference": self.reference,
             "places": len(self.distance_mm),
             "compared": len(distance),
-            "significant_share": float(np.mean(np.abs(distance) > level)) if len(distance) else None,
-            "mean_mm": float(np.mean(distance)) if len(distance) else None,
-            "rms_mm": float(np.sqrt(np.mean(distance**2))) if len(distance) else None,
+            "compared_area_mm2": float(area.sum()),
+            "significant_share": float(np.average(np.abs(distance) > level, weights=area)) if len(distance) else None,
+            "mean_mm": float(np.average(distance, weights=area)) if len(distance) else None,
+            "rms_mm": float(np.sqrt(np.average(distance**2, weights=area))) if len(distance) else None,
             "level_median_mm": float(np.median(level)) if len(distance) else None,
             "largest_rise_mm": float(max(changed.max(initial=0.0), 0.0)),
             "largest_loss_mm": float(min(changed.min(initial=0.0), 0.0)),
             "disc_mm": self.disc_mm,
             "deep_mm": self.deep_mm,
+            "regions": [region.record() for region in self.regions()],
             "registration": None
             if found is None
             else {
@@ -105,10 +169,11 @@ class SurfaceChange:
         if not known["compared"]:
             return ["the cloud and the reference do not overlap anywhere"]
         lines = [
+            f"reference                 {self.reference}",
             f"places compared           {known['compared']} of {known['places']}, means over {self.disc_mm:.3g} mm",
             f"distance, mm              mean {known['mean_mm']:+.4f}, rms {known['rms_mm']:.4f}",
             f"level of detection, mm    {known['level_median_mm']:.4f} (median; 95 %)",
-            f"significant change        {100 * float(str(known['significant_share'])):.1f} % of the places, "
+            f"significant change        {100 * float(str(known['significant_share'])):.1f} % of the area, "
             f"{known['largest_loss_mm']:+.3f} to {known['largest_rise_mm']:+.3f} mm",
         ]
         if (found := self.registration) is not None:
@@ -124,30 +189,37 @@ class SurfaceChange:
 
 def compare_clouds(
     cloud: PointCloud | str | os.PathLike[str],
-    reference: PointCloud | str | os.PathLike[str],
+    reference: Reference,
     *,
     register: bool = False,
+    datums: np.ndarray | str | os.PathLike[str] | None = None,
     disc_mm: float | None = None,
     deep_mm: float | None = None,
     unit: Unit = "mm",
 ) -> SurfaceChange:
-    """Find where a surface differs from an earlier cloud or a mesh by more than the uncertainty.
+    """Find where a surface differs from an earlier cloud, a mesh or an ideal shape by more than the uncertainty.
 
     At each place the points of both within a disc across the reference's normal are averaged (M3C2: Lague, Brodu and
     Leroux, ISPRS J. 82, 2013). The variance of the distance is that of M3C2-EP (Winiwarter, Anders and Höfle, ISPRS J.
     178, 2021) with the parts that this sensor's points have: noise of single points, or their roughness where that is
     larger, over their number; the stage's position of each image; and what all points share by calibration, which no
     averaging lowers. The two clouds count as calibrated independently, so that of one calibration the level is too
-    large rather than too small. The registration adds its own.
+    large rather than too small. A registration, or the fit of an ideal shape, adds its own, and takes up what of the
+    shared errors looks like a movement.
 
     Parameters
     ----------
     cloud
         What was measured; a cloud or its file.
     reference
-        An earlier cloud, or the file of a mesh (.stl, .obj, .off, or .ply with faces).
+        An earlier cloud; the file of a mesh (.stl, .obj, .off, or .ply with faces); or an ideal shape: "plane",
+        "sphere" or "cylinder" to fit one, or a TOML file with its kind and what is known of it.
     register
         Move the cloud onto the reference first (`uwlts.metrology.registration`); else their frames are taken as common.
+        An ideal shape without a place is fitted anyway.
+    datums
+        Spheres in the reference's frame that hold what has not changed, (K, 4) centre and radius in mm, or a TOML file
+        of tables [[datum]] with centre_mm and radius_mm: only points in them count for the registration or fit.
     disc_mm
         Diameter of the disc; about 30 points of the sparser side unless given.
     deep_mm
@@ -159,147 +231,131 @@ def compare_clouds(
     ------
     CaptureError
         A file cannot be read.
+    DescriptionError
+        A description of an ideal shape or of datums is not valid.
     EvaluationError
-        Clouds do not overlap, are too small, or have sizes as of other units.
+        Clouds do not overlap, are too small, have sizes as of other units, or do not determine the ideal shape.
 
     Examples
     --------
     >>> change = uwlts.compare_clouds("after.ply", "before.ply")
     >>> change.significant.mean(), change.distance_mm[change.significant].min()
+    >>> uwlts.compare_clouds("pipe.ply", "cylinder").regions()
     """
     new = cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
     for name, length in (("disc_mm", disc_mm), ("deep_mm", deep_mm)):
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
-    disc = disc_mm or _disc_of(_enough(new.points_mm, "cloud"))
-    surface = _surface(reference, unit, disc)
-    _require_same_unit(new.points_mm, _enough(surface.points_mm, "reference"))
-    if disc_mm is None and not surface.meshed:
-        disc = max(disc, _disc_of(surface.points_mm))
+    disc = disc_mm or disc_of(require_enough(new.points_mm, "cloud"), new.frame)
+    surface = read_reference(reference, unit=unit, disc_mm=disc)
+    fixed = None if datums is None else read_datums(datums)
+    if isinstance(surface, ReferencePoints):
+        require_same_unit(new.points_mm, require_enough(surface.points_mm, "reference"))
+        if disc_mm is None and not surface.meshed:
+            disc = max(disc, disc_of(surface.points_mm, surface.frame))
+        if fixed is not None and not register:
+            raise EvaluationError("datums hold a registration: ask for that, too (--register)")
+        sides = _against_points(new, surface, fixed, register=register, disc=disc, deep=deep_mm or _DEEP * disc)
+    else:
+        sides = _against_shape(new, surface, fixed, register=register, disc=disc, deep=deep_mm or _DEEP * disc)
     deep = deep_mm or _DEEP * disc
-    found, points, known = None, new.points_mm, new.uncertainty
-    if register:
-        target, normals = surface.points_mm, surface.normals
-        normals = _normals(target, target, disc) if normals is None else normals
-        variance = np.ones(len(points)) if known is None else known.random_mm2[:, [0, 3, 5]].mean(axis=1)
-        std = np.sqrt(np.maximum(variance, 1e-6))
-        found = register_to_surface(points, target, normals, reach_mm=deep, std_mm=std)
-        rotation = found.transform[:3, :3]
-        points, known = points @ rotation.T + found.transform[:3, 3], _turned(known, rotation)
-    places = points[_spread(points, disc / 2)]
-    normals = _normals(places, surface.points_mm, disc, given=surface.normals)
-    parts = [
-        _side(places, normals, each, uncertainty, frame, disc=disc, deep=deep)
-        for each, uncertainty, frame in (
-            (points, known, new.frame),
-            (surface.points_mm, surface.uncertainty, surface.frame),
-        )
-    ]
-    distance = parts[0][0] - parts[1][0]
-    # A mesh is what it is: between its samples nothing scatters.
-    variance = parts[0][1] + (0.0 if surface.meshed else parts[1][1])
+    variance, found = sides.variance_mm2, sides.registration
     if found is not None:
-        variance = variance + found.std_along(places, normals) ** 2
-    if not np.isfinite(distance).any():
+        variance = variance + found.std_along(sides.places, sides.normals) ** 2
+    if not np.isfinite(sides.distance_mm).any():
         raise EvaluationError(
             f"the cloud and the reference do not overlap within {deep:g} mm: do both have the same frame and unit? "
             "Give a larger deep_mm, or register them"
         )
-    return SurfaceChange(places, normals, distance, _TWO_SIDED * np.sqrt(variance), disc, deep, found)
+    level, area = TWO_SIDED * np.sqrt(variance), _areas(sides.places)
+    return SurfaceChange(
+        sides.places, sides.normals, sides.distance_mm, level, area, disc, deep, sides.moved, sides.reference
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class _Surface:
-    """Points (M, 3) of a reference, their normals where a mesh gives them, and how well they are known."""
+class _Sides:
+    """Distances (P,) at places and their variance without that of the estimate; ``moved`` if it moved the cloud."""
 
-    points_mm: np.ndarray
-    normals: np.ndarray | None = None
-    uncertainty: PointUncertainty | None = None
-    frame: np.ndarray | None = None
-
-    @property
-    def meshed(self) -> bool:
-        return self.normals is not None
-
-
-def _surface(reference: PointCloud | str | os.PathLike[str], unit: Unit, disc: float) -> _Surface:
-    scale = MM_PER_UNIT[checked_unit(unit)]
-    if not isinstance(reference, PointCloud):
-        if (mesh := _mesh(Path(reference))) is not None:
-            vertices, faces = scale * mesh[0], mesh[1]
-            return _sampled(vertices, faces, disc)
-        reference = read_cloud(reference)
-    if scale != 1.0 and reference.uncertainty is not None:
-        raise EvaluationError("a cloud with uncertainties is in mm: its unit cannot be m")
-    return _Surface(scale * reference.points_mm, None, reference.uncertainty, reference.frame)
+    places: np.ndarray
+    normals: np.ndarray
+    distance_mm: np.ndarray
+    variance_mm2: np.ndarray
+    registration: Registration | None
+    moved: Registration | None
+    reference: str
 
 
-def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Vertices (V, 3) and triangles (F, 3) of a file; None where it is a cloud."""
-    if path.suffix.lower() == ".h5":
-        return None
-    import trimesh
-
-    require_regular_file(path, error=CaptureError, called="reference")
-    if path.suffix.lower() == ".ply":
-        with path.open("rb") as file:
-            header = file.read(1 << 20).partition(b"end_header")[0]
-        if b"element face" not in header or b"element face 0" in header:
-            return None
-    try:
-        loaded: Any = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:
-        # Trimesh raises whatever its parsers do.
-        raise CaptureError(f"{path} is no mesh (.stl, .obj, .off, .ply) and no cloud: {error}") from error
-    vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces)
-    if not len(faces) or not np.isfinite(vertices).all():
-        raise CaptureError(f"{path} has no triangles, or vertices that are not finite")
-    return vertices, faces
-
-
-def _sampled(vertices: np.ndarray, faces: np.ndarray, disc: float) -> _Surface:
-    """Points spread evenly over a mesh, with the normals of their triangles."""
-    corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.linalg.norm(across, axis=1) / 2
-    total = float(area.sum())
-    if total <= 0:
-        raise EvaluationError("the mesh has no area")
-    count = int(np.clip(total / (np.pi / 4 * disc**2) * _SAMPLES_PER_DISC, 1000, _MOST_SAMPLES))
-    rng = np.random.default_rng(0)
-    # Equal shares of the area, so that no triangle is forgotten by chance.
-    chosen = np.searchsorted(np.cumsum(area) / total, (np.arange(count) + rng.random(count)) / count)
-    chosen = np.minimum(chosen, len(faces) - 1)
-    u, v = rng.random((2, count))
-    inside = u + v > 1
-    u[inside], v[inside] = 1 - u[inside], 1 - v[inside]
-    first, second, third = corners[chosen].transpose(1, 0, 2)
-    points = first + u[:, None] * (second - first) + v[:, None] * (third - first)
-    return _Surface(points, across[chosen] / (2 * area[chosen, None] + 1e-300))
+def _against_points(
+    new: PointCloud, surface: ReferencePoints, datums: np.ndarray | None, *, register: bool, disc: float, deep: float
+) -> _Sides:
+    points, known, other, found = new.points_mm, new.uncertainty, surface.uncertainty, None
+    if register:
+        target = surface.points_mm
+        normals = local_normals(target, target, disc_mm=disc) if surface.normals is None else surface.normals
+        sampled = SampledSurface(target, normals, uncertainty=other, frame=surface.frame)
+        found = register_to_surface(points, sampled, reach_mm=deep, uncertainty=known, frame=new.frame, datums=datums)
+        points, known = _moved(points, known, found)
+        if other is not None:
+            # The cloud follows what the reference's points share.
+            followed = [found.moves_mm(step, target) for step in found.by_reference]
+            other = replace(other, patterns_mm=other.patterns_mm - np.array(followed, np.float32))
+    places = points[_spread(points, disc / 2)]
+    normals = local_normals(places, surface.points_mm, disc_mm=disc, given=surface.normals)
+    here = local_means(places, normals, points, uncertainty=known, frame=new.frame, disc_mm=disc, deep_mm=deep)
+    there = local_means(
+        places, normals, surface.points_mm, uncertainty=other, frame=surface.frame, disc_mm=disc, deep_mm=deep
+    )
+    # A mesh is what it is: between its samples nothing scatters.
+    variance = here.variance_mm2 + (0.0 if surface.meshed else there.variance_mm2)
+    words = "mesh" if surface.meshed else "cloud"
+    return _Sides(places, normals, here.mean_mm - there.mean_mm, variance, found, found, words)
 
 
-def _enough(points: np.ndarray, name: str) -> np.ndarray:
-    if len(points) < _POINTS_PER_DISC:
-        raise EvaluationError(f"the {name} has {len(points)} points; at least {_POINTS_PER_DISC} are needed")
-    return points
-
-
-def _require_same_unit(cloud: np.ndarray, reference: np.ndarray) -> None:
-    sizes = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (cloud, reference)]
-    if sizes[0] > _OTHER_UNIT * sizes[1]:
-        raise EvaluationError(
-            f"the cloud is {sizes[0]:.4g} mm across and the reference {sizes[1]:.4g}: is that in metres? Give --unit m"
+def _against_shape(
+    new: PointCloud, shape: IdealShape, datums: np.ndarray | None, *, register: bool, disc: float, deep: float
+) -> _Sides:
+    points, known, chosen = new.points_mm, new.uncertainty, slice(None)
+    if datums is not None:
+        if not (register or shape.fitted):
+            raise EvaluationError("datums hold a registration or a fit, and this shape has a place: add --register")
+        away = np.linalg.norm(points[:, None] - datums[:, :3], axis=2)
+        if shape.fitted:
+            chosen = np.flatnonzero(np.any(away <= datums[:, 3], axis=1))
+    placed = place_shape(
+        shape, points[chosen], uncertainty=None if known is None else known[chosen], frame=new.frame[chosen]
+    )
+    found, moved = placed.registration, None
+    if found is not None and known is not None:
+        normals = placed.nearest(points).normals
+        followed = [found.moves_mm(step, points, normals) for step in found.by_cloud]
+        known = replace(known, patterns_mm=known.patterns_mm + np.array(followed, np.float32))
+    elif found is None and register:
+        found = moved = register_to_surface(
+            points, placed, reach_mm=deep, uncertainty=known, frame=new.frame, datums=datums
         )
-    if sizes[1] > 1000 * _OTHER_UNIT * sizes[0]:
-        raise EvaluationError(f"the cloud is {sizes[0]:.4g} mm across, the reference {sizes[1]:.4g} mm: is it in mm?")
+        points, known = _moved(points, known, found)
+    places = points[_spread(points, disc / 2)]
+    here: LocalMeans = local_means(
+        places,
+        normals := placed.nearest(places).normals,
+        points,
+        distance_mm=placed.nearest(points, reach_mm=deep).distance_mm,
+        uncertainty=known,
+        frame=new.frame,
+        disc_mm=disc,
+        deep_mm=deep,
+    )
+    return _Sides(places, normals, here.mean_mm, here.variance_mm2, found, moved, placed.words())
 
 
-def _disc_of(points: np.ndarray) -> float:
-    """Diameter of discs that hold some thirty points, from the usual distance of the sixth neighbour."""
-    sample = points[:: max(1, len(points) // 2000)]
-    seventh = KDTree(points).query(sample, k=7)[0][:, 6]
-    # A disc of radius r about a point holds six neighbours more: the area for thirty is five times as large.
-    return float(2 * np.median(seventh) * np.sqrt(_POINTS_PER_DISC / 6.0))
+def _areas(places: np.ndarray) -> np.ndarray:
+    """Area (P,) that each place stands for, from the disc about it that holds a dozen others."""
+    count = min(_AREA_NEIGHBOURS, len(places) - 1)
+    if count < 1:
+        return np.zeros(len(places))
+    away = np.asarray(KDTree(places).query(places, k=count + 1, workers=-1)[0])[:, -1]
+    return np.pi * away**2 / (count + 0.5)
 
 
 def _spread(points: np.ndarray, apart: float) -> np.ndarray:
@@ -307,95 +363,6 @@ def _spread(points: np.ndarray, apart: float) -> np.ndarray:
     cells = np.floor((points - points.min(axis=0)) / apart).astype(np.int64)
     first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
     return first[:: -(-len(first) // _MOST_PLACES)]
-
-
-def _normals(places: np.ndarray, surface: np.ndarray, disc: float, *, given: np.ndarray | None = None) -> np.ndarray:
-    """Unit normals (P, 3) of a surface near places: of the nearest sample of a mesh, or of the plane through points.
-
-    Those of clouds look towards the sensor, to -Z. Points within one disc's diameter are taken, at least eight.
-    """
-    tree = KDTree(surface)
-    if given is not None:
-        return given[tree.query(places, workers=-1)[1]]
-    result = np.empty_like(places)
-    nearest: Any = tree.query(places, k=min(2 * _POINTS_PER_DISC, len(surface)), workers=-1)
-    for number, (away, neighbours) in enumerate(zip(*nearest, strict=True)):
-        kept = neighbours[(away <= max(disc, away[7])) | (np.arange(len(away)) < 8)]
-        about = surface[kept] - surface[kept].mean(axis=0)
-        result[number] = np.linalg.eigh(about.T @ about)[1][:, 0]
-    return np.where(result[:, 2:] > 0, -result, result)
-
-
-def _neighbours(tree: KDTree, places: np.ndarray, radius: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Numbers of places and of the points near them, pair by pair, some places at a time."""
-    counts = tree.query_ball_point(places, radius, return_length=True, workers=-1)
-    part = np.cumsum(counts) // _PAIRS_AT_A_TIME
-    for number in np.unique(part):
-        chosen = np.flatnonzero(part == number)
-        found = tree.query_ball_point(places[chosen], radius, workers=-1)
-        lengths = np.array([len(each) for each in found])
-        if lengths.sum():
-            yield np.repeat(chosen, lengths), np.concatenate([np.asarray(each, np.intp) for each in found])
-
-
-def _side(
-    places: np.ndarray,
-    normals: np.ndarray,
-    points: np.ndarray,
-    known: PointUncertainty | None,
-    frame: np.ndarray | None,
-    *,
-    disc: float,
-    deep: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (P,) of the points of one side along the normals from the places, and its variance (P,)."""
-    count, mean, variance = (np.zeros(len(places)) for _ in range(3))
-    radius = float(np.hypot(disc / 2, deep))
-    for place, point in _neighbours(KDTree(points), places, radius):
-        away = points[point] - places[place]
-        along = np.einsum("ni,ni->n", away, normals[place])
-        across = np.einsum("ni,ni->n", away, away) - along**2
-        inside = (across <= (disc / 2) ** 2) & (np.abs(along) <= deep)
-        place, point, along = place[inside], point[inside], along[inside]
-        here = np.unique(place)
-        number = np.bincount(place, minlength=len(places))
-        total = np.bincount(place, along, minlength=len(places))
-        centre = total / np.maximum(number, 1)
-        scatter = np.bincount(place, (along - centre[place]) ** 2, minlength=len(places)) / np.maximum(number - 1, 1)
-        count[here], mean[here] = number[here], centre[here]
-        variance[here] = (scatter / np.maximum(number, 1))[here]
-        if known is not None:
-            variance[here] = _variance(place, point, normals, known, frame, number, variance)[here]
-    mean[count < _FEWEST] = np.nan
-    return mean, variance
-
-
-def _variance(
-    place: np.ndarray,
-    point: np.ndarray,
-    normals: np.ndarray,
-    known: PointUncertainty,
-    frame: np.ndarray | None,
-    number: np.ndarray,
-    rough: np.ndarray,
-) -> np.ndarray:
-    """Variance (P,) of the mean of each place's points along the normal: single points, images, and what all share."""
-    size, normal, many = len(number), normals[place], np.maximum(number, 1)
-    pairs = known.random_mm2[point]
-    single = sum(
-        (1 if i == j else 2) * pairs[:, column] * normal[:, i] * normal[:, j] for column, (i, j) in enumerate(PAIRS)
-    )
-    result = np.maximum(rough, np.bincount(place, single, minlength=size) / many**2)
-    moved = np.einsum("ni,ni->n", known.position_mm[point], normal)
-    image = np.arange(len(point)) if frame is None else frame[point].astype(np.int64)
-    # Points of one image move together, those of different images do not.
-    group, owner = np.unique(np.column_stack([place, image]), axis=0, return_inverse=True)
-    together = np.bincount(owner.ravel(), moved / many[place])
-    result += np.bincount(group[:, 0], together**2, minlength=size)
-    for pattern in known.patterns_mm:
-        along = np.einsum("ni,ni->n", pattern[point], normal)
-        result += (np.bincount(place, along, minlength=size) / many) ** 2
-    return result
 
 
 def _matrices(pairs: np.ndarray) -> np.ndarray:
@@ -406,10 +373,18 @@ def _matrices(pairs: np.ndarray) -> np.ndarray:
     return result
 
 
-def _turned(known: PointUncertainty | None, rotation: np.ndarray) -> PointUncertainty | None:
+def _moved(
+    points: np.ndarray, known: PointUncertainty | None, found: Registration
+) -> tuple[np.ndarray, PointUncertainty | None]:
+    """Points after a registration, and their uncertainty with what of the shared errors it takes up."""
+    rotation = found.transform[:3, :3]
+    points = points @ rotation.T + found.transform[:3, 3]
     if known is None:
-        return None
+        return points, None
     matrices = rotation @ _matrices(known.random_mm2) @ rotation.T
     pairs = np.stack([matrices[:, i, j] for i, j in PAIRS], axis=1)
-    turned = replace(known, random_mm2=pairs, position_mm=known.position_mm @ rotation.T)
-    return replace(turned, patterns_mm=known.patterns_mm @ rotation.T)
+    patterns = known.patterns_mm @ rotation.T
+    followed = [found.moves_mm(step, points) for step in found.by_cloud]
+    patterns = patterns + np.array(followed, np.float32).reshape(patterns.shape)
+    poses = None if known.poses_mm is None else known.poses_mm @ rotation.T
+    return points, PointUncertainty(pairs, known.position_mm @ rotation.T, patterns.astype(np.float32), poses)

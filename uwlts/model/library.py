@@ -112,7 +112,8 @@ def validated(model: type[AnyDescription], table: object, source: str | Path) ->
 
 
 def _explained(problem: ErrorDetails) -> str:
-    key = ".".join(str(part) for part in problem["loc"]) or "(whole description)"
+    # The kind that is meant where none is named has an empty tag.
+    key = ".".join(str(part) for part in problem["loc"] if part != "") or "(whole description)"
     if problem["type"] == "extra_forbidden":
         return f"  {key}: unknown key (check its spelling and its unit suffix, such as _mm or _deg)"
     if problem["type"] == "missing":

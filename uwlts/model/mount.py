@@ -71,7 +71,8 @@ class Mount(Description):
     further rotation (rad) about the platform's axes, R_true = exp(rotation) R. ``coverage_factor`` times a standard
     uncertainty is half of the 95 % interval (Student's t). ``point_std_mm`` is the noise of a point of a profile,
     ``pose_std_mm`` that of the platform's position for each coordinate; both are estimated from the profiles.
-    ``inputs`` holds the SHA-256 of every file that was read.
+    On a rotary table (``table``) the platform's z axis is the table's; shift along it and turn about it are chosen, and
+    have no variance. ``inputs`` holds the SHA-256 of every file that was read.
     """
 
     T_platform_sensor: Rows
@@ -86,6 +87,7 @@ class Mount(Description):
     pose_std_mm: NotNegative
     rms_mm: NotNegative
     held_out_rms_mm: NotNegative
+    table: bool = False
     poses: tuple[MountPose, ...]
     weaknesses: tuple[str, ...] = ()
     next_pose: NextPose | None = None
@@ -100,7 +102,7 @@ class Mount(Description):
         covariance = np.array(self.covariance)
         if np.abs(covariance - covariance.T).max() > 1e-9 * np.abs(covariance).max():
             raise ValueError("covariance must be a symmetric 6x6 matrix")
-        if not np.all(np.diag(covariance) > 0):
+        if not np.all(np.delete(np.diag(covariance), (2, 5) if self.table else ()) > 0):
             raise ValueError("covariance must have positive variances")
         return self
 

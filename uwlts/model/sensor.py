@@ -42,6 +42,17 @@ def _unit(vector: Vector) -> Vector:
     return vector
 
 
+Rows = tuple[tuple[float, ...], ...]
+
+
+def _mounted(rows: Rows) -> Rows:
+    matrix = np.array(rows) if [*map(len, rows)] == [4] * 4 else np.zeros((4, 4))
+    turn = matrix[:3, :3]
+    if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) and np.linalg.det(turn) > 0 and matrix[3, 3] == 1):
+        raise ValueError("must be a 4x4 matrix of a rotation, a shift, and 0 0 0 1")
+    return rows
+
+
 UnitVector = Annotated[Vector, AfterValidator(_unit)]
 
 _INDEX_FORMULA = 1.5e-5
@@ -572,7 +583,8 @@ class CaptureHeader(Description):
     ``medium_name`` is the medium's in the sensor's description, ``stage_direction`` the nominal unit direction in which
     the stage moves the sensor, in the OCS, ``saturation_dn`` the grey value at which pixels clip. ``target`` and
     ``artefact`` describe what was before the sensor (`parse_target`, `parse_artefact`); they are checked when they are
-    used. ``provenance`` says what recorded the capture, and how.
+    used. ``T_platform_sensor`` (4, 4), mm, is where the sensor is mounted on the platform that carries it, by the
+    drawing: the frames' poses are then the platform's. ``provenance`` says what recorded the capture, and how.
     """
 
     name: str
@@ -583,4 +595,5 @@ class CaptureHeader(Description):
     saturation_dn: Annotated[int, Field(gt=0)]
     target: Table | None = None
     artefact: Table | None = None
+    T_platform_sensor: Annotated[Rows, AfterValidator(_mounted)] | None = None
     provenance: Table = {}

@@ -25,6 +25,8 @@ class Trajectory:
     times_s : (N,) float64
     poses : (N, 4, 4) float64
         ``T_base_platform``, mm.
+    covariance : (N, 6, 6) float64, optional
+        Of each pose: the shift in mm, then a further rotation in rad about the base's axes, R_true = exp(rotation) R.
 
     Raises
     ------
@@ -34,6 +36,7 @@ class Trajectory:
 
     times_s: np.ndarray
     poses: np.ndarray
+    covariance: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         times, poses = np.array(self.times_s, dtype=np.float64), np.array(self.poses, dtype=np.float64)
@@ -49,7 +52,10 @@ class Trajectory:
             )
         if not is_rigid(poses, within=_ROUNDED):
             raise DescriptionError("the poses of a trajectory must be rotations with a shift (0 0 0 1 as last row)")
-        for name, values in (("times_s", times), ("poses", poses)):
+        known = {"times_s": times, "poses": poses}
+        if self.covariance is not None:
+            known["covariance"] = _checked_covariances(self.covariance, len(times))
+        for name, values in known.items():
             values.flags.writeable = False
             object.__setattr__(self, name, values)
 
@@ -60,6 +66,21 @@ class Trajectory:
     @cached_property
     def _rotations(self) -> RotationSpline:
         return RotationSpline(self.times_s, Rotation.from_matrix(self.poses[:, :3, :3]))
+
+    def rates_at(self, times_s: np.ndarray) -> np.ndarray:
+        """Velocities in mm/s and turns in rad/s (M, 6) in the base frame at times (M,) within the path."""
+        wanted = np.asarray(times_s, dtype=np.float64)
+        # SciPy's rates are in the moving frame.
+        turns = self._rotations(wanted).apply(self._rotations(wanted, 1))
+        return np.hstack([self._positions(wanted, 1), turns])
+
+    def covariance_at(self, times_s: np.ndarray) -> np.ndarray | None:
+        """Covariances (M, 6, 6) at times (M,), linear between those of the poses; None where they are not known."""
+        if self.covariance is None:
+            return None
+        flat = self.covariance.reshape(len(self.times_s), 36)
+        at = np.stack([np.interp(times_s, self.times_s, column) for column in flat.T], axis=1)
+        return at.reshape(-1, 6, 6)
 
     def poses_at(self, times_s: np.ndarray) -> np.ndarray:
         """``T_base_platform`` (M, 4, 4) at times (M,), mm; DescriptionError for times before or after the path."""
@@ -74,3 +95,21 @@ class Trajectory:
         poses[:, :3, :3] = self._rotations(wanted).as_matrix()
         poses[:, :3, 3] = self._positions(wanted)
         return poses
+
+
+def _checked_covariances(values: np.ndarray, count: int) -> np.ndarray:
+    """Covariances (N, 6, 6) of N poses; DescriptionError where they are none."""
+    covariances = np.array(values, dtype=np.float64)
+    if covariances.shape != (count, 6, 6) or not np.isfinite(covariances).all():
+        raise DescriptionError(
+            f"the covariances of {count} poses are finite numbers ({count}, 6, 6); found {covariances.shape}"
+        )
+    sizes = np.sqrt(np.maximum(np.einsum("nii->ni", covariances), 1e-30))
+    scaled = covariances / (sizes[:, :, None] * sizes[:, None])
+    lopsided = np.abs(scaled - np.swapaxes(scaled, 1, 2)).max(axis=(1, 2)) > _ROUNDED
+    wrong = lopsided | (np.linalg.eigvalsh(scaled)[:, 0] < -_ROUNDED)
+    if wrong.any():
+        raise DescriptionError(
+            f"the covariance of pose {int(np.argmax(wrong)) + 1} must be symmetric and without negative variances"
+        )
+    return covariances

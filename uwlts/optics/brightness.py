@@ -10,15 +10,16 @@ blur moves light from one line to the next and with it the centre that is seen t
 """
 
 import math
-from typing import Any
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from uwlts.model.calibration import Calibration
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Laser, Sensor, Uncertainty, Vector
-from uwlts.optics.reconstruction import reconstruct_profile
+from uwlts.model.stripe import pixels_of
+from uwlts.optics.line_table import LineTable
+from uwlts.optics.reconstruction import reconstruct_pixels
+from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 from uwlts.stripe.recording import FoundStripes
 
@@ -40,6 +41,9 @@ _LINES, _BEND_LINES, _LEAST_SHARE = 12, 6, 0.2
 
 _LEAST_ACROSS = 0.3
 """Least cosine between the stage's motion and the sheet's normal for which a scan shows what lies beside the sheet."""
+
+_TABLE_TOLERANCE = 1e-6
+"""Error, in mm and mm per mm or px, of tabulated points and their derivatives."""
 
 _MOVED_MM, _MOVED_PX = 0.05, 0.5
 """Steps of sheet and pixel for the derivatives of the points: some sigma of the sheet, within one pixel."""
@@ -70,21 +74,26 @@ def beside_sheet(
     sheet = calibration.sheet
     window = calibration.window if sensor.camera.window.mounted else None
 
-    def points(further_mm: float = 0.0, further_px: float = 0.0) -> np.ndarray:
+    def points(line: np.ndarray, place_px: np.ndarray, further_mm: float = 0.0) -> np.ndarray:
         shifted = sheet.model_copy(update={"offset_mm": sheet.offset_mm + further_mm})
         moved = calibration.model_copy(update={"sheet": shifted, "window": window})
-        at_px = centre_px + further_px
-        return reconstruct_profile(
-            moved, line, at_px, medium_index=medium_index, stage_mm=0.0, stage_direction=direction
+        pixels = pixels_of(line, place_px, stripe_along=calibration.stripe_along)
+        return reconstruct_pixels(
+            moved, pixels, medium_index=medium_index, stage_mm=0.0, stage_direction=direction
         ).points_mm
 
-    on_sheet = points()
-    per_mm = (points(_MOVED_MM) - on_sheet) / _MOVED_MM
+    def exact(line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
+        here = points(line, place_px)
+        per_mm = (points(line, place_px, _MOVED_MM) - here) / _MOVED_MM
+        return np.hstack([here, per_mm, (points(line, place_px + _MOVED_PX) - here) / _MOVED_PX])
+
+    table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE)
+    values = exact(line, centre_px) if table is None else table.values(line, centre_px)
+    # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
+    on_sheet, per_mm, per_px = values[:, :3], values[:, 3:6], values[:, 6:]
     in_camera = on_sheet @ frame[:3, :3].T + frame[:3, 3]
     away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
     sigma = sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
-    # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
-    per_px = (points(further_px=_MOVED_PX) - on_sheet) / _MOVED_PX
     known = width_px[np.isfinite(width_px)]
     thickest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA * np.abs(per_px[:, 2] / per_mm[:, 2])
     return per_mm * (slopes / across * np.minimum(sigma, thickest) ** 2)[:, None]
@@ -170,26 +179,74 @@ def _slopes(
     """Slopes (N,) by position and by column of planes fitted to the values within so many rows and columns."""
     first = column.min()
     shape = len(position), int(column.max() - first) + 1
-    there, z = np.zeros(shape), np.zeros(shape)
-    there[row, column - first] = 1.0
+    there, z = np.zeros(shape, np.bool_), np.zeros(shape)
+    there[row, column - first] = True
     z[row, column - first] = values - values.mean()
-    size: Any = (2 * rows + 1, 2 * columns + 1)  # SciPy takes a size for each axis
-    s = np.broadcast_to((position - position.mean())[:, None], shape)
-    x = np.broadcast_to(np.arange(shape[1]) - 0.5 * shape[1], shape)
-
-    def mean(of: np.ndarray) -> np.ndarray:
-        return uniform_filter(there * of, size, mode="constant") / share
-
-    share = np.maximum(uniform_filter(there, size, mode="constant"), 0.5 / (size[0] * size[1]))
-    ms, mx, mz = mean(s), mean(x), mean(z)
-    ss, xx, sx = mean(s * s) - ms * ms, mean(x * x) - mx * mx, mean(s * x) - ms * mx
-    sz, xz = mean(s * z) - ms * mz, mean(x * z) - mx * mz
-    wide = (share > _LEAST_SHARE) & (xx > 1.0)
+    s = position - position.mean()
     # Neighbours in a row, or in images taken nearly at one place, do not show the slope across it.
     step = np.median(position[rows:] - position[:-rows]) / rows if rows else 0.0
     least = max(0.15 * step**2, _LEAST_APART_MM**2)
-    deep = wide & (ss > least) & (ss < _REACH_MM**2) & (ss * xx - sx * sx > 1e-3 * ss * xx)
     by_position, by_column = np.zeros(shape), np.zeros(shape)
-    np.divide(sz * xx - xz * sx, ss * xx - sx * sx, out=by_position, where=deep)
-    np.divide(xz, xx, out=by_column, where=wide)
+    _fit_planes(there, z, np.ascontiguousarray(s, dtype=float), rows, columns, least, by_position, by_column)
     return by_position[row, column - first], by_column[row, column - first]
+
+
+@compiled
+def _fit_planes(
+    there: np.ndarray,
+    z: np.ndarray,
+    s: np.ndarray,
+    rows: int,
+    columns: int,
+    least: float,
+    by_position: np.ndarray,
+    by_column: np.ndarray,
+) -> None:
+    """Slopes (F, L) of planes through the values z (F, L) that are there, at positions s (F,), 0 where unknown.
+
+    The sums over the window are running ones, first along a row and then from row to row.
+    """
+    count, width = there.shape
+    along = np.zeros((count, 5, width))
+    for row in range(count):
+        n, x1, x2, z1, xz = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(width + columns):
+            for at, sign in ((k, 1.0), (k - 2 * columns - 1, -1.0)):
+                if 0 <= at < width and there[row, at]:
+                    x, value = at - 0.5 * width, z[row, at]
+                    n, x1, x2 = n + sign, x1 + sign * x, x2 + sign * x * x
+                    z1, xz = z1 + sign * value, xz + sign * x * value
+            if k >= columns:
+                to = along[row, :, k - columns]
+                to[0], to[1], to[2], to[3], to[4] = n, x1, x2, z1, xz
+    size = (2 * rows + 1) * (2 * columns + 1)
+    total = np.zeros((9, width))
+    for k in range(count + rows):
+        for row, sign in ((k, 1.0), (k - 2 * rows - 1, -1.0)):
+            if 0 <= row < count:
+                for at in range(width):
+                    n, x1, z1 = sign * along[row, 0, at], sign * along[row, 1, at], sign * along[row, 3, at]
+                    total[0, at] += n
+                    total[1, at] += x1
+                    total[2, at] += sign * along[row, 2, at]
+                    total[3, at] += z1
+                    total[4, at] += sign * along[row, 4, at]
+                    total[5, at] += s[row] * n
+                    total[6, at] += s[row] * s[row] * n
+                    total[7, at] += s[row] * x1
+                    total[8, at] += s[row] * z1
+        if k < rows:
+            continue
+        for at in range(width):
+            n = total[0, at]
+            if not there[k - rows, at] or n <= _LEAST_SHARE * size:
+                continue
+            mx, mz, ms = total[1, at] / n, total[3, at] / n, total[5, at] / n
+            xx, xz = total[2, at] / n - mx * mx, total[4, at] / n - mx * mz
+            if xx <= 1.0:
+                continue
+            by_column[k - rows, at] = xz / xx
+            ss, sx, sz = total[6, at] / n - ms * ms, total[7, at] / n - ms * mx, total[8, at] / n - ms * mz
+            of_both = ss * xx - sx * sx
+            if least < ss < _REACH_MM**2 and of_both > 1e-3 * ss * xx:
+                by_position[k - rows, at] = (sz * xx - xz * sx) / of_both

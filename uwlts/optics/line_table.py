@@ -60,10 +60,11 @@ class LineTable:
             if not np.isfinite(values).all():
                 return None
             # Axes: term of the place, term of the line, value.
-            series = np.einsum("ip,jl,plk->ijk", into_series, into_series, values, optimize=True)
+            series = np.tensordot(into_series, np.tensordot(into_series, values, (1, 1)), (1, 1))
             if max(np.abs(series[-2:]).max(), np.abs(series[:, -2:]).max()) <= tolerance:
                 by_line = chebyshev.chebvander((np.arange(lines[0], lines[1] + 1) - line) / half_lines, count - 1)
-                per_line = np.ascontiguousarray(np.einsum("lj,ijk->lik", by_line, series, optimize=True))
+                flat = np.moveaxis(series, 1, 0).reshape(count, -1)
+                per_line = (by_line @ flat).reshape(len(by_line), count, -1)
                 return cls(per_line, lines[0], place - half_places, place + half_places)
         return None
 
@@ -82,9 +83,9 @@ class LineTable:
         lines, places_px = (int(line.min()), int(line.max())), (float(place_px.min()), float(place_px.max()))
         return cls.of(exact, lines, places_px, tolerance=tolerance)
 
-    def values(self, line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
-        """Values (N, K) for lines (N,) int and places (N,) within the table."""
-        result = np.empty((len(line), self.series.shape[2]))
+    def values(self, line: np.ndarray, place_px: np.ndarray, *, out: np.ndarray | None = None) -> np.ndarray:
+        """Values (N, K), into ``out`` where that is given, for lines (N,) int and places (N,) within the table."""
+        result = np.empty((len(line), self.series.shape[2])) if out is None else out
         row = np.ascontiguousarray(line, dtype=np.intp) - self.first_line
         scale = 2.0 / (self.high_px - self.low_px)
         at = np.ascontiguousarray((np.asarray(place_px, dtype=float) - self.low_px) * scale - 1.0)
@@ -94,8 +95,20 @@ class LineTable:
 
 @compiled
 def _sum_series(series: np.ndarray, row: np.ndarray, at: np.ndarray, result: np.ndarray) -> None:
-    """Sums of Chebyshev polynomials, each by recurrence from the two before."""
+    """Sums of Chebyshev polynomials, each by recurrence from the two before.
+
+    Places are taken line by line, so that a line's series is fetched from memory once.
+    """
+    first = np.zeros(series.shape[0] + 1, np.int64)
     for n in range(row.size):
+        first[row[n] + 1] += 1
+    for line in range(series.shape[0]):
+        first[line + 1] += first[line]
+    order = np.empty(row.size, np.int64)
+    for n in range(row.size):
+        order[first[row[n]]] = n
+        first[row[n]] += 1
+    for n in order:
         terms, sums, x = series[row[n]], result[n], at[n]
         before, polynomial = x, 1.0
         for k in range(sums.size):

@@ -9,13 +9,24 @@ from plyfile import PlyData, PlyElement
 import uwlts
 from uwlts.metrology.change import SurfaceChange
 from uwlts.model.errors import OutputError
-from uwlts.report.page_toolkit import BLUE, RED, new_figure, png_data_uri, render_page, svg_of, write_page
+from uwlts.report.page_toolkit import BLUE, INK, RED, new_figure, png_data_uri, render_page, svg_of, write_page
+from uwlts.storage.export_ import laz_content
 from uwlts.storage.files import written_aside
 from uwlts.storage.json_files import json_text
 
 _NOT_SIGNIFICANT = "#cccccc"
 _INK = 60_000
 """Area of all dots together, square points: they nearly touch."""
+_COLUMNS = (
+    "region",
+    "centre / mm",
+    "area / mm²",
+    "extent / mm",
+    "largest / mm",
+    "mean / mm",
+    "level / mm",
+    "volume / mm³",
+)
 _CLIPPED = 0.995
 """Share of the places within the colours' range."""
 
@@ -28,9 +39,10 @@ def write_change(
     coloured: str | Path | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write the page of a change, its figures as JSON beside it, and with ``coloured`` its places as a PLY cloud.
+    """Write the page of a change, its figures as JSON beside it, and its places as a PLY or LAZ cloud (``coloured``).
 
-    The cloud's vertices have x, y, z, nx, ny, nz, distance, level (mm; NaN where not compared) and significant (0, 1).
+    The cloud's points have x, y, z (mm in PLY, m in LAZ), nx, ny, nz, distance, level (mm; NaN where not compared) and
+    significant (0, 1).
     OutputError if a file exists and ``overwrite`` is not given, or cannot be written.
     """
     text = render_page(
@@ -39,6 +51,8 @@ def write_change(
         title=title,
         software=f"uwlts {uwlts.__version__}",
         summary=change.lines(),
+        columns=_COLUMNS,
+        regions=_rows(change),
         map=_map(change),
         histogram=_histogram(change),
     )
@@ -48,22 +62,44 @@ def write_change(
 
 
 def _write_places(path: Path, change: SurfaceChange, *, overwrite: bool) -> None:
-    if path.suffix.lower() != ".ply":
-        raise OutputError(f"{path}: the places are written as PLY; give a name like change.ply")
-    columns = dict(zip(("x", "y", "z"), change.points_mm.T, strict=True))
-    columns |= dict(zip(("nx", "ny", "nz"), change.normals.T.astype(np.float32), strict=True))
-    columns |= {"distance": change.distance_mm.astype(np.float32), "level": change.level_mm.astype(np.float32)}
-    columns["significant"] = change.significant.astype(np.uint8)
-    vertices = np.empty(len(change.points_mm), [(name, values.dtype) for name, values in columns.items()])
-    for name, values in columns.items():
-        vertices[name] = values
-    with written_aside(path, overwrite=overwrite) as aside:
-        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(aside))
+    fields = dict(zip(("nx", "ny", "nz"), change.normals.T.astype(np.float32), strict=True))
+    fields |= {"distance": change.distance_mm.astype(np.float32), "level": change.level_mm.astype(np.float32)}
+    fields["significant"] = change.significant.astype(np.uint8)
+    match path.suffix.lower():
+        case ".laz":
+            content = laz_content(change.points_mm, np.zeros(len(change.points_mm), np.float32), fields)
+            with written_aside(path, overwrite=overwrite) as aside:
+                aside.write_bytes(content)
+        case ".ply":
+            columns = dict(zip(("x", "y", "z"), change.points_mm.T, strict=True)) | fields
+            vertices = np.empty(len(change.points_mm), [(name, values.dtype) for name, values in columns.items()])
+            for name, values in columns.items():
+                vertices[name] = values
+            with written_aside(path, overwrite=overwrite) as aside:
+                PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(aside))
+        case _:
+            raise OutputError(f"{path}: the places are written as PLY or LAZ; give a name like change.ply")
+
+
+def _rows(change: SurfaceChange) -> list[tuple[str, ...]]:
+    return [
+        (
+            str(number),
+            " ".join(f"{value:.1f}" for value in region.centre_mm),
+            f"{region.area_mm2:.1f}",
+            f"{region.extent_mm:.1f}",
+            f"{region.largest_mm:+.3f}",
+            f"{region.mean_mm:+.3f}",
+            f"{region.level_mm:.3f}",
+            f"{region.volume_mm3:+.1f}",
+        )
+        for number, region in enumerate(change.regions(), start=1)
+    ]
 
 
 def _map(change: SurfaceChange) -> str:
     """The places from above, across the two longest of their extents, coloured where the change is significant."""
-    first, second = np.sort(np.argsort(np.ptp(change.points_mm, axis=0))[1:])
+    first, second = np.sort(np.argsort(np.ptp(change.points_mm, axis=0), kind="stable")[1:])
     shown, changed = change.compared, change.significant
     limit = float(np.quantile(np.abs(change.distance_mm[shown]), _CLIPPED))
     figure, (axes,) = new_figure(9.0, 6.0)
@@ -81,6 +117,9 @@ def _map(change: SurfaceChange) -> str:
         linewidths=0,
     )
     figure.colorbar(colours, ax=axes, label="distance / mm (grey: within its level of detection)")
+    for number, region in enumerate(change.regions(), start=1):
+        place = region.centre_mm[first], region.centre_mm[second]
+        axes.annotate(str(number), place, xytext=(6, 6), textcoords="offset points", fontsize=8, color=INK)
     axes.set(xlabel=f"{'XYZ'[first]} / mm", ylabel=f"{'XYZ'[second]} / mm", aspect="equal")
     return png_data_uri(axes, dpi=130)
 

@@ -313,7 +313,11 @@ def _shown_lines(stripe: Stripe, *, enlarged: bool) -> np.ndarray:
     if not enlarged:
         return stripe.lines
     count = min(_LINES_ENLARGED, len(stripe.lines))
-    first = int(np.argmax(np.convolve(np.nan_to_num(stripe.amplitude), np.ones(count), mode="valid")))
+    # A 3D camera may not give amplitudes; then the place with the most lines is shown.
+    amplitude = (
+        stripe.amplitude if np.isfinite(stripe.amplitude).any() else np.where(np.isfinite(stripe.centre_px), 1, 0)
+    )
+    first = int(np.argmax(np.convolve(np.nan_to_num(amplitude), np.ones(count), mode="valid")))
     return stripe.lines[(stripe.lines >= first) & (stripe.lines < first + count)]
 
 

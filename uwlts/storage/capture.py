@@ -1,7 +1,8 @@
 """The capture file: what a camera saw of a scan, with everything known about it, written frame by frame.
 
 An HDF5 file with ``frames (N, H, W)`` (8 or 16 bit, one chunk per frame, Blosc zstd with bit shuffle, Fletcher-32
-checksum), per frame ``stage_mm``, ``pose`` (4, 4), ``laser_on``, ``exposure_ms`` and ``time_s``, and attributes
+checksum), per frame ``stage_mm``, ``pose`` (4, 4), ``laser_on``, ``exposure_ms`` and ``time_s``, perhaps
+``pose_covariance`` (6, 6), and attributes
 ``format``, ``version`` and ``header``: JSON with sensor, medium, target, artefact and provenance. Nothing in it is ever
 executed, and real and synthetic captures look the same.
 
@@ -56,6 +57,7 @@ FORMAT = "uwlts-capture"
 VERSION = 2
 """Of captures with centre lines or a moving stage; those of images at rest have version 1."""
 _PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (), "time_s": ()}
+_COVARIANCE = "pose_covariance"
 _MORE = {"has_image": bool, "encoder": float, "speed_mm_per_s": float}
 """Columns of version 2."""
 # What h5py raises on a damaged file depends on where the damage is.
@@ -89,6 +91,9 @@ def picture_of(seen: Seen, camera: Camera) -> np.ndarray:
 class Frame:
     """What was seen, with its stage position, light, exposure, time, and pose ``T_scene_object`` (4, 4) if known.
 
+    ``pose_covariance`` (6, 6) is that of the pose, if it is known: of the shift in mm, then of a further rotation in
+    rad about the scene's axes. Where the capture states a mount the pose is the platform's.
+
     ``encoder`` is the count of an encoder at that moment, where there is one. Of a stage that moves, position and time
     are those in the middle of the exposure, of an image's middle row where the shutter is rolling.
     """
@@ -101,6 +106,7 @@ class Frame:
     pose: np.ndarray | None = None
     encoder: float | None = None
     speed_mm_per_s: float = 0.0
+    pose_covariance: np.ndarray | None = None
 
     @property
     def image(self) -> np.ndarray:
@@ -137,6 +143,12 @@ class FrameTable:
         )
 
 
+def sensor_poses(capture: "Capture | FrameTable") -> np.ndarray:
+    """``T_scene_object`` (N, 4, 4) of the sensor's OCS: the poses, or the platform's with the mount of the drawing."""
+    mount = capture.header.T_platform_sensor
+    return capture.pose if mount is None else capture.pose @ np.array(mount)
+
+
 def part_path(path: Path) -> Path:
     """Name of an unfinished recording of ``path``."""
     return path.with_name(path.name + ".part")
@@ -155,7 +167,7 @@ def _recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None,
 
 def _arrays(file: h5py.File) -> dict[str, h5py.Dataset]:
     """A capture's datasets by their names, in a file of this program's."""
-    names = ("frames", "centre_lines", "stage_reports", *_MORE, *_PER_FRAME)
+    names = ("frames", "centre_lines", "stage_reports", *_MORE, _COVARIANCE, *_PER_FRAME)
     return {name: cast(h5py.Dataset, file[name]) for name in names if name in file}
 
 
@@ -170,11 +182,11 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
     """Records a capture. A context manager: leaving it normally finishes the file, an exception keeps the part.
 
     ``dtype`` is that of images; with ``centre_lines`` laser frames are centre lines, with ``moving`` frames have a
-    speed, and the stage's reports are added by `place`. ``plan`` says, as JSON, what is to be recorded beyond what the
-    header states; it is kept in the part and not in the finished capture. OutputError where the file exists (give
-    ``overwrite``), is an input of the running command or is being written by another process, a part is left over (give
-    ``resume`` or ``overwrite``), or storage fails; CaptureError for ``resume`` of a part that is damaged, or of another
-    header or plan.
+    speed, and the stage's reports are added by `place`; with ``covariances`` frames may have that of their pose.
+    ``plan`` says, as JSON, what is to be recorded beyond what the header states; it is kept in the part and not in the
+    finished capture. OutputError where the file exists (give ``overwrite``), is an input of the running command or is
+    being written by another process, a part is left over (give ``resume`` or ``overwrite``), or storage fails;
+    CaptureError for ``resume`` of a part that is damaged, or of another header or plan.
     """
 
     def __init__(
@@ -186,10 +198,12 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         centre_lines: bool = False,
         moving: bool = False,
         plan: Table | None = None,
+        covariances: bool = False,
         overwrite: bool = False,
         resume: bool = False,
     ):
         self.path, self.header, self._plan = Path(path), header, plan
+        self._per_frame = _PER_FRAME | ({_COVARIANCE: (6, 6)} if covariances else {})
         self._last_s = -math.inf
         self._part = part_path(self.path)
         camera = header.sensor.camera
@@ -259,7 +273,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                         fletcher32=True,
                         **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
                     )
-                columns = _PER_FRAME | (dict.fromkeys(_MORE, ()) if self._version() > 1 else {})
+                columns = self._per_frame | (dict.fromkeys(_MORE, ()) if self._version() > 1 else {})
                 if self._moving:
                     self._file.create_dataset("stage_reports", (0, 2), float, maxshape=(None, 2), chunks=(256, 2))
                 for name, shape in columns.items():
@@ -305,6 +319,10 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             raise CaptureError(f"a pose is a finite array (4, 4); found {frame.pose}")
         if frame.pose is not None and not is_rigid(frame.pose, within=POSE_ROUNDED):
             raise CaptureError(f"a pose is a rotation, a shift and 0 0 0 1; found {frame.pose.tolist()}")
+        if frame.pose_covariance is not None:
+            if _COVARIANCE not in self._per_frame:
+                raise CaptureError("the capture was begun without covariances of poses: begin it with covariances=True")
+            _require_covariances(np.asarray(frame.pose_covariance)[None], self.path)
         with self._storage():
             self._store(frame)
 
@@ -344,6 +362,8 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             kept, seen = "centre_lines", rows_of(frame.seen)
         else:
             kept, seen = "frames", frame.seen
+        if _COVARIANCE in self._per_frame:
+            values[_COVARIANCE] = np.full((6, 6), np.nan) if frame.pose_covariance is None else frame.pose_covariance
         # The time comes last: by its number frames are counted.
         values |= {"exposure_ms": frame.exposure_ms, "time_s": frame.time_s}
         count = len(self)
@@ -395,6 +415,16 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 note_made(self.path)
 
 
+def _require_covariances(values: np.ndarray, path: Path) -> None:
+    """CaptureError where values (N, 6, 6) are no covariances."""
+    if values.shape[1:] != (6, 6) or not np.isfinite(values).all():
+        raise CaptureError(f"{path}: the covariance of a pose is a finite array (6, 6)")
+    sizes = np.sqrt(np.maximum(np.einsum("nii->ni", values), 1e-30))
+    scaled = values / (sizes[:, :, None] * sizes[:, None])
+    if np.abs(scaled - np.swapaxes(scaled, 1, 2)).max() > 1e-6 or np.linalg.eigvalsh(scaled).min() < -1e-6:
+        raise CaptureError(f"{path}: the covariance of a pose is symmetric without negative variances")
+
+
 def _what_is_wrong(error: Exception) -> str:
     """HDF5's message about a file that it cannot open; the two most usual ones in plain English."""
     if found := re.search(r"truncated file: eof = (\d+).*stored_eof = (\d+)", str(error)):
@@ -421,7 +451,10 @@ class Capture(AbstractContextManager["Capture"]):
     laser_on : (N,) bool
         Whether the laser was on, rather than the lamp.
     pose : (N, 4, 4) float64
-        ``T_scene_object`` of the sensor's OCS, a rotation with a shift; all NaN for a frame without one.
+        ``T_scene_object`` of the sensor's OCS, a rotation with a shift; all NaN for a frame without one. It is that of
+        the platform, ``T_scene_platform``, where the header states ``T_platform_sensor``.
+    pose_covariance : (N, 6, 6) float64 or None
+        Covariance of each pose (`Frame`), all NaN where it is not known; None in captures without any.
     has_image : (N,) bool
         Whether a frame is an image, rather than a centre line.
     encoder : (N,) float64
@@ -501,6 +534,13 @@ class Capture(AbstractContextManager["Capture"]):
         )
         if not all(np.isfinite(values).all() for values in (self.stage_mm, self.exposure_ms, self.time_s)):
             raise CaptureError(f"{self.path} holds stage positions, exposures or times that are not finite")
+        self.pose_covariance: np.ndarray | None = None
+        if _COVARIANCE in self.file:
+            covariances: np.ndarray = self._dataset(_COVARIANCE, (6, 6), "f")[: self._count]
+            known = np.isfinite(covariances).all(axis=(1, 2))
+            if known.any():
+                _require_covariances(covariances[known], self.path)
+            self.pose_covariance = covariances
         finite = np.isfinite(self.pose).reshape(self._count, 16)
         if (finite.any(axis=1) != finite.all(axis=1)).any():
             raise CaptureError(f"{self.path} holds poses of which only some elements are known")
@@ -511,7 +551,7 @@ class Capture(AbstractContextManager["Capture"]):
         if unfinished and self._count > 1 and self.time_s[-1] < self.time_s[-2]:
             # The writer was killed between making room for its last frame and storing it.
             self._count -= 1
-            for name in (*_PER_FRAME, *_MORE):
+            for name in (*_PER_FRAME, *_MORE, *([] if self.pose_covariance is None else [_COVARIANCE])):
                 setattr(self, name, getattr(self, name)[: self._count])
         if (np.diff(self.time_s) < 0).any():
             raise CaptureError(f"{self.path} holds times that run backwards")
@@ -578,8 +618,11 @@ class Capture(AbstractContextManager["Capture"]):
         seen = self.seen(index)
         columns = (self.stage_mm, self.laser_on, self.exposure_ms, self.time_s)
         pose = self.pose[index] if np.isfinite(self.pose[index]).all() else None
+        own = None if self.pose_covariance is None else self.pose_covariance[index]
+        covariance = own if own is not None and np.isfinite(own).all() else None
         encoder = self.encoder[index].item() if np.isfinite(self.encoder[index]) else None
         known = {"pose": pose, "encoder": encoder, "speed_mm_per_s": self.speed_mm_per_s[index].item()}
+        known["pose_covariance"] = covariance
         return Frame(seen, *(column[index].item() for column in columns), **known)
 
     def frames(self, *, laser_on: bool | None = None) -> Iterator[tuple[int, np.ndarray]]:

@@ -3,23 +3,29 @@
 import json
 import os
 import re
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, fields, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import ArrayLike
 from plyfile import PlyData, PlyElement, PlyParseError
 
 from uwlts.model.errors import CaptureError
 from uwlts.model.input_file import opened, parsed_json, require_plain, require_regular_file, shortened
 from uwlts.model.sensor import Description, Table
+from uwlts.storage.copc_file import is_copc, read_copc
 from uwlts.storage.files import written_aside
 from uwlts.storage.hdf5_file import find_dataset, format_of, read_array, read_label, write_label
 
 FORMAT = "uwlts-cloud"
 VERSION = 1
+
+POINTS_OF_PART = 1_000_000
+"""Points of a part of a large cloud."""
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """The coordinates whose covariances are kept of the symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz."""
@@ -30,6 +36,7 @@ NO_INDEX = -1
 _PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
 _PER_POINT = ("points_mm", "intensity", "frame", "line")
 _KINDS = dict(zip(_PER_POINT, (np.float64, np.float32, np.int32, np.int32), strict=True)) | {"deviation_mm": np.float32}
+_KINDS |= {"time_s": np.float64}
 _COMMENT = "uwlts-metadata"
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
@@ -39,6 +46,7 @@ _LONGEST_PLY_HEADER = 2**24
 _MOST_PROPERTIES = 1000
 _TYPE_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _TYPE_BYTES |= {f"{kind}{bits}": bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)}
+_Rows = Callable[[int], slice]
 _PIECE = re.compile(rf"{_COMMENT} (\d+)/(\d+) (.*);")
 
 
@@ -54,15 +62,26 @@ class PointUncertainty:
         How each point moves for one standard deviation of its image's stage position, independent from image to image.
     patterns_mm : (M, N, 3) float32
         How each point moves for one standard deviation of what is independent in calibration and stage, largest first.
+    poses_mm : (K, N, 3) float32 or None
+        How each point moves for one standard deviation of each independent part of its image's pose, which is
+        independent from image to image.
     """
 
     random_mm2: np.ndarray
     position_mm: np.ndarray
     patterns_mm: np.ndarray
+    poses_mm: np.ndarray | None = None
 
     def __getitem__(self, selection: Any) -> "PointUncertainty":
         """That of a selection of the points, by a slice, indices or a mask."""
-        return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], self.patterns_mm[:, selection])
+        poses = None if self.poses_mm is None else self.poses_mm[:, selection]
+        patterns = self.patterns_mm[:, selection]
+        return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], patterns, poses)
+
+    def by_image_mm(self) -> np.ndarray:
+        """All that moves the points of an image together and is independent from image to image (1 + K, N, 3)."""
+        position = self.position_mm[None]
+        return position if self.poses_mm is None else np.concatenate([position, self.poses_mm])
 
     def systematic_mm2(self) -> np.ndarray:
         """Covariance (N, 6) of each point by calibration and stage."""
@@ -71,7 +90,8 @@ class PointUncertainty:
     def covariance_mm2(self) -> np.ndarray:
         """Covariance (N, 3, 3) of the coordinates of each point, of all kinds together."""
         pairs = self.random_mm2 + self.systematic_mm2()
-        covariance = np.einsum("ni,nj->nij", self.position_mm, self.position_mm)
+        by_image = self.by_image_mm()
+        covariance = np.einsum("kni,knj->nij", by_image, by_image)
         for column, (i, j) in enumerate(PAIRS):
             covariance[:, i, j] += pairs[:, column]
             if i != j:
@@ -81,6 +101,17 @@ class PointUncertainty:
     def std_mm(self) -> np.ndarray:
         """Standard uncertainty (N, 3) of each coordinate, of all kinds together."""
         return np.sqrt(np.einsum("nii->ni", self.covariance_mm2()))
+
+
+def images_along(known: PointUncertainty, normals: np.ndarray) -> np.ndarray:
+    """Motions (1 + K, N) along normals (N, 3) for one standard deviation of each part that an image's points share."""
+    return np.einsum("kni,ni->kn", known.by_image_mm(), normals)
+
+
+def variance_along(pairs: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Variance (N,) along unit directions (N, 3) by covariances (N, 6) in the order of `PAIRS`."""
+    parts = [(1 if i == j else 2) * directions[:, i] * directions[:, j] for i, j in PAIRS]
+    return np.einsum("ni,in->n", pairs, np.stack(parts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +131,8 @@ class PointCloud:
         Image of the scan and row (or column) of that image; -1 where unknown.
     deviation_mm : (N,) float32 or None
         Signed distance to the fitted or true surface; NaN where not evaluated.
+    time_s : (N,) float64 or None
+        Time of each point's image by the camera's clock, of scans by a moving platform.
     uncertainty : PointUncertainty or None
         How well the points are known.
     metadata : dict
@@ -117,6 +150,7 @@ class PointCloud:
     line: np.ndarray
     deviation_mm: np.ndarray | None = None
     uncertainty: PointUncertainty | None = None
+    time_s: np.ndarray | None = None
     metadata: Table = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -132,19 +166,30 @@ class PointCloud:
             raise CaptureError(f"{unusable} of {len(points)} points of the cloud are not finite; leave them out")
         if len(points) and (farthest := np.abs(points).max()) > _FARTHEST_MM:
             raise CaptureError(f"a point lies {farthest:g} mm from the origin; expected at most {_FARTHEST_MM:g} mm")
-        for name in (*_PER_POINT[1:], "deviation_mm"):
+        for name in (*_PER_POINT[1:], "deviation_mm", "time_s"):
             column = getattr(self, name)
             if column is not None and column.shape != (len(points),):
                 raise CaptureError(f"{name} has the shape {column.shape}; the cloud has {len(points)} points")
         if self.uncertainty is not None:
             known = self.uncertainty
             shapes = known.random_mm2.shape, known.position_mm.shape, known.patterns_mm.shape[1:]
-            if shapes != ((len(points), 6), points.shape, points.shape):
+            by_pose = None if known.poses_mm is None else known.poses_mm.shape[1:]
+            if shapes != ((len(points), 6), points.shape, points.shape) or by_pose not in (None, points.shape):
                 raise CaptureError(f"the uncertainty of {len(points)} points has the shapes {shapes}")
         _as_json(self.metadata)
 
     def __len__(self) -> int:
         return len(self.points_mm)
+
+    def selected(self, selection: slice | np.ndarray) -> "PointCloud":
+        """The cloud of a selection of the points, by a slice, indices or a mask."""
+        known, deviation = self.uncertainty, self.deviation_mm
+        return PointCloud(
+            *(getattr(self, name)[selection] for name in _PER_POINT),
+            deviation_mm=None if deviation is None else deviation[selection],
+            uncertainty=None if known is None else known[selection],
+            metadata=self.metadata,
+        )
 
     @property
     def covariance_mm2(self) -> np.ndarray | None:
@@ -156,10 +201,11 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
     """Write a cloud as HDF5 where the path ends with ``.h5``, else as binary little-endian PLY; whole or not at all.
 
     In HDF5 the datasets are those of `PointCloud` and `PointUncertainty`, by their names, with systematic_mm2 (N, 6)
-    besides. In PLY the vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int). Where
-    the uncertainty is known there are its covariances in mm2, random_xx to random_zz and systematic_xx to
-    systematic_zz, and in mm position_x to position_z, pattern0_x, pattern0_y and so on (`PointUncertainty`). The
-    metadata is JSON in numbered comments, short enough for every reader.
+    besides. In PLY the vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int), and
+    perhaps time (double, s). Where the uncertainty is known there are its covariances in mm2, random_xx to random_zz
+    and systematic_xx to systematic_zz, and in mm position_x to position_z, pattern0_x, pattern0_y and so on, and
+    perhaps pose0_x to pose5_z (`PointUncertainty`). The metadata is JSON in numbered comments,
+    short enough for every reader.
 
     Raises
     ------
@@ -171,6 +217,8 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
         return
     deviation = np.full(len(cloud), np.nan, np.float32) if cloud.deviation_mm is None else cloud.deviation_mm
     columns = dict(zip("xyz", cloud.points_mm.T, strict=True)) | {"intensity": cloud.intensity, "deviation": deviation}
+    if cloud.time_s is not None:
+        columns["time"] = cloud.time_s
     columns |= {"frame": cloud.frame, "line": cloud.line} | _uncertainty_columns(cloud.uncertainty)
     vertices = np.empty(len(cloud), [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
     for name, values in columns.items():
@@ -181,7 +229,7 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
 
 
 def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
-    """Read a cloud from HDF5 where the path ends with ``.h5``, else from PLY, also another program's (x, y, z suffice).
+    """Read a cloud from HDF5 (``.h5``), COPC (``.copc.laz``) or PLY, also another program's (x, y, z suffice).
 
     Fields that CloudCompare has saved again (`scalar_intensity` and so on) are recognised. Missing intensity is NaN,
     missing frame and line are -1, a deviation that is missing or NaN throughout is None.
@@ -197,11 +245,85 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
 def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None) -> tuple[PointCloud, int]:
     """Every n-th point of a cloud's file, ``at_most`` so many, and the number of points in the file; see `read_cloud`.
 
-    Of HDF5 and binary PLY only these are held in memory.
+    Of HDF5 and binary PLY only these are held in memory. Of COPC the upper levels are read, an even sample.
     """
-    path = Path(path)
+    if is_copc(path):
+        return _read_copc(path, None, at_most)
+    return _read_rows(Path(path), lambda count: _every(count, at_most))
+
+
+def read_region(
+    path: str | os.PathLike[str], low_mm: ArrayLike, high_mm: ArrayLike, at_most: int | None = None
+) -> PointCloud:
+    """The points of a cloud's file in the box from ``low_mm`` (3,) to ``high_mm`` (3,), an even sample of ``at_most``.
+
+    Of COPC only the nodes in the box are read, of other files a part at a time.
+    """
+    low, high = np.asarray(low_mm, float), np.asarray(high_mm, float)
+    if low.shape != (3,) or high.shape != (3,) or not (np.isfinite([low, high]).all() and (low < high).all()):
+        raise CaptureError(f"a region goes from x, y, z to larger x, y, z; found {low.tolist()} to {high.tolist()} mm")
+    if is_copc(path):
+        return _read_copc(path, (low, high), at_most)[0]
+    found = [
+        part.selected(np.flatnonzero(np.all((part.points_mm >= low) & (part.points_mm <= high), axis=1)))
+        for part in cloud_parts(path)
+    ]
+    whole = joined(found)
+    return whole.selected(_every(len(whole), at_most))
+
+
+def cloud_parts(path: str | os.PathLike[str], most: int = POINTS_OF_PART) -> Iterator[PointCloud]:
+    """The points of a cloud's file in their order, so many at a time, as `read_cloud` gives all of them.
+
+    Of HDF5 and binary PLY only one part is held in memory.
+    """
+    if is_copc(path):
+        whole = read_cloud(path)
+        yield from (whole.selected(slice(start, start + most)) for start in range(0, max(len(whole), 1), most))
+        return
+    start, total = 0, 1
+    while start < total:
+        part, total = _read_rows(Path(path), lambda _, start=start: slice(start, start + most))
+        yield part
+        start += most
+
+
+def joined(parts: Sequence[PointCloud]) -> PointCloud:
+    """One cloud of the parts of one cloud."""
+    known = [part.uncertainty for part in parts if part.uncertainty is not None]
+    poses = [each.poses_mm for each in known if each.poses_mm is not None]
+    deviations = [part.deviation_mm for part in parts if part.deviation_mm is not None]
+    times = [part.time_s for part in parts if part.time_s is not None]
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _PER_POINT}
+    return PointCloud(
+        **columns,
+        deviation_mm=np.concatenate(deviations) if len(deviations) == len(parts) else None,
+        uncertainty=PointUncertainty(
+            np.concatenate([each.random_mm2 for each in known]),
+            np.concatenate([each.position_mm for each in known]),
+            np.concatenate([each.patterns_mm for each in known], axis=1),
+            np.concatenate(poses, axis=1) if len(poses) == len(parts) else None,
+        )
+        if len(known) == len(parts)
+        else None,
+        time_s=np.concatenate(times) if len(times) == len(parts) else None,
+        metadata=parts[0].metadata,
+    )
+
+
+def _read_copc(
+    path: str | os.PathLike[str], box: tuple[np.ndarray, np.ndarray] | None, at_most: int | None
+) -> tuple[PointCloud, int]:
+    found = read_copc(path, box_mm=box, at_most=at_most)
+    unknown = np.full(len(found.points_mm), NO_INDEX)
+    frame, line = (unknown if each is None else each for each in (found.frame, found.line))
+    return PointCloud(found.points_mm, found.intensity, frame, line, found.deviation_mm), found.total
+
+
+def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
+    """The rows of a file that are selected by the number of all, and that number."""
     try:
-        return _read_hdf5(path, at_most) if _in_hdf5(path) else _read_ply(path, at_most)
+        return _read_hdf5(path, rows) if _in_hdf5(path) else _read_ply(path, rows)
     except CaptureError as error:
         raise CaptureError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
@@ -213,7 +335,7 @@ def _every(count: int, at_most: int | None) -> slice:
 
 def is_cloud(path: str | os.PathLike[str]) -> bool:
     """Whether a file is a cloud: by its ending, where that is not the captures' as well, and else by its label."""
-    return format_of(Path(path)) == FORMAT if _in_hdf5(path) else Path(path).suffix.lower() == ".ply"
+    return format_of(Path(path)) == FORMAT if _in_hdf5(path) else is_copc(path) or Path(path).suffix.lower() == ".ply"
 
 
 def _in_hdf5(path: str | os.PathLike[str]) -> bool:
@@ -232,7 +354,15 @@ def _uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.n
     names += _move_names(len(uncertainty.patterns_mm))
     patterns = np.moveaxis(uncertainty.patterns_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
     parts = uncertainty.random_mm2.T, uncertainty.systematic_mm2().T, uncertainty.position_mm.T, patterns
-    return dict(zip(names, np.vstack(parts).astype(np.float32), strict=True))
+    columns = dict(zip(names, np.vstack(parts).astype(np.float32), strict=True))
+    if uncertainty.poses_mm is not None:
+        poses = np.moveaxis(uncertainty.poses_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
+        columns |= dict(zip(_pose_names(len(uncertainty.poses_mm)), poses.astype(np.float32), strict=True))
+    return columns
+
+
+def _pose_names(count: int) -> list[str]:
+    return [f"pose{k}_{axis}" for k in range(count) for axis in "xyz"]
 
 
 def _as_json(metadata: Table) -> str:
@@ -270,7 +400,7 @@ def _metadata(comments: list[str]) -> Table:
     return metadata
 
 
-def _read_ply(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
+def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     with opened(path, called="cloud") as file:
         _refuse_impossible_header(file.read(_LONGEST_PLY_HEADER), size=os.fstat(file.fileno()).st_size, path=path)
     try:
@@ -282,7 +412,7 @@ def _read_ply(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
     if "vertex" not in ply:
         raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
     whole = ply["vertex"].data
-    vertices, names = whole[_every(len(whole), at_most)], whole.dtype.names or ()
+    vertices, names = whole[rows(len(whole))], whole.dtype.names or ()
     if missing := [axis for axis in "xyz" if axis not in names]:
         raise CaptureError(f"the vertices have no {', '.join(missing)}, only {', '.join(names) or 'nothing'}")
     known = {name.removeprefix("scalar_"): name for name in names} | {name: name for name in names}
@@ -308,6 +438,10 @@ def _read_ply(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
         columns = np.stack([column(name, np.nan) for name in wanted])
         random, position, patterns = columns[:6].T.copy(), columns[6:9].T.copy(), columns[9:].reshape(count, 3, -1)
         uncertainty = PointUncertainty(random, position, np.ascontiguousarray(np.moveaxis(patterns, 1, 2)))
+        parts = sum(f"pose{k}_x" in known for k in range(len(known)))
+        if parts and known.keys() >= set(_pose_names(parts)):
+            poses = np.stack([column(name, np.nan) for name in _pose_names(parts)]).reshape(parts, 3, -1)
+            uncertainty = replace(uncertainty, poses_mm=np.ascontiguousarray(np.moveaxis(poses, 1, 2)))
     deviation = column("deviation", np.nan)
     cloud = PointCloud(
         points_mm=np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"]),
@@ -316,6 +450,7 @@ def _read_ply(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
         line=indices("line"),
         deviation_mm=None if np.isnan(deviation).all() else deviation,
         uncertainty=uncertainty,
+        time_s=column("time", np.nan, np.float64) if "time" in known else None,
         metadata=_metadata(ply.comments),
     )
     return cloud, len(whole)
@@ -354,10 +489,9 @@ class _CloudHeader(Description):
 
 def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool) -> None:
     arrays = {name: getattr(cloud, name) for name in _PER_POINT}
-    if cloud.deviation_mm is not None:
-        arrays["deviation_mm"] = cloud.deviation_mm
+    arrays |= {name: each for name in ("deviation_mm", "time_s") if (each := getattr(cloud, name)) is not None}
     if cloud.uncertainty is not None:
-        arrays |= {part.name: getattr(cloud.uncertainty, part.name) for part in fields(PointUncertainty)}
+        arrays |= {name: each for name, each in vars(cloud.uncertainty).items() if each is not None}
         arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()
     # In memory first: HDF5 does not survive a full disk.
     content = BytesIO()
@@ -369,7 +503,7 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
         aside.write_bytes(content.getbuffer())
 
 
-def _read_hdf5(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
+def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     require_regular_file(path, called="cloud")
     names = [part.name for part in fields(PointUncertainty)]
     try:
@@ -377,10 +511,10 @@ def _read_hdf5(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
             header = read_label(file, _CloudHeader, path=path, format=FORMAT, version=VERSION)
             points = find_dataset(file, "points_mm", path=path)
             total = 0 if points is None or not points.ndim else len(points)
-            every = _every(total, at_most)
-            rows: dict[str, tuple[slice, ...]] = dict.fromkeys((*_KINDS, *names), (every,))
-            rows["patterns_mm"] = (slice(None), every)
-            found = {name: read_array(file, name, path=path, selection=rows[name]) for name in rows}
+            chosen = rows(total)
+            selection: dict[str, tuple[slice, ...]] = dict.fromkeys((*_KINDS, *names), (chosen,))
+            selection["patterns_mm"] = selection["poses_mm"] = (slice(None), chosen)
+            found = {name: read_array(file, name, path=path, selection=selection[name]) for name in selection}
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
     arrays = {name: values for name, values in found.items() if values is not None}
@@ -392,9 +526,12 @@ def _read_hdf5(path: Path, at_most: int | None) -> tuple[PointCloud, int]:
         n for n in ("frame", "line") if n in arrays and (np.abs(arrays[n].astype(np.float64)) >= 2**31).any()
     ]:
         raise CaptureError(f"{path} is damaged: {', '.join(unusable)} has values of more than 32 bits")
-    wanted = [*_PER_POINT, *(names if any(name in arrays for name in names) else ())]
+    needed = [name for name in names if name != "poses_mm"]
+    wanted = [*_PER_POINT, *(needed if any(name in arrays for name in names) else ())]
     if missing := [name for name in wanted if name not in arrays]:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
-    known = PointUncertainty(*(arrays[name] for name in names)) if names[0] in arrays else None
+    known = None
+    if needed[0] in arrays:
+        known = PointUncertainty(*(arrays[name] for name in needed), poses_mm=arrays.get("poses_mm"))
     per_point = {name: arrays[name] for name in _KINDS if name in arrays}
     return PointCloud(**per_point, uncertainty=known, metadata=header.metadata), total

@@ -1,14 +1,11 @@
-"""Export of captures as folders of images that `uwlts import` reads back, and of clouds as PLY, HDF5, XYZ, LAZ, E57."""
+"""Export of captures as folders of images that `uwlts import` reads back, and of clouds in other formats."""
 
 import csv
 import os
 import secrets
 import shutil
-from collections.abc import Callable
-from importlib import import_module
-from io import BytesIO
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Literal
 
 import cv2
@@ -16,13 +13,24 @@ import numpy as np
 import tomli_w
 
 from uwlts.model.command_files import keeps_inputs
-from uwlts.model.errors import OutputError, SetupError
+from uwlts.model.errors import CaptureError, OutputError
 from uwlts.model.stripe import rows_of
 from uwlts.storage.capture import Capture
-from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud, write_cloud
+from uwlts.storage.cloud import (
+    PointCloud,
+    cloud_parts,
+    is_cloud,
+    read_cloud,
+    read_region,
+    read_thinned_cloud,
+    write_cloud,
+)
+from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.files import refuse_unsuitable, require_possible_name, written_aside
 from uwlts.storage.import_.description import NAME
 from uwlts.storage.import_.matching import POSE_COLUMNS
+from uwlts.storage.las_file import laz_content, library
+from uwlts.storage.mcap_clouds import covariance_columns, mcap_of
 from uwlts.stripe import Stripe
 
 HEADER, TABLE = "header.json", "frames.csv"
@@ -35,6 +43,8 @@ def export(
     out: str | Path,
     *,
     images: Literal["png", "tiff"] = "png",
+    region_mm: tuple[Sequence[float], Sequence[float]] | None = None,
+    at_most: int | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> int:
@@ -43,12 +53,16 @@ def export(
     Parameters
     ----------
     file : str or Path
-        Capture (.h5) or cloud (.ply or .h5).
+        Capture (.h5) or cloud (.ply, .h5 or .copc.laz).
     out : str or Path
-        New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz or
-        .e57.
+        New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
+        .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz, which is written a part at a time.
     images : {"png", "tiff"}
         Format of a capture's images; both keep all bits.
+    region_mm : pair of (3,), optional
+        Only the points in the box from the first to the second corner.
+    at_most : int, optional
+        Only an even sample of about so many points.
     overwrite : bool
         Replace an existing cloud.
     progress : callable, optional
@@ -68,6 +82,15 @@ def export(
     SetupError
         The library for the cloud's format is not installed.
     """
+    if region_mm is not None or at_most is not None:
+        if not is_cloud(file):
+            raise CaptureError(f"{file} is no cloud: only clouds have regions and points")
+        cloud = read_thinned_cloud(file, at_most)[0] if region_mm is None else read_region(file, *region_mm, at_most)
+        export_cloud(cloud, Path(out), overwrite=overwrite)
+        return len(cloud)
+    if is_cloud(file) and is_copc(out):
+        refuse_unsuitable(Path(out), overwrite=overwrite)
+        return write_copc(out, lambda: cloud_parts(file), overwrite=overwrite, progress=progress)
     if is_cloud(file):
         cloud = read_cloud(file)
         export_cloud(cloud, Path(out), overwrite=overwrite)
@@ -133,13 +156,7 @@ def export_capture(
         shutil.rmtree(aside, ignore_errors=True)
 
 
-CLOUD_FORMATS = (".ply", ".h5", ".xyz", ".laz", ".e57")
-
-LAZ_STEP_M = 1e-7
-"""Coordinates in LAZ are whole multiples of it from the middle of the cloud: 0.1 um, over 214 m to either side."""
-
-_REACH_M = LAZ_STEP_M * (2**31 - 1)
-_INTENSITY_LIMITS = 0, 2**16 - 1
+CLOUD_FORMATS = (".ply", ".h5", ".xyz", ".laz", ".e57", ".mcap")
 
 
 def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> None:
@@ -149,8 +166,14 @@ def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> N
     - ``.xyz``: text, a line of names, then X Y Z in mm and the intensity (nan where unknown) of every point, with all
       the digits that they have.
     - ``.laz``: LAS 1.4, point format 6, metres in steps of 1e-7 m. The standard intensity is rounded to whole numbers
-      (0 where unknown); ``amplitude`` holds it as it is, ``frame``, ``line`` and ``deviation_mm`` the rest.
-    - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate.
+      (0 where unknown); ``amplitude`` holds it as it is, the standard ``gps_time`` the time in s where it is known,
+      ``frame``, ``line``, ``deviation_mm`` and the covariance ``cov_xx_mm2`` to ``cov_zz_mm2`` the rest.
+    - ``.copc.laz``: the same without times and covariances as COPC, in an octree with levels of detail.
+    - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate; the
+      image as column, the line as row where both are known and below 65536. The library writes neither times nor
+      covariances.
+    - ``.mcap``: messages sensor_msgs/msg/PointCloud2 of ROS 2, and where the name ends with ``.foxglove.mcap``
+      foxglove.PointCloud; one for each image where the points' times are known (`uwlts.storage.mcap_clouds`).
 
     OutputError where the suffix is none of these, the file exists, the cloud is empty, too wide for LAZ, or lacks
     intensities that E57 cannot leave out, or storage fails; SetupError where the format's library is not installed.
@@ -164,6 +187,9 @@ def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> N
     if suffix in (".ply", ".h5"):
         write_cloud(path, cloud, overwrite=overwrite)
         return
+    if is_copc(path):
+        write_copc(path, lambda: [cloud], overwrite=overwrite)
+        return
     with written_aside(path, overwrite=overwrite) as aside:
         if suffix == ".xyz":
             rows = zip(*cloud.points_mm.T.tolist(), cloud.intensity, strict=True)
@@ -172,41 +198,19 @@ def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> N
                 file.write("//X Y Z Intensity\n")
                 file.writelines(f"{x!r} {y!r} {z!r} {intensity!s}\n" for x, y, z, intensity in rows)
         elif suffix == ".laz":
-            aside.write_bytes(_laz(cloud))
+            fields = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
+            if cloud.deviation_mm is not None:
+                fields["deviation_mm"] = cloud.deviation_mm
+            fields |= covariance_columns(cloud)
+            aside.write_bytes(laz_content(cloud.points_mm, cloud.intensity, fields, time_s=cloud.time_s))
+        elif suffix == ".mcap":
+            aside.write_bytes(mcap_of(cloud, foxglove=path.name.lower().endswith(".foxglove.mcap")))
         else:
             _write_e57(cloud, aside, path)
 
 
-def _laz(cloud: PointCloud) -> bytes:
-    laspy = _library("laspy", "LAZ")
-    _library("lazrs", "LAZ")
-    points = 1e-3 * cloud.points_mm
-    middle = np.round((points.min(axis=0) + points.max(axis=0)) / 2, 3)
-    reach = np.abs(points - middle).max()
-    if not reach <= _REACH_M:
-        raise OutputError(
-            f"the cloud reaches {reach:.9g} m from its middle, LAZ in steps of {LAZ_STEP_M:g} m "
-            f"only {_REACH_M:.0f} m: write PLY or E57"
-        )
-    header = laspy.LasHeader(version="1.4", point_format=6)
-    header.offsets, header.scales = middle, np.full(3, LAZ_STEP_M)
-    extra = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
-    if cloud.deviation_mm is not None:
-        extra["deviation_mm"] = cloud.deviation_mm
-    header.add_extra_dims([laspy.ExtraBytesParams(name=name, type=values.dtype) for name, values in extra.items()])
-    table = laspy.LasData(header)
-    table.x, table.y, table.z = points.T
-    table.intensity = np.rint(np.nan_to_num(cloud.intensity)).clip(*_INTENSITY_LIMITS).astype(np.uint16)
-    for name, values in extra.items():
-        table[name] = values
-    # In memory: the compressor has errors of its own where storage fails.
-    content = BytesIO()
-    table.write(content, do_compress=True)
-    return content.getvalue()
-
-
 def _write_e57(cloud: PointCloud, aside: Path, path: Path) -> None:
-    pye57 = _library("pye57", "E57")
+    pye57 = library("pye57", "E57")
     unknown = np.isnan(cloud.intensity)
     if unknown.any() and not unknown.all():
         raise OutputError(
@@ -218,19 +222,11 @@ def _write_e57(cloud: PointCloud, aside: Path, path: Path) -> None:
     data: dict[str, np.ndarray] = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), columns, strict=True))
     if not unknown.any():
         data["intensity"] = cloud.intensity
+    if all(numbers.min() >= 0 and numbers.max() < 2**16 for numbers in (cloud.frame, cloud.line)):
+        data |= {"columnIndex": cloud.frame.astype(np.uint16), "rowIndex": cloud.line.astype(np.uint16)}
     try:
         file = pye57.E57(str(aside), mode="w")
         file.write_scan_raw(data, name=path.stem)
         file.close()
     except pye57.libe57.E57Exception as error:
         raise OutputError(f"cannot write {path}: {' '.join(str(error).split())[:200]}") from error
-
-
-def _library(name: Literal["laspy", "lazrs", "pye57"], format: str) -> ModuleType:
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise SetupError(
-            f"{format} needs the library {name}, which is not installed: pip install 'uwlts[clouds]', or write "
-            "PLY or XYZ"
-        ) from error

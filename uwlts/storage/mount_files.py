@@ -40,6 +40,16 @@ _OFTEN_MEANT = (
 _OFTEN_MEANT += ("euler-ZYZ-deg", "rotvec-deg", "rotvec-rad", "euler-ZYX-rad", "euler-xyz-rad", "euler-XYZ-rad")
 
 
+SensorAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
+SENSOR_AXES: dict[SensorAxis, np.ndarray] = {
+    sign + name: (-1.0 if sign else 1.0) * direction  # pyright: ignore[reportAssignmentType]
+    for sign in ("", "-")
+    for name, direction in zip("xyz", np.eye(3), strict=True)
+}
+_ON_AXIS = 1e-6
+"""By how much poses of a table may be off turns about its axis, mm and parts of one: printed with six decimals."""
+
+
 class MountDescription(Description):
     """Everything about a mount's calibration in a TOML file; files are sought beside it."""
 
@@ -50,6 +60,7 @@ class MountDescription(Description):
     pose_format: str = "matrix"
     profile_unit: Unit = "mm"
     pose_unit: Unit = "mm"
+    axis: SensorAxis | None = None
     scale: bool = False
     time: bool = False
 
@@ -63,6 +74,7 @@ class MountEvidence:
     artefact: Literal["sphere", "plane"]
     radius_mm: float | None = None
     names: list[str]
+    axis: SensorAxis | None = None
     scale: bool = False
     time: bool = False
     profile_times_s: np.ndarray | None = None
@@ -94,6 +106,7 @@ def read_mount_evidence(
     pose_format: str,
     profile_unit: Unit,
     pose_unit: Unit,
+    axis: SensorAxis | None,
     scale: bool,
     time: bool,
     profile_times_s: np.ndarray | None,
@@ -111,6 +124,7 @@ def read_mount_evidence(
         profiles, poses = path.parent / given.profiles, path.parent / given.poses
         artefact, radius_mm, pose_format = given.artefact, given.radius_mm, given.pose_format
         profile_unit, pose_unit, scale, time = given.profile_unit, given.pose_unit, given.scale, given.time
+        axis = given.axis
     if artefact not in ("sphere", "plane"):
         raise DescriptionError(f"the artefact is {artefact!r}; expected sphere or plane")
     if radius_mm is not None and not (np.isfinite(radius_mm) and radius_mm > 0 and artefact == "sphere"):
@@ -126,6 +140,8 @@ def read_mount_evidence(
         pose_times_s = times if pose_times_s is None else pose_times_s
     checked = [_checked_profile(profile, number) for number, profile in enumerate(profiles)]
     matrices = checked_matrices(np.asarray(poses, dtype=np.float64), "poses")
+    if axis is not None:
+        _require_table(matrices, axis=axis, artefact=artefact, scale=scale)
     if time and (profile_times_s is None or pose_times_s is None):
         raise DescriptionError("a time offset needs the times of profiles and poses: give both a column time_s")
     if profile_times_s is not None and pose_times_s is not None and (time or len(matrices) != len(checked)):
@@ -144,6 +160,7 @@ def read_mount_evidence(
         artefact=artefact,
         radius_mm=radius_mm,
         names=names or [str(number + 1) for number in range(len(checked))],
+        axis=axis,
         scale=scale,
         time=time,
         profile_times_s=profile_times_s,
@@ -152,6 +169,19 @@ def read_mount_evidence(
         rows=rows,
         digests=digests,
     )
+
+
+def _require_table(poses: np.ndarray, *, axis: str, artefact: str, scale: bool) -> None:
+    """DescriptionError where poses are not turns of a table about its z axis, or something else is wrong with it."""
+    if axis not in SENSOR_AXES:
+        raise DescriptionError(f"the axis is {axis!r}; expected one of {', '.join(SENSOR_AXES)} of the sensor's frame")
+    if artefact != "sphere" or scale:
+        raise DescriptionError("the axis of a rotary table follows from a sphere on it, which has no scale to find")
+    turns = np.linalg.inv(poses[0]) @ poses
+    if max(np.abs(turns[:, 2] - (0, 0, 1, 0)).max(), np.abs(turns[:, :2, 3]).max()) > _ON_AXIS:
+        raise DescriptionError(
+            "the poses are not turns about one z axis: give the angles of the rotary table (pose format angle-deg)"
+        )
 
 
 def _checked_profile(profile: np.ndarray, number: int) -> np.ndarray:

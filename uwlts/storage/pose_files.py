@@ -14,12 +14,12 @@ from uwlts.model.calibration import is_rigid
 from uwlts.model.errors import DescriptionError
 from uwlts.model.input_file import read_bytes
 from uwlts.model.trajectory import Trajectory
-from uwlts.storage.files import sha256_of
+from uwlts.storage.files import sha256_of, written_aside
 from uwlts.storage.ros_bags import read_bag_poses
 
 Unit = Literal["mm", "m"]
 PoseFormat = str
-"""matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, or euler-ORDER-deg, euler-ORDER-rad."""
+"""matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ORDER-deg or -rad, angle-deg, angle-rad."""
 MM_PER_UNIT: dict[Unit, float] = {"mm": 1.0, "m": 1000.0}
 FARTHEST_MM = 1e7
 """Ten kilometres: no platform reaches farther, and squares of larger numbers would lose the noise."""
@@ -89,15 +89,20 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def read_poses(path: str | Path, *, pose_format: PoseFormat, unit: Unit = "mm") -> tuple[np.ndarray, np.ndarray | None]:
+def read_poses(
+    path: str | Path, *, pose_format: PoseFormat = "matrix", unit: Unit = "mm"
+) -> tuple[np.ndarray, np.ndarray | None]:
     """``T_base_platform`` (P, 4, 4), mm, and their times (P,) or None, from a CSV file with one pose a line.
 
     Columns ``pose`` and ``time_s``, recognised by name, come in addition. The others are, in this order, 12 or 16
     elements of the matrix row by row; or the translation, then a quaternion (``quaternion-xyzw``, ``quaternion-wxyz``),
     a rotation vector (``rotvec-rad``, ``rotvec-deg``) or three Euler angles: ``euler-ZYX-deg`` turns about the moved
     axes (intrinsic), the first letter first; ``euler-zyx-deg`` about the fixed axes (extrinsic), as SciPy's
-    `Rotation.from_euler`. DescriptionError for a wrong count, numbers that are not finite, matrices that are not rigid,
-    quaternions without unit length and angles that look like degrees where radians are stated.
+    `Rotation.from_euler`. One column ``angle-deg`` or ``angle-rad`` is the angle of a rotary table that turns the
+    object about its z axis: the poses are then those of the sensor's side as seen from the object.
+
+    DescriptionError for a wrong count, numbers that are not finite, matrices that are not rigid, quaternions without
+    unit length and angles that look like degrees where radians are stated.
     """
     path = Path(path)
     rows, times = pose_rows(path, {})
@@ -108,35 +113,93 @@ def read_trajectory(path: str | Path, *, pose_format: PoseFormat = "matrix", uni
     """The path of a platform from a file as for `read_poses` with a column ``time_s``.
 
     With the format ``tum`` each line is the time in s, the position in m and the quaternion x y z w, separated by
-    blanks and without names, as the RGB-D benchmark of TU Munich has them. With the format ``ros`` the file is a bag of
-    ROS 1 or ROS 2; ``ros:/TOPIC`` or ``ros:PARENT>CHILD`` names the poses or transforms in it
+    blanks and without names, as the RGB-D benchmark of TU Munich has them. Columns ``cov_00`` to ``cov_55`` by name are
+    the upper triangles of the covariances (`Trajectory`), in the unit of the positions and rad. With the format ``ros``
+    the file is a bag of ROS 1 or ROS 2; ``ros:/TOPIC`` or ``ros:PARENT>CHILD`` names the poses or transforms in it
     (`uwlts.storage.ros_bags`). DescriptionError as `read_poses` and `Trajectory`, and where there are no times;
     SetupError where the library for bags is not installed.
     """
     path = Path(path)
     if pose_format == "ros" or pose_format.startswith("ros:"):
-        times, rows = read_bag_poses(path, pose_format.removeprefix("ros").removeprefix(":"))
-        return _trajectory(path, times, scaled(matrices_of(rows, "quaternion-xyzw", path), "m"))
-    rows, times = pose_rows(path, {})
+        times, rows, covariance = read_bag_poses(path, pose_format.removeprefix("ros").removeprefix(":"))
+        if covariance is not None:
+            units = np.array([1e3] * 3 + [1.0] * 3)
+            covariance = covariance * units[:, None] * units
+        return _trajectory(path, times, scaled(matrices_of(rows, "quaternion-xyzw", path), "m"), covariance)
+    columns = read_columns(path, {}, named=False)
+    covariance = _covariances(columns, path, MM_PER_UNIT[checked_unit(unit)])
+    rows, times = _rows_of(columns, path)
     if pose_format == "tum":
         if rows.shape[1] != 8:
             raise DescriptionError(f"{path} has {rows.shape[1]} columns; expected time, x, y, z and a quaternion (tum)")
         times, rows, pose_format, unit = rows[:, 0], rows[:, 1:], "quaternion-xyzw", "m"
     if times is None:
         raise DescriptionError(f"{path} has no column time_s: a trajectory needs the time of each pose")
-    return _trajectory(path, times, scaled(matrices_of(rows, pose_format, path), unit))
+    return _trajectory(path, times, scaled(matrices_of(rows, pose_format, path), unit), covariance)
 
 
-def _trajectory(path: Path, times: np.ndarray, poses: np.ndarray) -> Trajectory:
+def write_poses(path: str | Path, poses: np.ndarray, *, overwrite: bool = False) -> None:
+    """Write poses (P, 4, 4), mm, as CSV with 12 elements of the matrix a line.
+
+    `read_poses` reads them back with the format ``matrix``. OutputError where the file exists and ``overwrite`` is not
+    set, or cannot be written.
+    """
+    names = [f"m{row}{column}" for row in range(3) for column in range(4)]
+    rows = np.asarray(poses, dtype=np.float64)[:, :3].reshape(-1, 12)
+    with written_aside(path, overwrite=overwrite) as aside:
+        lines = [",".join(names), *(",".join(map(repr, row)) for row in rows.tolist())]
+        aside.write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+_COVARIANCE = {f"cov_{i}{j}": (i, j) for i in range(6) for j in range(i, 6)}
+
+
+def _covariances(columns: dict[str, np.ndarray], path: Path, mm_per_unit: float) -> np.ndarray | None:
+    """Covariances (N, 6, 6), mm and rad, taken out of the columns of a file; None where it has none."""
+    found = {name: columns.pop(name) for name in [*columns] if name in _COVARIANCE}
+    if not found:
+        return None
+    if missing := sorted(_COVARIANCE.keys() - found.keys()):
+        raise DescriptionError(f"{path} has columns of covariances, but not {', '.join(missing)}")
+    units = np.array([mm_per_unit] * 3 + [1.0] * 3)
+    covariances = np.empty((len(next(iter(found.values()))), 6, 6))
+    for name, (i, j) in _COVARIANCE.items():
+        covariances[:, i, j] = covariances[:, j, i] = found[name] * units[i] * units[j]
+    return covariances
+
+
+def write_trajectory(path: str | Path, trajectory: Trajectory, *, overwrite: bool = False) -> None:
+    """Write a trajectory as CSV for `read_trajectory` in the format quaternion-xyzw, mm; OutputError if that fails."""
+    turns = Rotation.from_matrix(trajectory.poses[:, :3, :3]).as_quat()
+    table = np.column_stack([trajectory.times_s, trajectory.poses[:, :3, 3], turns])
+    names = ["time_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"]
+    if trajectory.covariance is not None:
+        names += _COVARIANCE
+        table = np.column_stack([table, *(trajectory.covariance[:, i, j] for i, j in _COVARIANCE.values())])
+    with written_aside(path, overwrite=overwrite) as aside:
+        np.savetxt(aside, table, fmt="%.12g", delimiter=",", header=",".join(names), comments="")
+
+
+def trajectory_path(capture: str | Path) -> Path:
+    """Path of the file of what the platform reported during a capture, beside it."""
+    path = Path(capture)
+    return path.with_name(path.name.removesuffix(".h5") + ".trajectory.csv")
+
+
+def _trajectory(path: Path, times: np.ndarray, poses: np.ndarray, covariance: np.ndarray | None) -> Trajectory:
     try:
-        return Trajectory(times, poses)
+        return Trajectory(times, poses, covariance)
     except DescriptionError as error:
         raise DescriptionError(f"{path}: {error}") from error
 
 
 def pose_rows(path: Path, digests: dict[str, str]) -> tuple[np.ndarray, np.ndarray | None]:
     """Numbers (P, K) of the poses in a file, and their times (P,) or None."""
-    columns = read_columns(path, digests, named=False)
+    return _rows_of(read_columns(path, digests, named=False), path)
+
+
+def _rows_of(columns: dict[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    columns = {name: values for name, values in columns.items() if name not in _COVARIANCE}
     times = columns.pop("time_s", None)
     columns.pop("pose", None)
     rows = np.column_stack(list(columns.values())) if columns else np.empty((0, 0))
@@ -161,6 +224,8 @@ def matrices_of(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
         "quaternion-wxyz": (7,),
         "rotvec-rad": (6,),
         "rotvec-deg": (6,),
+        "angle-deg": (1,),
+        "angle-rad": (1,),
     }
     expected = (6,) if euler else counts.get(pose_format)
     if expected is None:
@@ -174,6 +239,11 @@ def matrices_of(rows: np.ndarray, pose_format: str, path: Path) -> np.ndarray:
     if pose_format == "matrix":
         result[:, : rows.shape[1] // 4] = rows.reshape(len(rows), -1, 4)
         return checked_matrices(result, path)
+    if pose_format.startswith("angle"):
+        # The object turns with the table; seen from it, the sensor turns the other way round.
+        angles = rows[:, 0] if pose_format.endswith("rad") else np.radians(rows[:, 0])
+        result[:, :3, :3] = Rotation.from_rotvec(np.outer(-angles, (0, 0, 1))).as_matrix()
+        return result
     result[:, :3, 3] = rows[:, :3]
     turns = rows[:, 3:]
     if pose_format.startswith("quaternion"):

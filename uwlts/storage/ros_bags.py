@@ -17,11 +17,15 @@ _POSES = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": lambda message: message.pose.pose,
     "geometry_msgs/msg/TransformStamped": lambda message: message.transform,
 }
+# A message without covariance has zeros, as its definition says.
+_WITH_COVARIANCE = ("nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseWithCovarianceStamped")
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
-def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray]:
-    """Times (N,) in s, as the messages' headers have them, and N poses (N, 7): x, y, z in m and a quaternion x y z w.
+def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Times (N,) in s, as the messages' headers have them, N poses (N, 7): x, y, z in m and a quaternion x y z w.
+
+    And their covariances (N, 6, 6) in m and rad about fixed axes, where every message states one.
 
     Parameters
     ----------
@@ -55,7 +59,8 @@ def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray
         ) from error
 
 
-def _poses(bag: Any, path: Path, wanted: str) -> tuple[np.ndarray, np.ndarray]:
+def _poses(bag: Any, path: Path, wanted: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    covariances: list[np.ndarray] = []
     topics = {connection.topic: connection.msgtype for connection in bag.connections if connection.msgtype in _POSES}
     parent, is_transform, child = wanted.partition(">")
     if is_transform or not (topics or wanted):
@@ -72,12 +77,14 @@ def _poses(bag: Any, path: Path, wanted: str) -> tuple[np.ndarray, np.ndarray]:
                 f"{path} has the topics with poses {held}; found none called '{wanted}': name one of them, or the "
                 "frames of a transform as PARENT>CHILD"
             )
-        rows = [
-            _row(message.header.stamp, _POSES[connection.msgtype](message))
-            for connection, message in _messages(bag, lambda connection: connection.topic == topic)
-        ]
-    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
-    return table[:, 0], table[:, 1:]
+        rows = []
+        for connection, message in _messages(bag, lambda connection: connection.topic == topic):
+            rows.append(_row(message.header.stamp, _POSES[connection.msgtype](message)))
+            if connection.msgtype in _WITH_COVARIANCE:
+                covariances.append(np.array(message.pose.covariance, dtype=np.float64).reshape(6, 6))
+    table, known = np.array(rows, dtype=np.float64).reshape(-1, 8), np.array(covariances)
+    stated = len(known) == len(table) > 0 and bool((np.einsum("nii->ni", known) > 0).all())
+    return table[:, 0], table[:, 1:], known if stated else None
 
 
 def _messages(bag: Any, chosen: Any) -> Any:

@@ -16,6 +16,7 @@ from uwlts.storage.hdf5_file import read_array, read_label, write_label
 FORMAT = "uwlts-truth"
 VERSION = 1
 _DIMENSIONS = {"centre_px": 2, "point_mm": 3, "normal": 3, "status": 2, "crossings": 2, "depth_mm": 2}
+_POSE = "pose"
 
 
 class TruthStatus(IntEnum):
@@ -41,6 +42,7 @@ class Truth:
     sheet; ``point_mm (F, L, 3)`` and ``normal (F, L, 3)`` are the surface there in scene coordinates; ``status (F, L)``
     is a `TruthStatus`; ``crossings (F, L)`` counts lit crossings of the sheet, of which the brightest is given.
     ``depth_mm (H, W)`` is the camera-frame z of what every pixel sees in the first frame. NaN where nothing is.
+    ``pose (F, 4, 4)`` is ``T_scene_object`` of the sensor's OCS, mm; None in files of earlier versions.
     """
 
     centre_px: np.ndarray
@@ -49,6 +51,7 @@ class Truth:
     status: np.ndarray
     crossings: np.ndarray
     depth_mm: np.ndarray
+    pose: np.ndarray | None = None
 
 
 def truth_path(capture: str | Path) -> Path:
@@ -63,6 +66,8 @@ def write_truth(path: str | Path, header: TruthHeader, truth: Truth, *, overwrit
     with written_aside(path, overwrite=overwrite) as aside, h5py.File(aside, "w", libver="latest") as file:
         write_label(file, format=FORMAT, version=VERSION, header=header)
         for name, values in vars(truth).items():
+            if values is None:
+                continue
             file.create_dataset(name, data=values, compression="gzip", compression_opts=1, fletcher32=True)
 
 
@@ -72,13 +77,16 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, TruthHeader, path=path, format=FORMAT, version=VERSION)
-            truth = Truth(**{name: _array(file, name, path) for name in _DIMENSIONS})
+            pose = _array(file, _POSE, path, dimensions=3) if _POSE in file else None
+            truth = Truth(**{name: _array(file, name, path) for name in _DIMENSIONS}, pose=pose)
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise CaptureError(f"{path} is not a truth file, or is damaged: {error}") from error
     lines = truth.status.shape
     shapes = {name: getattr(truth, name).shape for name in _DIMENSIONS if name != "depth_mm"}
     if shapes != {name: lines if _DIMENSIONS[name] == 2 else (*lines, 3) for name in shapes}:
         raise CaptureError(f"{path} contradicts itself: its arrays have the shapes {shapes}")
+    if truth.pose is not None and truth.pose.shape != (lines[0], 4, 4):
+        raise CaptureError(f"{path} contradicts itself: it has {lines[0]} frames and poses {truth.pose.shape}")
     if not np.isin(truth.status, list(TruthStatus)).all():
         raise CaptureError(f"{path} holds unknown statuses; known are {[int(status) for status in TruthStatus]}")
     visible = truth.status == TruthStatus.VISIBLE
@@ -87,9 +95,10 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
     return header, truth
 
 
-def _array(file: h5py.File, name: str, path: str | Path) -> np.ndarray:
+def _array(file: h5py.File, name: str, path: str | Path, *, dimensions: int | None = None) -> np.ndarray:
     values = read_array(file, name, path=path)
     kinds = "iu" if name in ("status", "crossings") else "f"
-    if values is None or values.dtype.kind not in kinds or values.ndim != _DIMENSIONS[name]:
-        raise CaptureError(f"{path} is damaged: it has no numbers '{name}' in {_DIMENSIONS[name]} dimensions")
+    dimensions = _DIMENSIONS[name] if dimensions is None else dimensions
+    if values is None or values.dtype.kind not in kinds or values.ndim != dimensions:
+        raise CaptureError(f"{path} is damaged: it has no numbers '{name}' in {dimensions} dimensions")
     return values

@@ -3,22 +3,25 @@
 A profile line is an image row when the stripe runs along the image height, an image column when it runs along the
 width. The steps: `candidates` finds where on each line a stripe may be, `search` looks at these places by the rules
 about several peaks, `peak_window` measures what stands there, `methods` place the centre, `extract` does all this and
-gives the statuses. `recording` does so for all laser images and says why there is no stripe.
+gives the statuses. `direct` tells the laser's own stripe from its reflections, `recording` does so for all laser images
+and says why there is no stripe.
 """
 
 from uwlts.model.stripe import Stripe, StripeStatus
-from uwlts.stripe.extract import extract_stripe, stripe_in, warm_up
+from uwlts.stripe.extract import extract_candidates, extract_stripe, stripe_in, warm_up
 from uwlts.stripe.methods import method_names
 from uwlts.stripe.recording import FoundStripes, find_stripes, why_no_stripe
-from uwlts.stripe.result import PeakRule, StripeOptions, StripeSettings
+from uwlts.stripe.result import PeakRule, StripeCandidates, StripeOptions, StripeSettings
 
 __all__ = [
     "FoundStripes",
     "PeakRule",
     "Stripe",
+    "StripeCandidates",
     "StripeOptions",
     "StripeSettings",
     "StripeStatus",
+    "extract_candidates",
     "extract_stripe",
     "find_stripes",
     "method_names",

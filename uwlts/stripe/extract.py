@@ -11,23 +11,25 @@ import numpy as np
 from uwlts.model.errors import ImageError
 from uwlts.model.stripe import Stripe, StripeStatus
 from uwlts.stripe.candidates import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
+from uwlts.stripe.direct import SeenStripes
+from uwlts.stripe.ends import copied, leave_ends_out
 from uwlts.stripe.learned import find_learned
 from uwlts.stripe.methods import amplitudes, place_centre
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
-from uwlts.stripe.result import LEARNED, StripeOptions
-from uwlts.stripe.search import MARGIN, look_at, search
+from uwlts.stripe.result import LEARNED, PeakRule, StripeCandidates, StripeOptions
+from uwlts.stripe.search import MARGIN, look_at, search, search_all, with_rivals
 
 _LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
-
-_SHORT_GAP = 2
-"""A stripe that is lost for so few lines, as in noise, goes on."""
 
 _MANY = 0.25
 """Lines with a stripe that is too wide, over those with one that is measured, from which a wider window is tried."""
 
+_LEAST_NOISE = 0.3
+"""Grey levels: standard deviation of rounding to whole ones."""
+
 # NumPy compares with its own integers several times as fast as with an enumeration.
-_OK, _NO_STRIPE, _AMBIGUOUS, _SATURATED, _END = (
-    np.uint8(StripeStatus[name]) for name in ("OK", "NO_STRIPE", "AMBIGUOUS", "SATURATED", "END")
+_OK, _NO_STRIPE, _AMBIGUOUS, _SATURATED = (
+    np.uint8(StripeStatus[name]) for name in ("OK", "NO_STRIPE", "AMBIGUOUS", "SATURATED")
 )
 
 
@@ -61,6 +63,59 @@ def extract_stripe(
         If the image, the background, `stripe_along` or `saturation` is not as described, or the lines are shorter
         than two search windows, too short to distinguish stripe and background.
     """
+    return _extracted(image, stripe_along, options, background, saturation).without_ends()
+
+
+def extract_candidates(
+    image: np.ndarray,
+    *,
+    stripe_along: str,
+    options: StripeOptions = StripeOptions(),
+    background: np.ndarray | None = None,
+    saturation: float | None = None,
+) -> StripeCandidates:
+    """All stripes on every profile line, up to six: of two sheets, of reflections.
+
+    Arguments and errors are as of `extract_stripe`. Two stripes of which one reaches into the other's pixels cannot be
+    measured, and neither is there. The method "learned" knows one stripe only.
+    """
+    found = _extracted(image, stripe_along, options, background, saturation)
+    return found.candidates(np.arange(len(found.stripe.status)))
+
+
+def see_stripes(
+    image: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions, saturation: float
+) -> SeenStripes:
+    """The stripe as of `extract_stripe`, its ends included, and the candidates on lines that hold more than one.
+
+    These only under the rule `PeakRule.DIRECT`. A 3D camera has found its stripe by itself.
+    """
+    if isinstance(image, Stripe):
+        return SeenStripes(copied(image), None, options.threshold_floor, options.half_window_px / 2, options.end_lines)
+    found = _extracted(image, stripe_along, options, None, saturation)
+    seen, jump_px = found.detection, found.options.half_window_px / 2
+    if seen is None or options.peak is not PeakRule.DIRECT:
+        return SeenStripes(found.stripe, None, options.threshold_floor, jump_px, options.end_lines)
+    lines = np.flatnonzero(found.several)
+    clear = found.stripe.status[lines] == _OK
+    if clear.any():
+        heights = {"coarse": seen.coarse, "fine": seen.fine}
+        of_rivals = with_rivals(found.profiles, seen.left, lines[clear], **heights, options=found.options)
+        lines = np.sort(np.concatenate([of_rivals, lines[~clear]]))
+    rivals = found.candidates(lines, least=2) if len(lines) else None
+    if rivals is not None and len(rivals.line) == 0:
+        rivals = None
+    return SeenStripes(found.stripe, rivals, seen.fine, jump_px, options.end_lines)
+
+
+def _extracted(
+    image: np.ndarray,
+    stripe_along: str,
+    options: StripeOptions,
+    background: np.ndarray | None,
+    saturation: float | None,
+) -> _Extracted:
+    """The stripe of an image with its ends; arguments and errors as of `extract_stripe`."""
     half = options.half_window_px
     _check_image(image, name="image")
     if stripe_along not in ("height", "width"):
@@ -88,14 +143,14 @@ def extract_stripe(
         kernel = (1, count) if stripe_along == "height" else (count, 1)
         signal = cv2.blur(signal.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
     profiles = _as_profiles(signal, stripe_along=stripe_along)
-    found = _found(profiles, options, clip)
+    found, several, detection = _found(profiles, options, clip)
     # A wider window is taken only if it measures what was too wide.
     wider, widest = options, min(options.widest_window_px, length // 4)
     while found.too_wide() and 2 * wider.half_window_px <= widest:
         wider = wider.doubled()
-        measured = _found(profiles, wider, clip)
+        measured, seen_several, seen = _found(profiles, wider, clip)
         if not measured.too_wide():
-            found, options = measured, wider
+            found, options, several, detection = measured, wider, seen_several, seen
 
     none = found.status == _NO_STRIPE
     if none.any():
@@ -104,19 +159,19 @@ def extract_stripe(
             _, low = block_extremes(_as_profiles(image, stripe_along=stripe_along), options.half_window_px // 2)
             white = low.max(axis=0) >= clip
         found.status[none & white] = _SATURATED
-    if options.end_lines:
-        good = found.status == _OK
-        jump_px = options.half_window_px / 2
-        found.discard(_half_lit(good, found.centre, lines=options.end_lines, jump_px=jump_px), _END)
-    return Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
+    stripe = Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
+    return _Extracted(stripe, several, profiles, options, detection)
 
 
 def stripe_in(
     seen: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions = StripeOptions(), saturation: float | None
 ) -> Stripe:
-    """The stripe of what a camera saw: that of an image as by `extract_stripe`, that of a 3D camera as it is."""
+    """The stripe of what a camera saw: that of an image as by `extract_stripe`, that of a 3D camera without its ends.
+
+    Of the ``options`` a 3D camera's stripe takes `StripeOptions.end_lines` alone.
+    """
     if isinstance(seen, Stripe):
-        return seen
+        return leave_ends_out(copied(seen), lines=options.end_lines, jump_px=options.half_window_px / 2)
     return extract_stripe(seen, stripe_along=stripe_along, options=options, saturation=saturation)
 
 
@@ -146,10 +201,11 @@ def _found_by_model(profiles: np.ndarray, options: StripeOptions, clip: float) -
     return found
 
 
-def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> _Lines:
-    """The stripe on each of the profiles (N, L), sought with one size of window."""
+def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> tuple[_Lines, np.ndarray, _Detection | None]:
+    """The stripe on each of the profiles (N, L), with one size of window, and which lines (L,) may hold several."""
     if options.method == LEARNED:
-        return _found_by_model(profiles, options, clip if math.isfinite(clip) else max(float(profiles.max()), 1.0))
+        found = _found_by_model(profiles, options, clip if math.isfinite(clip) else max(float(profiles.max()), 1.0))
+        return found, np.zeros(len(found.status), bool), None
     block = options.half_window_px // 2
     high, low = block_extremes(profiles, block)
     # Blocks more at either end of the lines, so that what one window covers can be crossed out without a check.
@@ -159,7 +215,9 @@ def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> _Lines:
     # 4 standard deviations over the median of the background, so that a stripe of 6 is hardly ever missed.
     coarse = max(options.threshold_floor, noise * (4.0 - MEDIAN_SURROUNDINGS))
     fine = max(options.threshold_floor, options.threshold_sigmas * noise * noise_gain(options.smoothing_px))
-    status, wide, peak = search(profiles, cv2.transpose(board), coarse=coarse, fine=fine, options=options, clip=clip)
+    left = cv2.transpose(board)
+    detection = _Detection(board, left, noise, coarse, fine, clip)
+    status, wide, several, peak = search(profiles, left, coarse=coarse, fine=fine, options=options, clip=clip)
     # A plateau wider than the window does not even stick out.
     white = low.max(axis=0) >= clip
     wide |= white
@@ -170,7 +228,61 @@ def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> _Lines:
         centre, found.amplitude[good] = place_centre(options.method, peak)
         found.centre[good] = peak.start + centre.astype(np.float64)
         found.width[good] = peak.sigma * FWHM_PER_SIGMA
-    return found
+    return found, several, detection
+
+
+@dataclass(frozen=True)
+class _Detection:
+    """Contrast of the blocks (B + 2 `MARGIN`, L), the same (L, B + 2 `MARGIN`) less what has been looked at, noise of a
+    pixel, least heights of blocks and peaks, and saturation."""
+
+    board: np.ndarray
+    left: np.ndarray
+    noise: float
+    coarse: float
+    fine: float
+    clip: float
+
+
+@dataclass(frozen=True)
+class _Extracted:
+    """The stripe of an image, which lines (L,) may hold several, and how it was sought on the profiles (N, L)."""
+
+    stripe: Stripe
+    several: np.ndarray
+    profiles: np.ndarray
+    options: StripeOptions
+    detection: _Detection | None
+
+    def without_ends(self) -> Stripe:
+        """The stripe without its ends."""
+        return leave_ends_out(self.stripe, lines=self.options.end_lines, jump_px=self.options.half_window_px / 2)
+
+    def candidates(self, lines: np.ndarray, *, least: int = 1) -> StripeCandidates:
+        """All stripes on those of some lines (M,) that have at least so many."""
+        stripe, seen, options = self.stripe, self.detection, self.options
+        count, along = len(stripe.status), stripe.stripe_along
+        if seen is None:
+            lines = np.intersect1d(lines, stripe.lines)
+            centre, amplitude, width = (each[lines] for each in (stripe.centre_px, stripe.amplitude, stripe.width_px))
+            return StripeCandidates(lines, centre, amplitude, width, np.zeros(len(lines)), count, along)
+        line, peak = np.empty(0, np.intp), None
+        if len(lines):
+            board, heights = cv2.transpose(seen.board), {"coarse": seen.coarse, "fine": seen.fine}
+            line, peak = search_all(self.profiles, board, lines, **heights, options=options, clip=seen.clip)
+            if least > 1 and len(line):
+                enough = np.bincount(line)[line] >= least
+                line, peak = line[enough], peak.keep(enough)
+        if peak is None or len(line) == 0:
+            amplitude, width = np.empty((2, 0), np.float32)
+            return StripeCandidates(line, np.empty(0), amplitude, width, np.empty(0), count, along)
+        centre, amplitude = place_centre(options.method, peak)
+        place = peak.start + centre.astype(np.float64)
+        # A matched filter: the squared height over the noise, summed over the profile of a Gaussian.
+        certainty = 0.5 * math.sqrt(math.pi) * peak.kernel_sigma() * (amplitude / max(seen.noise, _LEAST_NOISE)) ** 2
+        width, order = peak.sigma * np.float32(FWHM_PER_SIGMA), np.lexsort((place, line))
+        place, amplitude, width, certainty = (values[order] for values in (place, amplitude, width, certainty))
+        return StripeCandidates(line[order], place, amplitude, width, certainty.astype(np.float64), count, along)
 
 
 @dataclass(frozen=True)
@@ -195,26 +307,6 @@ class _Lines:
         self.status[lines] = status
         for values in (self.centre, self.amplitude, self.width):
             values[lines] = np.nan
-
-
-def _half_lit(good: np.ndarray, centre: np.ndarray, *, lines: int, jump_px: float) -> np.ndarray:
-    """Numbers (M,) of the lines with a centre that are among the ``lines`` last before a stripe ends or jumps.
-
-    ``good`` (L,) marks the lines with a centre. A stripe ends where more than a few lines in a row have none, and
-    jumps where neighbouring centres lie more than ``jump_px`` apart. The image's own border is no end.
-    """
-    if good.all() and np.abs(centre[1:] - centre[:-1]).max(initial=0.0) <= jump_px:
-        return np.empty(0, np.intp)
-    found = np.flatnonzero(good)
-    if len(found) == 0:
-        return found
-    # breaks[k] stands before found[k], the last one after all of them.
-    breaks = np.empty(len(found) + 1, bool)
-    breaks[1:-1] = (np.diff(found) > _SHORT_GAP + 1) | (np.abs(np.diff(centre[found])) > jump_px)
-    breaks[0], breaks[-1] = found[0] > _SHORT_GAP, len(good) - 1 - found[-1] > _SHORT_GAP
-    before = np.concatenate([[0], np.cumsum(breaks)])
-    place = np.arange(len(found))
-    return found[before[np.minimum(place + lines + 1, len(breaks))] > before[np.maximum(place - lines + 1, 0)]]
 
 
 def _check_image(image: np.ndarray, *, name: str) -> None:

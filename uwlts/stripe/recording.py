@@ -1,6 +1,6 @@
 """The stripes of all laser images of a recording, and why images show none."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,8 +9,9 @@ import numpy as np
 
 from uwlts.model.errors import CaptureError, ImageError
 from uwlts.model.stripe import StripeStatus
+from uwlts.stripe.direct import SeenStripes, direct_stripes, farther
 from uwlts.stripe.exposures import BracketImages, fused_images
-from uwlts.stripe.extract import extract_stripe, stripe_in
+from uwlts.stripe.extract import extract_stripe, see_stripes
 from uwlts.stripe.result import StripeOptions, StripeSettings
 
 BLACK = 0.02
@@ -60,10 +61,11 @@ def find_stripes(
 ) -> FoundStripes:
     """Find the stripe in all laser images of a recording, such as an opened `uwlts.storage.capture.Capture`.
 
-    Centre lines of a 3D camera are taken as they are.
+    Centre lines of a 3D camera are taken as they are, less the lines at their ends (`StripeOptions.end_lines`).
 
     Images of one place at several exposures are fused (`uwlts.stripe.exposures`); their stripe has the number of the
-    longest exposure, and amplitudes are in its grey levels.
+    longest exposure, and amplitudes are in its grey levels. Under the rule `PeakRule.DIRECT`, the default, reflections
+    are left out (`uwlts.stripe.direct`).
 
     ``options`` are as for `StripeOptions.of`. ``progress`` is called after each image with the number of images done
     and the number in all. CaptureError where the recording holds no laser image, or none of them shows a stripe.
@@ -72,13 +74,19 @@ def find_stripes(
     chosen = StripeOptions.of(capture.header.sensor, options)
     found: list[tuple[np.ndarray, ...]] = []
     statuses = np.zeros(len(StripeStatus), int)
-    for number, seen, saturation in fused_images(capture):
-        stripe = stripe_in(seen, stripe_along=along, options=chosen, saturation=saturation)
+    numbers: list[int] = []
+
+    def images() -> Iterator[SeenStripes]:
+        for number, seen, saturation in fused_images(capture):
+            numbers.append(number)
+            yield see_stripes(seen, stripe_along=along, options=chosen, saturation=saturation)
+            progress(number + 1, len(capture))
+
+    for count, stripe in enumerate(direct_stripes(images(), farther=farther(capture.header.sensor))):
         statuses += np.bincount(stripe.status, minlength=len(StripeStatus))
         good = stripe.lines
         of_lines = (values[good] for values in (stripe.centre_px, stripe.amplitude, stripe.width_px))
-        found.append((np.full(len(good), number), good, *of_lines))
-        progress(number + 1, len(capture))
+        found.append((np.full(len(good), numbers[count]), good, *of_lines))
     if not found:
         raise CaptureError(
             f"{capture.path.name} holds no image with the laser on among {len(capture)}: nothing to reconstruct"

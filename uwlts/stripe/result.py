@@ -11,6 +11,7 @@ import numpy as np
 
 from uwlts.model.errors import DescriptionError, RangeError
 from uwlts.model.sensor import Sensor
+from uwlts.model.stripe import Stripe, StripeStatus, pixels_of
 from uwlts.stripe.methods import method_names
 
 LEARNED = "learned"
@@ -18,8 +19,13 @@ LEARNED = "learned"
 
 
 class PeakRule(StrEnum):
-    """Which of several stripes on one line counts. First and last are in the order of growing pixel index."""
+    """Which of several stripes on one line counts. First and last are in the order of growing pixel index.
 
+    Direct is, in recordings, the one that the laser itself draws, not a reflection (`uwlts.stripe.direct`); in a single
+    image the strongest.
+    """
+
+    DIRECT = "direct"
     STRONGEST = "strongest"
     FIRST = "first"
     LAST = "last"
@@ -57,10 +63,11 @@ class StripeOptions:
     min_fwhm_px : float
         Least full width at half maximum, px; narrower things are hot pixels.
     ambiguous_ratio : float
-        Share of the strongest peak from which another one on the line counts as a stripe too. Under rule
-        ``strongest`` two such stripes make the line ambiguous; ``first`` and ``last`` choose among them, and the line
-        is ambiguous only if another reaches into the pixels used. Within one window peaks are separate only if the
-        profile falls below half height between them, and shares below one half count as one half.
+        Share of the strongest peak from which another one on the line counts as a stripe too. Under the rules
+        ``strongest``, and ``direct`` in a single image, two such stripes make the line ambiguous; ``first`` and
+        ``last`` choose among them, and the line is ambiguous only if another reaches into the pixels used. Within one
+        window peaks are separate only if the profile falls below half height between them, and shares below one half
+        count as one half.
     end_lines : int
         Lines left out on either side of a place where the stripe ends, or jumps by more than half of `half_window_px`
         from one line to the next: at an edge or a limb the sheet's width meets the surface only in part. 0 keeps them.
@@ -68,7 +75,7 @@ class StripeOptions:
 
     method: str = "profile-fit"
     model: str = ""
-    peak: PeakRule = PeakRule.STRONGEST
+    peak: PeakRule = PeakRule.DIRECT
     half_window_px: int = 16
     widest_window_px: int = 64
     smoothing_px: float = 1.0
@@ -132,3 +139,56 @@ class StripeOptions:
 
 StripeSettings = StripeOptions | Mapping[str, Any] | None
 """How the stripe is found: all options; some, in place of the sensor's own; or None, the sensor's own."""
+
+
+@dataclass(frozen=True)
+class StripeCandidates:
+    """All stripes of one image, M of them, in the order of lines and places: of several sheets, of reflections.
+
+    Attributes
+    ----------
+    line : (M,) int
+        Profile line of each; a line may have none, one, or several.
+    centre_px, amplitude, width_px : (M,) float64, float32, float32
+        As of `Stripe`.
+    log_likelihood : (M,) float64
+        Logarithm of the likelihood that the pixels have with the stripe over that without it, for the background's
+        white noise.
+    count : int
+        Number L of profile lines.
+    stripe_along : str
+        As of `Stripe`.
+    """
+
+    line: np.ndarray
+    centre_px: np.ndarray
+    amplitude: np.ndarray
+    width_px: np.ndarray
+    log_likelihood: np.ndarray
+    count: int
+    stripe_along: str
+
+    def split(self, sheets: int = 2) -> list[Stripe]:
+        """One `Stripe` for each of so many sheets of light, in the order of growing places.
+
+        Lines with another number of stripes than sheets do not show which is which: they are AMBIGUOUS, those without
+        any NO_STRIPE. RangeError for a number of sheets below 1.
+        """
+        if sheets < 1:
+            raise RangeError(f"sheets is {sheets}; expected 1 or more")
+        on_line = np.bincount(self.line, minlength=self.count)
+        status = np.full(self.count, StripeStatus.AMBIGUOUS, np.uint8)
+        status[on_line == 0], status[on_line == sheets] = StripeStatus.NO_STRIPE, StripeStatus.OK
+        lines = np.flatnonzero(on_line == sheets)
+        first = np.searchsorted(self.line, lines)
+        found = []
+        for number in range(sheets):
+            centre, amplitude, width = np.full(self.count, np.nan), *np.full((2, self.count), np.nan, np.float32)
+            for column, values in ((centre, self.centre_px), (amplitude, self.amplitude), (width, self.width_px)):
+                column[lines] = values[first + number]
+            found.append(Stripe(centre, amplitude, width, status.copy(), self.stripe_along))
+        return found
+
+    def pixels(self) -> np.ndarray:
+        """(M, 2) float64: image coordinates (u = column, v = row), px."""
+        return pixels_of(self.line, self.centre_px, stripe_along=self.stripe_along)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from uwlts.model.stripe import StripeStatus
@@ -25,11 +27,18 @@ from uwlts.stripe.result import PeakRule, StripeOptions
 _LOOKS = 4
 """Places looked at per line: hot pixels in front of the stripe and a second stripe after it."""
 
+_MOST = 6
+"""Most stripes on one line: two sheets, each with two reflections."""
+
 _COARSE_SLACK = 0.75
 """Block contrasts of equal stripes differ by this factor through where the pixels fall on them (sigma 0.7 px)."""
 
 _CLEAR = 3.0
 """From this multiple of the least height a block is no mere noise."""
+
+_RIVAL = 1.3
+"""From this multiple of the least height a block may be a second stripe: noise alone gets there on one line in a
+hundred, and to the least height on every second one."""
 
 _SPIKE = 0.85
 """Share of the least height below which three pixels' mean is noise; noise may lower that of a stripe a little."""
@@ -42,31 +51,67 @@ MARGIN = 2
 
 _OK, _NO_STRIPE = int(StripeStatus.OK), int(StripeStatus.NO_STRIPE)
 _AMBIGUOUS, _BORDER = int(StripeStatus.AMBIGUOUS), int(StripeStatus.BORDER)
-_ORDER = {PeakRule.FIRST: FIRST, PeakRule.STRONGEST: STRONGEST, PeakRule.LAST: LAST}
+_ORDER = {PeakRule.DIRECT: STRONGEST, PeakRule.STRONGEST: STRONGEST, PeakRule.FIRST: FIRST, PeakRule.LAST: LAST}
 
 
 def search(
     profiles: np.ndarray, board: np.ndarray, *, coarse: float, fine: float, options: StripeOptions, clip: float
-) -> tuple[np.ndarray, np.ndarray, PeakWindow]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, PeakWindow]:
     """Look at the blocks that stick out, in the order of the rule, until each line has its stripe or no block left.
 
     ``board`` (L, B + 2 `MARGIN`) holds the contrasts of the B blocks of each of the profiles (N, L), and zeros at
     either end; blocks that are done with are set to 0 in it. Blocks lower than ``coarse`` and peaks lower than ``fine``
     are noise. Under rule `strongest` a line with a stripe is searched once more for a second one.
 
-    Returns the status (L,) of each line, whether something bright was too wide to be measured (L,), and the windows of
-    the lines with a stripe, in their order.
+    Returns the status (L,) of each line, whether something bright was too wide to be measured (L,), whether more may
+    stand on it than one stripe (L,), and the windows of the lines with a stripe, in their order.
     """
     lines, rules = profiles.shape[1], _rules(options, coarse=coarse, fine=fine, clip=clip)
     peaks = PeakWindow.empty(lines, 2 * rules.half + rules.block, options.smoothing_px)
-    status, wide = np.full(lines, _NO_STRIPE, np.uint8), np.zeros(lines, np.bool_)
+    status = np.full(lines, _NO_STRIPE, np.uint8)
+    wide, several = np.zeros((2, lines), np.bool_)
     kernel = low_pass(options.smoothing_px)
     # Numba compiles longest for arrays that compiled code makes itself.
     smooth = np.empty(peaks.window.shape[1], np.float32)
     pixels = np.empty(smooth.size + kernel.size - 1, np.float32)
-    _search_lines(profiles, board, kernel, pixels, smooth, rules, status, wide, peaks)
+    _search_lines(profiles, board, kernel, pixels, smooth, rules, status, wide, several, peaks)
     good = status == _OK
-    return status, wide, peaks if good.all() else peaks.keep(good)
+    return status, wide, several, peaks if good.all() else peaks.keep(good)
+
+
+def search_all(
+    profiles: np.ndarray,
+    board: np.ndarray,
+    lines: np.ndarray,
+    *,
+    coarse: float,
+    fine: float,
+    options: StripeOptions,
+    clip: float,
+) -> tuple[np.ndarray, PeakWindow]:
+    """All stripes on some lines (M,): the line of each, in their order, and its window.
+
+    Arguments as of `search`. Two stripes of which one reaches into the other's pixels cannot be measured: neither is
+    there.
+    """
+    rules = _rules(replace(options, peak=PeakRule.FIRST), coarse=coarse, fine=fine, clip=clip)
+    peaks = PeakWindow.empty(_MOST * len(lines), 2 * rules.half + rules.block, options.smoothing_px)
+    kernel = low_pass(options.smoothing_px)
+    smooth = np.empty(peaks.window.shape[1], np.float32)
+    pixels = np.empty(smooth.size + kernel.size - 1, np.float32)
+    found = np.empty(_MOST * len(lines), np.intp)
+    count = _search_all(profiles, board, lines, kernel, pixels, smooth, rules, found, peaks)
+    return found[:count], peaks.keep(np.arange(count))
+
+
+def with_rivals(
+    profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, *, coarse: float, fine: float, options: StripeOptions
+) -> np.ndarray:
+    """Those of some lines (M,) on which something stands out in the board ``left`` by `search` that is no spike."""
+    rules = _rules(options, coarse=coarse, fine=fine, clip=np.inf)
+    found = np.zeros(len(lines), np.bool_)
+    _see_rivals(profiles, left, lines, np.empty(rules.block + 2, np.float32), rules, found)
+    return lines[found]
 
 
 def look_at(profiles: np.ndarray, lines: np.ndarray, centre: np.ndarray, options: StripeOptions) -> PeakWindow:
@@ -135,19 +180,22 @@ def _search_lines(
     rules: SearchRules,
     status: np.ndarray,
     wide: np.ndarray,
+    several: np.ndarray,
     peaks: PeakWindow,
 ) -> None:
-    """Fill `status`, `wide` and the windows of the lines that have a stripe; the windows of others are undefined."""
+    """Fill `status`, `wide`, `several` and the windows of lines with a stripe; those of others are undefined."""
     size, border = smooth.size, kernel.size // 2
     for line in range(profiles.shape[1]):
         blocks, least = board[line], np.float32(rules.coarse)
         for _ in range(_LOOKS):
-            chosen = _next_block(blocks, least, rules)
+            highest = _greatest_block(blocks)
+            if status[line] == _OK and highest >= _RIVAL * rules.coarse:
+                several[line] = True
+            chosen = _next_block(blocks, highest, least, rules)
             if chosen < 0:
                 break
-            there, place = np.float32(blocks[chosen]), (chosen - MARGIN) * rules.block
-            start = place - rules.half
-            window = pixels[border : border + size]
+            there = np.float32(blocks[chosen])
+            start, window = (chosen - MARGIN) * rules.block - rules.half, pixels[border : border + size]
             cut(profiles, line, start, window)
             near = window[rules.half - 1 : rules.half + rules.block + 1]
             if there < _CLEAR * rules.fine and _is_spike(near, there, rules.fine):
@@ -155,12 +203,9 @@ def _search_lines(
                 continue
             filtered(pixels, kernel, smooth)
             peak = measured(smooth, start, profiles.shape[0], rules)
-            # The window follows a peak of which a half-height crossing or a flank lies outside it.
-            to_end = np.float32(0.5 * (size - 1))
-            offset = peak.middle - to_end
-            outside = abs(offset) + peak.reach > to_end - FLANK + np.float32(0.5)
-            if (outside or not peak.closed) and peak.height >= rules.fine:
-                start += int(np.rint(offset))
+            offset = _offset(peak, size, rules)
+            if offset != 0:
+                start += offset
                 cut(profiles, line, start, window)
                 filtered(pixels, kernel, smooth)
                 peak = measured(smooth, start, profiles.shape[0], rules)
@@ -181,30 +226,120 @@ def _search_lines(
                     and peak.height >= rules.share * peaks.height[line]
                 ):
                     status[line] = _AMBIGUOUS
+                    several[line] = True
                     break
                 continue
             status[line] = verdict
             if verdict != _OK:
+                several[line] = True
                 break
             peaks.start[line] = start
-            peaks.middle[line], peaks.sigma[line], peaks.reach[line] = peak.middle, peak.sigma, peak.reach
-            peaks.base[line], peaks.slope[line], peaks.height[line] = peak.base, peak.slope, peak.height
-            for k in range(size):
-                peaks.window[line, k] = window[k]
+            _keep(peaks, line, peak, window)
             if rules.order != STRONGEST:
                 break
             least = max(least, there * np.float32(rules.share * _COARSE_SLACK))
 
 
 @compiled
-def _next_block(blocks: np.ndarray, least: np.float32, rules: SearchRules) -> int:
+def _see_rivals(
+    profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, near: np.ndarray, rules: SearchRules, found: np.ndarray
+) -> None:
+    """Mark the lines on which a block stands out that is no spike."""
+    for m in range(lines.size):
+        blocks = left[lines[m]]
+        for k in range(MARGIN, blocks.size - MARGIN):
+            if blocks[k] >= rules.coarse and not found[m]:
+                cut(profiles, lines[m], (k - MARGIN) * rules.block - 1, near)
+                there = np.float32(blocks[k])
+                found[m] = there >= _CLEAR * rules.fine or not _is_spike(near, there, rules.fine)
+
+
+@compiled
+def _search_all(
+    profiles: np.ndarray,
+    board: np.ndarray,
+    lines: np.ndarray,
+    kernel: np.ndarray,
+    pixels: np.ndarray,
+    smooth: np.ndarray,
+    rules: SearchRules,
+    found: np.ndarray,
+    peaks: PeakWindow,
+) -> int:
+    """Fill `found` and the windows of all stripes on some lines; returns how many there are."""
+    size, border, count = smooth.size, kernel.size // 2, 0
+    for line in lines:
+        blocks, first = board[line], count
+        for _ in range(2 * _MOST):
+            there = _greatest_block(blocks)
+            if there < rules.coarse or there <= 0 or count == first + _MOST:
+                break
+            chosen = 0
+            while blocks[chosen] != there:
+                chosen += 1
+            blocks[chosen] = 0
+            start, window = (chosen - MARGIN) * rules.block - rules.half, pixels[border : border + size]
+            cut(profiles, line, start, window)
+            near = window[rules.half - 1 : rules.half + rules.block + 1]
+            if there < _CLEAR * rules.fine and _is_spike(near, np.float32(there), rules.fine):
+                continue
+            filtered(pixels, kernel, smooth)
+            peak = measured(smooth, start, profiles.shape[0], rules)
+            offset = _offset(peak, size, rules)
+            if offset != 0:
+                start += offset
+                cut(profiles, line, start, window)
+                filtered(pixels, kernel, smooth)
+                peak = measured(smooth, start, profiles.shape[0], rules)
+            if _judged(peak, start, profiles.shape[0], rules) != _OK:
+                continue
+            place, known = start + peak.middle, False
+            for k in range(first, count):
+                apart = abs(place - (peaks.start[k] + peaks.middle[k]))
+                known |= apart <= np.float32(FWHM_PER_SIGMA) * max(peaks.sigma[k], peak.sigma)
+            if known:
+                continue
+            found[count], peaks.start[count] = line, start
+            _keep(peaks, count, peak, window)
+            count += 1
+    return count
+
+
+@compiled
+def _offset(peak: Peak, size: int, rules: SearchRules) -> int:
+    """How far a window is to follow a peak of which a half-height crossing or a flank lies outside it."""
+    to_end = np.float32(0.5 * (size - 1))
+    offset = peak.middle - to_end
+    outside = abs(offset) + peak.reach > to_end - FLANK + np.float32(0.5)
+    if (outside or not peak.closed) and peak.height >= rules.fine:
+        return int(np.rint(offset))
+    return 0
+
+
+@compiled
+def _keep(peaks: PeakWindow, number: int, peak: Peak, window: np.ndarray) -> None:
+    """Keep a peak and its window under a number."""
+    peaks.middle[number], peaks.sigma[number], peaks.reach[number] = peak.middle, peak.sigma, peak.reach
+    peaks.base[number], peaks.slope[number], peaks.height[number] = peak.base, peak.slope, peak.height
+    for k in range(window.size):
+        peaks.window[number, k] = window[k]
+
+
+@compiled
+def _greatest_block(blocks: np.ndarray) -> np.number:
+    """The highest contrast of a line's blocks."""
+    highest = blocks[0]
+    for k in range(blocks.size):
+        highest = max(highest, blocks[k])
+    return highest
+
+
+@compiled
+def _next_block(blocks: np.ndarray, highest: np.number, least: np.float32, rules: SearchRules) -> int:
     """The block that the rule names among those that reach `least`; -1 where none does.
 
     First and last are taken among the blocks with a share of the highest contrast on their line.
     """
-    highest = blocks[0]
-    for k in range(blocks.size):
-        highest = max(highest, blocks[k])
     if highest < least or highest <= 0:
         return -1
     chosen = 0

@@ -2,9 +2,10 @@
 
     python compare.py stripe.onnx runs/clean runs/turbid runs/shiny --real FOLDER
 
-A line counts as found where a method gives a centre within `NEAR_PX` of the true one, and as false where it gives one
-farther away or where no stripe is. Errors are those of the found lines; the Cramer-Rao bound is that of detector noise
-without speckle. On real images, whose truth nobody knows, it is by how much centres scatter about a smooth stripe.
+Lines count whose stripe is visible and could be known to a pixel by its Cramer-Rao bound. A line is found where a
+method gives a centre within `NEAR_PX` of the true one, and false where it gives one farther away or where no stripe is.
+Errors are those of the found lines; the bound is that of detector noise without speckle. On real images, whose truth
+nobody knows, the scatter of the centres about a smooth stripe is given instead.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Tally:
     def add(self, centre: np.ndarray, sample: dict[str, np.ndarray]) -> None:
         """Count the centres (L,) of one image."""
         status, truth = sample["status"], sample["centre_px"]
-        visible = np.isin(status, (LineStatus.VISIBLE, LineStatus.SATURATED))
+        visible = np.isin(status, (LineStatus.VISIBLE, LineStatus.SATURATED)) & (sample["bound_px"] < 1)
         judged = visible | np.isin(status, (LineStatus.NOT_CROSSED, LineStatus.SHADOWED))
         near = visible & (np.abs(centre - truth) <= NEAR_PX)
         self.errors.append((centre - truth)[near])

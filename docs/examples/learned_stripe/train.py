@@ -30,12 +30,15 @@ NO_STRIPE = -1.0
 
 
 def read_lines(folders: list[Path], split: str) -> tuple[np.ndarray, np.ndarray]:
-    """Lines (N, P) of uint8 and the true centre (N,) on each, `NO_STRIPE` where none is; faint ones are left out."""
+    """Lines (N, P) of uint8 and the true centre (N,) on each, `NO_STRIPE` where none is.
+
+    Left out are faint stripes, and those whose centre cannot be known to a pixel, as under saturated daylight.
+    """
     images, truths = [], []
     for folder in folders:
-        for sample in twin.load_dataset(folder, split=split, names=("image", "centre_px", "status")):
+        for sample in twin.load_dataset(folder, split=split, names=("image", "centre_px", "status", "bound_px")):
             status, centre = sample["status"], sample["centre_px"]
-            seen = np.isin(status, (LineStatus.VISIBLE, LineStatus.SATURATED))
+            seen = np.isin(status, (LineStatus.VISIBLE, LineStatus.SATURATED)) & (sample["bound_px"] < 1)
             none = np.isin(status, (LineStatus.NOT_CROSSED, LineStatus.SHADOWED, LineStatus.LASER_OFF))
             kept = seen | none
             images.append(np.ascontiguousarray(sample["image"].T[kept]))

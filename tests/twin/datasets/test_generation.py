@@ -159,7 +159,7 @@ def test_samples_are_read_in_any_way(folder):
     assert set(shapes) == {"image"} | set(everything.card.labels)
     assert shapes["image"] == shapes["mask"] == shapes["depth_mm"] == shapes["object_map"] == (128, 160)
     assert shapes["centre_px"] == shapes["snr"] == (160,) and shapes["point_mm"] == (160, 3)
-    assert shapes["light_e"] == (4, 128, 160)
+    assert shapes["light_e"] == (5, 128, 160)
     few = twin.load_dataset(folder, names=["image", "centre_px"])[0]
     assert set(few) == {"key", "image", "centre_px"}
     with pytest.raises(DescriptionError, match="unknown split 'dev'"):
@@ -246,6 +246,27 @@ def test_ctrl_c_leaves_complete_shards_only(tmp_path):
 
 
 @pytest.mark.slow
+def test_memory_does_not_grow_with_the_number_of_frames(tmp_path):
+    half = 'base = "thesis"\nname = "half"\n[camera]\nwidth_px = 320\nheight_px = 256\npixel_size_um = 21.2\n'
+    (tmp_path / "half.toml").write_text(half, encoding="utf-8")
+    text = 'title = "many"\nsensor = "half.toml"\nscene = "spheres"\nlabels = ["masks", "light"]\n'
+    text += 'without = ["multiple-scattering", "secondary-light"]\nspp = 4\n[motion]\ncount = 4\n'
+    (tmp_path / "many.toml").write_text(text, encoding="utf-8")
+    program = (
+        "import resource, sys, twin\n"
+        "twin.dataset(sys.argv[1], out=sys.argv[2], scenes=int(sys.argv[3]), workers=1)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    )
+    used_mb = []
+    for scenes in (2, 12):
+        line = [sys.executable, "-c", program, str(tmp_path / "many.toml"), str(tmp_path / f"of {scenes}"), str(scenes)]
+        used_mb.append(int(subprocess.run(line, check=True, capture_output=True, text=True).stdout) / 1024)
+    # The light of a frame, five numbers of 4 bytes for each pixel, is 1.6 MB, and half of it as a label: 40 more frames
+    # would need 100 MB.
+    assert used_mb[1] - used_mb[0] < 50
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["stripe-turbid", "stripe-shiny", "pipe-inspection", "calibration-boards"])
 def test_presets_are_rendered(name, tmp_path):
     samples = twin.load_dataset(twin.dataset(name, out=tmp_path / name, scenes=2, workers=1))
@@ -255,3 +276,63 @@ def test_presets_are_rendered(name, tmp_path):
             assert np.isfinite(sample["centre_px"]).sum() > 100
     if name == "calibration-boards":
         assert np.isfinite(samples[0]["target_px"]).all(axis=1).sum() > 50
+
+
+def test_shards_that_another_run_holds_are_left_to_it_and_then_waited_for(folder, tmp_path):
+    out, made = tmp_path / "shared", hashes(folder)
+    out.mkdir()
+    held = sorted(made)[-1]
+    # Another machine's run that takes a shard, and dies before it is written.
+    program = (
+        "import sys, time, pathlib\nfrom uwlts.storage.one_writer import one_writer\n"
+        "with one_writer(pathlib.Path(sys.argv[1])):\n"
+        "    print('held', flush=True)\n"
+        "    while len(list(pathlib.Path(sys.argv[1]).parent.glob('*.tar'))) < int(sys.argv[2]):\n"
+        "        time.sleep(0.02)\n"
+    )
+    line = [sys.executable, "-c", program, str(out / held), str(len(made) - 1)]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as other:
+        assert other.stdout is not None and other.stdout.readline() == "held\n"
+        with pytest.raises(OutputError, match="is writing it"):
+            twin.dataset(small(), out=out, workers=1, overwrite=True)
+        twin.dataset(small(), out=out, workers=1)
+    assert hashes(out) == made
+    assert not list(out.glob(".*"))
+
+
+def decoded(code: dict) -> np.ndarray:
+    """Mask of a compressed run length encoding, after the COCO API's description."""
+    runs, text = [], iter(code["counts"])
+    for character in text:
+        value, shift, bits = 0, 0, ord(character) - 48
+        while True:
+            value |= (bits & 31) << shift
+            shift += 5
+            if not bits & 32:
+                break
+            bits = ord(next(text)) - 48
+        if bits & 16:
+            value -= 1 << shift
+        runs.append(value + (runs[-2] if len(runs) > 2 else 0))
+    height, width = code["size"]
+    return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T
+
+
+def test_coco_annotations_hold_the_masks(folder):
+    shown = 0
+    for split in SPLITS:
+        coco = json.loads((folder / f"coco-{split}.json").read_text(encoding="utf-8"))
+        samples = twin.datasets.load(folder, split=split)
+        assert len(coco["images"]) == len(samples)
+        assert {one["name"] for one in coco["categories"]} == {"stripe", "saturated", "haze", "secondary", "particles"}
+        for one in coco["annotations"]:
+            sample, mask = samples[one["image_id"]], decoded(one["segmentation"])
+            np.testing.assert_array_equal(mask, (sample["mask"] & one["category_id"]) > 0)
+            rows, columns = np.nonzero(mask)
+            box = [columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1]
+            assert (one["bbox"], one["area"]) == (box, mask.sum())
+            assert coco["images"][one["image_id"]]["file_name"].endswith(f".tar/{sample['key']}.png")
+            shown += 1
+        numbers = [one["id"] for one in coco["annotations"]]
+        assert numbers == list(range(len(numbers)))
+    assert shown >= 16

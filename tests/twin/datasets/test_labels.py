@@ -10,8 +10,8 @@ from twin.datasets.description import FAINT_BELOW, LineStatus, Mask
 from twin.datasets.labels import labelled, noise_std_e, stripe_quality
 from twin.options import Effects, Options
 from twin.recording.studio import Exposed, Studio
-from twin.scene.description import Motion, PittedPipe, Shot
-from twin.scene.shapes import pitted_radius
+from twin.scene.forms.pitted_pipe import PittedPipe, pitted_radius
+from twin.scene.motion import Motion, Shot
 from uwlts.model.sensor import Sensor
 
 ALL_LABELS = ("centre", "quality", "points", "masks", "light", "depth", "sensor")
@@ -145,8 +145,8 @@ def test_the_light_of_all_ways_makes_the_image(thesis):
     grey = (light.sum(axis=0) + dark) * detector.gain_dn_per_e() + detector.black_level_dn
     # Rounded to whole grey values, and each part to 11 bits in light_e.
     np.testing.assert_allclose(taken.image, grey, rtol=4 * 2**-11, atol=0.51)
-    assert all(part.max() > 0 for part in light)
-    assert light[3].max() < 1.5 * light[3][light[3] > 0].min(), "daylight on an even plate"
+    assert [part.max() > 0 for part in light] == [True, True, True, False, True]
+    assert light[4].max() < 1.5 * light[4][light[4] > 0].min(), "daylight on an even plate"
     # Haze lies in the water before the plate, on the laser's side of the stripe.
     assert light[1].sum() > 0 and light[0].argmax() != light[1].argmax()
 
@@ -160,6 +160,8 @@ def test_masks_follow_from_light_and_noise(thesis):
     parts[2][0] = [0.0, 0.0, 400.0, 0.0, 0.0, 0.0]
     image = np.zeros(shape, np.uint8)
     image[1, 3] = 255
+    parts.insert(3, np.zeros(shape, np.float32))
+    parts[3][0] = [0.0, 0.0, 0.0, 0.0, 400.0, 4.0]
     taken = Exposed(image, 1.0, *parts)
     detector = small(thesis).detector.model_copy(update={"read_noise_e": 22.0, "dark_current_e_per_s": 0.0})
     noise = noise_std_e(taken, detector)
@@ -173,6 +175,7 @@ def test_masks_follow_from_light_and_noise(thesis):
     stripe[1, 1:], stripe[2, 2:4] = True, True  # 13 of 100 are below 1/e2, and less than an electron counts nowhere
     np.testing.assert_array_equal((mask & Mask.STRIPE) > 0, stripe)
     np.testing.assert_array_equal((mask & Mask.SATURATED) > 0, image == 255)
+    assert ((mask & Mask.PARTICLES) > 0).sum() == 1
     assert ((mask & Mask.HAZE) > 0).sum() == 4 and ((mask & Mask.SECONDARY) > 0).sum() == 1
 
 

@@ -68,7 +68,7 @@ def test_light_by_way_of_a_mirror_twice_goes_with_its_share_squared(thesis):
 def test_while_the_sensor_travels_the_light_by_way_of_a_mirror_travels_as_well(thesis):
     """The exposure is the mean of still ones at places along the way, the outermost with half the weight."""
     renderer = Renderer(thesis, clear(), hidden(SHARE), effects=replace(EFFECTS, motion=True))
-    way = Travel(direction=np.array([1.0, 0.0, 0.0]), exposure_mm=4.0, row_mm=0.0, middle_row=0.0)
+    way = Travel(velocity_mm_s=np.array([100.0, 0.0, 0.0]), exposure_s=0.04)
     moving = renderer.irradiance("laser", sensor_at(), spp=64, travel=way).astype(float)
     still = [renderer.irradiance("laser", sensor_at(x=x), spp=64).astype(float) for x in np.linspace(-2.0, 2.0, 9)]
     mean = np.average(still, axis=0, weights=[0.5, *[1.0] * 7, 0.5])

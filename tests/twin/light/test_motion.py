@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, sensor_at
 from twin.light.pose import Travel
@@ -13,6 +14,7 @@ from twin.recording.studio import Studio, true_stripe
 from uwlts.model.errors import DesignError
 
 ALONG_X = np.array([1.0, 0.0, 0.0])
+SPEED = 50.0
 TILTED = plate(side=200.0) | {"rotation_deg": (0.0, 30.0, 0.0)}
 
 
@@ -29,7 +31,7 @@ def renderer(thesis) -> Renderer:
 
 
 def travel(exposure_mm: float = 0.0, row_mm: float = 0.0) -> Travel:
-    return Travel(direction=ALONG_X, exposure_mm=exposure_mm, row_mm=row_mm, middle_row=0.0)
+    return Travel(velocity_mm_s=SPEED * ALONG_X, exposure_s=exposure_mm / SPEED, row_s=row_mm / SPEED)
 
 
 @pytest.mark.parametrize("exposure_mm", [3.0, 12.0])
@@ -59,6 +61,40 @@ def test_a_rolling_shutter_shifts_each_row_by_its_delay(renderer):
     np.testing.assert_allclose(moments(image)[0], rolled.centre_px, atol=0.05)
 
 
+def test_an_exposure_under_any_twist_is_the_mean_of_still_frames_along_it(renderer):
+    """The sensor turns about all axes and goes to all sides at once.
+
+    The mean of 17 still frames, the outermost with half the weight, is the trapezoid rule: the stripe moves by some 15
+    px, less than one of its widths from frame to frame, so that columns' means agree to hundredths of a pixel.
+    """
+    turn, velocity, exposure_s = np.array([0.6, -0.4, 0.8]), np.array([30.0, 20.0, -40.0]), 0.05
+    way = Travel(velocity_mm_s=velocity, turn_rad_s=turn, exposure_s=exposure_s)
+    moving = renderer.irradiance("laser", sensor_at(), spp=512, travel=way).astype(float)
+    still = []
+    for at_s in np.linspace(-0.5, 0.5, 17) * exposure_s:
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_rotvec(turn * at_s).as_matrix()
+        pose[:3, 3] = velocity * at_s
+        still.append(renderer.irradiance("laser", pose, spp=64).astype(float))
+    weights = np.r_[0.5, np.ones(15), 0.5]
+    (mean, spread), (expected, wide) = moments(moving), moments(np.average(still, axis=0, weights=weights))
+    np.testing.assert_allclose(mean, expected, atol=0.05)
+    np.testing.assert_allclose(spread, wide, rtol=0.02)
+    ends = [moments(image)[0] for image in (still[0], still[-1])]
+    assert np.abs(ends[1] - ends[0]).min() > 3
+
+
+def test_a_turn_moves_each_row_of_a_rolling_shutter(renderer):
+    """The truth of a row is that of a still frame at the pose of that row's moment."""
+    turn, row_s, begun = np.array([0.0, 30.0, 3.0]), 1e-4, sensor_at(x=15.0)
+    rolled = true_stripe(renderer, begun, travel=Travel(np.zeros(3), 0.0, turn, row_s=row_s))
+    for line in (4, 43):
+        pose = begun.copy()
+        pose[:3, :3] = Rotation.from_rotvec(turn * rolled.centre_px[line] * row_s).as_matrix()
+        assert true_stripe(renderer, pose).centre_px[line] == pytest.approx(rolled.centre_px[line], abs=2e-3)
+    assert np.abs(rolled.centre_px - true_stripe(renderer, begun).centre_px).max() > 1
+
+
 def test_too_fast_a_travel_is_refused_with_numbers(thesis):
     sensor = altered(thesis, {"exposure": {"laser_ms": 5.0}})
     fast = {"count": 5, "step_mm": 1.0, "speed_mm_per_s": 100.0}
@@ -66,6 +102,8 @@ def test_too_fast_a_travel_is_refused_with_numbers(thesis):
         Studio(sensor, scene_of(TILTED, motion=fast), Options(effects=NONE))
     studio = Studio(sensor, scene_of(TILTED, motion=fast | {"speed_mm_per_s": 50.0}), Options(effects=NONE))
     assert studio.period_s == pytest.approx(0.02)
-    assert studio.travel("laser") is None, "the motion is left out"
+    shot = next(studio.scene.motion.shots())
+    assert studio.travel(shot) is None, "the motion is left out"
     moving = Studio(sensor, studio.scene, Options(effects=replace(NONE, motion=True)))
-    assert moving.travel("laser").exposure_mm == pytest.approx(0.25)
+    way = moving.travel(shot)
+    assert way.velocity_mm_s * way.exposure_s == pytest.approx([0.25, 0.0, 0.0])

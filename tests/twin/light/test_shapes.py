@@ -11,9 +11,9 @@ from tests.virtual_sensors import clear, oracle_paths, scene_of, sensor_at
 from twin.backend.arrays import to_jit, to_numpy
 from twin.light.renderer import Renderer
 from twin.recording.studio import true_stripe
-from twin.scene.description import Weld
+from twin.scene.forms.head import head_depth
+from twin.scene.forms.weld import Weld, weld_height
 from twin.scene.objects import Objects, build_objects
-from twin.scene.shapes import head_depth, weld_height
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.storage.truth import TruthStatus
 

@@ -11,8 +11,9 @@ from tests.virtual_sensors import altered, camera_axes, scene_of, sensor_at
 from twin.light.renderer import Renderer
 from twin.options import NONE, Options
 from twin.recording.studio import Studio, depth_map, record_scene, with_window
-from twin.scene.description import CirclePlate, Motion, Scene, Shot
+from twin.scene.description import CirclePlate, Scene
 from twin.scene.finish import printed_shifts
+from twin.scene.motion import Motion, Shot
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 from uwlts.storage.truth import TruthStatus, read_truth, truth_path

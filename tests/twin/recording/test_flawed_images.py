@@ -9,6 +9,7 @@ from tests.virtual_sensors import altered, camera_axes, clear, cropped, oracle_p
 from twin.light.renderer import Renderer
 from twin.options import NONE, Flaws, Options
 from twin.recording.studio import Studio, record_scene
+from twin.sensor.flaws import dirt
 from uwlts.model.errors import DescriptionError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
@@ -18,12 +19,17 @@ TYPICAL = [
     "glare=0.02",
     "vignetting=0.4",
     "uneven-lamp=0.6",
+    "particles=1000",
+    "bubbles=200",
+    "caustics=0.3",
+    "dirt=0.1",
     "lamp-and-laser",
     "pixel-aspect=1.002",
     "tangential=0.001",
     "rolling-shutter=10",
     "jpeg=90",
     "colour-filter",
+    "camera-3d=16",
 ]
 NAMES = [text.partition("=")[0] for text in TYPICAL]
 
@@ -85,7 +91,7 @@ def test_what_is_no_flaw_is_refused(text, message):
         Flaws.of("glare", text)
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "rolling-shutter"])
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("rolling-shutter", "caustics", "camera-3d")])
 def test_each_flaw_alone_changes_an_image(sensor, plain, name):
     changed = images(studio(sensor, name))
     assert max(np.abs(a - b).max() for a, b in zip(plain, changed, strict=True)) >= 1
@@ -93,13 +99,49 @@ def test_each_flaw_alone_changes_an_image(sensor, plain, name):
     assert (plain[1] == changed[1]).all() == uneven, "an uneven lamp leaves the laser's image as it is"
 
 
+def test_caustics_pattern_the_days_light_on_surfaces_alone(sensor):
+    bright = altered(sensor, {"lamp": {"ambient_w_per_m2": 20.0}})
+    scene = scene_of(plate(side=400.0))
+    day = replace(NONE, ambient=True)
+    even, faint, strong = (
+        Renderer(bright, clear(), scene, effects=day, caustics=size).irradiance("day", sensor_at(), spp=4)
+        for size in (0.0, 0.05, 0.3)
+    )
+    inside = even > 0.5 * even.max()
+    assert inside.mean() > 0.5
+    for image, size in ((faint, 0.05), (strong, 0.3)):
+        share = image[inside] / even[inside]
+        # The trace's standard deviation is the strength; over a field of some waves it is known to a third of itself,
+        # and of strong ones the bright crests stand out.
+        assert 0.6 * size < share.std() < 2.0 * size
+        assert share.mean() == pytest.approx(1.0, abs=0.05 + size**2)
+    lamp = [
+        Renderer(bright, clear(), scene, effects=day, caustics=c).irradiance("lamp", sensor_at(), spp=4)
+        for c in (0.0, 0.3)
+    ]
+    np.testing.assert_array_equal(*lamp)
+
+
+def test_dirt_takes_its_share_in_patches_as_wide_as_the_pupil(sensor):
+    shares = np.array([dirt(sensor.camera, 0.2, seed=seed) for seed in range(12)])
+    assert shares.shape[1:] == (128, 160) and shares.min() >= 0 and shares.max() <= 1
+    # Each image sees the window through some tens of spots: its mean share is free to 0.05, that of 12 to 0.015.
+    assert shares.mean() == pytest.approx(0.8, abs=0.06)
+    assert shares.std() > 0.01
+    # Blurred over the pupil, it changes little from one pixel to the next.
+    assert np.abs(np.diff(shares, axis=2)).max() < 0.25
+    np.testing.assert_array_equal(shares[3], dirt(sensor.camera, 0.2, seed=3))
+
+
 def test_a_rolling_shutter_delays_the_rows_of_a_moving_sensor(sensor):
     scene = scene_of(plate(), motion={"speed_mm_per_s": 40.0})
-    travels = [
-        Studio(sensor, scene, Options(effects=replace(NONE, motion=True), flaws=Flaws.of(*effects))).travel("laser")
+    studios = [
+        Studio(sensor, scene, Options(effects=replace(NONE, motion=True), flaws=Flaws.of(*effects)))
         for effects in (["rolling-shutter=25"], [])
     ]
-    assert [travel.row_mm for travel in travels if travel] == pytest.approx([40.0 * 25e-6, 0.0])
+    travels = [each.travel(next(scene.motion.shots())) for each in studios]
+    assert [travel.row_s for travel in travels if travel] == pytest.approx([25e-6, 0.0])
+    assert [travel.velocity_mm_s[0] for travel in travels if travel] == pytest.approx([40.0, 40.0])
 
 
 def test_lamp_and_laser_together_are_the_sum_of_both(sensor, apart):

@@ -8,8 +8,10 @@ from tests.virtual_sensors import altered, plate, scene_of
 from twin.light.renderer import Renderer
 from twin.options import Options
 from twin.recording.studio import check_scene, medium_of
-from twin.scene.description import Motion, Pose, Scene, load_scene
+from twin.scene.description import Scene, load_scene
+from twin.scene.motion import Motion
 from twin.scene.objects import Objects, build_objects
+from twin.scene.placed import Pose
 from uwlts.model.errors import DescriptionError, RangeError
 from uwlts.model.library import library_folder, load_sensor, names
 from uwlts.model.sensor import Sensor

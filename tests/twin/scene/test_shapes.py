@@ -6,16 +6,11 @@ import trimesh
 from pydantic import ValidationError
 from scipy.signal import argrelmin
 
-from twin.scene.description import PittedPipe, Weld
-from twin.scene.shapes import (
-    head_depth,
-    head_surface,
-    pit_places,
-    pitted_radius,
-    pitted_surface,
-    weld_height,
-    weld_surface,
-)
+from twin.scene import placed
+from twin.scene.forms import Head, PittedPipe, Weld
+from twin.scene.forms.head import head_depth
+from twin.scene.forms.pitted_pipe import pit_places, pitted_radius
+from twin.scene.forms.weld import weld_height
 from uwlts.model.errors import DescriptionError
 
 HEIGHT = 160.0
@@ -33,7 +28,7 @@ def inner_points(mesh: trimesh.Trimesh) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def head() -> trimesh.Trimesh:
-    return mesh_of(head_surface(height_mm=HEIGHT))
+    return mesh_of(Head(kind="head", height_mm=HEIGHT).surface())
 
 
 def test_a_head_is_closed_and_its_normals_point_outwards(head):
@@ -50,7 +45,7 @@ def test_a_head_has_the_size_that_was_asked_for(head):
     low, high = head.bounds
     np.testing.assert_allclose([low[1], high[1]], [-80, 80], atol=1e-9)
     np.testing.assert_allclose((high - low)[[0, 2]] / HEIGHT, [0.57, 0.79], atol=0.005)
-    half, _ = head_surface(height_mm=HEIGHT / 2)
+    half, _ = Head(kind="head", height_mm=HEIGHT / 2).surface()
     np.testing.assert_allclose(2 * half, head.vertices, rtol=0, atol=1e-9)
 
 
@@ -92,7 +87,7 @@ def test_beside_a_head_there_is_nothing():
 def test_a_weld_is_an_open_sheet_that_faces_the_sensor(along):
     plate = (80.0, 120.0) if along == "x" else (120.0, 80.0)
     weld = Weld(kind="weld", along=along, plate_mm=plate)
-    mesh = mesh_of(weld_surface(weld))
+    mesh = mesh_of(weld.surface())
     assert mesh.is_winding_consistent
     assert mesh.face_normals[:, 2].max() < 0
     # One closed rim and no hole: V - E + F of a disk is 1.
@@ -152,10 +147,9 @@ def test_irregular_beads_follow_their_seed():
 
 
 def test_surfaces_are_the_same_every_time_and_kept_unharmed():
-    for make in (lambda: head_surface(height_mm=20.0), lambda: weld_surface(Weld(kind="weld", beads=1))):
+    for make in (lambda: Head(kind="head", height_mm=20.0).surface(), lambda: Weld(kind="weld", beads=1).surface()):
         first = make()
-        head_surface.cache_clear()
-        weld_surface.cache_clear()
+        placed._kept.cache_clear()
         for old, new in zip(first, make(), strict=True):
             assert old is not new
             np.testing.assert_array_equal(old, new)
@@ -165,7 +159,7 @@ def test_surfaces_are_the_same_every_time_and_kept_unharmed():
 
 def test_a_weld_too_fine_to_be_meshed_is_refused():
     with pytest.raises(DescriptionError, match=r"a weld in steps of 0\.0\d+ mm needs \d+ vertices"):
-        weld_surface(Weld(kind="weld", ripple_pitch_mm=0.2))
+        Weld(kind="weld", ripple_pitch_mm=0.2).surface()
 
 
 def test_an_undercut_runs_along_both_toes_of_a_bead():
@@ -178,7 +172,7 @@ def test_an_undercut_runs_along_both_toes_of_a_bead():
     np.testing.assert_allclose(np.abs(across[lost > 0.599]), 5.0, atol=0.03)
     np.testing.assert_allclose([np.abs(across[lost > 0]).min(), np.abs(across[lost > 0]).max()], [4.0, 6.0], atol=0.02)
     assert weld_height(cut, np.array([29.0]), np.array([5.0])) == 0, "it ends with the bead"
-    mesh = mesh_of(weld_surface(cut))
+    mesh = mesh_of(cut.surface())
     x, y, z = np.moveaxis(inner_points(mesh), -1, 0)
     assert np.abs(weld_height(cut, x, y) + z).max() < 0.015
     with pytest.raises(ValidationError, match="do not fit on plate_mm"):
@@ -189,7 +183,7 @@ PITTED = PittedPipe(kind="pitted_pipe", ovality=0.04, pits=5, seed=1)
 
 
 def test_a_pitted_pipe_has_the_diameters_and_pits_that_were_asked_for():
-    mesh = mesh_of(pitted_surface(PITTED))
+    mesh = mesh_of(PITTED.surface())
     assert mesh.is_winding_consistent
     axial = np.stack([mesh.triangles_center[:, 0], *np.zeros((2, len(mesh.faces)))], axis=1)
     outwards = np.sum((mesh.triangles_center - axial) * mesh.face_normals, axis=1)
@@ -212,7 +206,7 @@ def test_a_pitted_pipe_has_the_diameters_and_pits_that_were_asked_for():
 
 
 def test_a_pitted_pipes_facets_follow_its_smooth_surface():
-    mesh = mesh_of(pitted_surface(PITTED))
+    mesh = mesh_of(PITTED.surface())
     x, y, z = np.moveaxis(inner_points(mesh), -1, 0)
     away = np.abs(pitted_radius(PITTED, x, np.arctan2(y, -z)) - np.hypot(y, z))
     # Chords deviate by 0.01 mm along each side, the middles of faces by up to twice that.
@@ -221,10 +215,8 @@ def test_a_pitted_pipes_facets_follow_its_smooth_surface():
 
 
 def test_a_pipe_without_pits_is_a_plain_one_and_too_many_vertices_are_refused():
-    plain = mesh_of(pitted_surface(PittedPipe(kind="pitted_pipe", pits=0)))
+    plain = mesh_of(PittedPipe(kind="pitted_pipe", pits=0).surface())
     assert len(plain.vertices) < 500
     np.testing.assert_allclose(np.hypot(*plain.vertices.T[1:]), 50.0, rtol=1e-12)
     with pytest.raises(DescriptionError, match="make its pits wider or flatter"):
-        pitted_surface(
-            PittedPipe(kind="pitted_pipe", diameter_mm=400, length_mm=600, pit_diameter_mm=2, pit_depth_mm=5)
-        )
+        PittedPipe(kind="pitted_pipe", diameter_mm=400, length_mm=600, pit_diameter_mm=2, pit_depth_mm=5).triangles()

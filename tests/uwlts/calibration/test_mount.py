@@ -8,7 +8,16 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 import uwlts
-from tests.uwlts.mount_views import MOUNT, RADIUS_MM, SPHERE_MM, Campaign, errors_of, sphere_campaign
+from tests.uwlts.mount_views import (
+    MOUNT,
+    RADIUS_MM,
+    SPHERE_MM,
+    STANDOFF_MM,
+    Campaign,
+    errors_of,
+    profile_of,
+    sphere_campaign,
+)
 from uwlts.cli import main
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount, PlaneFound, SphereFound
@@ -248,3 +257,53 @@ def test_wrong_profiles_are_refused_in_words(tmp_path, rng):
 
 def test_the_simulated_sensor_is_where_it_is_said_to_be():
     assert np.linalg.det(MOUNT[:3, :3]) == pytest.approx(1.0)
+
+
+def table_campaign(rng, *, angles, place=(14.0, 6.0, 30.0)):
+    """Profiles of a sphere at a place on a table that turns by angles, and the table's frame in the sensor's (4, 4)."""
+    table, sensor = np.eye(4), np.eye(4)
+    table[:3, :3] = Rotation.from_euler("xyz", rng.uniform(-5, 5, 3), degrees=True).as_matrix()
+    tilt = Rotation.from_euler("xyz", [60 + rng.uniform(-3, 3), *rng.uniform(-5, 5, 2)], degrees=True)
+    sensor[:3, :3] = (Rotation.from_euler("x", np.pi) * tilt).as_matrix()
+    sensor[:3, 3] = (table @ [0, 0, place[2], 1])[:3] - sensor[:3, :3] @ [0, 0, STANDOFF_MM]
+    profiles = []
+    for angle in angles:
+        centre = table[:3, :3] @ Rotation.from_rotvec([0, 0, angle]).apply(place) + table[:3, 3]
+        seen_from = sensor.copy()
+        seen_from[:3, 3] += SPHERE_MM - centre
+        profiles.append(profile_of(seen_from, rng, noise_mm=0.03, background=False))
+    return profiles, np.linalg.inv(sensor) @ table
+
+
+def axis_errors(mount, table):
+    """Angle, rad, between the axis found and the true one, whose frame in the sensor's is given; distance there, mm."""
+    found = np.linalg.inv(mount.transform())
+    off = table[:3, 3] - found[:3, 3]
+    off -= off @ table[:3, 2] * table[:3, 2]
+    return float(np.arccos(min(1.0, found[:3, 2] @ table[:3, 2]))), float(np.linalg.norm(off))
+
+
+def test_the_axis_of_a_rotary_table_is_found(tmp_path, rng):
+    """Angle and distance have two coordinates each: beyond 5 standard deviations with a probability of 4e-6."""
+    angles = np.radians(np.linspace(0, 345, 16))
+    profiles, table = table_campaign(rng, angles=angles)
+    np.savetxt(tmp_path / "angles.csv", np.degrees(angles), header="angle", comments="")
+    poses, _ = read_poses(tmp_path / "angles.csv", pose_format="angle-deg")
+    mount = uwlts.calibrate_mount(profiles, poses, radius_mm=RADIUS_MM, axis="-z")
+    turn, shift = axis_errors(mount, table)
+    std = mount.std()
+    assert turn < 5 * np.linalg.norm(std[3:5]) < np.radians(0.2)
+    assert shift < 5 * np.hypot(np.linalg.norm(std[:2]), STANDOFF_MM * np.linalg.norm(std[3:5])) < 1.0
+    assert std[2] == std[5] == 0, "shift along the axis and turn about it are chosen"
+    uwlts.write_mount(tmp_path / "mount.json", mount)
+    assert read_mount(tmp_path / "mount.json") == mount
+    # The same profiles fit the mirrored table about an axis the other way round.
+    mirrored = uwlts.calibrate_mount(profiles, poses, radius_mm=RADIUS_MM, axis="z")
+    assert mirrored.rms_mm < 1.5 * mount.rms_mm
+    assert axis_errors(mirrored, table)[0] > 0.5
+
+
+def test_poses_that_are_no_turns_of_a_table_are_refused(rng):
+    campaign = sphere_campaign(rng, poses=6)
+    with pytest.raises(DescriptionError, match="not turns about one z axis"):
+        uwlts.calibrate_mount(campaign.profiles, campaign.poses, radius_mm=RADIUS_MM, axis="z")

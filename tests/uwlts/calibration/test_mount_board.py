@@ -137,5 +137,5 @@ def test_wrong_evidence_is_refused(thesis, capture_path):
         uwlts.calibrate_mount(capture_path, np.linalg.inv(poses), calibration=calibration)
     with pytest.raises(CalibrationError, match="insufficient rotation|T_base_platform"):
         uwlts.calibrate_mount(capture_path, np.tile(poses[0], (7, 1, 1)), calibration=calibration)
-    with pytest.raises(DescriptionError, match="give the capture's path"):
+    with pytest.raises(DescriptionError, match="shows a target: give no radius"):
         uwlts.calibrate_mount(capture_path, calibration=calibration, radius_mm=3.0)

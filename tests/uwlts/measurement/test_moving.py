@@ -7,7 +7,8 @@ from scipy.spatial.transform import Rotation
 import uwlts
 from tests.uwlts.measurement.test_reconstruction import CALIBRATION, FRESH, HEIGHT, WIDTH, small_sensor, stripe_image
 from tests.uwlts.mount_views import MOUNT
-from uwlts.measurement.moving import with_mount
+from uwlts.measurement.figure_uncertainty import shift_std_mm
+from uwlts.measurement.moving import Ride, with_platform
 from uwlts.model.mount import Mount, SphereFound
 from uwlts.storage.capture import CaptureHeader, CaptureWriter
 from uwlts.storage.cloud import PointUncertainty
@@ -41,7 +42,7 @@ def platform_at(stage_mm):
     return START @ moved @ np.linalg.inv(MOUNT)
 
 
-def record(path, *, stage=False, poses=False):
+def record(path, *, stage=False, poses=False, mount=None):
     """Five images, one without laser, taken each second and each 2 mm: by the stage, or by the platform."""
     header = CaptureHeader(
         name="scan",
@@ -50,6 +51,7 @@ def record(path, *, stage=False, poses=False):
         medium=FRESH,
         stage_direction=(1, 0, 0),
         saturation_dn=255,
+        T_platform_sensor=None if mount is None else tuple(map(tuple, mount.tolist())),
     )
     with CaptureWriter(path, header, dtype=np.uint8) as writer:
         for number in range(5):
@@ -133,6 +135,96 @@ def test_the_mount_s_uncertainty_moves_points_as_other_mounts_do():
         other[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ MOUNT[:3, :3]
         drawn.append(points(other))
     none = PointUncertainty(np.zeros((30, 6)), np.zeros((30, 3)), np.zeros((1, 30, 3)))
-    found = with_mount(none, points(MOUNT), poses, mount_of(MOUNT)).covariance_mm2()
+    ride = Ride(poses, None, np.arange(30.0))
+    found = with_platform(none, points(MOUNT), np.arange(30), ride, mount_of(MOUNT)).covariance_mm2()
     # The standard deviation of 4000 is right to 1.1 %; 90 of them stay within five of those.
     np.testing.assert_allclose(np.sqrt(np.einsum("nii->ni", found)), np.std(drawn, axis=0), rtol=0.056)
+
+
+def drawn_points(rng, seen, poses, errors):
+    """Points in the base frame of ``seen`` (n, 3) from poses (F, 4, 4) with errors (F, 6), (F, n, 3)."""
+    turned = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
+    return np.einsum("fij,nj->fni", turned, seen) + (poses[:, :3, 3] + errors[:, :3])[:, None]
+
+
+def test_errors_of_each_pose_move_its_image_s_points_together():
+    """Against 4000 draws of the poses' errors, each image's on its own; means over images average them."""
+    rng = np.random.default_rng(2)
+    seen, images = rng.uniform([-40, -1, 150], [40, 1, 300], size=(5, 3)), 6
+    poses = np.array([platform_at(20.0 * number) for number in range(images)])
+    root = np.tril(rng.normal(size=(6, 6))) * np.array([0.1, 0.1, 0.1, 4e-4, 4e-4, 4e-4])[:, None]
+    covariance = np.tile(root @ root.T, (images, 1, 1))
+    points, frame = drawn_points(rng, seen, poses, np.zeros((images, 6))).reshape(-1, 3), np.repeat(range(images), 5)
+    none = PointUncertainty(np.zeros((30, 6)), np.zeros((30, 3)), np.zeros((1, 30, 3)))
+    ride = Ride(poses, covariance, np.arange(6.0))
+    found = with_platform(none, points, frame, ride, None)
+    errors = rng.standard_normal((4000, images, 6)) @ root.T
+    drawn = np.array([drawn_points(rng, seen, poses, each).reshape(-1, 3) for each in errors])
+    # The standard deviation of 4000 is right to 1.1 %; 90 of them stay within five of those.
+    np.testing.assert_allclose(found.std_mm(), drawn.std(axis=0), rtol=0.056)
+    cloud = uwlts.PointCloud(points, np.ones(30), frame, np.arange(30), uncertainty=found)
+    mean = shift_std_mm(cloud, np.ones(30, dtype=bool))
+    np.testing.assert_allclose(mean, drawn.mean(axis=1).std(axis=0), rtol=0.056)
+    assert (mean < 0.6 * found.std_mm().mean(axis=0)).all()
+
+
+@pytest.mark.parametrize("kind", ["random walk", "common", "Gauss-Markov"])
+def test_errors_along_a_path_are_as_alike_as_its_covariances_say(kind):
+    """The length between the first and the last images, against 4000 draws of errors along the path.
+
+    A random walk is what variances that grow with time mean. Shapes in time hold 99 % of its variance, and what is left
+    counts as independent, which changes the distance of two images' points by 1 % at most.
+    """
+    rng = np.random.default_rng(3)
+    count, seen, std = 40, np.array([[10.0, 0.0, 200.0]]), np.array([0.5, 0.7, 0.3, 1e-4, 2e-4, 3e-4])
+    poses = np.array([platform_at(10.0 * number) for number in range(count)])
+    times = np.arange(count, dtype=float)
+    if kind == "random walk":
+        steps = rng.standard_normal((4000, count, 6)) * std / np.sqrt(count)
+        errors, correlation_s = np.cumsum(steps, axis=1), None
+        covariance = np.diag(std**2) * ((times + 1) / count)[:, None, None]
+    elif kind == "common":
+        errors = np.repeat(rng.standard_normal((4000, 1, 6)) * std, count, axis=1)
+        covariance, correlation_s = np.tile(np.diag(std**2), (count, 1, 1)), np.inf
+    else:
+        covariance, correlation_s = np.tile(np.diag(std**2), (count, 1, 1)), 30.0
+        alike = np.linalg.cholesky(np.exp(-np.abs(times[:, None] - times) / 30.0))
+        errors = np.einsum("fg,mgk->mfk", alike, rng.standard_normal((4000, count, 6)) * std)
+    points = drawn_points(rng, seen, poses, np.zeros((count, 6)))[:, 0]
+    none = PointUncertainty(np.zeros((count, 6)), np.zeros((count, 3)), np.zeros((1, count, 3)))
+    ride = Ride(poses, covariance, times, rates=np.zeros((count, 6)))
+    found = with_platform(none, points, np.arange(count), ride, None, correlation_s=correlation_s)
+    drawn = np.array([drawn_points(rng, seen, poses, each)[:, 0] for each in errors])
+    # 1.1 % of 4000 draws five times, and 1 % of the variance.
+    np.testing.assert_allclose(found.std_mm(), drawn.std(axis=0), rtol=0.065, atol=1e-3)
+    together = found.patterns_mm
+    apart = np.sqrt(np.sum(found.poses_mm**2, axis=0))
+    for first, last in ((0, count - 1), (count // 2, count - 1)):
+        common = np.sqrt(np.sum((together[:, last] - together[:, first]) ** 2, axis=0))
+        total = np.sqrt(common**2 + apart[first] ** 2 + apart[last] ** 2)
+        np.testing.assert_allclose(total, (drawn[:, last] - drawn[:, first]).std(axis=0), rtol=0.08, atol=2e-3)
+
+
+def test_the_time_offset_s_uncertainty_moves_points_along_the_path():
+    poses = np.array([platform_at(10.0 * number) for number in range(4)])
+    rates = np.tile([100.0, 0.0, 0.0, 0.0, 0.0, 0.1], (4, 1))
+    points = poses[:, :3, 3] + np.array([0.0, 200.0, 0.0])
+    none = PointUncertainty(np.zeros((4, 6)), np.zeros((4, 3)), np.zeros((1, 4, 3)))
+    mount = mount_of(MOUNT, time_offset_s=0.0, time_offset_std_s=2e-4, covariance=tuple(map(tuple, np.eye(6) * 1e-20)))
+    found = with_platform(none, points, np.arange(4), Ride(poses, None, np.arange(4.0), rates), mount)
+    # 100 mm/s along x, less 0.1 rad/s about z at 200 mm along y: 80 mm/s in 0.2 ms.
+    np.testing.assert_allclose(found.std_mm(), np.tile([0.016, 0.0, 0.0], (4, 1)), atol=1e-6)
+
+
+def test_a_mount_of_the_drawing_is_used_with_a_warning(tmp_path, expected):
+    path = record(tmp_path / "posed.h5", poses=True, mount=MOUNT)
+    cloud = uwlts.reconstruct(path, CALIBRATION)
+    np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
+    np.testing.assert_array_equal(cloud.time_s, cloud.frame)
+    assert "calibrate it" in cloud.warnings[-1]
+    turned = MOUNT.copy()
+    turned[0, 3] += 5.0
+    calibrated = uwlts.reconstruct(path, CALIBRATION, mount=mount_of(turned))
+    shift = np.linalg.norm(calibrated.points_mm - expected, axis=1)
+    np.testing.assert_allclose(shift, 5.0, atol=1e-8)
+    assert not calibrated.warnings

@@ -16,7 +16,7 @@ from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.reconstruction import reconstruct_profile
 from uwlts.storage.calibration_file import read_calibration, write_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame, FrameTable
 from uwlts.stripe import StripeOptions, find_stripes
 from uwlts.targets import ChessboardTarget
 
@@ -258,3 +258,23 @@ def test_images_of_the_target_come_from_one_medium(tmp_path):
         # All in water is the single viewpoint: refused here only because these images show no target.
         with pytest.raises(CalibrationError, match="found in no image"):
             calibrate_sequentially([fresh])
+
+
+def test_rows_of_a_rolling_shutter_are_where_the_stage_was_when_they_were_exposed(path):
+    speed, line_time_us = 40.0, 50.0
+    with Capture(path) as capture:
+        stripes = find_stripes(capture)
+        frames = list(capture)
+        header = capture.header
+    detector = header.sensor.detector.model_copy(update={"shutter": "rolling", "line_time_us": line_time_us})
+    rolling = header.model_copy(update={"sensor": header.sensor.model_copy(update={"detector": detector})})
+    at_rest = reconstruct_stripes(FrameTable.of(header, frames), stripes, CALIBRATION)
+    moving = [replace(frame, speed_mm_per_s=speed) for frame in frames]
+    together = reconstruct_stripes(FrameTable.of(header, moving), stripes, CALIBRATION)
+    rows = reconstruct_stripes(FrameTable.of(rolling, moving), stripes, CALIBRATION)
+    np.testing.assert_array_equal(together.points_mm, at_rest.points_mm)
+    # The stripe's rows are 1e-6 line_time later than the middle row for each row below it; the stage moves along X.
+    delay_s = 1e-6 * line_time_us * (stripes.centre_px[rows.stripe] - (HEIGHT - 1) / 2)
+    np.testing.assert_allclose((rows.points_mm - at_rest.points_mm)[:, 0], speed * delay_s, atol=1e-9)
+    np.testing.assert_allclose((rows.points_mm - at_rest.points_mm)[:, 1:], 0, atol=1e-9)
+    assert np.ptp(speed * delay_s) > 0.01

@@ -2,6 +2,7 @@
 
 import json
 
+import laspy
 import numpy as np
 import pytest
 import trimesh
@@ -10,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 import uwlts
 from uwlts.cli import app
-from uwlts.metrology.registration import register_to_surface
-from uwlts.model.errors import CaptureError, EvaluationError, OutputError
+from uwlts.metrology.registration import SampledSurface, register_to_surface
+from uwlts.model.errors import CaptureError, DescriptionError, EvaluationError, OutputError
 from uwlts.storage.cloud import PointCloud, PointUncertainty
 
 NOISE_MM, SHIFT_MM, TILT, STAGE_MM = 0.03, 0.04, 1e-3, 0.02
@@ -59,8 +60,8 @@ def test_nothing_is_claimed_where_nothing_changed():
     # What is common to all points makes the shares of single pairs scatter widely about 5 %.
     assert np.mean(shares) < 0.12
     quiet = [uwlts.compare_clouds(scanned(rng, common=False), scanned(rng, common=False)) for _ in range(3)]
-    share = np.mean([each.significant[each.compared].mean() for each in quiet])
-    assert 0.005 < share < 0.08
+    claimed = np.mean([share(each) for each in quiet])
+    assert 0.005 < claimed < 0.08
 
 
 def test_the_level_is_that_of_the_distances():
@@ -73,6 +74,83 @@ def test_the_level_is_that_of_the_distances():
     assert 0.6 < np.sqrt(np.mean(np.square(np.concatenate(ratios)))) < 1.5
 
 
+def share(change):
+    """Share of the area in which a change is claimed."""
+    return np.average(change.significant[change.compared], weights=change.area_mm2[change.compared])
+
+
+def test_a_registration_takes_up_what_looks_like_a_movement():
+    """Shift and tilt that all points share no longer count, and what is claimed stays at most the level's 5 %."""
+    rng = np.random.default_rng(12)
+    pairs = [(scanned(rng), scanned(rng)) for _ in range(4)]
+    found = [uwlts.compare_clouds(*pair, register=True) for pair in pairs]
+    plain = uwlts.compare_clouds(*pairs[0])
+    # Noise and images alone have 0.03 mm, shift and tilt of both clouds another 0.1 mm.
+    assert np.median(found[0].level_mm) < 0.5 * np.median(plain.level_mm)
+    # Neighbouring places share their images, so that the share of one pair has a standard deviation of 2 %.
+    assert np.mean([share(each) for each in found]) < 0.05 + 3 * 0.02 / np.sqrt(4)
+
+
+def tube(x, y):
+    """A pipe of 300 mm diameter, seen from outside."""
+    return 150.0 - np.sqrt(150.0**2 - x**2)
+
+
+@pytest.mark.parametrize(
+    ("reference", "surface"), [("plane", lambda x, y: 0 * x), ("cylinder", tube)], ids=["plane", "cylinder"]
+)
+def test_an_ideal_shape_is_fitted(reference, surface):
+    rng = np.random.default_rng(13)
+    quiet = uwlts.compare_clouds(scanned(rng, surface=surface), reference)
+    assert quiet.registration is None and share(quiet) < 0.05 + 3 * 0.02
+    dented = uwlts.compare_clouds(scanned(rng, surface=surface, change=dent), reference)
+    x, y, _ = dented.points_mm.T
+    inside = np.hypot(x - 10, y - 5) < 3
+    assert dented.significant[inside].mean() > 0.95
+    region = dented.regions()[0]
+    assert np.hypot(region.centre_mm[0] - 10, region.centre_mm[1] - 5) < 1
+    # 0.5 mm over a disc of 5 mm radius; the discs of 30 points blur its rim.
+    assert region.volume_mm3 == pytest.approx(-0.5 * np.pi * 5**2, rel=0.15)
+    assert reference in dented.reference
+
+
+def test_a_given_shape_is_taken_as_it_is(ball, tmp_path):
+    _, cloud = ball
+    (tmp_path / "ball.toml").write_text('kind = "sphere"\ndiameter_mm = 49.9\npoint_mm = [0, 0, 0.02]\n')
+    given = uwlts.compare_clouds(cloud, tmp_path / "ball.toml")
+    far = given.compared & (given.points_mm[:, 2] < -15) & (np.hypot(*given.points_mm[:, :2].T) > 6)
+    z = given.points_mm[far, 2] / 25.0
+    # The cloud's centre lies 0.02 mm before the sphere's, its radius is 0.05 mm larger; means of 30 points of 0.02 mm.
+    assert np.mean(given.distance_mm[far] - (0.05 - 0.02 * z)) == pytest.approx(0, abs=0.003)
+    (tmp_path / "ball.toml").write_text('kind = "sphere"\ndiameter_mm = 50.0\npoint_mm = [0, 0, 0.2]\n')
+    moved = uwlts.compare_clouds(cloud, tmp_path / "ball.toml", register=True)
+    # Turns about the sphere's centre are open; 10,000 points of 0.02 mm, the bump has no weight.
+    centre = moved.registration.transform[:3] @ [0, 0, 0, 1]
+    np.testing.assert_allclose(centre, [0, 0, 0.2], atol=0.005)
+    for text in ('kind = "sphere"\npoint_mm = [0, 0, 0]\n', 'kind = "cone"\n', "kind = \n"):
+        (tmp_path / "wrong.toml").write_text(text)
+        with pytest.raises(DescriptionError, match="wrong.toml"):
+            uwlts.compare_clouds(cloud, tmp_path / "wrong.toml")
+
+
+def test_datums_hold_the_registration(tmp_path):
+    """Half of the surface has moved up; datums on the other half keep that half where it was."""
+    rng = np.random.default_rng(14)
+    before = scanned(rng, common=False)
+    after = scanned(rng, common=False, change=lambda x, y: -0.4 * (x > 0))
+    datums = tmp_path / "datums.toml"
+    datums.write_text("".join(f"[[datum]]\ncentre_mm = [-16, {y}, 0]\nradius_mm = 12\n" for y in (-15, 15)))
+    held = uwlts.compare_clouds(after, before, register=True, datums=datums)
+    x = held.points_mm[:, 0]
+    assert np.nanmedian(held.distance_mm[x > 3]) == pytest.approx(0.4, abs=0.08)
+    assert abs(np.nanmedian(held.distance_mm[x < -3])) < 0.02
+    with pytest.raises(EvaluationError, match="--register"):
+        uwlts.compare_clouds(after, before, datums=datums)
+    datums.write_text("[[datum]]\ncentre_mm = [-16, 0, 0]\nradius_mm = -1\n")
+    with pytest.raises(DescriptionError, match="radius_mm"):
+        uwlts.compare_clouds(after, before, register=True, datums=datums)
+
+
 def test_a_dent_is_found():
     rng = np.random.default_rng(4)
     change = uwlts.compare_clouds(scanned(rng, change=dent), scanned(rng))
@@ -82,6 +160,7 @@ def test_a_dent_is_found():
     # Positive towards the sensor, so that a loss is negative.
     assert np.median(change.distance_mm[inside]) == pytest.approx(-0.5, abs=0.2)
     assert change.record()["largest_loss_mm"] < -0.4
+    assert change.regions()[0].largest_mm < -0.4
 
 
 def test_a_moved_cloud_is_registered():
@@ -116,12 +195,29 @@ def test_what_a_shape_does_not_tell_is_left_as_it_was(surface, open_words):
     assert abs(found.transform[1, 3]) < 0.05 and found.transform[2, 3] == pytest.approx(-0.2, abs=0.05)
 
 
+def profiles(rng, ends):
+    """A curved surface in dense profiles 1 mm apart, whose noise three neighbours share."""
+    x, y = np.meshgrid(np.arange(*ends, 1.0), np.arange(-15, 15, 0.15), indexing="ij")
+    drawn = rng.standard_normal((x.shape[0], x.shape[1] + 2))
+    noise = NOISE_MM * (drawn[:, :-2] + drawn[:, 1:-1] + drawn[:, 2:]) / np.sqrt(3)
+    points = np.column_stack([x.ravel(), y.ravel(), (0.02 * y**2 + noise).ravel()])
+    return PointCloud(points, np.ones(x.size), np.repeat(np.arange(len(x)), x.shape[1]), np.arange(x.size))
+
+
+def test_nothing_is_claimed_beyond_the_reference_or_of_shared_noise():
+    """Beside the border of the reference its nearest points lie on a line, which has no normal."""
+    rng = np.random.default_rng(8)
+    change = uwlts.compare_clouds(profiles(rng, (-40, 40)), profiles(rng, (-20, 20)))
+    assert np.abs(change.points_mm[change.compared, 0]).max() < 24
+    assert np.abs(change.distance_mm[change.compared]).max() < 0.2
+    # Some 1,500 places, ten neighbours of which share their points: 5 % scatter by 2 %; without the factor it is 25 %.
+    assert change.significant[change.compared].mean() < 0.12
+
+
 def test_too_far_apart_is_refused():
     points = np.random.default_rng(0).uniform(0, 10, (200, 3)) * [1, 1, 0]
     with pytest.raises(EvaluationError, match="same frame and unit"):
-        register_to_surface(
-            points + [0, 0, 50], points, np.tile([0, 0, 1.0], (200, 1)), reach_mm=2, std_mm=np.ones(200)
-        )
+        register_to_surface(points + [0, 0, 50], SampledSurface(points, np.tile([0, 0, 1.0], (200, 1))), reach_mm=2)
 
 
 @pytest.fixture(scope="module")
@@ -176,11 +272,18 @@ def test_the_command_writes_page_figures_and_cloud(ball, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["compare", "ball.ply", str(path), "--out", "change.html", "--coloured", "change.ply"]
     app(words, result_action="return_value")
+    app(
+        ["compare", "ball.ply", str(path), "--out", "again.html", "--coloured", "change.laz"],
+        result_action="return_value",
+    )
     record = json.loads((tmp_path / "change.json").read_text())
     assert record["largest_rise_mm"] == pytest.approx(0.3, abs=0.05) and record["registration"] is None
     places = PlyData.read(tmp_path / "change.ply")["vertex"].data
     assert set(places.dtype.names) >= {"x", "y", "z", "distance", "level", "significant"}
     assert places["significant"].mean() == pytest.approx(record["significant_share"], abs=0.2)
+    table = laspy.read(tmp_path / "change.laz")
+    np.testing.assert_allclose(1e3 * np.column_stack([table.x, table.y, table.z])[:, 0], places["x"], atol=1e-3)
+    np.testing.assert_array_equal(table["significant"], places["significant"])
     page = (tmp_path / "change.html").read_text()
     assert "level of detection" in page and "ball.ply against ball.stl" in page
     with pytest.raises(OutputError, match="exists already"):

@@ -11,6 +11,7 @@ import uwlts
 from tests.uwlts.storage.test_import import GIVEN, HEIGHT, WIDTH, lamp_image
 from uwlts.model.errors import CaptureError, DescriptionError, ImageError
 from uwlts.model.stripe import Coordinates
+from uwlts.report.pictures import stripe_picture, stripe_view
 from uwlts.storage.capture import Capture, CaptureWriter, Frame
 from uwlts.stripe import StripeStatus, find_stripes
 
@@ -55,7 +56,7 @@ def test_profiles_come_in_from_every_format(tmp_path: Path, suffix: str):
     imported = uwlts.import_images(folder, tmp_path / "a.h5")
     assert (imported.laser, imported.lamp, imported.warnings) == (4, 0, ())
     with Capture(tmp_path / "a.h5") as capture:
-        found = find_stripes(capture)
+        found = find_stripes(capture, options={"end_lines": 0})
         assert not capture.has_image.any() and capture.stage_mm.tolist() == [5.0, 5.5, 6.0, 6.5]
         good = np.isfinite(places)
         assert np.array_equal(np.stack([found.frame, found.line]), np.stack(np.nonzero(good)))
@@ -145,6 +146,40 @@ def test_amplitude_width_and_status_are_kept_and_damage_is_found(tmp_path: Path)
         assert np.array_equal(kept.status, stripe.status)
         assert np.array_equal(kept.amplitude, stripe.amplitude, equal_nan=True)
         assert find_stripes(capture).width_px.tolist() == [3.5] * (WIDTH - 1)
+
+
+def test_the_ends_of_a_centre_line_are_left_out_as_those_of_an_image(tmp_path: Path):
+    folder = described(tmp_path / "f", "map.npy")
+    places = np.full((1, WIDTH), 20.0)
+    places[0, 30:40] = np.nan
+    write(folder / "map.npy", places)
+    uwlts.import_images(folder, tmp_path / "a.h5")
+    with Capture(tmp_path / "a.h5") as capture:
+        left_out = set(range(WIDTH)) - set(find_stripes(capture).line.tolist())
+        # Two lines on either side of the gap, by StripeOptions; the image's border is no end.
+        assert left_out == set(range(28, 42)) and find_stripes(capture).lines_by_status["end"] == 4
+
+
+def test_a_picture_shows_the_centres_without_an_image(tmp_path: Path):
+    folder = described(tmp_path / "f", "map.npy")
+    places = profiles(1)
+    places[0, :40] = np.nan
+    write(folder / "map.npy", places)
+    uwlts.import_images(folder, tmp_path / "a.h5")
+    with Capture(tmp_path / "a.h5") as capture:
+        view = stripe_view(capture)
+    assert view is not None and not view.image.any()
+    upper, lower = stripe_picture(view).axes
+    drawn = upper.lines[0].get_xdata()
+    assert len(drawn) == len(view.stripe.lines) and lower.get_xlim()[0] >= 35
+
+
+def test_centre_lines_of_another_length_are_refused(tmp_path: Path):
+    folder = described(tmp_path / "f", "map.npy")
+    write(folder / "map.npy", profiles(1))
+    uwlts.import_images(folder, tmp_path / "a.h5")
+    with Capture(tmp_path / "a.h5") as capture:
+        header, stripe = capture.header, capture.seen(0)
     with CaptureWriter(tmp_path / "c.h5", header, dtype=np.dtype(np.uint8)) as writer:
         with pytest.raises(ImageError, match=f"centre line of {WIDTH} lines, the capture holds images"):
             writer.append(Frame(stripe, 0.0, True, 1.0, 0.0))

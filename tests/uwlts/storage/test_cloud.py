@@ -40,14 +40,14 @@ def some_cloud(count: int = 40, **changes) -> PointCloud:
 
 def some_uncertainty(count: int = 40, patterns: int = 3) -> PointUncertainty:
     rng = np.random.default_rng(5)
-    shapes = {"random_mm2": (count, 6), "patterns_mm": (patterns, count, 3)}
+    shapes = {"random_mm2": (count, 6), "patterns_mm": (patterns, count, 3), "poses_mm": (6, count, 3)}
     names = [part.name for part in fields(PointUncertainty)]
     return PointUncertainty(**{n: rng.normal(size=shapes.get(n, (count, 3))).astype(np.float32) for n in names})
 
 
 @KINDS
 def test_a_cloud_comes_back_bit_by_bit(tmp_path, name):
-    cloud = some_cloud(uncertainty=some_uncertainty())
+    cloud = some_cloud(uncertainty=some_uncertainty(), time_s=1.7e9 + np.arange(40) / 7)
     write_cloud(tmp_path / name, cloud)
     back = read_cloud(tmp_path / name)
     assert len(back) == 40
@@ -57,6 +57,7 @@ def test_a_cloud_comes_back_bit_by_bit(tmp_path, name):
         ("frame", np.int32),
         ("line", np.int32),
         ("deviation_mm", np.float32),
+        ("time_s", np.float64),
     ):
         assert getattr(back, field).dtype == kind
         np.testing.assert_array_equal(getattr(back, field), getattr(cloud, field))

@@ -17,8 +17,9 @@ from uwlts.model.errors import OutputError, SetupError
 from uwlts.runtime.console import run
 from uwlts.storage.capture import Capture, CaptureWriter, Frame
 from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
-from uwlts.storage.export_ import CLOUD_FORMATS, LAZ_STEP_M, export_capture, export_cloud
+from uwlts.storage.export_ import CLOUD_FORMATS, export_capture, export_cloud
 from uwlts.storage.import_ import import_images
+from uwlts.storage.las_file import LAZ_STEP_M
 
 
 def a_cloud(count: int = 500, *, reach_mm: float = 300.0, **changes) -> PointCloud:

@@ -31,6 +31,7 @@ def a_truth() -> Truth:
         status=np.where(hidden, TruthStatus.NO_STRIPE, TruthStatus.VISIBLE).astype(np.uint8),
         crossings=np.where(hidden, 0, 2).astype(np.uint8),
         depth_mm=np.full((16, 20), np.nan, np.float32),
+        pose=np.tile(np.eye(4), (FRAMES, 1, 1)),
     )
 
 
@@ -66,7 +67,9 @@ def test_scan_without_any_stripe(tmp_path: Path):
     hidden = np.full((2, 4), TruthStatus.NO_STRIPE, np.uint8)
     dark = Truth(nothing, nowhere, nowhere, hidden, np.zeros((2, 4), np.uint8), nothing)
     write_truth(tmp_path / "a.truth.h5", a_header(), dark)
-    assert (read_truth(tmp_path / "a.truth.h5")[1].status == TruthStatus.NO_STRIPE).all()
+    found = read_truth(tmp_path / "a.truth.h5")[1]
+    assert (found.status == TruthStatus.NO_STRIPE).all()
+    assert found.pose is None
 
 
 def test_place_beside_the_capture():
@@ -136,13 +139,18 @@ CONTRADICTIONS = {
     "one line": (replaced("centre_px", np.zeros(LINES)), "no numbers 'centre_px'"),
     "real status": (replaced("status", np.zeros((FRAMES, LINES))), "no numbers 'status'"),
     "fewer lines": (replaced("centre_px", np.zeros((FRAMES, LINES - 1))), "contradicts itself"),
+    "fewer poses": (replaced("pose", np.zeros((FRAMES - 1, 4, 4))), "3 frames and poses"),
     "fewer frames": (replaced("normal", np.zeros((FRAMES - 1, LINES, 3))), "contradicts itself"),
     "plane points": (replaced("point_mm", np.zeros((FRAMES, LINES, 2))), "contradicts itself"),
     "unknown status": (changed_at("status", (0, 0), 9), "unknown statuses"),
     "no point": (changed_at("point_mm", (1, 1, 2), np.nan), "not finite"),
     "no normal": (changed_at("normal", (1, 1, 0), np.nan), "not finite"),
     "endless centre": (changed_at("centre_px", (1, 1), np.inf), "not finite"),
-} | {f"missing {name}": (lambda file, name=name: file.__delitem__(name), f"no numbers '{name}'") for name in NAMES}
+} | {
+    f"missing {name}": (lambda file, name=name: file.__delitem__(name), f"no numbers '{name}'")
+    for name in NAMES
+    if name != "pose"
+}
 
 
 @pytest.mark.parametrize("case", CONTRADICTIONS)

@@ -15,7 +15,7 @@ FOUND = Path(__file__).parents[2] / "data" / "stripes-found.npz"
 LINES, LENGTH = 800, 128
 WAYS = {
     **{method: StripeOptions(method=method, end_lines=0) for method in method_names()},
-    **{f"{rule}": StripeOptions(peak=rule, end_lines=0) for rule in PeakRule if rule is not PeakRule.STRONGEST},
+    **{f"{rule}": StripeOptions(peak=rule, end_lines=0) for rule in (PeakRule.FIRST, PeakRule.LAST)},
     "smoothed along": StripeOptions(smoothing_lines=5, end_lines=0),
     "smoothed across": StripeOptions(smoothing_px=2.0, end_lines=0),
     "narrow window": StripeOptions(half_window_px=12, end_lines=0),

@@ -114,7 +114,9 @@ def _row(number: int, cells: dict[str, str], place: str) -> ImageRow:
             f"{place}: the pose is no rotation with a shift: its columns must be unit vectors at right angles, given "
             f"with four decimals or more, its last row 0 0 0 1"
         )
-    return ImageRow(texts["file"], number, light, texts["background"] or None, **numbers, pose=pose if given else None)
+    stage_mm, exposure_ms, time_s, encoder = (numbers[name] for name in _NUMBERS)
+    known = stage_mm, exposure_ms, time_s, pose if given else None, encoder
+    return ImageRow(texts["file"], number, light, texts["background"] or None, *known)
 
 
 def _number(text: str, place: str) -> float:

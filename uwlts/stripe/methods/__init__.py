@@ -15,7 +15,8 @@ from importlib import import_module
 
 import numpy as np
 
-from uwlts.stripe.peak_window import PeakWindow, gaussian_moments
+from uwlts.runtime.compiled import compiled
+from uwlts.stripe.peak_window import LEAST_KERNEL, PeakWindow
 
 
 @lru_cache
@@ -32,12 +33,36 @@ def place_centre(method: str, peak: PeakWindow) -> tuple[np.ndarray, np.ndarray]
 
 def amplitudes(peak: PeakWindow, centre: np.ndarray) -> np.ndarray:
     """Height (M,) float32, in grey levels, of the best-fitting Gaussian of each peak's sigma at the centre (M,)."""
-    sigma, kernel = np.maximum(peak.sigma, np.float32(0.3)), peak.kernel_sigma()
-    moments = np.empty((centre.size, 3), np.float32)
-    gaussian_moments(peak, centre, kernel, moments)
-    # The sum of the product of two Gaussians over the pixels, solved for the height of the first.
-    joint = 0.5 / math.pi * (1 / (sigma * sigma) + 1 / (kernel * kernel))
-    return moments[:, 0] * np.sqrt(joint)
+    result = np.empty(centre.size, np.float32)
+    _best_heights(peak, centre, result)
+    return result
+
+
+@compiled
+def _best_heights(peak: PeakWindow, centre: np.ndarray, result: np.ndarray) -> None:
+    """Fill the heights (M,); see `amplitudes`."""
+    size = peak.window.shape[1]
+    for m in range(centre.size):
+        pixels, ground, middle = peak.window[m], peak.base[m], centre[m]
+        sigma = max(peak.sigma[m], np.float32(0.3))
+        width = max(peak.sigma[m], np.float32(LEAST_KERNEL))
+        near = min(max(math.floor(middle + np.float32(0.5)), 0), size - 1)
+        # A Gaussian by recurrence on both sides; see `gaussian_moments`.
+        sharpness, offset, half = np.float32(1.0) / (width * width), np.float32(near) - middle, np.float32(0.5)
+        weight = np.exp(-half * sharpness * offset * offset)
+        after, before = np.exp(-sharpness * (half + offset)), np.exp(-sharpness * (half - offset))
+        falling = after * before
+        total, right, left = weight * (pixels[near] - ground), weight * after, weight * before
+        for k in range(1, math.ceil(np.float32(4.0) * width) + 1):
+            if near + k < size:
+                total += right * (pixels[near + k] - ground)
+            if near - k >= 0:
+                total += left * (pixels[near - k] - ground)
+            after, before = after * falling, before * falling
+            right, left = right * after, left * before
+        # The sum of the product of two Gaussians over the pixels, solved for the height of the first.
+        joint = np.float32(0.5 / math.pi) * (np.float32(1.0) / (sigma * sigma) + sharpness)
+        result[m] = total * math.sqrt(joint)
 
 
 @lru_cache

@@ -44,6 +44,9 @@ _KNOWN = 8
 _CENTRE, _HEIGHT, _SIGMA, _FIRST, _LAST, _WIDEST, _FLOOR, _REACH = (row * _LANES for row in range(_KNOWN))
 """Places of what is known of the lines fitted side by side: the fit, its limits, floor of the variance and reach."""
 
+_AFTER, _BEFORE, _RISE_AFTER, _RISE_BEFORE, _FALLING, _INVERSE = (row * _LANES for row in range(8, 14))
+"""Places behind the sums of the model on both sides, its ratios to the next pixels', how these fall, and 1 / sigma."""
+
 _TINY = np.finfo(np.float32).tiny
 
 _MEDIAN_MEAN_SQUARE = 0.934
@@ -69,11 +72,12 @@ def centres(peak: PeakWindow) -> np.ndarray:
     flanks = np.zeros(sampled.size, np.float32)
     _flank_noise(peak, sampled, flanks)
     # The floor: that of the usual line.
-    noise = max(_LEAST_NOISE, math.sqrt(np.median(flanks) / _MEDIAN_MEAN_SQUARE))
+    middle = [(sampled.size - 1) // 2, sampled.size // 2]
+    noise = max(_LEAST_NOISE, math.sqrt(np.partition(flanks, middle)[middle].mean() / _MEDIAN_MEAN_SQUARE))
     groups, most = -(-peak.start.size // _LANES), int(peak.reach.max())
     # Flat rows, of which the compiler knows that their parts do not overlap.
     signal = np.empty((groups, (2 * most + 1) * _LANES), np.float32)
-    known, sums = np.empty((groups, _KNOWN * _LANES), np.float32), np.empty(8 * _LANES, np.float32)
+    known, sums = np.empty((groups, _KNOWN * _LANES), np.float32), np.empty(14 * _LANES, np.float32)
     _set_side_by_side(peak, noise, signal, known)
     _improve(known, signal, sums, _USUAL_CONTRAST, _FIRST_STEPS)
     _improve(known, signal, sums, _contrast(known, signal, sampled, noise), _STEPS - _FIRST_STEPS)
@@ -161,28 +165,54 @@ def _improve(known: np.ndarray, signal: np.ndarray, sums: np.ndarray, contrast: 
 
 @compiled
 def _sum_moments(known: np.ndarray, signal: np.ndarray, squared_contrast: np.float32, sums: np.ndarray) -> None:
-    """Moments of f^2 / v up to u^4, then of (y - f) f / v up to u^2."""
-    for k in range(sums.size):
-        sums[k] = np.float32(0.0)
+    """Moments of f^2 / v up to u^4, then of (y - f) f / v up to u^2.
+
+    From the middle outwards, both sides at a time, the model goes on by the ratio of neighbouring values, which falls
+    by the same factor from pixel to pixel.
+    """
     most, reach = signal.size // (2 * _LANES), int(greatest(known[_REACH : _REACH + _LANES]))
-    for row in range(most - reach, most + reach + 1):
-        y, x = signal[row * _LANES :][:_LANES], np.float32(row - most)
+    y = signal[most * _LANES :][:_LANES]
+    for k in range(_LANES):
+        centre, inverse = known[_CENTRE + k], np.float32(1.0) / known[_SIGMA + k]
+        u, sharpness = -centre * inverse, inverse * inverse
+        square = u * u
+        f = known[_HEIGHT + k] * _exp(np.float32(-0.5) * square)
+        weight = f / (f * f * squared_contrast + known[_FLOOR + k])
+        left, weight = weight * (y[k] - f), weight * f
+        sums[k], sums[_LANES + k], sums[2 * _LANES + k] = weight, weight * u, weight * square
+        sums[3 * _LANES + k], sums[4 * _LANES + k] = weight * square * u, weight * square * square
+        sums[5 * _LANES + k], sums[6 * _LANES + k], sums[7 * _LANES + k] = left, left * u, left * square
+        after = _exp(sharpness * (centre - np.float32(0.5)))
+        before = _exp(sharpness * (-centre - np.float32(0.5)))
+        falling = _exp(-sharpness)
+        sums[_AFTER + k], sums[_BEFORE + k], sums[_INVERSE + k] = f * after, f * before, inverse
+        sums[_RISE_AFTER + k], sums[_RISE_BEFORE + k] = after * falling, before * falling
+        sums[_FALLING + k] = falling
+    for away in range(1, reach + 1):
+        y_after, y_before = signal[(most + away) * _LANES :][:_LANES], signal[(most - away) * _LANES :][:_LANES]
+        x = np.float32(away)
         for k in range(_LANES):
-            u = (x - known[_CENTRE + k]) / known[_SIGMA + k]
-            square = u * u
-            f = known[_HEIGHT + k] * _exp(np.float32(-0.5) * square)
-            weight = f / (f * f * squared_contrast + known[_FLOOR + k])
-            if abs(x) > known[_REACH + k]:
-                weight = np.float32(0.0)
-            left, weight = weight * (y[k] - f), weight * f
-            sums[k] += weight
-            sums[_LANES + k] += weight * u
-            sums[2 * _LANES + k] += weight * square
-            sums[3 * _LANES + k] += weight * square * u
-            sums[4 * _LANES + k] += weight * square * square
-            sums[5 * _LANES + k] += left
-            sums[6 * _LANES + k] += left * u
-            sums[7 * _LANES + k] += left * square
+            f, g = sums[_AFTER + k], sums[_BEFORE + k]
+            u, t = (x - known[_CENTRE + k]) * sums[_INVERSE + k], (-x - known[_CENTRE + k]) * sums[_INVERSE + k]
+            v = f / (f * f * squared_contrast + known[_FLOOR + k])
+            w = g / (g * g * squared_contrast + known[_FLOOR + k])
+            if x > known[_REACH + k]:
+                v, w = np.float32(0.0), np.float32(0.0)
+            right, left, v, w = v * (y_after[k] - f), w * (y_before[k] - g), v * f, w * g
+            sums[5 * _LANES + k] += right + left
+            sums[6 * _LANES + k] += right * u + left * t
+            sums[7 * _LANES + k] += right * u * u + left * t * t
+            sums[k] += v + w
+            v, w = v * u, w * t
+            sums[_LANES + k] += v + w
+            v, w = v * u, w * t
+            sums[2 * _LANES + k] += v + w
+            v, w = v * u, w * t
+            sums[3 * _LANES + k] += v + w
+            sums[4 * _LANES + k] += v * u + w * t
+            sums[_AFTER + k], sums[_BEFORE + k] = f * sums[_RISE_AFTER + k], g * sums[_RISE_BEFORE + k]
+            sums[_RISE_AFTER + k] *= sums[_FALLING + k]
+            sums[_RISE_BEFORE + k] *= sums[_FALLING + k]
 
 
 @compiled

@@ -1,0 +1,52 @@
+"""Spheres measured from images and from the centre lines of a 3D camera, rendered with the same noise.
+
+python docs/studies/centre_lines.py
+"""
+
+import os
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+import twin
+import uwlts
+
+WATERS = "clear", "coastal"
+PLACES = "near", "standoff", "far"
+CAMERAS = {"images": (), "centre lines": ("camera-3d",)}
+
+
+def main() -> None:
+    """Print a row for each water and camera."""
+    calibration = uwlts.nominal("thesis", medium="water")
+    print("water    camera        spacing error/um  std/um  diameter error/um  points  bytes       frames/s")
+    with tempfile.TemporaryDirectory() as folder:
+        for water in WATERS:
+            for camera, effects in CAMERAS.items():
+                rows = []
+                for place in PLACES:
+                    path = Path(folder) / "scan.h5"
+                    twin.simulate("spheres", placement=place, water=water, effects=effects, out=path, overwrite=True)
+                    with uwlts.open_capture(path) as capture:
+                        uwlts.reconstruct(capture, calibration)
+                        began = time.process_time()
+                        cloud = uwlts.reconstruct(capture, calibration)
+                        rate = len(capture) / (time.process_time() - began)
+                    result = uwlts.evaluate(cloud)
+                    diameter = np.abs([figure.value_mm for figure in result.diameters])
+                    spacing, std = abs(result.sphere_spacing.value_mm), result.std.value_mm
+                    rows.append(
+                        (1e3 * spacing, 1e3 * std, 1e3 * diameter.max(), len(cloud), os.path.getsize(path), rate)
+                    )
+                spacing, std, diameter, points, size, rate = np.mean(rows, axis=0)
+                print(
+                    f"{water:8s} {camera:12s}  {spacing:16.1f}  {std:6.1f}  {diameter:17.1f}  {points:6.0f}  "
+                    f"{size:10,.0f}  {rate:8.0f}",
+                    flush=True,
+                )
+
+
+if __name__ == "__main__":
+    main()

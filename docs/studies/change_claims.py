@@ -1,0 +1,71 @@
+"""How much of a surface in which nothing changed `uwlts compare` claims to have changed.
+
+Clouds are drawn with the errors that they state: noise of single points, the position of each image, and a shift and a
+tilt that all points share. Prints the rows of the table in docs/how-to/compare-scans.md.
+"""
+
+import numpy as np
+
+import uwlts
+from uwlts.storage.cloud import PointCloud, PointUncertainty
+
+NOISE_MM, SHIFT_MM, TILT, STAGE_MM = 0.03, 0.04, 1e-3, 0.02
+SIDE_MM, STEP_MM, PAIRS = 60.0, 0.5, 10
+
+
+def wavy(x, y):
+    return 2.0 * np.sin(x / 9.0) + 1.5 * np.cos(y / 7.0) + 0.01 * x * y / 5
+
+
+def pipe(x, y):
+    return 150.0 - np.sqrt(150.0**2 - x**2)
+
+
+def flat(x, y):
+    return 0 * x
+
+
+def scanned(rng: np.random.Generator, surface, *, common: bool) -> PointCloud:
+    """A cloud in lines of a stage."""
+    axis = np.arange(-SIDE_MM / 2, SIDE_MM / 2, STEP_MM)
+    x, y = np.meshgrid(axis, axis)
+    image = np.repeat(np.arange(len(axis))[None], len(axis), axis=0).ravel()
+    x, y = (each.ravel() + rng.uniform(-0.2, 0.2, x.size) for each in (x, y))
+    count = len(x)
+    patterns = np.zeros((2, count, 3), np.float32)
+    patterns[0, :, 2], patterns[1, :, 2] = common * SHIFT_MM, common * TILT * y
+    position, random = np.zeros((count, 3), np.float32), np.zeros((count, 6), np.float32)
+    position[:, 2], random[:, 5] = STAGE_MM, NOISE_MM**2
+    z = surface(x, y) + NOISE_MM * rng.normal(size=count) + STAGE_MM * rng.normal(size=len(axis))[image]
+    z += np.tensordot(rng.normal(size=2), patterns[:, :, 2], axes=1)
+    known = PointUncertainty(random, position, patterns)
+    return PointCloud(np.column_stack([x, y, z]), np.ones(count), image, np.zeros(count, int), uncertainty=known)
+
+
+def main() -> None:
+    rng = np.random.default_rng(11)
+    for name, surface, common, reference, register in (
+        ("two scans, noise and images only", wavy, False, None, False),
+        ("two scans", wavy, True, None, False),
+        ("two scans, registered", wavy, True, None, True),
+        ("plane, fitted", flat, True, "plane", False),
+        ("cylinder of 300 mm, fitted", pipe, True, "cylinder", False),
+    ):
+        shares, ratios, levels = [], [], []
+        for _ in range(PAIRS):
+            cloud = scanned(rng, surface, common=common)
+            other = scanned(rng, surface, common=common) if reference is None else reference
+            change = uwlts.compare_clouds(cloud, other, register=register)
+            seen = change.compared
+            shares.append(np.average(change.significant[seen], weights=change.area_mm2[seen]))
+            ratios.append(np.mean((1.96 * change.distance_mm[seen] / change.level_mm[seen]) ** 2))
+            levels.append(np.median(change.level_mm))
+        mean, median, most = (f"{100 * value:.1f} %" for value in (np.mean(shares), np.median(shares), max(shares)))
+        print(
+            f"| {name} | {mean} | {median} | {most} | {np.mean(levels):.3f} | {np.sqrt(np.mean(ratios)):.2f} |",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()

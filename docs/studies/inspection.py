@@ -1,0 +1,333 @@
+"""What inspections find in rendered scans, and how right their figures are.
+
+    python docs/studies/inspection_scenes.py runs/inspection      # and render, as it says
+    cd runs/inspection/calibration && uwlts calibrate --air target-bare.h5 target-air.h5 --water target-water.h5 \
+        --step step-near-water.h5 step-standoff-water.h5 step-far-water.h5 --out calibration.json
+    python docs/studies/inspection.py runs/inspection docs/pictures
+
+Prints the tables of the documentation: the probability of detection of pits by their depth (hit or miss, logistic in
+the logarithm of the depth, with the bound of its likelihood ratio: MIL-HDBK-1823A, appendix G), errors and coverage of
+all values against the closed form, and what is claimed to have changed where nothing has.
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from inspection_scenes import AXIS_Z_MM, DIAMETER_MM, OVALITY, SIDES_DEG, WATERS, Pits, large_pits, small_pits
+from scipy import optimize
+from scipy.spatial.transform import Rotation
+from stripe_tables import table
+
+import uwlts
+from twin.scene.description import load_scene
+from twin.scene.forms import Flange, Weld
+from twin.scene.forms.weld import weld_height
+from uwlts.metrology.features import Feature, FeatureKind, Inspection
+from uwlts.storage.capture import CaptureWriter
+
+HOLLOWS = FeatureKind.PIT, FeatureKind.DENT
+BLEMISHES = *HOLLOWS, FeatureKind.PROTRUSION
+
+
+def cloud_of(folder: Path, water: str, name: str) -> uwlts.PointCloud:
+    """The cloud of a recording, reconstructed once."""
+    path = folder / water / f"{name}.cloud.h5"
+    if not path.exists():
+        cloud = uwlts.reconstruct(folder / water / f"{name}.h5", folder / "calibration" / "calibration.json")
+        uwlts.write_cloud(path, cloud)
+    return uwlts.read_cloud(path)
+
+
+def around(folder: Path, water: str) -> uwlts.PointCloud:
+    """The pipe from six sides as one scan with known poses, in the pipe's frame."""
+    joined = folder / water / "pipe-around.h5"
+    if not joined.exists():
+        with uwlts.open_capture(folder / water / f"pipe-side-{SIDES_DEG[0]}.h5") as first:
+            header, kind = first.header, first.dtype
+        time_s = 0.0
+        with CaptureWriter(joined, header, dtype=kind) as writer:
+            for side in SIDES_DEG:
+                with uwlts.open_capture(folder / water / f"pipe-side-{side}.h5") as capture:
+                    for frame in capture:
+                        pose = np.eye(4)
+                        pose[:3, :3] = Rotation.from_euler("x", -side, degrees=True).as_matrix()
+                        at = frame.stage_mm * np.array(capture.header.stage_direction) - [0.0, 0.0, AXIS_Z_MM]
+                        pose[:3, 3] = pose[:3, :3] @ at
+                        time_s += 1.0
+                        writer.append(replace(frame, pose=pose, time_s=time_s))
+    return cloud_of(folder, water, "pipe-around")
+
+
+def distances(pits: Pits, places: np.ndarray) -> np.ndarray:
+    """Distances (..., P) of places (..., 3) in the scene from the pits' middles, along the surface, in mm."""
+    x, y, z = np.moveaxis(places, -1, 0)[..., None]
+    return np.hypot(pits.along - x, pits.around - DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z))
+
+
+def matched(found: Inspection, pits: Pits) -> list[Feature | None]:
+    """The feature that lies on each pit, the deepest of several."""
+    result: list[Feature | None] = [None] * len(pits.depth)
+    for feature in reversed(found.of(*HOLLOWS)):
+        away = distances(pits, feature.place_mm)
+        nearest = int(np.argmin(away / pits.diameter))
+        if away[nearest] < pits.diameter[nearest] / 2 + 0.5:
+            result[nearest] = feature
+    return result
+
+
+def false_ones(found: Inspection, pits: Pits) -> int:
+    """Features that lie on no pit."""
+    return sum(bool(np.all(distances(pits, each.place_mm) > pits.diameter / 2 + 0.5)) for each in found.of(*BLEMISHES))
+
+
+def detection(depth: np.ndarray, hit: np.ndarray) -> tuple[float, float, np.ndarray]:
+    """Depths a90 and a90/95 and the logistic's parameters (2,): depth of 90 % and slope in the logarithm.
+
+    The bound is that of the profile likelihood at 95 %, one-sided, which also exists where hits and misses do not mix.
+    """
+    x = np.log(depth)
+
+    def loss(at_90: float, slope: float) -> float:
+        logit = np.log(9.0) + slope * (x - at_90)
+        return float(np.sum(np.logaddexp(0, np.where(hit, -logit, logit))))
+
+    def profile(at_90: float) -> float:
+        best = optimize.minimize_scalar(lambda s: loss(at_90, np.exp(s)), bounds=(-1, 5), method="bounded")
+        return float(best.fun)
+
+    grid = np.linspace(x.min() - 1, x.max() + 1, 600)
+    losses = np.array([profile(at) for at in grid])
+    best = int(np.argmin(losses))
+    slope = float(
+        np.exp(optimize.minimize_scalar(lambda s: loss(grid[best], np.exp(s)), bounds=(-1, 5), method="bounded").x)
+    )
+    # Half of chi-square's 90 % quantile with one degree of freedom.
+    within = losses <= losses[best] + 1.3528
+    return float(np.exp(grid[best])), float(np.exp(grid[within].max())), np.array([grid[best], slope])
+
+
+def true_values(diameter: float, depth: float, edge: float) -> dict[str, float]:
+    """Values of a pit depth (1 - t^2)^2 within the contour of an edge's depth."""
+    t = np.sqrt(1 - np.sqrt(min(edge / depth, 1.0)))
+    radius = diameter / 2
+    lost = 2 * depth * radius * (t - 2 * t**3 / 3 + t**5 / 5)
+    return {
+        "depth": depth,
+        "length": 2 * radius * t,
+        "width": 2 * radius * t,
+        "area": np.pi * (radius * t) ** 2,
+        "lost area": lost,
+    }
+
+
+def figure_rows(name: str, pairs: list[tuple[Feature, dict[str, float]]]) -> list[list[str]]:
+    """Rows of a table of errors: value, number, bias, spread, mean standard uncertainty, coverage."""
+    rows = []
+    for value in pairs[0][1] if pairs else ():
+        known = [(feature[value], truth[value]) for feature, truth in pairs if value in feature]
+        error = np.array([each.value - truth for each, truth in known])
+        inside = np.mean([each.low <= truth <= each.high for each, truth in known])
+        stated = np.mean([each.uncertainty for each, _ in known])
+        rows.append(
+            [
+                name,
+                value,
+                f"{len(known)}",
+                f"{error.mean():+.4f}",
+                f"{error.std():.4f}",
+                f"{stated:.4f}",
+                f"{100 * inside:.0f} %",
+            ]
+        )
+    return rows
+
+
+def true_weld(weld: Weld) -> dict[str, float]:
+    """Values of a weld by their definitions, from its closed form on a fine grid."""
+    x, y = np.arange(-24.5, 24.6, 0.25), np.arange(-15, 15, 0.005)
+    sections = np.array([weld_height(weld, np.full(len(y), at), y) for at in x])
+    toes, angles = [], []
+    for section in sections:
+        top, peak = section.max(), int(np.argmax(section))
+        ends, slopes = [], []
+        for half, sign in ((np.arange(peak, -1, -1), -1), (np.arange(peak, len(y)), 1)):
+            at = [y[half[int(np.argmax(section[half] < share * top))]] for share in (0.5, 0.1)]
+            slope = 0.4 * top / abs(at[1] - at[0])
+            ends.append(at[1] + sign * 0.1 * top / slope)
+            slopes.append(180 - np.degrees(np.arctan(slope)))
+        toes.append(ends[1] - ends[0])
+        angles.append(slopes)
+    left, right = np.median(angles, axis=0)
+    undercuts = dict.fromkeys(("undercut left", "undercut right", "largest undercut"), weld.undercut_depth_mm)
+    sizes = {"height": float(sections.max(axis=1).mean()), "width": float(np.median(toes))} | undercuts
+    return sizes | {"toe angle left": left, "toe angle right": right, "misalignment": 0.0}
+
+
+def pit_pairs(found: list[Feature | None], pits: Pits, chosen: np.ndarray) -> list[tuple[Feature, dict[str, float]]]:
+    """Features and true values of those chosen (P,) bool of the pits that were found."""
+    return [
+        (each, true_values(diameter, depth, each["edge depth"].value))
+        for each, diameter, depth, one in zip(found, pits.diameter, pits.depth, chosen, strict=True)
+        if each is not None and one
+    ]
+
+
+def small_pits_in(folder: Path, water: str) -> tuple[list[list[str]], list[list[str]], dict]:
+    """Rows of detection and of figures, and what a curve of each diameter is drawn from."""
+    pits, inspected = small_pits(), uwlts.inspect(cloud_of(folder, water, "pipe-after"))
+    found = matched(inspected, pits)
+    hit = np.array([each is not None for each in found])
+    plain = uwlts.inspect(cloud_of(folder, water, "pipe-before"))
+    false = false_ones(inspected, pits), len(plain.of(*BLEMISHES))
+    print(f"{water}: indications that are no pit: {false[0]} with pits, {false[1]} without; {inspected.notes[-1]}")
+    seen, figures, curves = [], [], {}
+    for diameter in np.unique(pits.diameter):
+        own = pits.diameter == diameter
+        a90, bound, fitted = detection(pits.depth[own], hit[own])
+        curves[water, float(diameter)] = pits.depth[own], hit[own], fitted, bound
+        seen.append([water, f"{diameter:g}", f"{np.sum(hit[own])} of {np.sum(own)}", f"{a90:.3f}", f"{bound:.3f}"])
+        deep = pit_pairs(found, pits, own & (pits.depth > 0.1))
+        figures += figure_rows(f"{water}, {diameter:g} mm, 0.1 to 0.4 mm deep", deep)
+    return seen, figures, curves
+
+
+def large_pits_in(folder: Path, water: str) -> list[list[str]]:
+    """Rows of the figures of large pits; each is printed."""
+    pits, inspected = large_pits(), uwlts.inspect(cloud_of(folder, water, "pipe-corroded"), wall_mm=9.5)
+    found = matched(inspected, pits)
+    print(f"{water}: large pits found: {sum(each is not None for each in found)}, false: {false_ones(inspected, pits)}")
+    for k, each in enumerate(found):
+        if each is not None:
+            print(f"  {pits.diameter[k]:g} mm, {pits.depth[k]:g} mm deep: {each['depth'].text()}")
+    return figure_rows(f"{water}, 10 to 24 mm, 0.5 to 5 mm deep", pit_pairs(found, pits, pits.diameter >= 10))
+
+
+def wholes_in(folder: Path, water: str) -> list[list[str]]:
+    """Rows of the figures of the pipe from six sides and of the weld."""
+    pipe = uwlts.inspect(around(folder, water))
+    truth = {"diameter": DIAMETER_MM, "ovality": DIAMETER_MM * OVALITY, "ovality share": 100 * OVALITY}
+    rows = figure_rows(f"{water}, pipe", [(pipe.features[0], truth | {"straightness": 0.0})])
+    sections = pipe.of(FeatureKind.SECTION)
+    rows += figure_rows(f"{water}, sections", [(each, {"ovality": truth["ovality"]}) for each in sections])
+    print(f"{water}: blemishes on the smooth pipe from six sides: {len(pipe.of(*BLEMISHES))}")
+    weld = load_scene(str(folder / f"weld-{water}.toml")).objects[0]
+    assert isinstance(weld, Weld)
+    bead = uwlts.inspect(cloud_of(folder, water, "weld"), "weld").features[0]
+    return rows + figure_rows(f"{water}, weld", [(bead, true_weld(weld))])
+
+
+def unchanged_in(folder: Path, water: str) -> None:
+    """Print where change is claimed beside the pits, which is where nothing changed."""
+    before = cloud_of(folder, water, "pipe-before")
+    for name, pits in (("pipe-after", small_pits()), ("pipe-corroded", large_pits())):
+        change = uwlts.compare_clouds(cloud_of(folder, water, name), before)
+        reach = pits.diameter / 2 + change.disc_mm / 2
+        clear = change.compared & np.all(distances(pits, change.points_mm) > reach, axis=1)
+        share = 100 * float(change.significant[clear].mean())
+        print(f"{water}, {name}: change is claimed on {share:.2f} % of {clear.sum()} places where nothing changed")
+
+
+def flanges_in(folder: Path, water: str) -> list[list[str]]:
+    """Rows of the figures of a flange and its holes."""
+    scene = load_scene(str(folder / f"flange-{water}.toml")).objects[0]
+    assert isinstance(scene, Flange)
+    found = uwlts.inspect(cloud_of(folder, "flanges", f"flange-{water}"), "flange")
+    truth = {"flatness": scene.flatness_mm, "bore": scene.bore_diameter_mm, "bolt circle": scene.bolt_circle_mm}
+    holes = [(hole, {"diameter": scene.hole_diameter_mm, "position": 0.0}) for hole in found.of(FeatureKind.HOLE)]
+    rows = figure_rows(f"{water}, flange", [(found.features[0], truth)])
+    return rows + figure_rows(f"{water}, holes of the flange", holes)
+
+
+def main(folder: Path, pictures: Path) -> None:
+    """Print all tables and draw the pictures."""
+    head = ["of", "value", "number", "bias", "spread", "stated std", "truth within the 95 % interval"]
+    seen, figures, curves = [], [], {}
+    for water in WATERS:
+        detected, rows, drawn = small_pits_in(folder, water)
+        seen, figures, curves = seen + detected, figures + rows, curves | drawn
+        figures += large_pits_in(folder, water)
+        unchanged_in(folder, water)
+        print(table(head, wholes_in(folder, water)))
+    print(table(["water", "diameter mm", "found", "a90 mm", "a90/95 mm"], seen))
+    print(table(head, figures))
+    draw_curves(curves, pictures / "inspection-detection.svg")
+    draw_map(folder, pictures / "inspection-pits.png")
+    for water in WATERS:
+        print(table(head, flanges_in(folder, water)))
+
+
+def draw_curves(curves: dict, path: Path) -> None:
+    """Probability of detection against depth: hits, misses, the logistic and the depth of 90 % at 95 % confidence."""
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True, layout="constrained")
+    for ax, water in zip(axes, WATERS, strict=True):
+        for diameter, colour in ((2.0, "#d1495b"), (3.0, "#2152ac"), (5.0, "#3b8d5a")):
+            depth, hit, (at_90, slope), bound = curves[water, diameter]
+            x = np.geomspace(0.006, 0.4, 200)
+            ax.semilogx(
+                x,
+                1 / (1 + np.exp(-np.log(9) - slope * (np.log(x) - at_90))),
+                color=colour,
+                label=f"{diameter:g} mm wide",
+            )
+            ax.plot(depth, np.where(hit, 1.0, 0.0) + 0.01 * (diameter - 3), "|", color=colour, markersize=5)
+            ax.plot([bound], [0.9], "o", color=colour, markersize=4)
+        ax.axhline(0.9, color="#999999", linewidth=0.7)
+        ax.set(title=f"{water} water", xlabel="depth of the pit / mm")
+    axes[0].set(ylabel="probability of detection")
+    axes[1].legend(frameon=False, title="dots: a90/95", loc="center left")
+    figure.savefig(path)
+
+
+def draw_map(folder: Path, path: Path) -> None:
+    """The corroded pipe unrolled, with the pits that were found and their depths."""
+    cloud = cloud_of(folder, "coastal", "pipe-corroded")
+    found = uwlts.inspect(cloud, wall_mm=9.5)
+    x, y, z = cloud.points_mm[::2].T
+    figure, ax = plt.subplots(figsize=(9, 4.4), layout="constrained")
+    colours = ax.scatter(
+        DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z),
+        x,
+        c=found.deviation_mm[::2],
+        s=5,
+        cmap="magma",
+        vmin=-3,
+        vmax=0.2,
+        linewidths=0,
+    )
+    for feature in found.of(*BLEMISHES):
+        x, y, z = feature.place_mm
+        depth = feature["depth"]
+        text = f"{depth.value:.2f} ± {0.5 * (depth.high - depth.low):.2f}"
+        at = DIAMETER_MM / 2 * np.arctan2(y, AXIS_Z_MM - z), x
+        ax.annotate(
+            text,
+            at,
+            (at[0], at[1] + 0.55 * feature.extent_mm[0] + 1),
+            ha="center",
+            color="#1d6fb8",
+            fontsize=8,
+            fontweight="bold",
+        )
+        ax.add_patch(
+            plt.Rectangle(
+                (at[0] - feature.extent_mm[1] / 2, at[1] - feature.extent_mm[0] / 2),
+                *feature.extent_mm[[1, 0]],
+                fill=False,
+                color="#1d6fb8",
+            )
+        )
+    figure.colorbar(colours, label="distance from the undamaged pipe / mm")
+    ax.set(
+        xlabel="around the pipe / mm",
+        ylabel="along the pipe / mm",
+        aspect="equal",
+        title="Pits found in coastal water, depth and half its 95 % interval / mm",
+    )
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -1,0 +1,160 @@
+"""Objects of known shape for the study of inspections, as meshes and scenes, and the campaign that renders them.
+
+    python docs/studies/inspection_scenes.py runs/inspection      # meshes, scenes and campaigns
+    twin record runs/inspection/calibration.toml --out runs/inspection/calibration
+    twin record runs/inspection/clear.toml --out runs/inspection/clear
+    twin record runs/inspection/coastal.toml --out runs/inspection/coastal
+    twin record runs/inspection/flanges.toml --out runs/inspection/flanges
+
+A pipe of 300 mm diameter and 0.5 % ovality: smooth, with a grid of small pits for the probability of detection, and
+with large pits; and one seen from six sides. All surfaces are known in closed form (`radius_mm`).
+"""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+import trimesh
+
+DIAMETER_MM, OVALITY, AXIS_Z_MM = 300.0, 0.005, 150.0
+OVAL_AT = np.radians(20.0)
+"""Direction of the largest diameter, from -z towards y."""
+SAG_MM = 0.002
+"""Largest distance of facets from the surface: a tenth of the points' noise."""
+SIDES_DEG = tuple(range(0, 360, 60))
+WATERS = ("clear", "coastal")
+
+
+@dataclass(frozen=True)
+class Pits:
+    """Pits (P,): places along the axis and along the round pipe's circumference, diameters and depths, mm."""
+
+    along: np.ndarray
+    around: np.ndarray
+    diameter: np.ndarray
+    depth: np.ndarray
+
+
+NO_PITS = Pits(*(np.zeros(0) for _ in range(4)))
+
+
+def small_pits() -> Pits:
+    """A grid of pits of 2, 3 and 5 mm diameter whose depths run evenly, in logarithms, from 0.006 to 0.4 mm."""
+    along, around = np.meshgrid(7.0 * np.arange(-4, 5), 7.0 * (np.arange(22) - 10.5), indexing="ij")
+    count, rng = along.size, np.random.default_rng(21)
+    order = rng.permutation(count)
+    diameter = np.array([2.0, 3.0, 5.0])[order % 3]
+    depth = np.exp(np.interp((order // 3 + rng.random(count)) / (count / 3), [0, 1], np.log([0.006, 0.4])))
+    shift = rng.uniform(-0.7, 0.7, (2, count))
+    return Pits(along.ravel() + shift[0], around.ravel() + shift[1], diameter, depth)
+
+
+def large_pits() -> Pits:
+    """Pits of 0.3 to 5 mm depth, as corrosion leaves them, apart from each other."""
+    along = [-18.0, 16.0, -14.0, 12.0, -17.0, 15.0, 0.0, -1.0, 2.0]
+    around = [-58.0, -55.0, -22.0, -18.0, 22.0, 24.0, 52.0, 0.0, -40.0]
+    diameter = [10.0, 16.0, 20.0, 14.0, 24.0, 12.0, 18.0, 3.0, 5.0]
+    depth = [1.0, 2.0, 3.0, 4.0, 5.0, 0.5, 1.5, 0.3, 0.4]
+    return Pits(*(np.array(each, float) for each in (along, around, diameter, depth)))
+
+
+def radius_mm(along: np.ndarray, angle: np.ndarray, pits: Pits) -> np.ndarray:
+    """Distance from the axis at places along it and angles from -z towards y; pits are depth (1 - t^2)^2 deep."""
+    loss = np.zeros(np.broadcast(along, angle).shape)
+    for x, s, diameter, depth in zip(pits.along, pits.around, pits.diameter, pits.depth, strict=True):
+        t2 = ((along - x) ** 2 + (DIAMETER_MM / 2 * angle - s) ** 2) / (diameter / 2) ** 2
+        loss = np.maximum(loss, depth * np.maximum(1 - t2, 0) ** 2)
+    return DIAMETER_MM / 2 * (1 + OVALITY / 2 * np.cos(2 * (angle - OVAL_AT))) - loss
+
+
+def pipe_mesh(pits: Pits, *, half_length: float, half_arc: float | None) -> trimesh.Trimesh:
+    """The pipe, or its front within an arc, as triangles fine enough for its pits."""
+    plain = np.sqrt(8 * SAG_MM * DIAMETER_MM / 2)
+    step = plain
+    if len(pits.depth):
+        bend = float(np.max(8 * pits.depth / (pits.diameter / 2) ** 2))
+        step = float(np.clip(np.sqrt(8 * SAG_MM / bend), 0.1, 0.2))
+    half_angle = np.pi if half_arc is None else 2 * half_arc / DIAMETER_MM
+    angle = np.linspace(-half_angle, half_angle, int(np.ceil(half_angle * DIAMETER_MM / step)) + 1)
+    x = np.linspace(-half_length, half_length, int(np.ceil(2 * half_length / step)) + 1 if len(pits.depth) else 2)
+    along, around = np.meshgrid(x, angle, indexing="ij")
+    radius = radius_mm(along, around, pits)
+    vertices = np.stack([along, radius * np.sin(around), -radius * np.cos(around)], axis=-1).reshape(-1, 3)
+    corner = np.arange(along.size).reshape(along.shape)
+    a, b, c, d = (each.ravel() for each in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def _scene(title: str, thing: dict[str, Any], motion: dict[str, Any]) -> dict[str, Any]:
+    return {"title": title, "medium": "water", "motion": motion, "objects": [thing]}
+
+
+def scenes(folder: Path) -> dict[str, dict[str, Any]]:
+    """Scenes by their names; the meshes are written into the folder."""
+
+    def pipe(mesh: str, turn_deg: float = 0.0) -> dict[str, Any]:
+        place = {"position_mm": [0.0, 0.0, AXIS_Z_MM], "rotation_deg": [turn_deg, 0.0, 0.0]}
+        return {"kind": "mesh", "path": f"{mesh}.ply", "reflectance": 0.4} | place
+
+    for name, pits, half_length, half_arc in (
+        ("pipe-before", NO_PITS, 60.0, None),
+        ("pipe-after", small_pits(), 36.0, 105.0),
+        ("pipe-corroded", large_pits(), 36.0, 105.0),
+    ):
+        pipe_mesh(pits, half_length=half_length, half_arc=half_arc).export(folder / f"{name}.ply")
+    found = {
+        "pipe-before": _scene("Pipe", pipe("pipe-before"), {"start_mm": -15.0, "step_mm": 0.5, "count": 61}),
+        "pipe-after": _scene("Small pits", pipe("pipe-after"), {"start_mm": -32.0, "step_mm": 0.5, "count": 129}),
+        "pipe-corroded": _scene("Pits", pipe("pipe-corroded"), {"start_mm": -31.5, "step_mm": 1.0, "count": 64}),
+    }
+    for side in SIDES_DEG:
+        motion = {"start_mm": -20.0, "step_mm": 10.0, "count": 5}
+        found[f"pipe-side-{side}"] = _scene(f"Pipe turned by {side} deg", pipe("pipe-before", side), motion)
+    weld = {"kind": "weld", "beads": 1, "plate_mm": [80.0, 120.0], "length_mm": 60.0, "width_mm": 12.0}
+    weld |= {"height_mm": 2.0, "undercut_depth_mm": 0.5, "undercut_width_mm": 2.5, "finish": "painted"}
+    found["weld"] = _scene("Weld with undercut", weld, {"start_mm": -25.0, "step_mm": 1.0, "count": 51})
+    return found
+
+
+def main(folder: Path) -> None:
+    """Write meshes, scenes and campaigns."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names = scenes(folder)
+    for water in WATERS:
+        for name, scene in names.items():
+            (folder / f"{name}-{water}.toml").write_text(tomli_w.dumps({"water": water} | scene), encoding="utf-8")
+        recordings = [{"name": name, "scene": f"{name}-{water}.toml"} for name in names]
+        campaign = {"base": "thesis", "title": f"inspection, {water}", "recordings": recordings}
+        (folder / f"{water}.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
+    flange = {
+        "kind": "flange",
+        "outer_diameter_mm": 150.0,
+        "bore_diameter_mm": 60.0,
+        "bolt_circle_mm": 110.0,
+        "holes": 6,
+    }
+    flange |= {"hole_diameter_mm": 14.0, "first_hole_deg": 10.0, "flatness_mm": 0.1, "reflectance": 0.4}
+    scene = _scene("Flange", flange, {"start_mm": -75.0, "step_mm": 1.5, "count": 101})
+    for water in WATERS:
+        (folder / f"flange-{water}.toml").write_text(tomli_w.dumps({"water": water} | scene), encoding="utf-8")
+    recordings = [{"name": f"flange-{water}", "scene": f"flange-{water}.toml"} for water in WATERS]
+    campaign = {"base": "thesis", "title": "inspection, flanges", "recordings": recordings}
+    (folder / "flanges.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
+    axial = {"direction": [0.0, 0.0, 1.0], "start_mm": -126.0, "step_mm": 17.6, "count": 12}
+    calibration = [
+        {"name": "target-bare", "scene": "target", "motion": {"step_mm": 18.0, "count": 16}},
+        {"name": "target-air", "scene": "target-through-window", "motion": {"step_mm": 18.0, "count": 16}},
+        {"name": "target-water", "scene": "target-through-window", "media": ["water"]}
+        | {"motion": axial | {"lights": ["lamp", "laser"]}},
+        {"scene": "step", "placements": ["near", "standoff", "far"]},
+    ]
+    campaign = {"base": "thesis", "title": "inspection, calibration", "recordings": calibration}
+    (folder / "calibration.toml").write_text(tomli_w.dumps(campaign), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,80 @@
+"""Dark beside shining surfaces at one exposure and in a bracket of three, against the true stripe.
+
+``python docs/studies/stripe_brackets.py`` prints the table of docs/explanation/stripe-methods.md.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from twin.options import Options, use_variant
+from twin.scene.description import Scene
+from uwlts.model.library import load_sensor
+from uwlts.stripe import extract_stripe
+from uwlts.stripe.exposures import fused
+
+BRACKET = (1.0, 5.0, 25.0)
+FRAMES, CLEAR_MM, FULL_DN = 6, 2.0, 255.0
+
+
+def scene(*things: dict[str, object]) -> Scene:
+    motion = {"start_mm": -0.5 * FRAMES, "step_mm": 1.0, "count": FRAMES}
+    return Scene.model_validate({"title": "", "medium": "water", "objects": things, "motion": motion})
+
+
+def plate(y: float, **finish: object) -> dict[str, object]:
+    return {"kind": "plate", "width_mm": 80.0, "height_mm": 60.0, "position_mm": (0.0, y, 0.0)} | finish
+
+
+WELD = {
+    "kind": "weld",
+    "finish": "metal",
+    "plate_mm": (80.0, 120.0),
+    "along": "x",
+    "beads": 3,
+    "position_mm": (0, 0, 0),
+}
+RUBBER, STEEL = {"reflectance": 0.004}, {"finish": "metal", "reflectance": 0.6}
+CASES = {
+    "black rubber beside shining steel": (scene(plate(-32.0, **RUBBER), plate(32.0, **STEEL)), ("rubber", "steel")),
+    "weld beads of bare steel": (scene(WELD), ("beads",)),
+}
+
+
+def rows() -> Iterator[str]:
+    from twin.recording.studio import Studio, true_stripe
+
+    yield "| scene | surface | image | lines found % | bias px | std px |"
+    yield "| --- | --- | --- | --- | --- | --- |"
+    for name, (of, surfaces) in CASES.items():
+        studio, sensor = Studio(load_sensor("thesis"), of, Options(spp=64)), load_sensor("thesis")
+        exposure = studio.exposure_ms["laser"] * np.array(BRACKET)
+        errors: dict[tuple[str, str], list[np.ndarray]] = {}
+        for number, shot in enumerate(of.motion.shots()):
+            truth = true_stripe(studio.renderer, studio.pose(shot))
+            images = [studio.exposed(shot, 10 * number + k, exposure=BRACKET[k]).image for k in range(len(BRACKET))]
+            image, saturation = fused(images, exposure, full_dn=FULL_DN)
+            looked = {
+                "exposure 1": (images[0], FULL_DN),
+                "exposure 25": (images[-1], FULL_DN),
+                "bracket": (image, saturation),
+            }
+            y = truth.point_mm[:, 1]
+            for shown, (each, full) in looked.items():
+                found = extract_stripe(each, stripe_along=sensor.camera.stripe_along, saturation=full)
+                for surface in surfaces:
+                    here = np.isfinite(truth.centre_px)
+                    if len(surfaces) > 1:
+                        here &= (y < -CLEAR_MM - 2.0) if surface == "rubber" else (y > CLEAR_MM + 2.0)
+                    errors.setdefault((surface, shown), []).append((found.centre_px - truth.centre_px)[here])
+        for (surface, shown), values in sorted(errors.items(), key=lambda one: one[0][0]):
+            error = np.concatenate(values)
+            near = error[np.abs(error) < 2.0]
+            bias, spread = np.median(near) if len(near) else np.nan, np.std(near) if len(near) else np.nan
+            yield f"| {name} | {surface} | {shown} | {100 * len(near) / len(error):.1f} | {bias:+.3f} | {spread:.3f} |"
+
+
+if __name__ == "__main__":
+    use_variant()
+    for row in rows():
+        print(row, flush=True)

@@ -1,0 +1,213 @@
+"""Wrong and lost points on scenes with mirrors and inside corners: the brightest peak, and the direct stripe.
+
+``python docs/studies/stripe_reflections.py`` prints the table of docs/explanation/stripe-methods.md and draws its
+picture. A point is wrong that lies more than 3 px from every place of the image where the laser lights a surface; a lit
+profile line without a right point is lost. The scenes of the first half were looked at while the rules were made, those
+of the second were not.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from twin.options import Options, use_variant
+from twin.scene.description import Scene, load_scene
+from uwlts.model.library import load_sensor
+from uwlts.stripe import StripeOptions, extract_candidates, find_stripes
+
+NEAR_PX, FRAMES, STEP_MM = 3.0, 5, 5.0
+BRIGHTEST = StripeOptions(peak="strongest", ambiguous_ratio=1.0)
+PICTURE = Path("docs/pictures/stripe-reflections.png")
+PICTURED = "inside corner, 12°"
+Thing = dict[str, Any]
+
+
+def mirror(z: float, reflectance: float = 0.02, share: float = 0.85) -> Thing:
+    size = {"width_mm": 160.0, "height_mm": 200.0}
+    return {"kind": "plate", **size, "position_mm": [0, 0, z], "reflectance": reflectance, "mirror": share}
+
+
+def sphere(diameter: float = 50.0, at: tuple[float, float, float] = (0, 0, 0), finish: str = "painted") -> Thing:
+    return {"kind": "sphere", "diameter_mm": diameter, "position_mm": at, "finish": finish}
+
+
+def block(size: tuple[float, float, float], at: tuple[float, float, float], **more: Any) -> Thing:
+    return {"kind": "block", "size_mm": size, "position_mm": at, "finish": "metal"} | more
+
+
+def corner(side: str, *, high: float = 40.0, **finish: Any) -> list[Thing]:
+    """A floor and a wall on it: beside the stripe's middle (y, -y), or along it and in view of the camera (x)."""
+    z = -0.5 * high + 10.0
+    wall = {
+        "y": ((100, 40, high), (0, 50, z)),
+        "-y": ((100, 40, high), (0, -50, z)),
+        "x": ((40, 140, high), (20, 0, z)),
+    }
+    return [block((100, 140, 20), (0, 0, 20), **finish), block(*wall[side], **finish)]
+
+
+def scene(*things: Thing, turned: Any = (0, 0, 0), at: Any = (0, 0, 0), water: Any = None) -> Scene:
+    motion = {"start_mm": -0.5 * STEP_MM * (FRAMES - 1), "step_mm": STEP_MM, "count": FRAMES}
+    table: dict[str, Any] = {"title": "", "medium": "water", "objects": list(things), "motion": motion, "water": water}
+    placement = {"position_mm": at, "rotation_deg": turned}
+    return Scene.model_validate(table | {"placements": {"here": placement}, "placement": "here"})
+
+
+SHINING = {"mirror": 0.4, "reflectance": 0.5}
+SEEN = {
+    "sphere on a mirror": scene(sphere(), mirror(25.0)),
+    "sphere on a mirror, 20°": scene(sphere(), mirror(25.0), turned=(20, 0, 0)),
+    "sphere above a mirror, 10° and 8°, coastal": scene(
+        sphere(40.0, (0, 20, -12)), mirror(25.0, 0.05), turned=(10, 8, 0), water="coastal"
+    ),
+    "step standard on a mirror": load_scene("step"),
+    "painted block on a mirror, 15°": scene(
+        block((80, 40, 40), (0, 10, 0), finish="painted"), mirror(20.0, 0.04), turned=(15, 0, 0)
+    ),
+    "grey block on a mirror, -25°": scene(
+        block((80, 40, 40), (0, -10, 0), finish="diffuse", reflectance=0.3),
+        mirror(20.0, 0.03),
+        turned=(-25, 0, 0),
+        at=(0, 0, 40),
+    ),
+    PICTURED: scene(*corner("y", **SHINING), turned=(12, 0, 0)),
+    "inside corner, 8°, coastal": scene(*corner("y", mirror=0.7, reflectance=0.25), turned=(8, 0, 0), water="coastal"),
+    "inside corner, 25° and 5°": scene(
+        *corner("y", finish="diffuse", mirror=0.3, reflectance=0.4), turned=(25, 5, 0), at=(0, 10, -30)
+    ),
+    "inside corner, turned about all axes": scene(*corner("y", mirror=0.6, reflectance=0.3), turned=(10, 10, 20)),
+    "corner along the stripe": scene(*corner("x", **SHINING)),
+    "clean corner along the stripe": scene(
+        *corner("x", finish="diffuse", mirror=0.85, reflectance=0.1), turned=(5, 0, 3)
+    ),
+}
+HELD_OUT = {
+    "sphere on a mirror, -18° and 4°, coastal": scene(
+        sphere(40.0), mirror(20.0, 0.03), turned=(-18, 4, 0), at=(0, 0, 30), water="coastal"
+    ),
+    "two spheres on a mirror, 14°, -5°, 10°": scene(
+        sphere(30.0, (0, -32, 0)), sphere(30.0, (0, 32, 0)), mirror(15.0, 0.04), turned=(14, -5, 10)
+    ),
+    "PVC sphere on a mirror, 25°, near": scene(
+        sphere(50.0, finish="pvc"), mirror(25.0, 0.05, 0.7), turned=(25, 0, 0), at=(0, 0, -40)
+    ),
+    "PVC block on a mirror, -12° and 6°, far": scene(
+        block((80, 50, 30), (0, 0, 0), finish="pvc"), mirror(15.0, 0.04), turned=(-12, 6, 0), at=(0, 0, 60)
+    ),
+    "inside corner, 15° and -6°, turbid": scene(
+        *corner("-y", finish="diffuse", mirror=0.5, reflectance=0.3), turned=(-15, -6, 0), water=1.0
+    ),
+    "inside corner, 18° and 3°, far": scene(
+        *corner("y", mirror=0.6, reflectance=0.3), turned=(18, 3, 0), at=(0, 0, 60)
+    ),
+    "high inside corner, 10°, coastal": scene(
+        *corner("y", high=70.0, finish="diffuse", mirror=0.6, reflectance=0.3), turned=(10, 0, 0), water="coastal"
+    ),
+    "corner along the stripe, 3° and -4°": scene(
+        *corner("x", finish="diffuse", mirror=0.6, reflectance=0.25), turned=(3, 0, -4)
+    ),
+    "sphere on paint": scene(sphere(), block((160, 200, 10), (0, 0, 30), finish="painted"), turned=(5, 5, 0)),
+}
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Images (F, H, W) of a scene, as `find_stripes` takes them, and (N, 3) image, line and place of what is lit."""
+
+    images: np.ndarray
+    lit: np.ndarray
+
+    @property
+    def capture(self) -> Any:
+        """What `find_stripes` needs of a capture."""
+        count, sensor = len(self.images), load_sensor("thesis")
+        about = {"header": SimpleNamespace(sensor=sensor, saturation_dn=255), "path": Path("rendered.h5")}
+        about |= {
+            "has_image": np.ones(count, bool),
+            "laser_on": np.ones(count, bool),
+            "stage_mm": np.arange(count),
+            "exposure_ms": np.ones(count),
+        }
+        return _Capture(images=self.images, pose=np.full((count, 4, 4), np.nan), **about)
+
+
+class _Capture(SimpleNamespace):
+    def seen(self, index: int) -> np.ndarray:
+        return self.images[index]
+
+    def image(self, index: int) -> np.ndarray:
+        return self.images[index]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+def rendered(of: Scene) -> Rendered:
+    from twin.recording.studio import Studio, crossings
+
+    studio, images, lit = Studio(load_sensor("thesis"), of, Options()), [], []
+    for number, shot in enumerate(of.motion.shots()):
+        images.append(studio.image(shot, number))
+        found = crossings(studio.renderer, studio.pose(shot))
+        shone = found.brightness > 0
+        lit.append(np.column_stack([np.full(shone.sum(), number), found.line[shone], found.centre_px[shone]]))
+    return Rendered(np.stack(images), np.concatenate(lit))
+
+
+def wrong_and_lost(of: Rendered, options: StripeOptions) -> tuple[float, float, int]:
+    """Percent of the points that are wrong, percent of the lit lines without a right one, and the number of points."""
+    stripes, wrong, right = find_stripes(of.capture, options=options), 0, 0
+    lines = np.unique(of.lit[:, :2], axis=0)
+    for number in range(len(of.images)):
+        here = stripes[stripes.frame == number]
+        tree = cKDTree(of.lit[of.lit[:, 0] == number, 1:])
+        away = tree.query(np.column_stack([here.line, here.centre_px]))[0]
+        wrong += int(np.count_nonzero(away > NEAR_PX))
+        right += len(np.intersect1d(here.line[away <= NEAR_PX], lines[lines[:, 0] == number, 1]))
+    count = len(stripes.line)
+    return 100.0 * wrong / max(count, 1), 100.0 * (1.0 - right / len(lines)), count
+
+
+def rows() -> Iterator[str]:
+    yield "| scene | brightest peak: wrong % | lost % | direct stripe: wrong % | lost % |"
+    yield "| --- | --- | --- | --- | --- |"
+    for group in (SEEN, HELD_OUT):
+        for name, of in group.items():
+            shown = rendered(of)
+            (wrong, lost, _), (ours, missing, _) = (wrong_and_lost(shown, o) for o in (BRIGHTEST, StripeOptions()))
+            yield f"| {name} | {wrong:.2f} | {lost:.1f} | {ours:.2f} | {missing:.1f} |"
+            if name == PICTURED:
+                draw(shown)
+        yield "| | | | | |" if group is SEEN else ""
+
+
+def draw(of: Rendered) -> None:
+    """Picture of the corner: image, all candidates, and what both rules take."""
+    import matplotlib.pyplot as plt
+
+    number = FRAMES // 2
+    figure, axes = plt.subplots(1, 3, figsize=(10.5, 3.6), sharex=True, sharey=True, layout="constrained")
+    all_of_them = extract_candidates(of.images[number], stripe_along="width", saturation=255)
+    shown = [(all_of_them.line, all_of_them.centre_px)]
+    for options in (BRIGHTEST, StripeOptions()):
+        stripes = find_stripes(of.capture, options=options)
+        here = stripes[stripes.frame == number]
+        shown.append((here.line, here.centre_px))
+    titles = "all stripes of the image", "brightest peak", "direct stripe"
+    for axis, (line, centre), title in zip(axes, shown, titles, strict=True):
+        axis.imshow((of.images[number] / 255.0) ** 0.4, cmap="gray", interpolation="none")
+        axis.plot(line, centre, ".", color="#d62728", markersize=1.5)
+        axis.set(title=title, xlabel="profile line (column), px", xlim=(640, 1080), ylim=(700, 330))
+    axes[0].set_ylabel("row, px")
+    figure.savefig(PICTURE, dpi=110)
+
+
+if __name__ == "__main__":
+    use_variant()
+    for row in rows():
+        print(row, flush=True)

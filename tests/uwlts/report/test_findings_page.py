@@ -1,0 +1,74 @@
+"""Report of an inspection: what stands on the page, in the JSON and in the PDF, and what is refused."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import uwlts
+from tests.uwlts.metrology.test_surface_mesh import NOISE_MM
+from uwlts.cli import app
+from uwlts.model.errors import EvaluationError, OutputError, SetupError
+from uwlts.report import pdf
+from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.files import sha256_of
+
+DEPTH_MM = 1.5
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A pipe of 120 mm diameter with one pit, whose cloud names a calibration."""
+    rng, radius = np.random.default_rng(9), 60.0
+    x, angle = np.meshgrid(np.arange(0, 80, 0.5), np.radians(np.arange(-60, 60, 0.4)), indexing="ij")
+    frame = np.repeat(np.arange(len(x)), x.shape[1])
+    x, angle = x.ravel(), angle.ravel()
+    away = np.hypot(x - 40, radius * angle) / 6
+    r = radius - DEPTH_MM * np.where(away < 1, (1 - away**2) ** 2, 0)
+    points = np.column_stack([x, r * np.sin(angle), 400 - r * np.cos(angle)])
+    points[:, 2] += NOISE_MM * rng.normal(size=len(x))
+    random = np.tile([NOISE_MM**2 * (i == j == 2) for i, j in PAIRS], (len(x), 1)).astype(np.float32)
+    nothing = np.zeros_like(points, np.float32)
+    known = PointUncertainty(random, nothing, nothing[None])
+    metadata = {"capture": "pipe.h5", "sensor": "thesis", "calibration": "0" * 64}
+    cloud = PointCloud(points, np.ones(len(x)), frame, np.zeros(len(x), int), uncertainty=known, metadata=metadata)
+    folder = tmp_path_factory.mktemp("pipe")
+    uwlts.write_cloud(folder / "pipe.ply", cloud)
+    return folder
+
+
+def test_page_json_and_pdf_say_the_same(folder, chromium, monkeypatch):
+    monkeypatch.chdir(folder)
+    words = ["findings-report", "pipe.ply", "--wall-mm", "8", "--captures", "pipe.ply", "--out", "report.html", "--pdf"]
+    app(words, result_action="return_value")
+    record = json.loads((folder / "report.json").read_text())
+    pits = [each for each in record["inspection"]["features"] if each["kind"] == "pit"]
+    assert len(pits) == 1
+    wall = pits[0]["values"]["remaining wall"]
+    # The noise of one point is 0.02 mm.
+    assert wall["value"] == pytest.approx(8 - DEPTH_MM, abs=5 * NOISE_MM)
+    assert record["sources"][0]["sha256"] == sha256_of(folder / "pipe.ply")
+    page = chromium.new_page()
+    page.goto((folder / "report.html").as_uri())
+    text = page.inner_text("main")
+    page.close()
+    assert "least remaining wall" in text.lower() and f"{wall['value']:.3f}" in text
+    for part in ("GUM", "VDI/VDE 2634", "ASME B31G", "Traceability", record["sources"][0]["sha256"]):
+        assert part in text
+    assert (folder / "report.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_foreign_calibrations_and_missing_browsers_are_refused(folder, tmp_path, monkeypatch):
+    uwlts.write_calibration(tmp_path / "other.json", uwlts.nominal("thesis", medium="water"))
+    with pytest.raises(EvaluationError, match="another calibration"):
+        uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", calibration=tmp_path / "other.json")
+    with pytest.raises(EvaluationError, match="give that, too"):
+        uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", certificate=tmp_path / "other.json")
+    with pytest.raises(OutputError, match="which is HTML"):
+        uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.json")
+    monkeypatch.delenv("CHROMIUM", raising=False)
+    monkeypatch.setattr(pdf, "shutil", SimpleNamespace(which=lambda name: None))
+    with pytest.raises(SetupError, match="needs Chromium"):
+        uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", pdf=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["other.json"]

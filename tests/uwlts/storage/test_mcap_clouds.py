@@ -1,0 +1,143 @@
+"""Time, image and covariance of each point in exchange formats, read back by the formats' own libraries."""
+
+import laspy
+import numpy as np
+import pye57
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+import uwlts
+from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.export_ import export_cloud
+
+FIELDS = ("x", "y", "z", "intensity", "frame", "line", "time")
+NUMBERS = {5: "<i4", 7: "<f4", 8: "<f8"}
+"""Datatypes of sensor_msgs/PointField."""
+
+
+@pytest.fixture
+def cloud():
+    rng, count = np.random.default_rng(3), 600
+    frame = np.repeat(np.arange(12), 50)
+    known = PointUncertainty(
+        rng.uniform(0.001, 0.002, (count, 6)).astype(np.float32),
+        rng.normal(0, 0.01, (count, 3)).astype(np.float32),
+        rng.normal(0, 0.02, (2, count, 3)).astype(np.float32),
+        rng.normal(0, 0.03, (6, count, 3)).astype(np.float32),
+    )
+    return PointCloud(
+        rng.uniform(-300, 300, (count, 3)),
+        rng.uniform(1, 255, count),
+        frame,
+        np.arange(count) % 50,
+        uncertainty=known,
+        time_s=1.7e9 + 0.125 * frame,
+    )
+
+
+def assert_same(cloud: PointCloud, table: dict[str, np.ndarray]) -> None:
+    np.testing.assert_allclose(np.stack([table[a] for a in "xyz"], 1), 1e-3 * cloud.points_mm, atol=2e-8)
+    for name, expected in {
+        "frame": cloud.frame,
+        "line": cloud.line,
+        "time": cloud.time_s,
+        "intensity": cloud.intensity,
+    }.items():
+        np.testing.assert_array_equal(table[name], expected)
+    for i, j in PAIRS:
+        expected = cloud.covariance_mm2[:, i, j].astype(np.float32)
+        np.testing.assert_array_equal(table[f"cov_{'xyz'[i]}{'xyz'[j]}_mm2"], expected)
+
+
+def test_point_cloud2_of_ros_2(cloud, tmp_path):
+    path = tmp_path / "a.mcap"
+    export_cloud(cloud, path)
+    parts, stamps = [], []
+    with path.open("rb") as file:
+        for schema, channel, message, decoded in make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
+            assert schema.name == "sensor_msgs/msg/PointCloud2" and channel.topic == "/points"
+            assert message.log_time == decoded.header.stamp.sec * 10**9 + decoded.header.stamp.nanosec
+            kind = np.dtype(
+                {
+                    "names": [field.name for field in decoded.fields],
+                    "formats": [NUMBERS[field.datatype] for field in decoded.fields],
+                    "offsets": [field.offset for field in decoded.fields],
+                    "itemsize": decoded.point_step,
+                }
+            )
+            parts.append(np.frombuffer(bytes(decoded.data), kind))
+            assert len(parts[-1]) == decoded.width == 50
+            stamps.append(decoded.header.stamp.sec)
+    assert len(parts) == 12 and stamps[0] == 1_700_000_000
+    table = np.concatenate(parts)
+    assert_same(cloud, {name: table[name] for name in table.dtype.names})
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
+        assert [c.msgtype for c in bag.connections] == ["sensor_msgs/msg/PointCloud2"] and bag.message_count == 12
+
+
+def test_point_cloud_of_foxglove(cloud, tmp_path):
+    from foxglove.messages import PointCloud as Message
+
+    path = tmp_path / "a.foxglove.mcap"
+    export_cloud(cloud, path)
+    parts = []
+    with path.open("rb") as file:
+        for schema, _, message in make_reader(file).iter_messages():
+            assert schema.name == "foxglove.PointCloud" and schema.encoding == "protobuf"
+            assert message.log_time == round(1e9 * cloud.time_s[50 * len(parts)])
+            parts.append(message.data)
+    assert len(parts) == 12
+    # The library reads no protobuf: the packed points stand in the message as they are.
+    first = cloud.points_mm[0].astype(np.float64) * 1e-3
+    assert first.astype("<f4").tobytes() in parts[0] and b"cov_xx_mm2" in parts[0]
+    assert Message.get_schema().name == "foxglove.PointCloud"
+
+
+def test_a_cloud_without_times_is_one_message(cloud, tmp_path):
+    plain = PointCloud(cloud.points_mm, cloud.intensity, cloud.frame, cloud.line)
+    export_cloud(plain, tmp_path / "a.mcap")
+    with (tmp_path / "a.mcap").open("rb") as file:
+        (found,) = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+    assert found[3].width == len(plain) and [field.name for field in found[3].fields] == list(FIELDS[:-1])
+
+
+def test_laz_has_time_image_and_covariance(cloud, tmp_path):
+    export_cloud(cloud, tmp_path / "a.laz")
+    found = laspy.read(tmp_path / "a.laz")
+    table = {axis: np.asarray(getattr(found, axis)) for axis in "xyz"}
+    table |= {"time": np.asarray(found.gps_time), "intensity": np.asarray(found["amplitude"])}
+    table |= {
+        name: np.asarray(found[name])
+        for name in ("frame", "line", *(f"cov_{'xyz'[i]}{'xyz'[j]}_mm2" for i, j in PAIRS))
+    }
+    np.testing.assert_allclose(table["x"], 1e-3 * cloud.points_mm[:, 0], atol=1e-7)
+    assert_same(cloud, table | {a: (1e-3 * cloud.points_mm)[:, k] for k, a in enumerate("xyz")})
+
+
+def test_e57_has_image_and_line(cloud, tmp_path):
+    export_cloud(cloud, tmp_path / "a.e57")
+    file = pye57.E57(str(tmp_path / "a.e57"))
+    found = file.read_scan_raw(0)
+    file.close()
+    np.testing.assert_array_equal(found["columnIndex"], cloud.frame)
+    np.testing.assert_array_equal(found["rowIndex"], cloud.line)
+
+
+def test_ply_has_time_image_and_covariance(cloud, tmp_path):
+    uwlts.write_cloud(tmp_path / "a.ply", cloud)
+    again = uwlts.read_cloud(tmp_path / "a.ply")
+    np.testing.assert_array_equal(again.time_s, cloud.time_s)
+    np.testing.assert_array_equal(again.frame, cloud.frame)
+    np.testing.assert_allclose(again.covariance_mm2, cloud.covariance_mm2, rtol=1e-6)
+
+
+def test_times_before_zero_are_refused(cloud, tmp_path):
+    early = PointCloud(cloud.points_mm, cloud.intensity, cloud.frame, cloud.line, time_s=cloud.time_s - 2e9)
+    with pytest.raises(uwlts.Error, match="no time before 0"):
+        export_cloud(early, tmp_path / "a.mcap")
+    assert not list(tmp_path.iterdir())

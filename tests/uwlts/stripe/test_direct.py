@@ -1,0 +1,123 @@
+"""The laser's own stripe among reflections, on drawn images; `docs/studies/stripe_reflections.py` has rendered ones."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from uwlts.model.errors import RangeError
+from uwlts.model.library import load_sensor
+from uwlts.stripe import StripeOptions, StripeStatus, extract_candidates, extract_stripe, find_stripes
+from uwlts.stripe.direct import farther
+
+LINES, LENGTH = 400, 320
+BRIGHTEST = StripeOptions(peak="strongest", ambiguous_ratio=1.0)
+NOISE = 1.0
+
+
+def drawn(*stripes: tuple[np.ndarray, float]) -> np.ndarray:
+    """(LENGTH, LINES) uint8: columns with stripes of sigma 2 px at places (LINES,), NaN for none, of some height."""
+    rows = np.arange(LENGTH)[:, None]
+    light = sum(np.nan_to_num(height * np.exp(-0.5 * ((rows - place) / 2.0) ** 2)) for place, height in stripes)
+    noise = np.random.default_rng(3).normal(0, NOISE, (LENGTH, LINES))
+    return np.clip(np.rint(10 + light + noise), 0, 255).astype(np.uint8)
+
+
+def on(first: int, last: int, place: np.ndarray) -> np.ndarray:
+    """Places on the lines from one to another, NaN elsewhere."""
+    lines = np.arange(LINES)
+    return np.where((lines >= first) & (lines < last), place, np.nan)
+
+
+def found(*images: np.ndarray, options: StripeOptions = StripeOptions(), sensor: str = "thesis"):
+    """What `find_stripes` finds in images of one recording."""
+    count = len(images)
+    header = SimpleNamespace(sensor=load_sensor(sensor), saturation_dn=255)
+    about = {"laser_on": np.ones(count, bool), "has_image": np.ones(count, bool), "stage_mm": np.arange(float(count))}
+    about |= {"exposure_ms": np.ones(count), "pose": np.full((count, 4, 4), np.nan), "path": Path("drawn.h5")}
+
+    class Images(SimpleNamespace):
+        def __len__(self) -> int:
+            return count
+
+    capture = Images(header=header, image=images.__getitem__, seen=images.__getitem__, **about)
+    return find_stripes(capture, options=options)
+
+
+X = np.arange(LINES)
+FLOOR, WALL = on(0, 200, 240 - 0.1 * X), on(200, 280, 220 - 1.5 * (X - 200))
+TOP, REFLECTED = on(280, LINES, 100 - 0.1 * (X - 280)), on(200, 270, 240 - 0.1 * X)
+
+
+def test_the_wall_of_a_shining_corner_is_taken_and_the_floor_in_it_is_not():
+    """The wall shows the floor once more, eight times as bright as itself, and going on straight from it."""
+    image = drawn((FLOOR, 120), (WALL, 15), (TOP, 100), (REFLECTED, 110))
+    true = np.nanmax([FLOOR, WALL, TOP], axis=0)
+    stripes, brightest = found(image), found(image, options=BRIGHTEST)
+    wrong = np.abs(stripes.centre_px - true[stripes.line]) > 3
+    assert not wrong.any()
+    assert np.mean(np.abs(brightest.centre_px - true[brightest.line]) > 3) > 0.1
+    # Where both stripes merge nothing is taken: 16 lines on either side of the corner at a slope of 1.4 px a line.
+    assert len(stripes.line) > LINES - 2 * 16 - 12
+    assert np.count_nonzero((stripes.line > 220) & (stripes.line < 275)) > 45
+
+
+def test_a_reflection_below_a_mirrors_faint_stripe_is_left_out():
+    """Nothing joins the two: the faint one goes on beyond the bright one, which begins and ends in the void."""
+    mirror, arc = on(0, LINES, 150 + 0.1 * X), on(120, 220, 260 - 0.01 * (X - 170) ** 2)
+    stripes = found(drawn((mirror, 10), (arc, 90)))
+    assert np.abs(stripes.centre_px - mirror[stripes.line]).max() < 3
+    assert len(stripes.line) > 0.9 * LINES
+
+
+def test_a_dimmer_stripe_before_the_floor_that_nothing_joins_is_a_reflection():
+    """A wall that faces the camera shows the floor nearer than it is, and dimmer."""
+    floor, ghost = on(0, LINES, 200 + 0.05 * X), on(30, 350, 120 + 0.05 * X)
+    stripes = found(drawn((floor, 120), (ghost, 45)))
+    assert np.abs(stripes.centre_px - floor[stripes.line]).max() < 3
+    assert len(stripes.line) > 0.95 * LINES
+
+
+@pytest.mark.parametrize("place", [on(0, LINES, 150 + 40 * np.sin(X / 50)), FLOOR])
+def test_images_with_one_stripe_give_what_extraction_gives(place):
+    image = drawn((place, 80))
+    alone, stripes = extract_stripe(image, stripe_along="width", saturation=255), found(image, image)
+    for frame in (0, 1):
+        here = stripes[stripes.frame == frame]
+        np.testing.assert_array_equal(here.line, alone.lines)
+        np.testing.assert_array_equal(here.centre_px, alone.centre_px[alone.lines])
+
+
+def test_a_rod_before_a_floor_and_a_groove_in_it_stay():
+    floor = on(0, LINES, 200 + 0 * X)
+    for place in (120.0, 260.0):
+        piece = on(150, 190, place + 0 * X)
+        true = np.where(np.isnan(piece), floor, piece)
+        stripes = found(drawn((true, 100)))
+        assert np.abs(stripes.centre_px - true[stripes.line]).max() < 1
+        assert len(stripes.line) >= LINES - 8  # two lines on either side of each of both jumps
+
+
+def test_two_sheets_are_split_in_their_order():
+    near, far = 100 + 0.1 * X, 180 + 0.05 * X
+    candidates = extract_candidates(drawn((near, 60), (on(0, 300, far), 140)), stripe_along="width", saturation=255)
+    first, second = candidates.split(2)
+    assert np.mean(first.status[:300] == StripeStatus.OK) > 0.99
+    assert (first.status[300:] == StripeStatus.AMBIGUOUS).all()
+    for stripe, place in ((first, near), (second, far)):
+        # Noise of one level on 60: Cramer-Rao bound 0.02 px; more than five times that.
+        assert np.nanmax(np.abs(stripe.centre_px[:300] - place[:300])) < 0.12
+    assert np.isnan(second.centre_px[300:]).all()
+    assert (np.diff(candidates.line) >= 0).all()
+    # The brighter one is so much more certain: the squares of the heights.
+    likelihood = candidates.log_likelihood[candidates.line == 150]
+    assert likelihood[1] / likelihood[0] == pytest.approx((140 / 60) ** 2, rel=0.3)
+    with pytest.raises(RangeError, match="sheets is 0"):
+        candidates.split(0)
+
+
+def test_which_way_is_farther_follows_from_the_sensors_description():
+    sensor = load_sensor("thesis")
+    # Seen from the camera beside the laser, what is farther lies towards the laser's side of the image.
+    assert farther(sensor) == 1

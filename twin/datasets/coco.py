@@ -1,0 +1,95 @@
+"""Masks of a data set as COCO annotations, one JSON file for each split, which any tool for segmentation reads.
+
+Every kind of mask is a category, and every one that an image shows is an annotation of the image: a compressed run
+length encoding of the whole mask with its box and area (https://cocodataset.org/#format-data). ``file_name`` is the
+image's name in the data set: ``train-000000.tar/000012-00.png`` in an archive, ``train-000000.h5/000012-00`` in HDF5.
+"""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from twin.datasets.description import SPLITS, Mask
+from twin.datasets.loading import DataCard, DataSet
+from uwlts.storage.files import written_aside
+
+
+def coco_path(folder: Path, split: str) -> Path:
+    """Path of the annotations of a split."""
+    return folder / f"coco-{split}.json"
+
+
+def write_coco(folder: Path, card: DataCard) -> list[Path]:
+    """Write the annotations of every split with images, whose samples hold masks; the files' paths.
+
+    Images are read one at a time, and annotations written as they come: memory does not grow with the data set.
+    """
+    paths = [coco_path(folder, split) for split in SPLITS if card.frames[split]]
+    for path, split in zip(paths, (split for split in SPLITS if card.frames[split]), strict=True):
+        with written_aside(path, overwrite=True) as aside, open(aside, "w", encoding="utf-8") as file:
+            head = {
+                "info": {"description": card.title, "version": card.versions.get("uwlts", "")},
+                "licenses": [{"id": 1, "name": card.licence, "url": ""}],
+                "categories": [{"id": int(one), "name": str(one.name).lower()} for one in Mask],
+            }
+            file.write(json.dumps(head)[:-1])
+            for key, entries in (("images", _images), ("annotations", _annotations)):
+                file.write(f', "{key}": [')
+                for number, entry in enumerate(entries(folder, card, split)):
+                    file.write((",\n" if number else "\n") + json.dumps(entry))
+                file.write("]")
+            file.write("}\n")
+    return paths
+
+
+def _images(folder: Path, card: DataCard, split: Any) -> Iterator[dict[str, Any]]:
+    names = _names(card, split)
+    for number, sample in enumerate(DataSet(folder, card, split, ("key",))):
+        ending = ".png" if card.file_format == "webdataset" else ""
+        size = {"width": card.image["width_px"], "height": card.image["height_px"]}
+        yield {"id": number, "file_name": f"{names[number]}/{sample['key']}{ending}", "license": 1} | size
+
+
+def _names(card: DataCard, split: Any) -> list[str]:
+    """Name of the shard of each image of a split."""
+    return [shard.name for shard in card.shards if shard.split == split for _ in range(shard.frames)]
+
+
+def _annotations(folder: Path, card: DataCard, split: Any) -> Iterator[dict[str, Any]]:
+    count = 0
+    for image, sample in enumerate(DataSet(folder, card, split, ("mask",))):
+        for kind in Mask:
+            mask = (sample["mask"] & kind) > 0
+            if not mask.any():
+                continue
+            rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+            first = int(columns[0]), int(rows[0])
+            box = [*first, int(columns[-1]) + 1 - first[0], int(rows[-1]) + 1 - first[1]]
+            code = {"size": list(mask.shape), "counts": encoded(mask)}
+            where = {"image_id": image, "category_id": int(kind), "iscrowd": 1}
+            yield {"id": count} | where | {"segmentation": code, "bbox": box, "area": int(mask.sum())}
+            count += 1
+
+
+def encoded(mask: np.ndarray) -> str:
+    """Compressed run length encoding of a mask (H, W), bool, as the COCO API's ``maskApi.c`` writes it.
+
+    Lengths of runs down the columns, of unset pixels first. From the third on the difference from the one two before
+    is written, in groups of five bits, the lowest first, each with a bit for more to come, as characters from "0" on.
+    """
+    flat = np.concatenate([[False], mask.ravel(order="F")])
+    starts = np.flatnonzero(flat[1:] != flat[:-1])
+    runs = np.diff(np.concatenate([[0], starts, [mask.size]]))
+    written = runs.copy()
+    written[3:] -= runs[1:-2]
+    text = []
+    for value in written.tolist():
+        more = True
+        while more:
+            bits, value = value & 31, value >> 5
+            more = value != (-1 if bits & 16 else 0)
+            text.append(chr(48 + (bits | 32 if more else bits)))
+    return "".join(text)

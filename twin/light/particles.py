@@ -1,0 +1,170 @@
+"""Grains and bubbles in the laser sheet: each is seen as a spot of its own, unlike the water's even scattering.
+
+Their places are drawn in the image: a piece of it sees a piece of the sheet, and in its volume so many of them drift.
+A body in the irradiance E that sends the radiant intensity I (W/sr) towards the camera adds as much light to the image
+as a surface of the radiance I / F in one pixel, F being the area square to the ray that a pixel sees there; defocus and
+the body's own size spread it over a disc.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, assert_never
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from twin.backend.arrays import Float, to_jit
+from twin.light.camera import CameraView
+from twin.light.illumination import Light
+from twin.light.pose import SensorPose
+from twin.scene.objects import Objects
+
+Body = Literal["particles", "bubbles"]
+
+_LEAST_MM, _MOST_MM = 0.1, 5.0
+"""Diameters that are resolved one by one; smaller ones are the water's turbidity."""
+_SLOPE = 3.0
+"""N(> d) goes as d^-3 (Bader, J. Geophys. Res. 75, 2822, 1970; Sheldon et al., Limnol. Oceanogr. 17, 327, 1972: equal
+volume in equal logarithmic intervals)."""
+_REFLECTANCE = 0.3
+"""Of the grains' matter, as a diffuse sphere: assumed, aggregates are grey to brownish white."""
+_SIGMAS = 3.0
+"""Bodies farther than so many standard deviations from the sheet's middle are dark."""
+_MOST_BODIES = 50_000
+"""In one image; more of them are a haze."""
+_MARGIN_PX = 20.0
+"""Bodies so far beside the image still reach into it."""
+
+
+@dataclass(frozen=True)
+class Spots:
+    """Bodies seen in an image: places (N,) in px, their light in W/mm2 times pixels, and radii (N,) of their discs."""
+
+    x: np.ndarray
+    y: np.ndarray
+    light: np.ndarray
+    radius_px: np.ndarray
+
+    def drawn(self, height: int, width: int) -> np.ndarray:
+        """Irradiance (H, W), float32, of all spots; a disc's border is as wide as a pixel."""
+        image = np.zeros((height, width), np.float32)
+        for x, y, light, radius in zip(self.x, self.y, self.light, self.radius_px, strict=True):
+            reach = radius + 1
+            first_row, first_column = max(0, math.floor(y - reach)), max(0, math.floor(x - reach))
+            rows = np.arange(first_row, min(height, math.ceil(y + reach) + 1))[:, None]
+            columns = np.arange(first_column, min(width, math.ceil(x + reach) + 1))
+            if rows.size and columns.size:
+                disc = np.clip(radius + 0.5 - np.hypot(rows - y, columns - x), 0, 1)
+                # Of a disc that the border cuts only a part is there.
+                whole = max(math.pi * radius**2, 1.0)
+                image[rows, columns] += light * disc / (max(disc.sum(), whole) if reach > 3 else max(disc.sum(), 1e-9))
+        return image
+
+
+def spots(
+    view: CameraView,
+    light: Light,
+    objects: Objects,
+    pose: SensorPose,
+    *,
+    body: Body,
+    per_litre: float,
+    extinction: Float,
+    wavelength_nm: float,
+    defocus: bool,
+    sparkle: bool,
+    rng: np.random.Generator,
+) -> Spots:
+    """Bodies in a light's sheet as a camera sees them at a pose, ``per_litre`` of them larger than 0.1 mm in diameter.
+
+    Bodies behind and within objects, and in their shadow, are left out. With ``sparkle`` the light of each is that of
+    as many independent grains of speckle as its disc holds (gamma distributed: Goodman, Speckle Phenomena, Sec. 4.6).
+    """
+    camera = view.camera
+    width, height = camera.width_px + 2 * _MARGIN_PX, camera.height_px + 2 * _MARGIN_PX
+
+    def seen(x: np.ndarray, y: np.ndarray, aside: np.ndarray) -> dict[str, np.ndarray]:
+        """Of places in the image: volume (mm3) per pixel, the sheet's light there, and the area that a pixel sees."""
+        at = [(to_jit(mi.Float, x + dx), to_jit(mi.Float, y + dy)) for dx, dy in ((0, 0), (1, 0), (0, 1))]
+        bundles = [view.bundle(*each) for each in at]
+        crossed = [light.crossing(*light.in_own_frame(each.origin, each.direction)) for each in bundles]
+        t, bundle = crossed[0][0], bundles[0]
+        points = [each.origin + each.direction * where for each, (where, _) in zip(bundles, crossed, strict=True)]
+        area = dr.norm(dr.cross(points[1] - points[0], points[2] - points[0]))
+        middle = light.at(mi.Point3f(points[0]))
+        place = mi.Point3f(points[0] + middle.normal * (middle.sigma_mm * to_jit(mi.Float, aside)))
+        lit = light.at(place)
+        hit = objects.scene.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction))
+        free = (bundle.weight > 0) & (t > 0) & (~hit.is_valid() | (t < hit.t)) & (lit.irradiance > 0)
+        free &= light.reaches(objects.scene, place, lit, None, free)
+        volume = dr.select(free, area * 2 * _SIGMAS * middle.sigma_mm, 0.0)
+        across = area * dr.abs(dr.dot(bundle.direction, middle.normal))
+        cosine = dr.dot(lit.direction, -bundle.direction)
+        gathered = bundle.weight * lit.irradiance * dr.exp(-extinction * t)
+        depth = view.depth_mm(mi.Point3f(points[0]))
+        values = {"volume": volume, "light": gathered, "across": across, "cosine": cosine, "depth": depth}
+        dr.eval(*values.values())
+        return {name: value.numpy().astype(float) for name, value in values.items()}
+
+    # The largest volume per pixel, found on a coarse grid, limits how many places are tried.
+    x, y = (g.ravel() for g in np.meshgrid(np.linspace(0, 1, 24) * width, np.linspace(0, 1, 24) * height))
+    coarse = seen(x - _MARGIN_PX, y - _MARGIN_PX, np.zeros_like(x))["volume"]
+    if not coarse.any():
+        return Spots(*(np.zeros(0) for _ in range(4)))
+    largest = 1.5 * coarse.max()
+    tried = min(rng.poisson(1e-6 * per_litre * largest * width * height), _MOST_BODIES)
+    # Never none, which would take kernels of their own.
+    x, y = (rng.uniform(-_MARGIN_PX, side - _MARGIN_PX, max(tried, 2)) for side in (width, height))
+    found = seen(x, y, rng.uniform(-_SIGMAS, _SIGMAS, len(x)))
+    kept = (rng.uniform(0, largest, len(x)) < found["volume"]) & (np.arange(len(x)) < tried)
+    x, y, found = x[kept], y[kept], {name: values[kept] for name, values in found.items()}
+    below = 1 - (_LEAST_MM / _MOST_MM) ** _SLOPE
+    diameter = _LEAST_MM * (1 - below * rng.random(len(x))) ** (-1 / _SLOPE)
+    match body:
+        case "particles":
+            share, shown = diffuse_sphere(found["cosine"]), diameter
+        case "bubbles":
+            # A glint, much smaller than the bubble.
+            share, shown = bubble(found["cosine"]), np.zeros_like(diameter)
+        case _:
+            assert_never(body)
+    intensity = share * np.square(diameter / 2)
+    blur = view.blur_radius_px(found["depth"]) if defocus else 0.0
+    size_px = 0.5 * shown / np.sqrt(np.maximum(found["across"], 1e-12))
+    light_seen, radius = found["light"] * intensity / np.maximum(found["across"], 1e-12), np.hypot(size_px, blur)
+    if sparkle:
+        working = camera.f_number * (1 + camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm))
+        grain_px = 1e-3 * wavelength_nm * working / camera.pixel_size_um
+        grains = np.maximum(1.0, math.pi * np.square(radius / grain_px))
+        light_seen = light_seen * rng.gamma(grains) / grains
+    return Spots(x, y, light_seen, radius)
+
+
+def diffuse_sphere(cosine: np.ndarray) -> np.ndarray:
+    """Radiant intensity in 1/sr of a diffuse sphere per irradiance and squared radius.
+
+    2 / 3 rho (sin a + (pi - a) cos a) / pi, a being the angle between the directions to the light and to the viewer,
+    whose negative cosine is that of scattering (Lambert's sphere: H. N. Russell, Astrophys. J. 43, 173, 1916).
+    ``cosine`` is that between the light's direction and that to the viewer, i.e. of scattering.
+    """
+    angle = np.pi - np.arccos(np.clip(cosine, -1, 1))
+    return 2 / 3 * _REFLECTANCE * (np.sin(angle) + (np.pi - angle) * np.cos(angle)) / np.pi
+
+
+def bubble(cosine: np.ndarray, *, index: float = 1.33) -> np.ndarray:
+    """Radiant intensity in 1/sr that an air bubble reflects, per irradiance and squared radius.
+
+    A reflecting sphere sends R / 4 into every direction (Davis, J. Opt. Soc. Am. 45, 572, 1955), with Fresnel's R of
+    its surface at the angle of incidence (180 deg - scattering) / 2: all is reflected up to a scattering angle of some
+    83 deg. ``cosine`` is that of the scattering angle. What passes through the bubble is left out.
+    """
+    incidence = (np.pi - np.arccos(np.clip(cosine, -1, 1))) / 2
+    inside = index * np.sin(incidence)
+    cos_in, cos_out = np.cos(incidence), np.sqrt(np.maximum(1 - np.square(inside), 0))
+    square = (index * cos_in - cos_out) / (index * cos_in + cos_out)
+    parallel = (cos_in - index * cos_out) / (cos_in + index * cos_out)
+    reflected = np.where(inside >= 1, 1.0, 0.5 * (np.square(square) + np.square(parallel)))
+    return reflected / 4

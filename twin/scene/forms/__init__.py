@@ -1,0 +1,16 @@
+"""Objects of forms that are known in closed form, as fine triangle meshes; they face -z, towards the sensor.
+
+A new one is a module with its description, its formula and its triangles, and an entry of `AnyForm`.
+"""
+
+from twin.scene.forms.flange import Flange
+from twin.scene.forms.head import Head
+from twin.scene.forms.lines import Cable, Rope
+from twin.scene.forms.overgrown_pipe import OvergrownPipe
+from twin.scene.forms.pitted_pipe import PittedPipe
+from twin.scene.forms.seabed import Seabed
+from twin.scene.forms.weld import Weld
+
+AnyForm = Cable | Flange | Head | OvergrownPipe | PittedPipe | Rope | Seabed | Weld
+
+__all__ = ["AnyForm", "Cable", "Flange", "Head", "OvergrownPipe", "PittedPipe", "Rope", "Seabed", "Weld"]

@@ -1,0 +1,162 @@
+"""A pipe flange: a ring with a circle of bolt holes, some of them with bolts, and a face that is not quite flat."""
+
+from itertools import pairwise
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy.spatial import Delaunay
+
+from twin.scene.forms.triangles import quads, require_few, step_of
+from twin.scene.placed import FreeForm
+from uwlts.model.sensor import NotNegative, Positive
+
+_SAG_MM = 0.004
+"""Largest distance of the facets' corners and sides from the round edges and the face."""
+_EMBEDDED_MM = 0.5
+"""Part of a bolt's head that lies behind the face, which need not be flat there; also the least `thickness_mm`."""
+
+
+class Flange(FreeForm):
+    """A flange in its own x-y plane about its own origin; its face lies at z = 0 and faces -z, the ring is behind it.
+
+    ``holes`` holes lie evenly on the bolt circle, the first ``first_hole_deg`` from x towards y; the first ``bolts`` of
+    them carry hexagonal heads of ``head_width_mm`` across flats, standing ``head_height_mm`` before the face, two flats
+    square to the radius. The face is a saddle, ``flatness_mm`` from its lowest to its highest point
+    (`flange_face`).
+    """
+
+    kind: Literal["flange"]
+    outer_diameter_mm: Positive = 165.0
+    bore_diameter_mm: Positive = 62.0
+    thickness_mm: Annotated[float, Field(ge=_EMBEDDED_MM)] = 18.0
+    bolt_circle_mm: Positive = 125.0
+    holes: Annotated[int, Field(ge=0, le=200)] = 4
+    hole_diameter_mm: Positive = 18.0
+    first_hole_deg: float = 45.0
+    bolts: Annotated[int, Field(ge=0, le=200)] = 0
+    head_width_mm: Positive = 24.0
+    head_height_mm: Positive = 10.0
+    flatness_mm: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _has_room(self) -> Self:
+        if self.bore_diameter_mm >= self.outer_diameter_mm:
+            raise ValueError(
+                f"bore_diameter_mm {self.bore_diameter_mm:g} is not smaller than outer_diameter_mm "
+                f"{self.outer_diameter_mm:g}"
+            )
+        if self.flatness_mm > _EMBEDDED_MM:
+            raise ValueError(f"flatness_mm {self.flatness_mm:g} is more than {_EMBEDDED_MM:g}")
+        if self.holes and self.land_mm() <= 0:
+            raise ValueError(
+                f"{self.holes} holes of hole_diameter_mm {self.hole_diameter_mm:g} on a bolt_circle_mm of "
+                f"{self.bolt_circle_mm:g} touch each other, the bore of {self.bore_diameter_mm:g} or the rim of "
+                f"{self.outer_diameter_mm:g}"
+            )
+        if self.bolts > self.holes:
+            raise ValueError(f"bolts is {self.bolts}, for {self.holes} holes")
+        if self.bolts and self.head_width_mm <= self.hole_diameter_mm:
+            raise ValueError(
+                f"head_width_mm {self.head_width_mm:g} falls through a hole_diameter_mm of {self.hole_diameter_mm:g}"
+            )
+        return self
+
+    def land_mm(self) -> float:
+        """Least width of material between a hole and the next one, the bore or the rim."""
+        circle, hole = self.bolt_circle_mm / 2, self.hole_diameter_mm / 2
+        to_next = 2 * circle * np.sin(np.pi / self.holes) - 2 * hole if self.holes > 1 else np.inf
+        edges = circle - hole - self.bore_diameter_mm / 2, self.outer_diameter_mm / 2 - circle - hole
+        return float(min(to_next, *edges))
+
+    def hole_places(self) -> np.ndarray:
+        """Middles (holes, 2) of the bolt holes in the flange's own x-y plane, in mm."""
+        angle = np.radians(self.first_hole_deg) + 2 * np.pi * np.arange(self.holes) / max(self.holes, 1)
+        return self.bolt_circle_mm / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    def triangles(self) -> tuple[np.ndarray, np.ndarray]:
+        """The closed surface of the ring, and those of the bolts' heads, each closed on its own.
+
+        Facets deviate from the round edges and from `flange_face` by `_SAG_MM`. DescriptionError where holes so close
+        together on so large a ring need too many vertices.
+        """
+        flat, faces, circles = self._ring()
+        z = flange_face(self, *flat.T, edges=True)
+        count = len(flat)
+        solid = [np.c_[flat, z], np.c_[flat, np.full(count, self.thickness_mm)]]
+        # Seen from before, anticlockwise in x and y is clockwise.
+        parts = [faces[:, ::-1], faces + count]
+        for number, circle in enumerate(circles):
+            beside = np.roll(circle, -1)
+            wall = quads(circle, beside, beside + count, circle + count)
+            parts.append(wall if number == 0 else wall[:, ::-1])
+        corners, count = np.concatenate(solid), 2 * count
+        for x, y in self.hole_places()[: self.bolts]:
+            vertices, hexagon = self._head(x, y)
+            parts.append(hexagon + count)
+            corners, count = np.concatenate([corners, vertices]), count + len(vertices)
+        return corners, np.concatenate(parts)
+
+    def _ring(self) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+        """Vertices (V, 2) of the plane ring, faces (F, 3), and the vertices of its round edges, the rim first.
+
+        Delaunay's triangles keep a circle's chords where no other vertex is nearer than they are long.
+        """
+        outer, bore, hole = (d / 2 for d in (self.outer_diameter_mm, self.bore_diameter_mm, self.hole_diameter_mm))
+        width = min(self.land_mm(), outer - bore) if self.holes else outer - bore
+        # The saddle's second derivative is flatness / R^2, far less than that of the edges.
+        rings = [((0.0, 0.0), outer), ((0.0, 0.0), bore), *(((x, y), hole) for x, y in self.hole_places())]
+        edges, steps = [], []
+        for middle, radius in rings:
+            steps.append(min(step_of(_SAG_MM, 1 / radius), 0.5 * width))
+            angle = np.linspace(0, 2 * np.pi, max(24, int(np.ceil(2 * np.pi * radius / steps[-1]))), endpoint=False)
+            edges.append(np.array(middle) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+        coarse = max(steps)
+        require_few(
+            int(np.pi * outer**2 / coarse**2) + sum(map(len, edges)), step_mm=coarse, advice="leave more between holes"
+        )
+        x, y = np.meshgrid(*[np.arange(-outer, outer, coarse)] * 2)
+        # Every second row is shifted by half a step.
+        inner = np.stack([x + 0.5 * coarse * (np.arange(len(x)) % 2)[:, None], y], axis=-1).reshape(-1, 2)
+        kept = np.hypot(*inner.T) < outer - coarse
+        for ((x, y), radius), step in zip(rings[1:], steps[1:], strict=True):
+            kept &= np.hypot(inner[:, 0] - x, inner[:, 1] - y) > radius + step
+        points = np.concatenate([*edges, inner[kept]])
+        faces = Delaunay(points).simplices
+        a, b, c = (points[faces[:, k]] for k in range(3))
+        turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+        faces = np.where(turn[:, None] > 0, faces, faces[:, ::-1])
+        # A facet in a hole has its corners on the hole's edge, as nothing else lies in there.
+        first = np.cumsum([0, *map(len, edges)])
+        holes = [(faces >= low) & (faces < high) for low, high in pairwise(first[1:])]
+        filled = np.any([every.all(axis=1) for every in holes], axis=0)
+        return (
+            points,
+            faces[~filled & (np.abs(turn) > 1e-12)],
+            [np.arange(low, high) for low, high in pairwise(first)],
+        )
+
+    def _head(self, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices (12, 3) and faces of a hexagonal head over a hole."""
+        angle = np.arctan2(y, x) + np.pi / 6 + np.pi / 3 * np.arange(6)
+        edge = np.array([x, y]) + self.head_width_mm / np.sqrt(3) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        vertices = np.concatenate([np.c_[edge, np.full(6, z)] for z in (-self.head_height_mm, _EMBEDDED_MM)])
+        ring = np.arange(6)
+        fan = np.stack([np.zeros(4, int), ring[1:5], ring[2:6]], axis=1)
+        sides = quads(ring, np.roll(ring, -1), np.roll(ring, -1) + 6, ring + 6)
+        return vertices, np.concatenate([fan[:, ::-1], fan + 6, sides])
+
+
+def flange_face(flange: Flange, x: np.ndarray, y: np.ndarray, *, edges: bool = False) -> np.ndarray:
+    """Position z in mm of a flange's face at places ``x``, ``y`` (N,) of its own frame; NaN where there is no face.
+
+    z = flatness / 2 (r / R)^2 cos(2 angle), with the rim's radius R: a saddle, whose least-squares plane is z = 0 and
+    whose rim touches two parallel planes ``flatness_mm`` apart in two points each. ``edges`` gives values beyond its
+    edges too. Bolts stand before it.
+    """
+    z = 0.5 * flange.flatness_mm * (np.square(x) - np.square(y)) / (flange.outer_diameter_mm / 2) ** 2
+    radius = np.hypot(x, y)
+    on = (radius <= flange.outer_diameter_mm / 2) & (radius >= flange.bore_diameter_mm / 2)
+    for at_x, at_y in flange.hole_places():
+        on &= np.hypot(x - at_x, y - at_y) >= flange.hole_diameter_mm / 2
+    return np.where(on | edges, z, np.nan)

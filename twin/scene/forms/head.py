@@ -1,0 +1,112 @@
+"""A dummy head with the stub of its neck."""
+
+from typing import Literal
+
+import numpy as np
+
+from twin.scene.forms.triangles import quads
+from twin.scene.placed import FreeForm
+from uwlts.model.sensor import Positive
+
+# Unit of the head's tables is its height, from the neck's cut at y = -0.5 to the crown at 0.5.
+# Bodies of half-ellipses, front and back, about the y axis: y of the middle, half height, flatness of the ends, half
+# width, front, back.
+_BODIES = np.array(
+    [
+        (0.150, 0.350, 2.0, 0.285, 0.330, 0.340),  # skull
+        (-0.110, 0.285, 3.0, 0.220, 0.325, 0.150),  # jaw
+        (-0.550, 0.450, 6.0, 0.135, 0.130, 0.200),  # neck
+    ]
+)
+_UNION_POWER = 6
+# Gaussian hills on the face: x (with its mirror image, where it is not 0), y, their sigmas, and how far they stand out.
+_FEATURES = np.array(
+    [
+        (0.090, 0.155, 0.055, 0.025, 0.018),  # brows
+        (0.095, 0.090, 0.042, 0.030, -0.050),  # sockets
+        (0.095, 0.084, 0.026, 0.020, 0.032),  # eyes
+        (0.150, -0.015, 0.045, 0.040, 0.022),  # cheekbones
+        (0.105, -0.120, 0.040, 0.050, -0.016),  # cheeks
+        (0.000, 0.080, 0.024, 0.045, 0.024),  # bridge of the nose
+        (0.000, 0.010, 0.024, 0.045, 0.055),  # its ridge
+        (0.000, -0.060, 0.028, 0.030, 0.085),  # its tip
+        (0.036, -0.072, 0.020, 0.022, 0.034),  # its wings
+        (0.000, -0.163, 0.042, 0.015, 0.020),  # upper lip
+        (0.000, -0.205, 0.038, 0.016, 0.022),  # lower lip
+        (0.000, -0.290, 0.045, 0.032, 0.035),  # chin
+    ]
+)
+_ROWS, _COLUMNS, _FINER_IN_FRONT = 900, 640, 0.45
+"""Facets of a head: rows from crown to neck, columns round it, and how much finer than even these are on the face."""
+
+
+class Head(FreeForm):
+    """A dummy head with the stub of its neck, about its own origin; its face looks along -z, its crown lies at +y.
+
+    ``height_mm`` runs from the neck's cut to the crown.
+    """
+
+    kind: Literal["head"]
+    height_mm: Positive = 160.0
+
+    def triangles(self) -> tuple[np.ndarray, np.ndarray]:
+        """A closed surface; everything is in proportion to its height: 0.57 wide, and 0.79 from nose to back."""
+        return _triangles(self.height_mm)
+
+
+def head_depth(x: np.ndarray, y: np.ndarray, *, height_mm: float) -> np.ndarray:
+    """Position of a head's front along z at places ``x``, ``y`` (N,), all in mm; NaN beside its outline."""
+    x, y = x / height_mm, y / height_mm
+    half_width, front, _ = _outline(y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        facing = np.sqrt(1 - np.square(x / half_width))
+    return height_mm * np.where(np.abs(y) <= 0.5, _front(x, y, front, facing), np.nan)
+
+
+def _triangles(height_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """A dummy head with the stub of its neck: vertices (V, 3) in mm and faces (F, 3) of a closed surface.
+
+    The y axis runs from the neck through the middle of the skull to the crown; the face looks along -z. ``height_mm``
+    is the whole height; everything else is in proportion: 0.57 wide, and 0.79 from nose to back.
+    """
+    # Rows at equal distances along the front's outline, from the crown, where it is level, to the neck.
+    y = 0.5 - np.square(np.linspace(0, 1, 20 * _ROWS))
+    way = np.concatenate([[0], np.cumsum(np.hypot(np.diff(y), np.diff(_outline(y)[1])))])
+    y = np.interp(np.linspace(0, way[-1], _ROWS + 1), way, y)[1:, None]
+    angle = np.linspace(-np.pi, np.pi, _COLUMNS, endpoint=False)
+    angle = angle - _FINER_IN_FRONT * np.sin(angle)
+    half_width, front, back = _outline(y)
+    x, facing = half_width * np.sin(angle), np.broadcast_to(np.cos(angle), (_ROWS, _COLUMNS))
+    z = np.where(facing > 0, _front(x, y, front, facing), -back * facing)
+    sides = np.stack([x, np.broadcast_to(y, x.shape), z], axis=-1).reshape(-1, 3)
+
+    ring = np.arange(_COLUMNS)
+    corner = (np.arange(_ROWS - 1)[:, None] * _COLUMNS + ring).ravel()
+    beside = (np.arange(_ROWS - 1)[:, None] * _COLUMNS + np.roll(ring, -1)).ravel()
+    crown, cut = len(sides), len(sides) + 1
+    last = crown - _COLUMNS + ring
+    faces = np.concatenate(
+        [
+            quads(corner, beside, beside + _COLUMNS, corner + _COLUMNS),
+            np.stack([np.full_like(ring, crown), np.roll(ring, -1), ring], axis=1),
+            np.stack([np.full_like(ring, cut), last, np.roll(last, -1)], axis=1),
+        ]
+    )
+    return height_mm * np.concatenate([sides, [[0, 0.5, 0], [0, -0.5, 0]]]), faces
+
+
+def _outline(y: np.ndarray) -> np.ndarray:
+    """Half width, front and back (3, ...) of the head's bodies at heights y (...), melted into each other."""
+    middle, half, flatness, *radii = (column[:, *[None] * np.ndim(y)] for column in _BODIES.T)
+    share = np.sqrt(np.maximum(1 - np.abs((y - middle) / half) ** flatness, 0))
+    return np.stack([np.sum((radius * share) ** _UNION_POWER, axis=0) ** (1 / _UNION_POWER) for radius in radii])
+
+
+def _front(x: np.ndarray, y: np.ndarray, front: np.ndarray, facing: np.ndarray) -> np.ndarray:
+    """Depth z of the face; ``facing`` (1 in the middle, 0 at the sides) fades the features out."""
+    relief = sum(
+        height * np.exp(-0.5 * (np.square((x - side * at_x) / sigma_x) + np.square((y - at_y) / sigma_y)))
+        for at_x, at_y, sigma_x, sigma_y, height in _FEATURES
+        for side in ((1, -1) if at_x else (1,))
+    )
+    return -front * facing - relief * np.square(facing)

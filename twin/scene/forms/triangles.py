@@ -1,0 +1,96 @@
+"""Triangles between vertices that lie on smooth functions, whose facets cut corners by a known distance."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from uwlts.model.errors import DescriptionError
+
+_MOST_VERTICES = 4_000_000
+
+
+def require_few(vertices: int, *, step_mm: float, advice: str) -> None:
+    """DescriptionError where a surface in such steps needs more vertices than memory is meant for."""
+    if vertices > _MOST_VERTICES:
+        raise DescriptionError(
+            f"a surface in steps of {step_mm:.3g} mm needs {vertices} vertices, more than {_MOST_VERTICES}: {advice}"
+        )
+
+
+def step_of(sag_mm: float, curvature: float) -> float:
+    """Step in mm over which a chord deviates by ``sag_mm`` from a curve of a second derivative ``curvature`` (1/mm).
+
+    A chord over a step h deviates by c h^2 / 8.
+    """
+    return float(np.sqrt(8 * sag_mm / curvature))
+
+
+def tube(x: np.ndarray, around: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and faces (F, 3) of a tube about the x axis that is open at its ends.
+
+    ``x`` (N,) are places along it, ``around`` (M,) angles from -z towards y over one turn, ``radius`` (N, M).
+    """
+    places = np.broadcast_to(x[:, None], radius.shape), radius * np.sin(around), -radius * np.cos(around)
+    corner = np.arange(radius.size).reshape(radius.shape)
+    beside = np.roll(corner, -1, axis=1)
+    faces = quads(*(part.ravel() for part in (corner[:-1], beside[:-1], beside[1:], corner[1:])))
+    return np.stack(places, axis=-1).reshape(-1, 3), faces
+
+
+def grid_faces(shape: tuple[int, int]) -> np.ndarray:
+    """Triangles (F, 3) between the vertices of a grid (rows, columns), numbered row by row."""
+    corner = np.arange(shape[0] * shape[1]).reshape(shape)
+    return quads(*(part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1])))
+
+
+def quads(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Triangles (2 N, 3) of quadrangles whose corners (N,) run round in this order."""
+    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+
+
+def nodes(middles: Iterable[float], reach: float, *, step: float, length: float) -> np.ndarray:
+    """Places of vertices along one side of the plate: fine up to ``reach`` from each middle, none on flat ground."""
+    count = int(np.ceil(2 * reach / step)) + 1
+    fine = [np.linspace(middle - reach, middle + reach, count) for middle in middles]
+    return np.unique(np.concatenate([[-0.5 * length, 0.5 * length], *fine]))
+
+
+def wave(place: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A smooth irregular function between -1 and 1, with waves of 2 to 8 units of ``place``."""
+    frequency, phase = rng.uniform(1 / 8, 1 / 2, 4), rng.uniform(0, 2 * np.pi, 4)
+    return np.mean([np.sin(2 * np.pi * f * place + p) for f, p in zip(frequency, phase, strict=True)], axis=0)
+
+
+def waves(
+    places: np.ndarray, rng: np.random.Generator, *, shortest: float, longest: float, count: int = 24
+) -> np.ndarray:
+    """A smooth irregular function between -1 and 1 at ``places`` (D, ...): plane waves of all directions.
+
+    Their wavelengths, from ``shortest`` to ``longest``, are evenly spread over the logarithm, and their amplitudes grow
+    with them, as on natural surfaces, which look alike at every scale.
+    """
+    direction = rng.normal(size=(count, len(places)))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    wavelength, phase = np.geomspace(shortest, longest, count), rng.uniform(0, 2 * np.pi, count)
+    total = np.zeros(places.shape[1:])
+    for towards, length, at in zip(direction, wavelength, phase, strict=True):
+        total += length * np.cos(2 * np.pi / length * np.tensordot(towards, places, axes=1) + at)
+    return total / wavelength.sum()
+
+
+def bowed_plate(
+    first_mm: np.ndarray, last_mm: np.ndarray, *, bow_mm: float, cells: int = 64
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices (V, 3), faces (F, 3) and uv (V, 2) of a plate between two opposite corners (2,) that faces -z.
+
+    Its middle stands ``bow_mm`` before its corners, as on a sphere. uv run from 0 to 1 along x and against y.
+    """
+    (width, height), middle = last_mm - first_mm, (first_mm + last_mm) / 2
+    u, v = np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1))
+    x, y = (u - 0.5) * width, (0.5 - v) * height
+    z = bow_mm * (x**2 + y**2) / (0.25 * (width**2 + height**2))
+    return (
+        np.stack([middle[0] + x, middle[1] + y, z], -1).reshape(-1, 3),
+        grid_faces(x.shape),
+        np.stack([u, v], -1).reshape(-1, 2),
+    )

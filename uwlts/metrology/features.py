@@ -1,0 +1,265 @@
+"""Features of an inspected object: their values with uncertainty, their place in the cloud, and their definitions."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from uwlts.model.sensor import Table
+
+COVERAGE = 0.95
+"""Coverage probability of the intervals of all values."""
+COVERAGE_FACTOR = 1.96
+"""Standard normal quantile of (1 + COVERAGE) / 2."""
+
+
+class FeatureKind(StrEnum):
+    """Kind of a feature; a section is one across a pipe."""
+
+    PIPE = "pipe"
+    SECTION = "section"
+    PIT = "pit"
+    DENT = "dent"
+    PROTRUSION = "protrusion"
+    WELD = "weld"
+    STEP = "step"
+    FLANGE = "flange"
+    HOLE = "hole"
+    GAP = "gap"
+
+
+@dataclass(frozen=True)
+class Definition:
+    """What a value of a feature is, and the document that defines it or the quantity that it serves."""
+
+    unit: str
+    text: str
+    source: str
+
+
+_GAUSSIAN = "ISO 14405-1 (GG), least squares"
+_OUT_OF_ROUND = "DNV-ST-F101, out of roundness"
+_UNDERCUT = "ISO 5817, 5011"
+_B31G = "ASME B31G"
+_BLEMISH = {
+    "depth": Definition("mm", "greatest depth below the undamaged surface, interpolated from around it", _B31G + ", d"),
+    "edge depth": Definition("mm", "depth of the contour that bounds length, width and area", "this project"),
+    "length": Definition("mm", "extent of the contour along the pipe's axis", _B31G + ", L"),
+    "width": Definition("mm", "extent of the contour along the circumference", "POF 100, width"),
+    "area": Definition("mm2", "area within the contour, on the surface", "this project"),
+    "lost area": Definition(
+        "mm2",
+        "area of metal lost in the axial plane: at each place along the axis the greatest depth, summed",
+        _B31G + " (river-bottom profile), A",
+    ),
+    "remaining wall": Definition("mm", "wall thickness given less the depth", _B31G + ", t - d"),
+}
+
+DEFINITIONS: dict[FeatureKind, dict[str, Definition]] = {
+    FeatureKind.PIPE: {
+        "diameter": Definition("mm", "mean diameter of the sections", _GAUSSIAN),
+        "ovality": Definition("mm", "largest less smallest diameter of the elliptic part", _OUT_OF_ROUND),
+        "ovality share": Definition("%", "ovality over the diameter", "DNV-ST-F101, f0"),
+        "straightness": Definition(
+            "mm", "largest distance of two sections' centres across their line, by the axis's bow", "ISO 12780-1, STRt"
+        ),
+        "axis place 1": Definition("mm", "place of the axis along the feature's first axis", _GAUSSIAN),
+        "axis place 2": Definition("mm", "place of the axis along the feature's second axis", _GAUSSIAN),
+        "axis slope 1": Definition("deg", "angle from the stated axis towards the feature's first axis", _GAUSSIAN),
+        "axis slope 2": Definition("deg", "angle from the stated axis towards the feature's second axis", _GAUSSIAN),
+    },
+    FeatureKind.SECTION: {
+        "diameter": Definition("mm", "mean diameter of the section", _GAUSSIAN),
+        "ovality": Definition("mm", "largest less smallest diameter of the elliptic part", _OUT_OF_ROUND),
+        "ovality angle": Definition("deg", "direction of the largest diameter, from the first axis", "this project"),
+    },
+    FeatureKind.PIT: _BLEMISH,
+    FeatureKind.DENT: _BLEMISH,
+    FeatureKind.PROTRUSION: {
+        "height": Definition("mm", "greatest height above the surface around it", "this project"),
+        **{name: _BLEMISH[name] for name in ("edge depth", "length", "width", "area")},
+    },
+    FeatureKind.WELD: {
+        "height": Definition(
+            "mm", "greatest height above the line between both plates, mean of the sections", "ISO 5817, 502"
+        ),
+        "largest height": Definition("mm", "the same in the highest section", "ISO 5817, 502"),
+        "width": Definition("mm", "distance of the toes, median of the sections", "ISO 5817, 502, b"),
+        "undercut left": Definition("mm", "depth of the groove at the left toe, mean along the weld", _UNDERCUT),
+        "undercut right": Definition("mm", "depth of the groove at the right toe, mean along the weld", _UNDERCUT),
+        "largest undercut": Definition("mm", "depth of the groove where it is deepest", "ISO 5817, 5012"),
+        "toe angle left": Definition(
+            "deg", "180 deg less the slope of the flank from 10 to 50 % height, median", "ISO 5817, 505"
+        ),
+        "toe angle right": Definition("deg", "the same at the right toe", "ISO 5817, 505"),
+        "misalignment": Definition("mm", "offset of the plates in the middle of the weld", "ISO 5817, 507"),
+    },
+    FeatureKind.STEP: {
+        "height": Definition("mm", "distance of the upper face from the lower one's plane", "ISO 5436-1, type A"),
+        "parallelism": Definition("deg", "angle between both faces", "ISO 1101"),
+    },
+    FeatureKind.FLANGE: {
+        "flatness": Definition("mm", "range of the smoothed face about its least-squares plane", "ISO 12781-1, FLTt"),
+        "bolt circle": Definition("mm", "diameter of the circle through the holes' centres", "ASME B16.5"),
+        "bore": Definition("mm", "diameter of the face's inner edge", "ASME B16.5"),
+        "parallelism": Definition("deg", "angle between the face and the datum that was given", "ISO 1101"),
+    },
+    FeatureKind.HOLE: {
+        "diameter": Definition("mm", "diameter of the circle through the edge", _GAUSSIAN),
+        "position": Definition("mm", "distance of the centre from its place on an even bolt circle", "ISO 5458"),
+    },
+    FeatureKind.GAP: {
+        "width": Definition("mm", "mean distance of the two edges", "VDA gap and flush"),
+        "parallelism": Definition("deg", "angle between the two edges", "ISO 1101"),
+        "flush": Definition("mm", "offset of the two faces in the middle of the gap", "VDA gap and flush"),
+    },
+}
+"""Definitions of all values by kind of feature and name."""
+
+
+@dataclass(frozen=True)
+class FeatureValue:
+    """A value of a feature in its definition's unit.
+
+    Attributes
+    ----------
+    name, unit : str
+    value : float
+    random : float
+        Standard uncertainty by noise of the points and positions of the stage.
+    systematic : float or None
+        Standard uncertainty by what is common to all points; None where the cloud does not state it.
+    low, high : float
+        Ends of the 95 % coverage interval; never below zero for values that cannot be negative.
+    """
+
+    name: str
+    value: float
+    unit: str
+    random: float
+    systematic: float | None
+    low: float
+    high: float
+
+    @property
+    def uncertainty(self) -> float:
+        """Combined standard uncertainty, of what is known."""
+        return float(np.hypot(self.random, self.systematic or 0.0))
+
+    def text(self) -> str:
+        """Name, value and half of the interval in words."""
+        return f"{self.name} {self.value:.4g} ({self.low:.4g} to {self.high:.4g}) {self.unit}"
+
+
+@dataclass(frozen=True, eq=False)
+class Feature:
+    """A feature that was found.
+
+    Attributes
+    ----------
+    kind : FeatureKind
+    name : str
+        Unique in its inspection, such as "pit 3".
+    values : tuple of FeatureValue
+        By the names in ``DEFINITIONS[kind]``, which hold unit, text and source of each.
+    place_mm : (3,) float64
+        Its middle, in the cloud's frame; of a pit the deepest place.
+    axes : (3, 3) float64
+        Unit directions in rows, in the cloud's frame: along its length, its width, and outwards. Of a pipe and a
+        section two directions across the axis, then the axis.
+    extent_mm : (3,) float64
+        Its size along these.
+    points : (K,) int
+        Indices of its points in the cloud.
+    false_alarm : float or None
+        Probability that noise alone gives so clear an indication anywhere on the inspected area; None where nothing
+        had to be detected.
+    """
+
+    kind: FeatureKind
+    name: str
+    values: tuple[FeatureValue, ...]
+    place_mm: np.ndarray
+    axes: np.ndarray
+    extent_mm: np.ndarray
+    points: np.ndarray
+    false_alarm: float | None = None
+
+    def __getitem__(self, name: str) -> FeatureValue:
+        """The value of a name; KeyError where the feature has none."""
+        for value in self.values:
+            if value.name == name:
+                return value
+        raise KeyError(f"{self.name} has no {name}: {', '.join(value.name for value in self.values)}")
+
+    def __contains__(self, name: str) -> bool:
+        return any(value.name == name for value in self.values)
+
+    def record(self) -> Table:
+        """The feature as JSON, with the number of its points."""
+        defined = DEFINITIONS[self.kind]
+        return {
+            "kind": str(self.kind),
+            "name": self.name,
+            "values": {
+                v.name: {
+                    "value": v.value,
+                    "unit": v.unit,
+                    "random": v.random,
+                    "systematic": v.systematic,
+                    "low": v.low,
+                    "high": v.high,
+                    "definition": defined[v.name].text,
+                    "source": defined[v.name].source,
+                }
+                for v in self.values
+            },
+            "place_mm": self.place_mm.tolist(),
+            "axes": self.axes.tolist(),
+            "extent_mm": self.extent_mm.tolist(),
+            "points": len(self.points),
+            "false_alarm": self.false_alarm,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """What an inspection found in a cloud.
+
+    Attributes
+    ----------
+    kind : str
+        What was looked for: "pipe", "weld", "step", "flange" or "gap".
+    features : tuple of Feature
+        The whole first, then its parts.
+    deviation_mm : (N,) float64
+        Distance of every point of the cloud from the undamaged surface, positive outwards; NaN where it was left out.
+    level_mm : (N,) float64
+        Depth from which an indication of the smallest size counts at that point; NaN where none is looked for.
+    notes : tuple of str
+        What limits the result, for its reader.
+    """
+
+    kind: str
+    features: tuple[Feature, ...]
+    deviation_mm: np.ndarray
+    level_mm: np.ndarray
+    notes: tuple[str, ...] = ()
+
+    def of(self, *kinds: FeatureKind) -> tuple[Feature, ...]:
+        """The features of some kinds."""
+        return tuple(feature for feature in self.features if feature.kind in kinds)
+
+    def record(self) -> Table:
+        """Features and notes as JSON."""
+        return {
+            "kind": self.kind,
+            "coverage": COVERAGE,
+            "features": [feature.record() for feature in self.features],
+            "notes": list(self.notes),
+        }
+
+    def lines(self) -> list[str]:
+        """The inspection as text: one line for each feature."""
+        lines = [f"{each.name:16}{', '.join(value.text() for value in each.values)}" for each in self.features]
+        return [*lines, *(f"note: {note}" for note in self.notes)]

@@ -1,0 +1,303 @@
+"""The surface near any place, by points about it: oriented normals, and curved patches weighted by covariance.
+
+A patch is a paraboloid over the plane of a normal, fitted by moving least squares (Levin, Math. Comp. 67, 1998) to the
+points on the same side of a wall. Its height at the place is linear in the points, so that its uncertainty follows from
+theirs by propagation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from uwlts.runtime.compiled import compiled
+
+_SAME_SIDE = 0.5
+"""Cosine of the angle between normals up to which points lie on the same side of a wall or an edge: 60 deg."""
+_FEWEST = 8
+"""Points of a patch, which has six coefficients."""
+_MOST_IMAGES = 256
+_TERMS = 6
+
+
+class PointGrid:
+    """Points (N, 3) sorted into cubes, for all those near a place."""
+
+    def __init__(self, points_mm: np.ndarray, cell_mm: float):
+        self.cell_mm = cell_mm
+        self.low = points_mm.min(axis=0) - cell_mm
+        cells = np.floor((points_mm - self.low) / cell_mm).astype(np.int64)
+        # A border of empty cubes, so that neighbours never wrap around.
+        self.shape = cells.max(axis=0) + 2
+        keys = (cells[:, 0] * self.shape[1] + cells[:, 1]) * self.shape[2] + cells[:, 2]
+        self.order = np.argsort(keys, kind="stable")
+        self.keys = keys[self.order]
+        self.points_mm = np.ascontiguousarray(points_mm[self.order], dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """What the patches are fitted to.
+
+    Attributes
+    ----------
+    points_mm, normals : (N, 3) float64
+        Points, and unit normals out of the material.
+    weight : (N,) float64
+        One over the variance along the normal, by everything that is known.
+    noise_mm2 : (N,) float64
+        Variance along the normal by each point's own noise; 0 where it is not known.
+    position_mm : (N,) float64
+        Move along the normal by the position of the point's image, which moves those of an image together.
+    image : (N,) int64
+    patterns_mm : (M, N) float64
+        Moves along the normal that all points of a scan share.
+    scan : (N,) int64
+        Scan of each point; the patterns of different scans are independent.
+    """
+
+    points_mm: np.ndarray
+    normals: np.ndarray
+    weight: np.ndarray
+    noise_mm2: np.ndarray
+    position_mm: np.ndarray
+    image: np.ndarray
+    patterns_mm: np.ndarray
+    scan: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class LocalPatches:
+    """Patches at P places.
+
+    Attributes
+    ----------
+    height_mm : (P,) float64
+        Of the surface over the place, along the normal.
+    normals : (P, 3) float64
+        Of the patch at the place, out of the material.
+    found : (P,) bool
+        Where points about the place determine the height better than one point alone would; elsewhere it would be an
+        extrapolation.
+    noise_mm, shared_mm : (P,) float64
+        Standard uncertainty of the height by what differs from point to point or image to image, and by what all points
+        of a scan share.
+    """
+
+    height_mm: np.ndarray
+    normals: np.ndarray
+    found: np.ndarray
+    noise_mm: np.ndarray
+    shared_mm: np.ndarray
+
+
+def surface_normals(points_mm: np.ndarray, *, radius_mm: float, towards: np.ndarray) -> np.ndarray:
+    """Unit normals (N, 3) of the planes through all points within a radius of each, turned ``towards`` (3,)."""
+    grid = PointGrid(points_mm, radius_mm)
+    moments = np.empty((len(points_mm), 6))
+    _moments(points_mm.astype(np.float64), grid.points_mm, grid.keys, grid.low, grid.shape, radius_mm, moments)
+    matrices = moments[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    normals = np.linalg.eigh(matrices)[1][:, :, 0]
+    return np.where((normals @ towards)[:, None] < 0, -normals, normals)
+
+
+class LocalSurface:
+    """A surface given by `SurfacePoints`, smoothed over a radius."""
+
+    def __init__(self, surface: SurfacePoints, *, radius_mm: float):
+        self.radius_mm = radius_mm
+        self._grid = grid = PointGrid(surface.points_mm, radius_mm)
+        self._columns = tuple(
+            np.ascontiguousarray(each[grid.order])
+            for each in (surface.normals, surface.weight, surface.noise_mm2, surface.position_mm, surface.image)
+        )
+        self._patterns = np.ascontiguousarray(surface.patterns_mm[:, grid.order].T)
+        self._scan = np.ascontiguousarray(surface.scan[grid.order])
+
+    def patches(self, places_mm: np.ndarray, *, with_uncertainty: bool = False) -> LocalPatches:
+        """Patches at places (P, 3), each on the side of a wall on which its nearest point lies."""
+        places, grid = np.ascontiguousarray(places_mm, dtype=np.float64), self._grid
+        height, found = np.zeros(len(places)), np.zeros(len(places), np.bool_)
+        normals, variance = np.zeros((len(places), 3)), np.zeros((len(places), 2))
+        scans = int(self._scan.max(initial=0)) + 1
+        fill: Any = _patches
+        fill(
+            places,
+            grid.points_mm,
+            grid.keys,
+            grid.low,
+            grid.shape,
+            self.radius_mm,
+            *self._columns,
+            self._patterns if with_uncertainty else self._patterns[:, :0],
+            self._scan,
+            scans,
+            height,
+            normals,
+            found,
+            variance,
+        )
+        return LocalPatches(height, normals, found, np.sqrt(variance[:, 0]), np.sqrt(variance[:, 1]))
+
+
+@compiled
+def _row(keys, low, shape, cell, place, row):
+    """First and last of the sorted points in three cubes in a row, of the nine rows about a place."""
+    x = int(np.floor((place[0] - low[0]) / cell)) + row // 3 - 1
+    y = int(np.floor((place[1] - low[1]) / cell)) + row % 3 - 1
+    z = int(np.floor((place[2] - low[2]) / cell))
+    if x < 0 or y < 0 or x >= shape[0] or y >= shape[1] or z < -1 or z > shape[2]:
+        return 0, 0
+    first = (x * shape[1] + y) * shape[2]
+    start = np.searchsorted(keys, first + max(z - 1, 0))
+    return start, np.searchsorted(keys, first + min(z + 1, shape[2] - 1), side="right")
+
+
+@compiled
+def _moments(places, points, keys, low, shape, radius, moments):
+    """Second central moments (P, 6) xx, xy, xz, yy, yz, zz of the points within the radius of each place."""
+    for number in range(len(places)):
+        place, count = places[number], 0
+        sums, products = np.zeros(3), np.zeros(6)
+        for row in range(9):
+            start, end = _row(keys, low, shape, radius, place, row)
+            for k in range(start, end):
+                a, b, c = points[k, 0] - place[0], points[k, 1] - place[1], points[k, 2] - place[2]
+                if a * a + b * b + c * c <= radius * radius:
+                    count += 1
+                    sums += np.array((a, b, c))
+                    products += np.array((a * a, a * b, a * c, b * b, b * c, c * c))
+        mean, column = sums / max(count, 1), 0
+        for i in range(3):
+            for j in range(i, 3):
+                moments[number, column] = products[column] / max(count, 1) - mean[i] * mean[j]
+                column += 1
+
+
+@compiled
+def _patches(
+    places,
+    points,
+    keys,
+    low,
+    shape,
+    radius,
+    normals,
+    weight,
+    noise,
+    position,
+    image,
+    patterns,
+    scan,
+    scans,
+    height,
+    fitted_normals,
+    found,
+    variance,
+):
+    """Fill heights (P,), normals (P, 3), whether found (P,), and variances (P, 2) by noise and by what is shared."""
+    by = np.empty(_TERMS)
+    for number in range(len(places)):
+        place = places[number]
+        nearest, least = -1, radius * radius
+        for row in range(9):
+            start, end = _row(keys, low, shape, radius, place, row)
+            for k in range(start, end):
+                away = (points[k, 0] - place[0]) ** 2 + (points[k, 1] - place[1]) ** 2 + (points[k, 2] - place[2]) ** 2
+                if away < least:
+                    nearest, least = k, away
+        if nearest < 0:
+            continue
+        normal = normals[nearest]
+        # Two directions across the normal.
+        first = (
+            np.array((0.0, -normal[2], normal[1])) if abs(normal[0]) < 0.7 else np.array((-normal[1], normal[0], 0.0))
+        )
+        first /= np.sqrt(np.sum(first * first))
+        second = np.cross(normal, first)
+        matrix, right = np.zeros((_TERMS, _TERMS)), np.zeros(_TERMS)
+        count, total, left_u, left_v = 0, 0.0, 0.0, 0.0
+        for row in range(9):
+            start, end = _row(keys, low, shape, radius, place, row)
+            for k in range(start, end):
+                kernel = _term(points[k], place, normal, first, second, normals[k], radius, by)
+                if kernel > 0:
+                    share = kernel * weight[k]
+                    count += 1
+                    total += share
+                    left_u += share * by[1] * radius
+                    left_v += share * by[2] * radius
+                    up = _height(points[k], place, normal)
+                    for i in range(_TERMS):
+                        right[i] += share * by[i] * up
+                        for j in range(_TERMS):
+                            matrix[i, j] += share * by[i] * by[j]
+        if count < _FEWEST:
+            continue
+        for i in range(_TERMS):
+            # So little that it only keeps points on few lines from having any curvature along them.
+            matrix[i, i] += 1e-6 * total
+        inverse = np.linalg.inv(matrix)
+        answer = inverse[0]
+        coefficients = inverse @ right
+        square, scatter, freedom = 0.0, 0.0, 0.0
+        single, images, moves, many = 0.0, np.empty(_MOST_IMAGES, np.int64), np.zeros(_MOST_IMAGES), 0
+        shared = np.zeros((scans, patterns.shape[1]))
+        for row in range(9):
+            start, end = _row(keys, low, shape, radius, place, row)
+            for k in range(start, end):
+                kernel = _term(points[k], place, normal, first, second, normals[k], radius, by)
+                if kernel <= 0:
+                    continue
+                share = kernel * weight[k]
+                part = share * np.sum(answer * by)
+                square += part * part
+                residual = _height(points[k], place, normal) - np.sum(coefficients * by)
+                scatter += share * residual * residual
+                freedom += share
+                single += part * part * noise[k]
+                at = 0
+                while at < many and images[at] != image[k]:
+                    at += 1
+                if at == many and many < _MOST_IMAGES:
+                    images[at] = image[k]
+                    many += 1
+                at = min(at, _MOST_IMAGES - 1)
+                moves[at] += part * position[k]
+                for m in range(patterns.shape[1]):
+                    shared[scan[k], m] += part * patterns[k, m]
+        # Better known than by one point, and not at the edge of its points.
+        beside = np.sqrt(left_u * left_u + left_v * left_v) / total
+        if square >= 1.0 or beside > 0.4 * radius:
+            continue
+        found[number] = True
+        height[number] = coefficients[0]
+        slope = normal - (coefficients[1] * first + coefficients[2] * second) / radius
+        fitted_normals[number] = slope / np.sqrt(np.sum(slope * slope))
+        rough = scatter / freedom * count / max(count - _TERMS, 1) * square
+        variance[number, 0] = max(single, rough) + np.sum(moves[:many] ** 2)
+        variance[number, 1] = np.sum(shared * shared)
+
+
+@compiled
+def _height(point, place, normal):
+    """Height of a point over a place along the normal."""
+    return (point[0] - place[0]) * normal[0] + (point[1] - place[1]) * normal[1] + (point[2] - place[2]) * normal[2]
+
+
+@compiled
+def _term(point, place, normal, first, second, own, radius, by):
+    """Fill the terms (6,) 1, u, v, u^2, u v, v^2 of a point in units of the radius; its kernel, 0 without weight."""
+    if own[0] * normal[0] + own[1] * normal[1] + own[2] * normal[2] < _SAME_SIDE:
+        return 0.0
+    a, b, c = point[0] - place[0], point[1] - place[1], point[2] - place[2]
+    u = (a * first[0] + b * first[1] + c * first[2]) / radius
+    v = (a * second[0] + b * second[1] + c * second[2]) / radius
+    up = (a * normal[0] + b * normal[1] + c * normal[2]) / radius
+    across = u * u + v * v
+    if across >= 1.0 or abs(up) > 1.0:
+        return 0.0
+    by[0], by[1], by[2], by[3], by[4], by[5] = 1.0, u, v, u * u, u * v, v * v
+    return (1.0 - across) ** 2

@@ -1,0 +1,358 @@
+"""Inspection of a weld bead between two plates, by the quantities of ISO 5817.
+
+Heights are over the line between both plates. In each section across the weld they are local quadratics over the width,
+sums over the points, so that the points' errors run through to every value: by each pattern that all points share, and
+by noise drawn anew (GUM Supplement 1, JCGM 101:2008).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import ndimage, sparse
+
+from uwlts.metrology.evaluation import TOWARDS_SENSOR
+from uwlts.metrology.features import Feature, FeatureKind, FeatureValue, Inspection
+from uwlts.metrology.fits import fit_plane
+from uwlts.metrology.least_squares import MAD_TO_STD, evenly_thinned, fit_robustly, principal_axes
+from uwlts.metrology.propagation import NormalErrors, normal_errors, plain_value
+from uwlts.model.errors import EvaluationError
+from uwlts.storage.cloud import PointCloud
+
+_FEWEST = 500
+_TO_START = 20_000
+_DRAWS, _SEED = 32, 635
+"""The standard deviation of so many is right to 13 %."""
+_TOGETHER = 5
+"""Sections of which an undercut's depth is the mean."""
+_MOST_SECTIONS = 100
+_POINTS_IN_SECTION = 80
+_BANDWIDTH_SHARE = 0.04
+"""Of the bead's width, half the window of a local quadratic: narrower than an undercut."""
+_POINTS_IN_BANDWIDTH = 3.0
+"""Spacings of points in half a window, at least."""
+_FLANK = 0.1, 0.5
+"""Of the bead's height: the points of a flank whose line gives toe and toe angle."""
+_HALF_FROM_CROWN = 1.9
+"""Half of a bead's width in half of its width at half the height: 1.85 of a bell (1 - t^2)^2, 1.4 of a parabola."""
+_CLEAR = 1.3
+"""Of half the width: beyond it the plates are fitted, clear of undercuts of a good part of the bead's width."""
+_FEWEST_BESIDE = 50
+_BEYOND_SHARE = 0.35
+"""Of the bead's width: how far beyond its toe an undercut is looked for."""
+_INSIDE_SHARE = 0.05
+"""Of the bead's width: how far within the toe, where the groove begins."""
+_PLATE_SHARE = 2.0
+"""Of the bead's width: how far beside the bead the plates are fitted."""
+_WHOLE_SHARE = 0.7
+"""Of the usual height: lower sections are the bead's ends."""
+_SIGNIFICANT = 4.0
+"""Standard deviations of the plates' points that a bead must stand out."""
+_TUKEY = 4.685
+
+
+def inspect_weld(cloud: PointCloud, *, section_mm: float | None = None) -> Inspection:
+    """Measure the highest weld bead of a cloud: height, width, undercut, toe angles and misalignment.
+
+    The plates on both sides are fitted robustly; the bead runs along the longest extent of what stands out of them.
+    Sections are ``section_mm`` long, or as short as their points allow. Toes are where the lines through the flanks,
+    from 10 to 50 % of the height, meet the plates. EvaluationError where no bead stands out.
+    """
+    if section_mm is not None and not 0 < section_mm < np.inf:
+        raise EvaluationError(f"section_mm is {section_mm:g}; expected a positive length in mm")
+    if len(cloud) < _FEWEST:
+        raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST} are needed for a weld")
+    bead = _bead_of(cloud, section_mm)
+    errors = normal_errors(cloud, bead.chosen, np.broadcast_to(bead.axes[2], (len(bead.chosen), 3)))
+    values, extent = _values(bead, errors)
+    feature = Feature(FeatureKind.WELD, "weld", values, bead.middle_mm, bead.axes, extent, bead.chosen[bead.on_bead])
+    deviation = np.full(len(cloud), np.nan)
+    deviation[bead.chosen] = bead.heights_mm
+    count = bead.profiles.sections
+    notes = [f"{count} sections of {bead.length_mm / count:.2g} mm; left is where the second axis points away from"]
+    if cloud.uncertainty is None:
+        notes.append("the cloud states no uncertainty: intervals are of the scatter of its points alone")
+    return Inspection("weld", (feature,), deviation, np.full(len(cloud), np.nan), tuple(notes))
+
+
+@dataclass(frozen=True, eq=False)
+class _Profiles:
+    """Heights over the plates on a grid across each section, as sums over the points.
+
+    ``smooth`` (S G, n) are local quadratics of the points, ``plates`` two pairs: what a plate's level, slope along and
+    slope across (3,) add to the reference in each cell (S G, 3), and their own sums over the points (3, n).
+    """
+
+    across_mm: np.ndarray
+    sections: int
+    smooth: sparse.csr_array
+    plates: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+    def of(self, heights: np.ndarray) -> np.ndarray:
+        """Profiles (S, G) for heights (n,) of the points."""
+        reference = sum(base @ (rows @ heights) for base, rows in self.plates)
+        return (self.smooth @ heights - reference).reshape(self.sections, len(self.across_mm))
+
+
+@dataclass(frozen=True, eq=False)
+class _Bead:
+    """A bead and its plates.
+
+    ``axes`` (3, 3) are along, across and outwards, ``chosen`` (n,) the points on and beside the bead, ``raw_mm`` (n,)
+    their heights over the middle, ``heights_mm`` (n,) those over the plates, ``half_mm`` about half of its width and
+    ``noise_mm`` the standard deviation of a point that gives local means their scatter; ``wider`` are profiles by wider
+    local quadratics.
+    """
+
+    axes: np.ndarray
+    middle_mm: np.ndarray
+    chosen: np.ndarray
+    raw_mm: np.ndarray
+    heights_mm: np.ndarray
+    on_bead: np.ndarray
+    half_mm: float
+    length_mm: float
+    noise_mm: float
+    profiles: _Profiles
+    wider: _Profiles
+
+
+def _bead_of(cloud: PointCloud, section_mm: float | None) -> _Bead:
+    axes, middle, half, ends = _found(cloud.points_mm)
+    local = (cloud.points_mm - middle) @ axes.T
+    reach = half * (1 + 2 * _PLATE_SHARE)
+    chosen = np.flatnonzero((np.abs(local[:, 1]) < reach) & (local[:, 0] >= ends[0]) & (local[:, 0] <= ends[1]))
+    along, across, raw = local[chosen].T
+    sides = [across < -_CLEAR * half, across > _CLEAR * half]
+    if min(map(np.count_nonzero, sides)) < _FEWEST_BESIDE:
+        raise EvaluationError("the plate was not seen on both sides of the bead")
+    design = np.column_stack([np.ones(len(along)), along, across])
+    rows = [_robust_rows(design, raw, side) for side in sides]
+    # Between the toes the reference runs from one plate to the other.
+    share = np.clip((across + half) / (2 * half), 0, 1)
+    heights = raw - (1 - share) * (design @ rows[0] @ raw) - share * (design @ rows[1] @ raw)
+    length, images = float(np.ptp(along)), len(np.unique(cloud.frame[chosen]))
+    count = max(1, len(along) // _POINTS_IN_SECTION)
+    # Several sections to an image would hold its points by chance.
+    count = min(count, _MOST_SECTIONS, images if images > 1 else count)
+    if section_mm is not None:
+        count = max(1, int(length / section_mm))
+    section = np.clip(((along - along.min()) / length * count).astype(int), 0, count - 1)
+    spacing = 2 * reach * count / len(along)
+    bandwidth = max(_BANDWIDTH_SHARE * 2 * half, _POINTS_IN_BANDWIDTH * spacing)
+    edge = half * (1 + 2 * _BEYOND_SHARE) + bandwidth
+    grid = np.linspace(-edge, edge, int(np.ceil(6 * edge / bandwidth)) + 1)
+    smooth = _profile_rows(across, section, count, grid, bandwidth)
+    centres = along.min() + (np.arange(count) + 0.5) * length / count
+    cells = np.column_stack([np.ones(count * len(grid)), np.repeat(centres, len(grid)), np.tile(grid, count)])
+    part = np.clip((cells[:, 2:] + half) / (2 * half), 0, 1)
+    profiles = _Profiles(grid, count, smooth, ((cells * (1 - part), rows[0]), (cells * part, rows[1])))
+    wider = replace(profiles, smooth=_profile_rows(across, section, count, grid, np.sqrt(2) * bandwidth))
+    beside = np.abs(cells[:, 2]) > half * (1 + _BEYOND_SHARE)
+    means = profiles.of(raw).ravel()[beside]
+    expected = np.sqrt(np.asarray(smooth.power(2).sum(axis=1)).ravel()[beside])
+    seen = MAD_TO_STD * float(np.nanmedian(np.abs(means) / expected))
+    on_bead = np.abs(across) < half
+    return _Bead(axes, middle, chosen, raw, heights, on_bead, half, length, seen, profiles, wider)
+
+
+def _found(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+    """Axes (3, 3), middle (3,), about half of the width and ends (2,) of what stands out highest of a plane."""
+    start = fit_robustly(lambda p: fit_plane(p, towards=TOWARDS_SENSOR), evenly_thinned(points, _TO_START))
+    up, heights = start.fit.normal, start.fit.distances_mm(points)
+    noise = MAD_TO_STD * float(np.median(np.abs(heights - np.median(heights))))
+    top = float(np.quantile(heights, 0.995))
+    if top < _SIGNIFICANT * noise:
+        raise EvaluationError(
+            f"no bead stands out: 99.5 % of the points are lower than {top:.3g} mm, and all scatter by {noise:.3g} mm"
+        )
+    crown = points[heights > 0.5 * top]
+    flat = (crown - crown.mean(axis=0)) @ (np.eye(3) - np.outer(up, up))
+    along = principal_axes(flat)[1][0]
+    along = along * np.sign(along[np.argmax(np.abs(along))])
+    axes = np.array([along, np.cross(up, along), up])
+    # Of several beads side by side the one with most points at half the height.
+    across = crown @ axes[1]
+    count, edges = np.histogram(across, bins=max(10, int(np.sqrt(len(crown)))))
+    filled = count > 0.05 * count.max()
+    labelled: Any = ndimage.label(filled)
+    labels = labelled[0]
+    best = int(np.argmax(np.bincount(labels, count * (labels > 0))))
+    low, high = edges[:-1][labels == best].min(), edges[1:][labels == best].max()
+    crown = crown[(across >= low) & (across <= high)]
+    middle = np.median(crown, axis=0)
+    half = _HALF_FROM_CROWN * 0.5 * float(high - low)
+    ends = np.quantile((crown - middle) @ along, [0.005, 0.995])
+    return axes, middle, half, ends
+
+
+def _robust_rows(design: np.ndarray, heights: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """Rows (3, n) whose products with heights are the coefficients of the plane of one side, outliers aside."""
+    weight = side.astype(float)
+    rows = np.zeros((3, len(heights)))
+    for _ in range(8):
+        normal = (design * weight[:, None]).T @ design
+        rows = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ (design * weight[:, None]).T
+        left = heights - design @ (rows @ heights)
+        spread = max(MAD_TO_STD * float(np.median(np.abs(left[side]))), 1e-12)
+        weight = side * np.square(np.clip(1 - np.square(left / (_TUKEY * spread)), 0, None))
+    return rows
+
+
+def _profile_rows(
+    across: np.ndarray, section: np.ndarray, count: int, grid: np.ndarray, bandwidth: float
+) -> sparse.csr_array:
+    """Rows (S G, n) whose products with heights are local quadratics across each section; empty ones are NaN."""
+    order = np.lexsort((across, section))
+    starts = np.searchsorted(section[order], np.arange(count + 1))
+    columns, values, lengths = [], [], [0]
+    for k in range(count):
+        own = order[starts[k] : starts[k + 1]]
+        place = across[own]
+        nothing = own[:1] if len(own) else order[:1]
+        first, last = np.searchsorted(place, grid - bandwidth), np.searchsorted(place, grid + bandwidth)
+        for middle, a, b in zip(grid, first, last, strict=True):
+            u = (place[a:b] - middle) / bandwidth
+            row = _quadratic_row(u)
+            columns.append(own[a:b] if row is not None else nothing)
+            values.append(row if row is not None else np.array([np.nan]))
+            lengths.append(lengths[-1] + len(values[-1]))
+    parts = np.concatenate(values), np.concatenate(columns), np.array(lengths)
+    return sparse.csr_array(parts, shape=(count * len(grid), len(across)))
+
+
+def _quadratic_row(u: np.ndarray) -> np.ndarray | None:
+    if len(u) < 5 or u.min() > -0.2 or u.max() < 0.2:
+        return None
+    weight = np.maximum(1 - u * u, 0)
+    design = np.stack([np.ones(len(u)), u, u * u], axis=1)
+    normal = (design * weight[:, None]).T @ design
+    if np.linalg.cond(normal) > 1e6:
+        return None
+    return np.linalg.solve(normal, np.eye(3)[0]) @ (design * weight[:, None]).T
+
+
+_NAMES = (
+    "height", "largest height", "width", "undercut left", "undercut right", "largest undercut", "toe angle left",
+    "toe angle right", "misalignment",
+)  # fmt: skip
+
+
+def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...], np.ndarray]:
+    profiles = bead.profiles.of(bead.raw_mm)
+    tops = _tops(bead, profiles)
+    high = tops > _WHOLE_SHARE * float(np.median(tops[np.isfinite(tops)]))
+    whole = np.flatnonzero(high & np.isfinite(tops))
+    toes = _toes_and_slopes(bead, profiles, whole)[:, :2]
+    seen = _figures(bead, bead.raw_mm, whole, toes)
+    rng = np.random.default_rng(_SEED)
+    noise = np.maximum(bead.noise_mm, errors.single_mm)
+    drawn = []
+    for _ in range(_DRAWS):
+        moves = rng.standard_normal(len(noise)) * noise
+        moves += errors.drawn_of_images(rng)
+        drawn.append(_figures(bead, bead.raw_mm + moves, whole, toes) - seen)
+    random, bias = np.nanstd(drawn, axis=0), np.zeros(len(seen))
+    # The extreme of a noisy profile is too far out, by about as much as with as much noise again.
+    extremes = ["undercut" in name or "height" in name for name in _NAMES]
+    bias[extremes] = np.maximum(np.nanmean(drawn, axis=0)[extremes], 0)
+    # Wider local quadratics show what these blur.
+    blur = _figures(replace(bead, profiles=bead.wider), bead.raw_mm, whole, toes) - seen
+    random = np.sqrt(random**2 + bias**2 + np.nan_to_num(blur) ** 2)
+    plain = np.where(extremes, np.maximum(seen - bias, 0), seen)
+    common = None
+    if errors.patterns_mm is not None:
+        moved = [_figures(bead, bead.raw_mm + pattern, whole, toes) - seen for pattern in errors.patterns_mm]
+        common = np.sqrt(np.nansum(np.square(moved), axis=0))
+    values = tuple(
+        plain_value(
+            FeatureKind.WELD, name, float(value), float(random[k]), None if common is None else common[k], least=0
+        )
+        for k, (name, value) in enumerate(zip(_NAMES, plain, strict=True))
+        if np.isfinite(value)
+    )
+    return values, np.array([bead.length_mm, float(plain[2]), float(plain[1])])
+
+
+def _tops(bead: _Bead, profiles: np.ndarray) -> np.ndarray:
+    """Greatest height (S,) of each profile between the toes; -inf where there is none."""
+    inside = np.isfinite(profiles) & (np.abs(bead.profiles.across_mm) < bead.half_mm)
+    return np.max(np.where(inside, profiles, -np.inf), axis=1)
+
+
+def _toes_and_slopes(bead: _Bead, profiles: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Toes left and right, and the flanks' slopes there (W, 4), of some sections."""
+    tops = _tops(bead, profiles)
+    return np.array([_flanks(bead.profiles.across_mm, profiles[k], float(tops[k])) for k in whole])
+
+
+def _figures(bead: _Bead, raw: np.ndarray, whole: np.ndarray, toes: np.ndarray) -> np.ndarray:
+    """Values in the order of `_NAMES` for heights (n,) of the points.
+
+    Of the sections ``whole`` (W,); undercuts are looked for beyond the ``toes`` (W, 2).
+    """
+    profiles, grid = bead.profiles.of(raw), bead.profiles.across_mm
+    tops, flanks = _tops(bead, profiles), _toes_and_slopes(bead, profiles, whole)
+    width = float(np.nanmedian(flanks[:, 1] - flanks[:, 0]))
+    angles = 180 - np.degrees(np.arctan(np.nanmedian(flanks[:, 2:], axis=0)))
+    depths = np.full((2, len(whole)), np.nan)
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        beyond = sign * (grid - toes[:, side, None]) / (2 * bead.half_mm)
+        groove = np.where((beyond > -_INSIDE_SHARE) & (beyond < _BEYOND_SHARE), profiles[whole], np.nan)
+        lowest = np.argmin(np.where(np.isfinite(groove), groove, np.inf), axis=1)
+        # Where the lines beside the deepest one were lost, that is not the groove's bottom.
+        beside = [profiles[whole, np.clip(lowest + step, 0, len(grid) - 1)] for step in (-1, 1)]
+        known = np.isfinite(groove).any(axis=1) & np.isfinite(beside).all(axis=0)
+        depths[side, known] = -np.nanmin(groove[known], axis=1)
+    # The deepest of neighbouring sections together: of single ones it would be the noise's.
+    seen = [row[np.isfinite(row)] for row in depths]
+    left, right = (np.mean(row) if len(row) else np.nan for row in seen)
+    deepest = max((_largest_mean(row, _TOGETHER) for row in seen if len(row)), default=np.nan)
+    middle = [float((rows @ raw)[0]) for _, rows in bead.profiles.plates]
+    values = [
+        float(np.mean(tops[whole])),
+        _largest_mean(tops[whole], 3),
+        width,
+        float(left),
+        float(right),
+        float(deepest),
+        *(float(angle) for angle in angles),
+        abs(middle[1] - middle[0]),
+    ]
+    return np.array(values)
+
+
+def _largest_mean(values: np.ndarray, count: int) -> float:
+    """Largest mean of so many neighbours."""
+    count = min(count, len(values))
+    return float(np.max(np.mean(np.lib.stride_tricks.sliding_window_view(values, count), axis=-1)))
+
+
+def _flanks(grid: np.ndarray, profile: np.ndarray, top: float) -> tuple[float, float, float, float]:
+    """Toes left and right, and slopes of the flanks there, from the lines through their lower halves."""
+    peak = int(np.nanargmax(profile))
+    low, high = _FLANK[0] * top, _FLANK[1] * top
+    result = []
+    for step in (-1, 1):
+        k = peak
+        while 0 < k < len(grid) - 1 and not profile[k] < high:
+            k += step
+        first = k
+        while 0 < k < len(grid) - 1 and not profile[k] < low:
+            k += step
+        # From the crossing of one level to that of the other, interpolated, so that nothing jumps with the noise.
+        places = [_level_between(grid, profile, j, step, level) for j, level in ((first, high), (k, low))]
+        slope = (high - low) / abs(places[1] - places[0]) if places[0] != places[1] else np.nan
+        result.append((places[1] + step * low / slope, slope))
+    (left, slope_left), (right, slope_right) = result
+    return float(left), float(right), float(slope_left), float(slope_right)
+
+
+def _level_between(grid: np.ndarray, profile: np.ndarray, at: int, step: int, level: float) -> float:
+    inner, outer = profile[at - step], profile[at]
+    if not (np.isfinite(inner) and np.isfinite(outer)) or inner == outer:
+        return float(grid[at])
+    share = np.clip((inner - level) / (inner - outer), 0, 1)
+    return float(grid[at - step] + share * (grid[at] - grid[at - step]))

@@ -1,0 +1,320 @@
+"""Report of an inspection for the owner of the object: findings first, then pictures, uncertainty and traceability."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import uwlts
+from uwlts.metrology.features import (
+    COVERAGE,
+    COVERAGE_FACTOR,
+    DEFINITIONS,
+    Feature,
+    FeatureKind,
+    FeatureValue,
+    Inspection,
+)
+from uwlts.metrology.inspection import InspectionKind, inspect
+from uwlts.model.any_calibration import calibration_digest
+from uwlts.model.command_files import keeps_inputs
+from uwlts.model.errors import EvaluationError
+from uwlts.model.sensor import Table
+from uwlts.report.certificate import check_certificate
+from uwlts.report.numbers import as_fine_as
+from uwlts.report.page_toolkit import (
+    INK,
+    MISSING,
+    RED,
+    Tile,
+    new_figure,
+    png_data_uri,
+    refuse_unsuitable_page,
+    render_page,
+    write_page,
+)
+from uwlts.report.pdf import print_pdf, refuse_unsuitable_pdf
+from uwlts.report.plot import DEVIATIONS
+from uwlts.storage.calibration_file import load_calibration
+from uwlts.storage.cloud import PointCloud, read_cloud
+from uwlts.storage.files import refuse_unsuitable, sha256_of
+from uwlts.storage.json_files import json_text
+
+_BLEMISHES = (FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
+_FIRST = ("depth", "height", "remaining wall")
+"""Values that stand first in the table of findings."""
+_SMALLEST = 1e-6
+"""An uncertainty below it is written as 0."""
+_MOST_PICTURES = 40
+_MOST_DRAWN = 60_000
+_AROUND = 1.2
+"""Times a finding's size: how much is drawn around it."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file that the findings rest on, with its SHA-256 digest, and what is to be said of it."""
+
+    role: str
+    name: str
+    sha256: str
+    note: str
+
+
+@keeps_inputs
+def write_findings(
+    cloud: str | os.PathLike[str],
+    kind: InspectionKind = "pipe",
+    *,
+    out: str | Path,
+    pdf: bool = False,
+    title: str | None = None,
+    captures: Sequence[str | Path] = (),
+    calibration: str | Path | None = None,
+    certificate: str | Path | None = None,
+    section_mm: float | None = None,
+    wall_mm: float | None = None,
+    false_alarm: float = 0.05,
+    datum: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+) -> Inspection:
+    """Inspect a cloud and write the report for the object's owner: a page, the same as JSON, and as PDF.
+
+    Parameters
+    ----------
+    cloud, kind, section_mm, wall_mm, false_alarm, datum
+        As for `uwlts.inspect`.
+    out
+        Page to write; the JSON goes beside it.
+    pdf
+        Also print the page to a PDF beside it, with the Chromium or Chrome that is installed.
+    title
+        Title of the report; the kind and the cloud's name unless given.
+    captures
+        Captures that the cloud was reconstructed from, for the traceability.
+    calibration
+        Calibration of the sensor; it has to be the one that the cloud names.
+    certificate
+        Its certificate (JSON), whose seal is checked.
+    overwrite
+        Replace existing files.
+
+    Raises
+    ------
+    OutputError
+        A file exists and ``overwrite`` is not given, or cannot be written.
+    CaptureError, CalibrationError
+        A file cannot be read.
+    EvaluationError
+        The cloud does not show such an object, or the calibration or certificate belongs to another one.
+    SetupError
+        A PDF is asked for and there is no browser.
+    """
+    page, path = Path(out), Path(cloud)
+    refuse_unsuitable_page(page, example="findings.html", overwrite=overwrite)
+    if pdf:
+        refuse_unsuitable_pdf(page.with_suffix(".pdf"))
+        refuse_unsuitable(page.with_suffix(".pdf"), overwrite=overwrite)
+    measured = read_cloud(path)
+    sources = _sources(path, measured, captures, calibration, certificate)
+    found = inspect(measured, kind, section_mm=section_mm, wall_mm=wall_mm, false_alarm=false_alarm, datum=datum)
+    made = datetime.now(UTC).isoformat(timespec="seconds")
+    text = _page(found, measured, sources, title=title or f"Inspection of {path.name}", made=made)
+    record: Table = {
+        "title": title or f"Inspection of {path.name}",
+        "made": made,
+        "software": f"uwlts {uwlts.__version__}",
+        "sources": [vars(source) for source in sources],
+        "inspection": found.record(),
+    }
+    if pdf:
+        print_pdf(text, page.with_suffix(".pdf"), overwrite=overwrite)
+    write_page(page, text, beside=json_text(record, indent=1), overwrite=overwrite)
+    return found
+
+
+def _sources(
+    path: Path,
+    cloud: PointCloud,
+    captures: Sequence[str | Path],
+    calibration: str | Path | None,
+    certificate: str | Path | None,
+) -> list[Source]:
+    named = cloud.metadata.get("calibration")
+    words = ", ".join(f"{key} {cloud.metadata[key]}" for key in ("sensor", "medium") if cloud.metadata.get(key))
+    sources = [Source("cloud", path.name, sha256_of(path), f"{len(cloud):,} points{', ' + words if words else ''}")]
+    for each in captures:
+        same = Path(each).name == cloud.metadata.get("capture")
+        sources.append(Source("capture", Path(each).name, sha256_of(each), "named by the cloud" if same else ""))
+    if calibration is not None:
+        digest = calibration_digest(load_calibration(calibration))
+        if named is not None and named != digest:
+            raise EvaluationError(
+                f"the cloud {path.name} was reconstructed by another calibration than {calibration}: it names "
+                f"{str(named)[:12]}..., and this one has {digest[:12]}...; give the calibration that it was made with"
+            )
+        note = "the one that the cloud names" if named == digest else "the cloud names no calibration"
+        sources.append(Source("calibration", Path(calibration).name, sha256_of(calibration), note))
+    if certificate is not None:
+        if calibration is None:
+            raise EvaluationError("a certificate is that of a calibration: give that, too")
+        if problems := check_certificate(certificate, calibration):
+            raise EvaluationError(f"the certificate {certificate} does not hold: {'; '.join(problems)}")
+        sources.append(Source("certificate", Path(certificate).name, sha256_of(certificate), "its seal is intact"))
+    return sources
+
+
+def _page(found: Inspection, cloud: PointCloud, sources: list[Source], *, title: str, made: str) -> str:
+    parts = [each for each in found.features if each.kind in _BLEMISHES]
+    whole = [each for each in found.features if each.kind not in (*_BLEMISHES, FeatureKind.SECTION, FeatureKind.HOLE)]
+    repeated = [each for each in found.features if each.kind in (FeatureKind.SECTION, FeatureKind.HOLE)]
+    drawn = sorted(parts, key=lambda each: -each.values[0].value)[:_MOST_PICTURES]
+    kinds = list(dict.fromkeys(each.kind for each in found.features))
+    return render_page(
+        "uwlts.report",
+        "findings.html.j2",
+        title=title,
+        made=made,
+        software=f"uwlts {uwlts.__version__}",
+        tiles=_tiles(whole, parts),
+        findings=_rows(parts),
+        whole=[(each.name, [_value_row(value) for value in each.values]) for each in whole],
+        repeated=_rows(repeated),
+        map=_map(found, cloud, parts),
+        pictures=[(each.name, _picture(each, found, cloud)) for each in drawn],
+        left_out=len(parts) - len(drawn),
+        notes=found.notes,
+        sources=[(each.role, each.name, each.note, each.sha256) for each in sources],
+        stated=cloud.uncertainty is not None,
+        searched=found.kind == "pipe",
+        coverage=f"{100 * COVERAGE:.0f} %",
+        factor=f"{COVERAGE_FACTOR:g}",
+        definitions=[
+            (str(kind), name, known.unit, known.text, known.source)
+            for kind in kinds
+            for name, known in DEFINITIONS[kind].items()
+            if any(name in each for each in found.features if each.kind == kind)
+        ],
+    )
+
+
+def _with_interval(value: FeatureValue) -> str:
+    half = COVERAGE_FACTOR * value.uncertainty
+    if half <= _SMALLEST:
+        return f"{value.value:.4g}"
+    shown = as_fine_as(value.value, half, digits=2)
+    if value.low > value.value - 0.9 * half:
+        # Not symmetric: a value that cannot be negative.
+        return f"{shown} ({as_fine_as(value.low, half, digits=2)} to {as_fine_as(value.high, half, digits=2)})"
+    return f"{shown} ± {as_fine_as(half, half, digits=2)}"
+
+
+def _value_row(value: FeatureValue) -> tuple[str, ...]:
+    parts = value.random, value.systematic
+    fine = [
+        MISSING if part is None else as_fine_as(part, part, digits=2) if part > _SMALLEST else "0" for part in parts
+    ]
+    return value.name, value.unit, _with_interval(value), *fine
+
+
+def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str, ...]]] | None:
+    """Headings and rows of features with values of the same names; None where there are none."""
+    if not features:
+        return None
+    units = {value.name: value.unit for each in features for value in each.values}
+    units = {name: units[name] for name in (*(n for n in _FIRST if n in units), *(n for n in units if n not in _FIRST))}
+    rows = []
+    for each in features:
+        place = " ".join(f"{number:.1f}" for number in each.place_mm)
+        rows.append((each.name, place, *(_with_interval(each[name]) if name in each else MISSING for name in units)))
+    return ("finding", "place / mm", *(f"{name} / {unit}" for name, unit in units.items())), rows
+
+
+def _tiles(whole: list[Feature], parts: list[Feature]) -> list[Tile]:
+    tiles = []
+    for kind in _BLEMISHES:
+        if own := [each for each in parts if each.kind == kind]:
+            worst = max(own, key=lambda each: each.values[0].value)
+            value = worst.values[0]
+            plural = f"{kind}s" if len(own) > 1 else str(kind)
+            note = f"largest {value.name} {_with_interval(value)} {value.unit} ({worst.name})"
+            tiles.append(Tile(plural, str(len(own)), note, accent=True))
+    walls = [each["remaining wall"] for each in parts if "remaining wall" in each]
+    if walls:
+        least = min(walls, key=lambda value: value.value)
+        tiles.append(Tile("least remaining wall", f"{_with_interval(least)} {least.unit}", accent=True))
+    if whole and whole[0].kind == FeatureKind.PIPE and not parts:
+        tiles.append(Tile("pits, dents, protrusions", "none found", accent=True))
+    for each in whole[:1]:
+        for value in each.values[:5]:
+            if not value.name.startswith("axis"):
+                tiles.append(Tile(f"{each.name}: {value.name}", f"{_with_interval(value)} {value.unit}"))
+    return tiles
+
+
+def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:
+    """All points by their deviation: of a pipe unrolled along its axis, else across the two longest extents."""
+    seen = np.flatnonzero(np.isfinite(found.deviation_mm))
+    seen = seen[:: max(1, len(seen) // _MOST_DRAWN)]
+    whole = found.features[0] if found.features else None
+    pipe = whole if whole is not None and whole.kind == FeatureKind.PIPE else None
+    middle = cloud.points_mm[seen].mean(axis=0)
+    u, v = _flat(cloud.points_mm[seen], pipe, middle)
+    # As wide as the surface asks for at a height of 5 inches, with the bar of colours beside it.
+    width = 1.8 + 4.5 * float(np.ptp(u)) / max(float(np.ptp(v)), 1e-9)
+    figure, (axes,) = new_figure(float(np.clip(width, 4.0, 9.0)), 5.0)
+    # A robust range: the findings are drawn larger below.
+    limit = float(np.quantile(np.abs(found.deviation_mm[seen]), 0.995)) or 1e-3
+    style: dict[str, Any] = {"cmap": DEVIATIONS, "vmin": -limit, "vmax": limit, "linewidths": 0, "s": 3}
+    colours = axes.scatter(u, v, c=found.deviation_mm[seen], rasterized=True, **style)
+    figure.colorbar(colours, ax=axes, label="above the undamaged surface / mm")
+    for each in parts:
+        x, y = _flat(each.place_mm[None], pipe, middle)
+        axes.annotate(each.name, (x[0], y[0]), xytext=(8, 8), textcoords="offset points", fontsize=8, color=INK)
+        axes.plot(x, y, "o", markersize=14, markerfacecolor="none", markeredgecolor=RED)
+    labels = ("along the axis / mm", "around the circumference / mm") if pipe else ("first extent / mm", "second / mm")
+    axes.set(xlabel=labels[0], ylabel=labels[1], aspect="equal")
+    return png_data_uri(figure, dpi=130)
+
+
+def _flat(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates (N,) of points on a map: along and around a pipe from the side of ``middle`` (3,), else X and Y."""
+    if pipe is None:
+        return points[:, 0], points[:, 1]
+    away = (points - pipe.place_mm) @ pipe.axes.T
+    side = (middle - pipe.place_mm) @ pipe.axes.T
+    angle = np.arctan2(away[:, 1], away[:, 0]) - np.arctan2(side[1], side[0])
+    return away[:, 2], (np.remainder(angle + np.pi, 2 * np.pi) - np.pi) * pipe["diameter"].value / 2
+
+
+def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
+    """A finding from above, and cut along its length through its deepest place."""
+    local = (cloud.points_mm - feature.place_mm) @ feature.axes.T
+    half = np.maximum(_AROUND * feature.extent_mm[:2], 2.0)
+    near = np.isfinite(found.deviation_mm) & (np.abs(local[:, :2]) < half).all(axis=1)
+    # The other side of a pipe lies below.
+    near &= np.abs(local[:, 2]) < max(2 * float(half.max()), 5.0)
+    local, deviation = local[near], found.deviation_mm[near]
+    figure, (above, cut) = new_figure(9.0, 3.4, columns=2)
+    limit = float(np.abs(deviation).max(initial=1e-3))
+    size = float(np.clip(40_000 / max(len(local), 1), 3, 60))
+    style: dict[str, Any] = {"cmap": DEVIATIONS, "vmin": -limit, "vmax": limit, "linewidths": 0, "s": size}
+    colours = above.scatter(local[:, 0], local[:, 1], c=deviation, **style)
+    figure.colorbar(colours, ax=above, label="deviation / mm")
+    above.set(xlabel="along its length / mm", ylabel="across / mm", aspect="equal")
+    width = max(0.15 * float(feature.extent_mm[1]), 0.5)
+    inside = np.abs(local[:, 1]) < width
+    cut.plot(local[inside, 0], deviation[inside], ".", markersize=3, label=f"points within {width:.2g} mm of the cut")
+    cut.axhline(0, color=INK, linewidth=0.8)
+    value = feature.values[0]
+    sign = 1 if feature.kind == FeatureKind.PROTRUSION else -1
+    cut.axhline(sign * value.value, color=RED, linewidth=1, label=f"{value.name} {_with_interval(value)} {value.unit}")
+    cut.set(xlabel="along its length / mm", ylabel="deviation / mm")
+    cut.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 1.22), ncols=2, frameon=False)
+    return png_data_uri(figure, dpi=110)

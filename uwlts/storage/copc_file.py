@@ -1,0 +1,245 @@
+"""Large clouds as COPC (cloud-optimised point cloud, copc.io): written in bounded memory, read by region and level.
+
+A COPC file is LAZ 1.4 whose points stand in an octree. Every level of the tree holds a random share of the points of
+its nodes, four times as many as the level above, as a surface has; all levels down to one give an even sample.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from uwlts.model.errors import CaptureError, OutputError
+from uwlts.model.input_file import opened
+from uwlts.storage.files import written_aside
+from uwlts.storage.las_file import INTENSITY_LIMITS, LAZ_STEP_M, las_middle, library
+
+SUFFIX = ".copc.laz"
+
+_POINTS_OF_NODE = 60_000
+"""Points of the root, and of the usual node: compressed they are some 500 kB, one request of a viewer."""
+_DEEPEST = 7
+_MOST_LEVELS = 16
+_FIELDS: dict[str, type] = {"amplitude": np.float32, "frame": np.int32, "line": np.int32, "deviation_mm": np.float32}
+
+Progress = Callable[[int, int], None]
+
+
+def is_copc(path: str | os.PathLike[str]) -> bool:
+    """Whether a file's name ends with ``.copc.laz``."""
+    return Path(path).name.lower().endswith(SUFFIX)
+
+
+class CloudPart(Protocol):
+    """Points (N, 3) and columns (N,) of a cloud, as in `uwlts.storage.cloud.PointCloud`."""
+
+    @property
+    def points_mm(self) -> np.ndarray: ...
+    @property
+    def intensity(self) -> np.ndarray: ...
+    @property
+    def frame(self) -> np.ndarray: ...
+    @property
+    def line(self) -> np.ndarray: ...
+    @property
+    def deviation_mm(self) -> np.ndarray | None: ...
+
+
+class CopcPoints(NamedTuple):
+    """Points (N, 3) in mm and columns (N,) of a file, None where it has no such field, and its number of points."""
+
+    points_mm: np.ndarray
+    intensity: np.ndarray
+    frame: np.ndarray | None
+    line: np.ndarray | None
+    deviation_mm: np.ndarray | None
+    total: int
+
+
+@dataclass(eq=False)
+class _Sorter:
+    """Points of nodes, in a temporary file in the order in which they came, and where each node's runs lie."""
+
+    file: Any
+    kind: np.dtype
+    runs: dict[int, list[tuple[int, int]]] = field(default_factory=dict)
+    end: int = 0
+
+    def add(self, nodes: np.ndarray, table: np.ndarray) -> None:
+        """Add records of a table (N,) that belong to nodes (N,)."""
+        order = np.argsort(nodes, kind="stable")
+        keys, starts = np.unique(nodes[order], return_index=True)
+        table[order].tofile(self.file)
+        for key, start, stop in zip(keys.tolist(), starts, np.append(starts[1:], len(nodes)), strict=True):
+            self.runs.setdefault(key, []).append((self.end + int(start), int(stop - start)))
+        self.end += len(nodes)
+
+    def merge(self, node: int, into: int) -> None:
+        """Count the records of one node as those of another."""
+        self.runs.setdefault(into, []).extend(self.runs.pop(node))
+
+    def of(self, node: int) -> np.ndarray:
+        """All records of a node."""
+        parts = []
+        for start, count in self.runs[node]:
+            self.file.seek(start * self.kind.itemsize)
+            parts.append(np.fromfile(self.file, self.kind, count))
+        return np.concatenate(parts)
+
+
+def write_copc(
+    path: str | os.PathLike[str],
+    parts: Callable[[], Iterable[CloudPart]],
+    *,
+    overwrite: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> int:
+    """Write the parts of a cloud as COPC, whole or not at all; returns the number of points.
+
+    ``parts`` gives the parts anew whenever it is called, which is twice. One part and one node are in memory at a time;
+    the rest waits in a temporary file beside the output, of some 46 bytes for each point. Coordinates are in m in steps
+    of 1e-7 m, the fields those of LAZ (`uwlts.export`).
+
+    OutputError where the file exists, the cloud is empty or too wide, or storage fails; SetupError without copclib.
+    """
+    copc, _ = library("copclib", "COPC"), library("laspy", "COPC")
+    low, high, total = np.full(3, np.inf), np.full(3, -np.inf), 0
+    for part in parts():
+        if len(part.points_mm):
+            low, high = np.minimum(low, part.points_mm.min(axis=0)), np.maximum(high, part.points_mm.max(axis=0))
+            total += len(part.points_mm)
+    if not total:
+        raise OutputError("the cloud has no points: there is nothing to export")
+    middle = las_middle(1e-3 * low, 1e-3 * high)
+    # The cube of the root, not quite filled, so that no point lies on its last face.
+    half = max(5.05e-4 * float((high - low).max()), 1e-3)
+    centre = 5e-4 * (low + high)
+    depth = int(np.clip(np.ceil(np.log(max(0.75 * total / _POINTS_OF_NODE, 1)) / np.log(4)), 0, _DEEPEST))
+    share = np.cumsum(4.0 ** np.arange(depth + 1)) / np.sum(4.0 ** np.arange(depth + 1))
+    shape, rng, done = (depth + 1,) + (2**depth,) * 3, np.random.default_rng(0), 0
+    with written_aside(path, overwrite=overwrite) as aside, tempfile.TemporaryFile(dir=aside.parent) as file:
+        header = _header(middle)
+        kind = header.point_format.dtype()
+        sorter = _Sorter(file, kind)
+        for part in parts():
+            if not len(part.points_mm):
+                continue
+            level = np.searchsorted(share, rng.random(len(part.points_mm)), side="right")
+            cell = np.floor((1e-3 * part.points_mm - (centre - half)) / (2 * half) * 2**depth).astype(np.int64)
+            cell = cell.clip(0, 2**depth - 1) >> (depth - level)[:, None]
+            sorter.add(np.ravel_multi_index((level, *cell.T), shape), _table(part, kind, middle))
+            done += len(part.points_mm)
+            progress(done, 2 * total)
+        for node in sorted(sorter.runs, reverse=True):
+            level, *cell = np.unravel_index(node, shape)
+            above = int(np.ravel_multi_index((level - 1, *(n >> 1 for n in cell)), shape)) if level else node
+            # A reader finds a node through those above it; few points may have none there.
+            if level and above not in sorter.runs:
+                sorter.merge(node, above)
+        writer = _writer(copc, header, aside, low=1e-3 * low, high=1e-3 * high, centre=centre, half=half)
+        for node in sorted(sorter.runs):
+            table = sorter.of(node)
+            key = [int(n) for n in np.unravel_index(node, shape)]
+            writer.AddNode(copc.VoxelKey(*key), copc.VectorChar(table.view(np.int8).ravel()))
+            done += len(table)
+            progress(done, 2 * total)
+        writer.Close()
+    return total
+
+
+def _header(middle: np.ndarray) -> Any:
+    laspy = library("laspy", "COPC")
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.offsets, header.scales = middle, np.full(3, LAZ_STEP_M)
+    # Which copclib demands of point format 6.
+    header.global_encoding.wkt = True
+    header.add_extra_dims([laspy.ExtraBytesParams(name=name, type=kind) for name, kind in _FIELDS.items()])
+    return header
+
+
+def _writer(copc: Any, header: Any, aside: Path, *, low: Any, high: Any, centre: np.ndarray, half: float) -> Any:
+    laspy = library("laspy", "COPC")
+    with tempfile.TemporaryDirectory() as folder:
+        # copclib takes the fields' names from a file only.
+        empty = os.path.join(folder, "fields.laz")
+        table = laspy.LasData(header)
+        table.x = table.y = table.z = np.zeros(1)
+        table.write(empty)
+        named = copc.LazReader(empty).laz_config.extra_bytes_vlr
+    scale, offset = copc.Vector3(*[LAZ_STEP_M] * 3), copc.Vector3(*header.offsets.tolist())
+    settings = copc.CopcConfigWriter(6, scale, offset, "", named)
+    settings.las_header.min, settings.las_header.max = copc.Vector3(*low.tolist()), copc.Vector3(*high.tolist())
+    info = settings.copc_info
+    info.center_x, info.center_y, info.center_z = centre.tolist()
+    # Some 250 points along the edge of a node of a surface.
+    info.halfsize, info.spacing = half, 2 * half / np.sqrt(_POINTS_OF_NODE)
+    return copc.FileWriter(str(aside), settings)
+
+
+def _table(part: CloudPart, kind: np.dtype, middle: np.ndarray) -> np.ndarray:
+    table = np.zeros(len(part.points_mm), kind)
+    for name, values in zip("XYZ", (1e-3 * part.points_mm - middle).T / LAZ_STEP_M, strict=True):
+        table[name] = np.rint(values)
+    # Return 1 of 1.
+    table["bit_fields"] = 0b0001_0001
+    table["intensity"] = np.rint(np.nan_to_num(part.intensity)).clip(*INTENSITY_LIMITS)
+    deviation = np.float32(np.nan) if part.deviation_mm is None else part.deviation_mm
+    for name, values in zip(_FIELDS, (part.intensity, part.frame, part.line, deviation), strict=True):
+        table[name] = values
+    return table
+
+
+def read_copc(
+    path: str | os.PathLike[str], *, box_mm: tuple[np.ndarray, np.ndarray] | None = None, at_most: int | None = None
+) -> CopcPoints:
+    """The points of a COPC file within a box.
+
+    With ``at_most`` only as many levels are read as hold about so many points in the box, at least the first, and an
+    even sample of these is taken if they are more. Fields of other programs' files that are missing are left out.
+
+    CaptureError where it cannot be read or is no COPC; SetupError without laspy.
+    """
+    laspy, path = library("laspy", "COPC"), Path(path)
+    try:
+        with opened(path, called="cloud") as file:
+            reader = laspy.CopcReader(file)
+            total = int(reader.header.point_count)
+            box = None if box_mm is None else laspy.copc.Bounds(1e-3 * box_mm[0], 1e-3 * box_mm[1])
+            found = _queried(reader, box, at_most)
+    except (OSError, RuntimeError, ValueError, KeyError, laspy.errors.LaspyException) as error:
+        raise CaptureError(f"{path} is not a complete COPC file: {' '.join(str(error).split())[:200]}") from error
+    columns = {name: np.asarray(found[name]) for name in found.point_format.dimension_names if name in _FIELDS}
+    deviation = columns.get("deviation_mm")
+    return CopcPoints(
+        1e3 * np.column_stack([found.x, found.y, found.z]),
+        np.asarray(columns.get("amplitude", found["intensity"]), np.float32),
+        columns.get("frame"),
+        columns.get("line"),
+        None if deviation is None or np.isnan(deviation).all() else deviation,
+        total,
+    )
+
+
+def _queried(reader: Any, box: Any, at_most: int | None) -> Any:
+    """Points of the levels that are needed, those of each level read once."""
+    if at_most is None:
+        return reader.query(bounds=box)
+    count, found = 0, []
+    for level in range(_MOST_LEVELS):
+        part = reader.query(bounds=box, level=level)
+        if count and not len(part):
+            break
+        found.append(part)
+        count += len(part)
+        # The next level holds four times as many.
+        if count >= at_most or count + 4 * len(part) > 2 * at_most:
+            break
+    array = np.concatenate([part.array for part in found])
+    array = array[:: max(1, -(-len(array) // at_most))]
+    return type(found[0])(array, found[0].point_format, found[0].scales, found[0].offsets)

@@ -1,0 +1,147 @@
+"""Clouds as MCAP recordings: messages PointCloud2 of ROS 2, or foxglove.PointCloud; without ROS installed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+
+from uwlts.model.errors import OutputError, SetupError
+from uwlts.storage.cloud import PAIRS, PointCloud
+
+TOPIC, FRAME_ID = "/points", "base"
+_POINT_CLOUD2 = "sensor_msgs/msg/PointCloud2"
+_NANOSECONDS = 10**9
+
+
+def covariance_columns(cloud: PointCloud) -> dict[str, np.ndarray]:
+    """Columns (N,) float32 ``cov_xx_mm2`` to ``cov_zz_mm2`` of the covariance of each point; none where not known."""
+    covariance = cloud.covariance_mm2
+    if covariance is None:
+        return {}
+    names = [f"cov_{'xyz'[i]}{'xyz'[j]}_mm2" for i, j in PAIRS]
+    return {name: covariance[:, i, j].astype(np.float32) for name, (i, j) in zip(names, PAIRS, strict=True)}
+
+
+def mcap_of(cloud: PointCloud, *, foxglove: bool) -> bytes:
+    """A recording of a cloud on the topic ``/points``, one message for each moment where the points' times are known.
+
+    Points have the fields x, y, z (m) and intensity as 32-bit floating point numbers, which viewers expect, frame and
+    line as 32-bit integers, time (s, 64 bits) where known, and the covariance in mm2 (`covariance_columns`).
+
+    Raises
+    ------
+    OutputError
+        A time is negative: messages have none before the clock's zero.
+    SetupError
+        A library is not installed.
+    """
+    if cloud.time_s is not None and cloud.time_s.min() < 0:
+        raise OutputError(f"a point has the time {cloud.time_s.min():g} s: messages have no time before 0")
+    return _foxglove(cloud) if foxglove else _ros2(cloud)
+
+
+def _table(cloud: PointCloud) -> np.ndarray:
+    """Points as rows of packed numbers, little-endian."""
+    columns: dict[str, np.ndarray] = dict(zip("xyz", (1e-3 * cloud.points_mm).astype(np.float32).T, strict=True))
+    columns |= {"intensity": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
+    if cloud.time_s is not None:
+        columns["time"] = cloud.time_s
+    columns |= covariance_columns(cloud)
+    table = np.empty(len(cloud), [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
+    for name, values in columns.items():
+        table[name] = values
+    return table
+
+
+def _moments(cloud: PointCloud) -> Iterator[tuple[int, np.ndarray]]:
+    """Times in ns, and the numbers of the points of each."""
+    if cloud.time_s is None:
+        yield 0, np.arange(len(cloud))
+        return
+    order = np.argsort(cloud.time_s, kind="stable")
+    _, first = np.unique(cloud.time_s[order], return_index=True)
+    for rows in np.split(order, first[1:]):
+        yield round(float(cloud.time_s[rows[0]]) * _NANOSECONDS), rows
+
+
+def _ros2(cloud: PointCloud) -> bytes:
+    try:
+        from mcap.writer import Writer
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise _missing(error) from error
+    store: Any = get_typestore(Stores.ROS2_HUMBLE)
+    point_cloud2, field = store.types[_POINT_CLOUD2], store.types["sensor_msgs/msg/PointField"]
+    header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
+    kinds = {"<f4": field.FLOAT32, "<f8": field.FLOAT64, "<i4": field.INT32}
+    table = _table(cloud)
+    fields = [
+        field(name=name, offset=int(offset), datatype=kinds[kind.str], count=1)
+        for name, (kind, offset) in _layout(table).items()
+    ]
+    content = BytesIO()
+    writer = Writer(content)
+    writer.start(profile="ros2", library="uwlts")
+    text = store.generate_msgdef(_POINT_CLOUD2, ros_version=2)[0]
+    schema = writer.register_schema(name=_POINT_CLOUD2, encoding="ros2msg", data=text.encode())
+    channel = writer.register_channel(topic=TOPIC, message_encoding="cdr", schema_id=schema)
+    for number, (time, rows) in enumerate(_moments(cloud)):
+        message = point_cloud2(
+            header=header(stamp=stamp(sec=time // _NANOSECONDS, nanosec=time % _NANOSECONDS), frame_id=FRAME_ID),
+            height=1,
+            width=len(rows),
+            fields=fields,
+            is_bigendian=False,
+            point_step=table.itemsize,
+            row_step=table.itemsize * len(rows),
+            data=np.frombuffer(table[rows].tobytes(), np.uint8),
+            is_dense=True,
+        )
+        data = bytes(store.serialize_cdr(message, _POINT_CLOUD2))
+        writer.add_message(channel_id=channel, log_time=time, publish_time=time, sequence=number, data=data)
+    writer.finish()
+    return content.getvalue()
+
+
+def _foxglove(cloud: PointCloud) -> bytes:
+    try:
+        import foxglove
+        from foxglove import channels, messages
+    except ImportError as error:
+        raise _missing(error) from error
+    kind_of = messages.PackedElementFieldNumericType
+    kinds = {"<f4": kind_of.Float32, "<f8": kind_of.Float64, "<i4": kind_of.Int32}
+    table = _table(cloud)
+    fields = [
+        messages.PackedElementField(name=name, offset=int(offset), type=kinds[kind.str])
+        for name, (kind, offset) in _layout(table).items()
+    ]
+    pose = messages.Pose(
+        position=messages.Vector3(x=0.0, y=0.0, z=0.0), orientation=messages.Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+    )
+    content, context = BytesIO(), foxglove.Context()
+    with foxglove.open_mcap(content, context=context):
+        channel = channels.PointCloudChannel(TOPIC, context=context)
+        for time, rows in _moments(cloud):
+            message = messages.PointCloud(
+                timestamp=messages.Timestamp(time // _NANOSECONDS, time % _NANOSECONDS),
+                frame_id=FRAME_ID,
+                pose=pose,
+                point_stride=table.itemsize,
+                fields=fields,
+                data=table[rows].tobytes(),
+            )
+            channel.log(message, log_time=time)
+    return content.getvalue()
+
+
+def _layout(table: np.ndarray) -> dict[str, tuple[np.dtype, int]]:
+    """Type and offset of each field of a packed table."""
+    return {name: (entry[0], entry[1]) for name, entry in (table.dtype.fields or {}).items()}
+
+
+def _missing(error: ImportError) -> SetupError:
+    return SetupError(f"MCAP needs the library {error.name}, which is not installed: pip install 'uwlts[ros]'")

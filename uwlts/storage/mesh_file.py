@@ -1,0 +1,142 @@
+"""A measured surface as triangles, and its files: STL, PLY with the uncertainty of every vertex, and binary glTF."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from uwlts.model.errors import OutputError
+from uwlts.model.sensor import Table
+from uwlts.storage.files import written_aside
+
+MESH_FORMATS = (".stl", ".ply", ".glb")
+
+_FARTHEST_SINGLE_MM = 16_000.0
+"""Numbers of 32 bits have steps of a micrometre there."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMesh:
+    """Triangles with the uncertainty of their vertices.
+
+    Attributes
+    ----------
+    vertices_mm, normals : (V, 3) float64
+        Vertices in the clouds' frame, and unit normals there, towards the sensor.
+    faces : (F, 3) int64
+        Vertices of each triangle, anticlockwise from the sensor.
+    noise_mm, shared_mm : (V,) float64
+        Standard uncertainty along the normal by noise and the positions of images, and by what all points of a scan
+        share; 0 where the clouds do not state it.
+    cube_mm, radius_mm : float
+        Edge of the cubes, and the radius of the patches.
+    left_out : float
+        Share of the clouds' points that are farther from the mesh than the patches' radius.
+    metadata : dict
+        What the clouds are and come from.
+    """
+
+    vertices_mm: np.ndarray
+    normals: np.ndarray
+    faces: np.ndarray
+    noise_mm: np.ndarray
+    shared_mm: np.ndarray
+    cube_mm: float
+    radius_mm: float
+    left_out: float
+    metadata: Table
+
+    @property
+    def std_mm(self) -> np.ndarray:
+        """Standard uncertainty (V,) of each vertex along its normal, mm."""
+        return np.hypot(self.noise_mm, self.shared_mm)
+
+    def area_mm2(self) -> float:
+        """Area of all triangles."""
+        a, b, c = (self.vertices_mm[self.faces[:, k]] for k in range(3))
+        return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+    def lines(self) -> list[str]:
+        """The summary as text."""
+        std = np.quantile(self.std_mm, [0.5, 0.95])
+        return [
+            f"mesh                      {len(self.vertices_mm)} vertices, {len(self.faces)} triangles, "
+            f"{self.area_mm2():.5g} mm2",
+            f"cubes, patches            {self.cube_mm:.3g} mm, radius {self.radius_mm:.3g} mm",
+            f"standard uncertainty, mm  {std[0]:.4f} (median), {std[1]:.4f} (95 % of the vertices)",
+            f"points without a surface  {100 * self.left_out:.2f} %",
+        ]
+
+
+def write_mesh(path: str | os.PathLike[str], mesh: SurfaceMesh, *, overwrite: bool = False) -> None:
+    """Write a mesh in the format that the path's suffix names, whole or not at all.
+
+    - ``.ply``: binary, mm. Vertices have x, y, z (double), nx, ny, nz, and the standard uncertainty along the normal:
+      uncertainty, and its parts uncertainty_noise and uncertainty_shared (float, mm).
+    - ``.glb``: glTF 2.0, in m about the origin of the mesh's node, with normals and the attribute _uncertainty (mm).
+    - ``.stl``: binary, mm, triangles alone.
+
+    Raises
+    ------
+    OutputError
+        The suffix is another one, the file exists and ``overwrite`` is not set, the mesh lies too far from the origin
+        for STL, or the file cannot be written.
+    """
+    path = Path(path)
+    match path.suffix.lower():
+        case ".ply":
+            with written_aside(path, overwrite=overwrite) as aside:
+                _ply(mesh).write(str(aside))
+        case ".stl" | ".glb":
+            content = _stl(mesh) if path.suffix.lower() == ".stl" else _glb(mesh)
+            with written_aside(path, overwrite=overwrite) as aside:
+                aside.write_bytes(content)
+        case _:
+            raise OutputError(f"{path} ends with none of {', '.join(MESH_FORMATS)}, which name the format of a mesh")
+
+
+def _ply(mesh: SurfaceMesh) -> PlyData:
+    columns = dict(zip("xyz", mesh.vertices_mm.T, strict=True))
+    columns |= dict(zip(("nx", "ny", "nz"), mesh.normals.T.astype(np.float32), strict=True))
+    parts = {"uncertainty": mesh.std_mm, "uncertainty_noise": mesh.noise_mm, "uncertainty_shared": mesh.shared_mm}
+    columns |= {name: values.astype(np.float32) for name, values in parts.items()}
+    vertices = np.empty(len(mesh.vertices_mm), [(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        vertices[name] = values
+    faces = np.empty(len(mesh.faces), [("vertex_indices", np.int32, (3,))])
+    faces["vertex_indices"] = mesh.faces
+    elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
+    return PlyData(elements, byte_order="<")
+
+
+def _stl(mesh: SurfaceMesh) -> bytes:
+    import trimesh
+
+    farthest = float(np.abs(mesh.vertices_mm).max())
+    if farthest > _FARTHEST_SINGLE_MM:
+        raise OutputError(
+            f"the mesh reaches {farthest:.6g} mm from the origin, where the numbers of STL have steps of more than a "
+            "micrometre: write PLY or glTF"
+        )
+    content: Any = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).export(file_type="stl")
+    return content
+
+
+def _glb(mesh: SurfaceMesh) -> bytes:
+    import trimesh
+
+    # Small numbers about the middle keep their digits in 32 bits.
+    middle = np.round(1e-3 * mesh.vertices_mm.mean(axis=0), 3)
+    local = trimesh.Trimesh(1e-3 * mesh.vertices_mm - middle, mesh.faces, vertex_normals=mesh.normals, process=False)
+    local.vertex_attributes["_uncertainty"] = mesh.std_mm.astype(np.float32)
+    place = np.eye(4)
+    place[:3, 3] = middle
+    scene = trimesh.Scene()
+    scene.add_geometry(local, transform=place)
+    content: Any = scene.export(file_type="glb", include_normals=True)
+    return content

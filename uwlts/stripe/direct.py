@@ -1,0 +1,489 @@
+"""Which of several stripes on a line is the laser's own on the surface, and which are reflections.
+
+A mirror, or the inside corner of shining faces, shows stripes once more. Neither brightness nor order tells the right
+one by itself: on a clean mirror the reflection of a painted sphere outshines the mirror's own stripe. But the laser's
+stripe goes on from line to line over the whole profile, across corners, while a reflection begins or ends in the void.
+Of all paths through the candidates of an image the one is sought that jumps least; where two hardly differ, the line
+stays ambiguous. Paths of least cost with their margins: the min-sum algorithm on a chain, forwards and backwards
+(Bishop, Pattern Recognition and Machine Learning, section 8.4.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uwlts.model.placement import camera_from_object
+from uwlts.model.sensor import Sensor
+from uwlts.model.stripe import Stripe, StripeStatus
+from uwlts.runtime.compiled import compiled
+from uwlts.stripe.ends import leave_ends_out
+from uwlts.stripe.result import StripeCandidates
+
+_GAP = 12
+"""Lines that a dim stripe may be lost for and go on."""
+
+_SLACK_PX = 2.0
+"""How much farther a stripe may have moved for each line that it was lost for."""
+
+_TURN = 0.3
+"""Share of a new step in the slope with which a stripe is expected to go on."""
+
+_SMOOTH_PX, _ROUGH, _ROUGHEST = 1.5, 0.03, 0.15
+"""Departure from the straight way that noise explains, cost in jumps of each px beyond it, and the highest: stripes are
+smooth, and chains of speckles are not."""
+
+_SKIPPED, _LOST = 0.1, 0.005
+"""Cost, in jumps, of a line whose candidates the path passes by: of a clear stripe, and of a faint one, which noise may
+hide."""
+
+_FAINT = 4.0
+"""Height, in least heights of a stripe, below which one is faint."""
+
+_BEHIND, _DIMMER, _OCTAVES = 0.002, 0.002, 3.0
+"""Cost, in jumps, of each candidate nearer to the sensor on the same line, and of each halving of the brightness below
+the line's brightest, up to so many: they decide between paths with equally many jumps. A surface hides what lies behind
+it, so that what is seen behind is a reflection; reflections are dimmer than what they show."""
+
+_MARGIN = 0.3
+"""Jumps by which a path has to be the better one."""
+
+
+_VOTE = 0.01
+"""Cost, in jumps, of a candidate that an image beside refuses at its place, and what one costs less that it takes."""
+
+_REFUSED_BESIDE = 3
+"""Lines between which a reflection that two stripes' crossing hides is the same one."""
+
+_CROSSING_LINES, _FEWEST_LINES, _OPENING = 12, 6, 0.2
+"""Lines, at most and at least, from which two stripes' distance shows where they cross, and its least growth per
+line."""
+
+_BESIDE, _AS_BRIGHT, _LONGEST_CROSSING = 4.0, 0.5, 24
+"""Distance, in jumps' lengths, within which stripes may run into each other; share of the brightness from which the
+other one matters; and most lines of a crossing."""
+
+_GRAIN, _FEWEST_BESIDE, _STRAIGHT_PX, _STEEPEST = 3, 4, 2.5, 6.0
+"""A stripe shows within `_GAP` lines on so many others, at least, those next to it aside, over which a grain of speckle
+may reach too, within so many px of a straight line of no more than so many px per line."""
+
+_TAKEN, _OPEN, _REFUSED = 1, 0, -1
+"""States of a candidate."""
+
+_OK, _AMBIGUOUS = np.uint8(StripeStatus.OK), np.uint8(StripeStatus.AMBIGUOUS)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenStripes:
+    """The stripe of an image, before ends are left out, and the candidates where there are several, None for no line.
+
+    ``least`` is the least height of a stripe in grey levels, ``jump_px`` how far apart neighbouring lines' centres are
+    on two stripes, ``end_lines`` as of `StripeOptions`.
+    """
+
+    stripe: Stripe
+    rivals: StripeCandidates | None
+    least: float
+    jump_px: float
+    end_lines: int
+
+
+def direct_stripes(images: Iterable[SeenStripes], *, farther: int) -> Iterator[Stripe]:
+    """The stripe of each of a recording's images without reflections; images without rivals keep theirs.
+
+    ``images`` follow each other along the scan; ``farther`` is as of `farther`, 0 where unknown. Lines on which it
+    stays open which stripe is the laser's own are AMBIGUOUS, and ends are left out. Each
+    stripe is given when the next image has come.
+    """
+    before: _Paths | None = None
+    last: tuple[SeenStripes, _Paths | None] | None = None
+    for image in images:
+        path = None
+        if image.rivals is not None:
+            path = _Paths.of(image.stripe, image.rivals, least=image.least, jump_px=image.jump_px)
+            path.decide(farther, np.zeros(len(path.line)))
+        if last is not None:
+            yield _chosen(*last, beside=(before, path), farther=farther)
+            before = last[1]
+        last = image, path
+    if last is not None:
+        yield _chosen(*last, beside=(before,), farther=farther)
+
+
+def _chosen(image: SeenStripes, path: _Paths | None, *, beside: Sequence[_Paths | None], farther: int) -> Stripe:
+    """The direct stripe of an image: decided once more where the images beside it, which show nearly the same, vote."""
+    stripe = image.stripe
+    if path is not None:
+        vote = sum((path.vote(other) for other in beside if other is not None), np.zeros(len(path.line)))
+        if vote.any():
+            path = replace(path, state=path.state.copy())
+            path.decide(farther, vote)
+        stripe = path.stripe(stripe)
+    return leave_ends_out(stripe, lines=image.end_lines, jump_px=image.jump_px)
+
+
+@dataclass(eq=False)
+class _Paths:
+    """Candidates (M,) of an image on all of its lines, which of them are alone on theirs, and the state of each."""
+
+    line: np.ndarray
+    centre_px: np.ndarray
+    amplitude: np.ndarray
+    width_px: np.ndarray
+    alone: np.ndarray
+    state: np.ndarray
+    least: float
+    jump_px: float
+
+    @classmethod
+    def of(cls, stripe: Stripe, rivals: StripeCandidates, *, least: float, jump_px: float) -> _Paths:
+        """The candidates of an image."""
+        alone = np.setdiff1d(stripe.lines, rivals.line)
+        line = np.concatenate([alone, rivals.line])
+        order = np.argsort(line, kind="stable")
+        columns = (
+            np.concatenate([getattr(stripe, name)[alone], getattr(rivals, name)])[order]
+            for name in ("centre_px", "amplitude", "width_px")
+        )
+        line, centre, amplitude, width = line[order], *columns
+        # Spots of a few lines are no stripe, unless nothing else is there.
+        kept = np.zeros(len(line), np.bool_)
+        _keep_stripes(line, centre, amplitude, kept)
+        line, centre, amplitude, width = (values[kept] for values in (line, centre, amplitude, width))
+        single = np.bincount(line)[line] == 1
+        state = np.full(len(line), _OPEN, np.int8)
+        return cls(line, centre, amplitude, width, single, state, least, jump_px)
+
+    def decide(self, farther: int, vote: np.ndarray) -> None:
+        """Take the candidates that the best path goes through, if it is clearly the best."""
+        margin = path_margins(
+            self.line,
+            self.centre_px,
+            self.amplitude,
+            farther=farther,
+            jump_px=self.jump_px,
+            least=self.least,
+            vote=vote,
+        )
+        _take(self.line, margin, self.alone, self.state)
+        _refuse_between(self.line, self.centre_px, self.alone, self.state, self.jump_px)
+        _refuse_tails(self.line, self.centre_px, self.alone, self.state, self.jump_px)
+        _refuse_crossings(self.line, self.centre_px, self.amplitude, self.state, self.jump_px)
+
+    def vote(self, other: _Paths) -> np.ndarray:
+        """What each candidate costs (M,) by what another image has decided at its place."""
+        result = np.zeros(len(self.line))
+        _vote(self.line, self.centre_px, other.line, other.centre_px, other.state, other.alone, self.jump_px, result)
+        return result
+
+    def stripe(self, before: Stripe) -> Stripe:
+        """The stripe of the taken candidates; lines without any that had one are AMBIGUOUS."""
+        centre, amplitude = np.full(len(before.status), np.nan), np.full(len(before.status), np.nan, np.float32)
+        width, status = amplitude.copy(), before.status.copy()
+        taken = self.state == _TAKEN
+        status[self.line], lines = _AMBIGUOUS, self.line[taken]
+        status[lines] = _OK
+        centre[lines], amplitude[lines] = self.centre_px[taken], self.amplitude[taken]
+        width[lines] = self.width_px[taken]
+        return Stripe(centre, amplitude, width, status, before.stripe_along)
+
+
+def farther(sensor: Sensor) -> int:
+    """1 where a stripe that is farther away lies at a larger pixel index of its line, -1 where at a smaller one."""
+    depths = np.array([(0.0, 0.0, -1.0, 1.0), (0.0, 0.0, 1.0, 1.0)])
+    seen = depths @ camera_from_object(sensor).T
+    across = 1 if sensor.camera.stripe_along == "width" else 0
+    near, far = seen[:, across] / seen[:, 2]
+    return 1 if far > near else -1
+
+
+def path_margins(
+    line: np.ndarray,
+    centre_px: np.ndarray,
+    amplitude: np.ndarray,
+    *,
+    farther: int,
+    jump_px: float,
+    least: float,
+    vote: np.ndarray,
+) -> np.ndarray:
+    """Cost (M,), in jumps beyond the best path, of the best path through each candidate (M,) of an image.
+
+    ``line`` (M,) grows; ``farther`` is as of `farther`, 0 where unknown. Neighbours more than ``jump_px`` apart are
+    a jump. ``vote`` (M,) is added to the cost of each candidate.
+    """
+    skipped = np.where(amplitude < _FAINT * least, _LOST, _SKIPPED)
+    cost = vote + _own_cost(line, centre_px, amplitude, farther)
+    through = np.empty(len(line))
+    _least_cost(line, centre_px, cost, skipped, jump_px, through)
+    backwards = np.empty(len(line))
+    _least_cost(
+        line.max() - line[::-1], centre_px[::-1].copy(), cost[::-1].copy(), skipped[::-1].copy(), jump_px, backwards
+    )
+    through += backwards[::-1] - cost
+    return through - through.min()
+
+
+def _own_cost(line: np.ndarray, centre_px: np.ndarray, amplitude: np.ndarray, farther: int) -> np.ndarray:
+    """Cost (M,) of candidates by the others on their lines."""
+    _, group, count = np.unique(line, return_inverse=True, return_counts=True)
+    brightest = np.zeros(len(count))
+    np.maximum.at(brightest, group, amplitude)
+    dimmer = np.clip(np.log2(brightest[group] / np.maximum(amplitude, 1e-6)), 0.0, _OCTAVES)
+    order = np.lexsort((farther * centre_px, line))
+    rank = np.empty(len(line))
+    rank[order] = np.arange(len(line)) - (np.cumsum(count) - count)[group[order]]
+    return _DIMMER * dimmer + _BEHIND * (rank if farther else 0.0)
+
+
+@compiled
+def _least_cost(
+    line: np.ndarray, centre: np.ndarray, cost: np.ndarray, skipped: np.ndarray, jump_px: float, result: np.ndarray
+) -> None:
+    """Cost (M,) of the best path that ends in each candidate, its own included."""
+    count = line.size
+    # What it costs to pass by, from the first line on: the number of lines with candidates before each one.
+    lines_before, slope = np.zeros(count), np.zeros(count)
+    for k in range(1, count):
+        lines_before[k] = lines_before[k - 1] + (1.0 if line[k] != line[k - 1] else 0.0)
+    elsewhere, best_of_line, first = 0.0, np.inf, 0
+    for k in range(count):
+        if k > 0 and line[k] != line[k - 1]:
+            elsewhere = min(elsewhere + _SKIPPED, best_of_line + 1.0)
+            best_of_line = np.inf
+        while line[k] - line[first] > _GAP:
+            first += 1
+        best = elsewhere
+        for j in range(first, k):
+            apart = line[k] - line[j]
+            if apart == 0:
+                break
+            moved, allowed = centre[k] - centre[j], jump_px + _SLACK_PX * (apart - 1)
+            off = min(abs(moved), abs(moved - slope[j] * apart))
+            if off <= allowed:
+                way = result[j] + min(skipped[j], skipped[k]) * (lines_before[k] - lines_before[j] - 1.0)
+                way += min(max(off - _SMOOTH_PX, 0.0) * _ROUGH, _ROUGHEST)
+                if way < best:
+                    best, slope[k] = way, slope[j] + _TURN * (moved / apart - slope[j])
+        result[k] = best + cost[k]
+        best_of_line = min(best_of_line, result[k])
+
+
+@compiled
+def _keep_stripes(line: np.ndarray, centre: np.ndarray, amplitude: np.ndarray, kept: np.ndarray) -> None:
+    """Mark candidates that go on straight over neighbouring lines, and the brightest ones of lines without any such."""
+    slopes = int(4.0 * _STEEPEST) + 1
+    for k in range(line.size):
+        for number in range(slopes):
+            slope, beside = _STEEPEST * (2.0 * number / (slopes - 1) - 1.0), 0
+            for side in (-1, 1):
+                j, last = k + side, line[k]
+                while 0 <= j < line.size and abs(line[j] - line[k]) <= _GAP:
+                    away = line[j] - line[k]
+                    if (
+                        abs(away) > _GRAIN
+                        and line[j] != last
+                        and abs(centre[j] - centre[k] - slope * away) <= _STRAIGHT_PX
+                    ):
+                        beside, last = beside + 1, line[j]
+                    j += side
+            if beside >= _FEWEST_BESIDE:
+                kept[k] = True
+                break
+    first = 0
+    while first < line.size:
+        last, best, some = first, first, False
+        while last < line.size and line[last] == line[first]:
+            some |= kept[last]
+            best = last if amplitude[last] > amplitude[best] else best
+            last += 1
+        for k in range(first, last):
+            kept[k] |= not some and amplitude[k] >= _AS_BRIGHT * amplitude[best]
+        first = last
+
+
+@compiled
+def _take(line: np.ndarray, margin: np.ndarray, alone: np.ndarray, state: np.ndarray) -> None:
+    """Take on each line the candidate on the best path, if every path by way of another one is clearly worse.
+
+    Candidates that are alone are taken.
+    """
+    first = 0
+    while first < line.size:
+        last = first
+        while last < line.size and line[last] == line[first]:
+            state[last] = _TAKEN
+            last += 1
+        if not alone[first]:
+            best, second = first, np.inf
+            for k in range(first + 1, last):
+                if margin[k] < margin[best]:
+                    second, best = margin[best], k
+                else:
+                    second = min(second, margin[k])
+            clear = second - margin[best] >= _MARGIN
+            for k in range(first, last):
+                state[k] = _REFUSED if margin[k] > _MARGIN and (clear or margin[best] > _MARGIN) else _OPEN
+            if clear and margin[best] <= _MARGIN:
+                state[best] = _TAKEN
+        first = last
+
+
+@compiled
+def _refuse_between(line: np.ndarray, centre: np.ndarray, alone: np.ndarray, state: np.ndarray, jump_px: float) -> None:
+    """Refuse candidates that are alone between refused ones of the same stripe: where noise hides the true one."""
+    for k in range(line.size):
+        if alone[k]:
+            refused = True
+            for side in (-1, 1):
+                j, beside = k + side, False
+                while 0 <= j < line.size and abs(line[j] - line[k]) <= _GAP:
+                    if not alone[j] and _linked(line, centre, k, j, jump_px):
+                        beside = state[j] != _TAKEN
+                        break
+                    j += side
+                refused &= beside
+            state[k] = _REFUSED if refused else _TAKEN
+
+
+@compiled
+def _refuse_tails(line: np.ndarray, centre: np.ndarray, alone: np.ndarray, state: np.ndarray, jump_px: float) -> None:
+    """Refuse candidates that are alone and go on from a longer refused stripe only, where the true one is dark."""
+    first, count = 0, line.size
+    while first < count:
+        if not alone[first] or state[first] != _TAKEN:
+            first += 1
+            continue
+        last = first
+        while last + 1 < count and alone[last + 1] and _linked(line, centre, last, last + 1, jump_px):
+            last += 1
+        longest, safe = 0, False
+        for end, side in ((first, -1), (last, 1)):
+            j = end + side
+            while 0 <= j < count and abs(line[j] - line[end]) <= _GAP:
+                if _linked(line, centre, end, j, jump_px):
+                    safe |= state[j] == _TAKEN
+                    if state[j] != _TAKEN:
+                        longest = max(longest, _refused_run(line, centre, state, j, side, jump_px))
+                j += side
+        if not safe and longest > last - first:
+            state[first : last + 1] = _REFUSED
+        first = last + 1
+
+
+@compiled
+def _refused_run(
+    line: np.ndarray, centre: np.ndarray, state: np.ndarray, number: int, side: int, jump_px: float
+) -> int:
+    """Lines over which a refused stripe goes on to a side."""
+    at, j = number, number + side
+    while 0 <= j < line.size and abs(line[j] - line[at]) <= _GAP:
+        if state[j] != _TAKEN and line[j] != line[at] and _linked(line, centre, at, j, jump_px):
+            at = j
+        j += side
+    return abs(line[at] - line[number])
+
+
+@compiled
+def _linked(line: np.ndarray, centre: np.ndarray, one: int, other: int, jump_px: float) -> bool:
+    """Whether two candidates may be of the same stripe."""
+    return abs(centre[one] - centre[other]) <= jump_px + _SLACK_PX * max(abs(line[one] - line[other]) - 1, 0)
+
+
+@compiled
+def _refuse_crossings(
+    line: np.ndarray, centre: np.ndarray, amplitude: np.ndarray, state: np.ndarray, jump_px: float
+) -> None:
+    """Open what is taken where a refused stripe and another one run into each other."""
+    count = line.size
+    hidden = np.zeros(count, np.bool_)
+    for i in range(count):
+        rival = _nearest_beside(line, centre, i)
+        if state[i] == _TAKEN or rival < 0 or amplitude[i] < _AS_BRIGHT * amplitude[rival]:
+            continue
+        away = centre[i] - centre[rival]
+        if abs(away) > _BESIDE * jump_px:
+            continue
+        for side in (-1, 1):
+            if _pair_beside(line, centre, state, i, -side, away, _REFUSED_BESIDE, jump_px) >= 0:
+                continue
+            # How the distance grows from here on.
+            seen, at, apart = 1, i, away
+            while seen < _CROSSING_LINES:
+                j = _pair_beside(line, centre, state, at, side, away, _REFUSED_BESIDE + 1, jump_px)
+                if j < 0:
+                    break
+                seen, at, apart = seen + 1, j, centre[j] - centre[_nearest_beside(line, centre, j)]
+            if seen < _FEWEST_LINES:
+                continue
+            growth = (abs(apart) - abs(away)) / abs(line[at] - line[i])
+            if growth > _OPENING:
+                reach = min(abs(away) / growth, _LONGEST_CROSSING) + 2.0
+                j = i - side
+                while 0 <= j < count and abs(line[j] - line[i]) <= reach:
+                    hidden[j] |= line[j] != line[i]
+                    j -= side
+    for k in range(count):
+        if hidden[k] and state[k] == _TAKEN:
+            state[k] = _OPEN
+
+
+@compiled
+def _nearest_beside(line: np.ndarray, centre: np.ndarray, number: int) -> int:
+    """Number of the candidate on the same line that is nearest; -1 where none is."""
+    first, best = number, -1
+    while first > 0 and line[first - 1] == line[number]:
+        first -= 1
+    while first < line.size and line[first] == line[number]:
+        if first != number and (best < 0 or abs(centre[first] - centre[number]) < abs(centre[best] - centre[number])):
+            best = first
+        first += 1
+    return best
+
+
+@compiled
+def _pair_beside(
+    line: np.ndarray,
+    centre: np.ndarray,
+    state: np.ndarray,
+    number: int,
+    side: int,
+    away: float,
+    most: int,
+    jump_px: float,
+) -> int:
+    """Number of the next candidate of a refused stripe, to some side, that has another one on the same side of it."""
+    j = number + side
+    while 0 <= j < line.size and abs(line[j] - line[number]) <= most:
+        if line[j] != line[number] and state[j] != _TAKEN and _linked(line, centre, number, j, jump_px):
+            other = _nearest_beside(line, centre, j)
+            if other >= 0 and (centre[j] - centre[other]) * away > 0:
+                return j
+        j += side
+    return -1
+
+
+@compiled
+def _vote(
+    line: np.ndarray,
+    centre: np.ndarray,
+    other_line: np.ndarray,
+    other_centre: np.ndarray,
+    other_state: np.ndarray,
+    other_alone: np.ndarray,
+    jump_px: float,
+    result: np.ndarray,
+) -> None:
+    """Add the votes of another image's candidates on the same lines, at places no farther than a jump."""
+    first = 0
+    for k in range(line.size):
+        while first < other_line.size and other_line[first] < line[k]:
+            first += 1
+        nearest, j = jump_px, first
+        while j < other_line.size and other_line[j] == line[k]:
+            if abs(other_centre[j] - centre[k]) < nearest:
+                nearest = abs(other_centre[j] - centre[k])
+                result[k] = 0.0 if other_alone[j] else -_VOTE * other_state[j]
+            j += 1

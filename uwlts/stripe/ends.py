@@ -1,0 +1,54 @@
+"""Ends of a stripe: lines beside a place where it ends or jumps, where the sheet meets the surface in part."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from uwlts.model.stripe import Stripe, StripeStatus
+
+_SHORT_GAP = 2
+"""A stripe that is lost for so few lines, as in noise, goes on."""
+
+_NONE = np.empty(0, np.intp)
+
+# NumPy compares with its own integers several times as fast as with an enumeration.
+_OK, _END = np.uint8(StripeStatus.OK), np.uint8(StripeStatus.END)
+
+
+def copied(stripe: Stripe) -> Stripe:
+    """A stripe of its own arrays."""
+    arrays = (each.copy() for each in (stripe.centre_px, stripe.amplitude, stripe.width_px, stripe.status))
+    return Stripe(*arrays, stripe.stripe_along)
+
+
+def leave_ends_out(stripe: Stripe, *, lines: int, jump_px: float) -> Stripe:
+    """A stripe without the last ``lines`` before it ends or jumps, END from now on; see `StripeOptions.end_lines`.
+
+    The stripe itself is changed.
+    """
+    if lines:
+        ends = _half_lit(stripe.status == _OK, stripe.centre_px, lines=lines, jump_px=jump_px)
+        stripe.status[ends] = _END
+        for values in (stripe.centre_px, stripe.amplitude, stripe.width_px):
+            values[ends] = np.nan
+    return stripe
+
+
+def _half_lit(good: np.ndarray, centre: np.ndarray, *, lines: int, jump_px: float) -> np.ndarray:
+    """Numbers (M,) of the lines with a centre that are among the ``lines`` last before a stripe ends or jumps.
+
+    ``good`` (L,) marks the lines with a centre. A stripe ends where more than a few lines in a row have none, and
+    jumps where neighbouring centres lie more than ``jump_px`` apart. The image's own border is no end.
+    """
+    if good.all() and np.abs(centre[1:] - centre[:-1]).max(initial=0.0) <= jump_px:
+        return _NONE
+    found = np.flatnonzero(good)
+    if len(found) == 0:
+        return found
+    # breaks[k] stands before found[k], the last one after all of them.
+    breaks = np.empty(len(found) + 1, bool)
+    breaks[1:-1] = (np.diff(found) > _SHORT_GAP + 1) | (np.abs(np.diff(centre[found])) > jump_px)
+    breaks[0], breaks[-1] = found[0] > _SHORT_GAP, len(good) - 1 - found[-1] > _SHORT_GAP
+    before = np.concatenate([[0], np.cumsum(breaks)])
+    place = np.arange(len(found))
+    return found[before[np.minimum(place + lines + 1, len(breaks))] > before[np.maximum(place - lines + 1, 0)]]
