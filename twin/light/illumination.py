@@ -130,14 +130,15 @@ class Light:
         o, d = self.in_own_frame(origin, direction)
         back = (self.sheet.begins_at_z_mm - o.z) / d.z
         length = dr.select((d.z < 0) & (back > 0), dr.minimum(length, back), length)
-        light = slope = None
-        middle = -o.x / _away_from_zero(d.x)
-        for _ in range(2):
+
+        def step(middle: Float) -> tuple[SheetLight, Float, Float]:
             t = dr.clip(middle, 0.0, length)
             light = self.sheet.at(mi.Point3f(o + d * t))
             slope = _away_from_zero(dr.dot(d, light.normal))
-            middle = t - light.distance_mm / slope
-        return length, light, slope, middle
+            return light, slope, t - light.distance_mm / slope
+
+        _, _, middle = step(-o.x / _away_from_zero(d.x))
+        return length, *step(middle)
 
     def near_crossing(self, origin: Point3f, direction: Vector3f, length: Float) -> tuple[Float, Float]:
         """Where rays of the sensor's OCS, up to ``length``, come nearest to the sheet, and how near, in mm along them.
@@ -203,7 +204,7 @@ class SheetLobe:
         return dr.lerp(self._share_left_out(), 1.0, u)
 
     def at_angles(self, heights: tuple[Float, Float], u: Float) -> tuple[Vector3f, Bool]:
-        """Directions at angles given by 1 - cos and 1 + cos, and whether they are valid; ``u`` draws the azimuth."""
+        """Directions, and whether they are valid, at angles given by 1 - cos and 1 + cos; u draws the azimuth."""
         before, after = heights
         sine = dr.sqrt(before * after)
         reach = self._reach(sine)

@@ -84,13 +84,14 @@ class Walker:
     reach_mm: Float
 
     @property
-    def _scatters(self) -> bool:
+    def scatters(self) -> bool:
+        """Whether walks are scattered by the water."""
         return self.effects.multiple_scattering and self.scattering.coefficient > 0
 
     @property
     def finds_light(self) -> bool:
         """Whether any light on longer ways is rendered."""
-        return self._scatters or self.effects.secondary_light
+        return self.scatters or self.effects.secondary_light
 
     def radiance(self, bundle: Rays, cell: UInt32, cells: int, *, seed: int) -> np.ndarray:
         """Sum (cells,) over the rays of each cell of their weight times the light that came on a longer way."""
@@ -161,7 +162,7 @@ class Walker:
 
         found = mi.Float(0.0)
         for light in self.lights:
-            if self._scatters:
+            if self.scatters:
                 found += self._scattered_by_sheet(light, o, d, length, walks.away, rng.next_float32())
             found += dr.exp(-c * length) * self._lit_end(light, walks, si, bsdf, end, hit)
 
@@ -176,7 +177,7 @@ class Walker:
         strength = walks.strength * passed
         # It may find more light than one in any direction: scattered on, it may run towards the laser.
         promise = mi.Float(1.0)
-        for towards in towards_laser if self._scatters else ():
+        for towards in towards_laser if self.scatters else ():
             ahead = 4 * math.pi * self.scattering.phase(one_minus_cosine(towards, d))
             promise = dr.maximum(promise, dr.select(in_water, ahead, 1.0))
         survival = dr.minimum(strength * promise / _SURVIVES_FROM, 1.0)
@@ -191,7 +192,7 @@ class Walker:
             reflectance, density = bsdf.eval_pdf(context, si, si.to_local(self.pose.direction(onward)), hit & ~in_water)
             value = dr.select(in_water, self.scattering.phase(one_minus_cosine(d, onward)), reflectance[0])
             density = dr.select(in_water, value, density * (1 - mirror))
-            if self._scatters:
+            if self.scatters:
                 density *= 1 - _TOWARDS_LASER - _TOWARDS_SHEET
                 for towards, sheet in zip(towards_laser, sheets, strict=True):
                     density += whole * of_laser * self.scattering.narrow.density(one_minus_cosine(towards, onward))
@@ -210,7 +211,7 @@ class Walker:
         specular = ~in_water & (choice < mirror)
         sample, _ = bsdf.sample(context, si, u1, u2, hit & ~in_water)
         onward = self.pose.object_direction(si.to_world(sample.wo))
-        if self._scatters:
+        if self.scatters:
             # All tables are read at once, whichever a direction is drawn from.
             table, axis, share = self.scattering.angles, d, u2.x
             laser, first = dr.full(mi.Bool, False, dr.width(which)), 0.0
@@ -316,7 +317,7 @@ class Walker:
         choice, near, u = rng.next_float32(), rng.next_float32(), rng.next_float32()
         c = self.scattering.c
         through = dr.exp(-c * length)
-        if not self._scatters:
+        if not self.scatters:
             return dr.full(mi.Bool, False, dr.width(hit)), length, dr.select(hit, through, 0.0)
         fall = dr.maximum(c, 4 / self.reach_mm)
         share = 1 - dr.exp(-fall * length)
