@@ -158,7 +158,7 @@ def test_surfaces_are_the_same_every_time_and_kept_unharmed():
 
 
 def test_a_weld_too_fine_to_be_meshed_is_refused():
-    with pytest.raises(DescriptionError, match=r"a weld in steps of 0\.0\d+ mm needs \d+ vertices"):
+    with pytest.raises(DescriptionError, match=r"a surface in steps of 0\.0\d+ mm needs \d+ vertices"):
         Weld(kind="weld", ripple_pitch_mm=0.2).surface()
 
 
