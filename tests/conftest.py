@@ -76,6 +76,8 @@ SERVING = {
     "test_gige_camera.py",
     "test_calibrate_live.py",
     "test_scan_command.py",
+    "test_scan_3d.py",
+    "test_continuous_scan.py",
     "test_scan_exposure.py",
     "test_scan_ended.py",
     "test_scan_faults.py",

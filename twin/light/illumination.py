@@ -13,7 +13,7 @@ import numpy as np
 from twin.backend.arrays import Bool, Float, Point2f, Point3f, Vector3f, opaque, opaque_transform
 from twin.light.pose import Rays, SensorPose
 from twin.light.sheet import Sheet, SheetLight
-from twin.light.water import AngleTable
+from twin.light.water import AngleTable, one_minus_cosine
 from twin.scene.objects import MirrorFace
 
 _CLEAR_MM = 1e-2
@@ -121,20 +121,31 @@ class Light:
             light = replace(light, irradiance=light.irradiance * self._share)
         return t, light
 
-    def _middle_near(self, o: Point3f, d: Vector3f, t: Float) -> tuple[SheetLight, Float, Float]:
-        """The light at ``t`` on rays of the sheet's own OCS, the slope of its distance, and the middle found by it."""
-        light = self.sheet.at(mi.Point3f(o + d * t))
-        slope = _away_from_zero(dr.dot(d, light.normal))
-        return light, slope, t - light.distance_mm / slope
+    def _middle_of(self, origin: Point3f, direction: Vector3f, length: Float) -> tuple[Float, SheetLight, Float, Float]:
+        """Where rays of the sensor's OCS, up to ``length``, pass the sheet's middle.
+
+        The part of ``length`` before the window, the light near the middle, the slope of its distance along the ray,
+        and the middle's place on it, which may lie outside.
+        """
+        o, d = self.in_own_frame(origin, direction)
+        back = (self.sheet.begins_at_z_mm - o.z) / d.z
+        length = dr.select((d.z < 0) & (back > 0), dr.minimum(length, back), length)
+
+        def step(middle: Float) -> tuple[SheetLight, Float, Float]:
+            t = dr.clip(middle, 0.0, length)
+            light = self.sheet.at(mi.Point3f(o + d * t))
+            slope = _away_from_zero(dr.dot(d, light.normal))
+            return light, slope, t - light.distance_mm / slope
+
+        _, _, middle = step(-o.x / _away_from_zero(d.x))
+        return length, *step(middle)
 
     def near_crossing(self, origin: Point3f, direction: Vector3f, length: Float) -> tuple[Float, Float]:
         """Where rays of the sensor's OCS, up to ``length``, come nearest to the sheet, and how near, in mm along them.
 
         Within the sheet, its standard deviation counts as the distance.
         """
-        o, d = self.in_own_frame(origin, direction)
-        _, _, middle = self._middle_near(o, d, dr.clip(-o.x / _away_from_zero(d.x), 0.0, length))
-        light, slope, middle = self._middle_near(o, d, dr.clip(middle, 0.0, length))
+        length, light, slope, middle = self._middle_of(origin, direction, length)
         t = dr.clip(middle, 0.0, length)
         return t, dr.abs(middle - t) + light.sigma_mm / dr.abs(slope)
 
@@ -144,12 +155,7 @@ class Light:
         The density is 0 where a ray up to ``length`` keeps clear of the sheet. It only steers samples: whoever uses it
         evaluates the true light there.
         """
-        o, d = self.in_own_frame(origin, direction)
-        back = (self.sheet.begins_at_z_mm - o.z) / d.z
-        length = dr.select((d.z < 0) & (back > 0), dr.minimum(length, back), length)
-        t = dr.clip(-o.x / _away_from_zero(d.x), 0.0, length)
-        _, _, middle = self._middle_near(o, d, t)
-        light, slope, middle = self._middle_near(o, d, dr.clip(middle, 0.0, length))
+        length, light, slope, middle = self._middle_of(origin, direction, length)
         spread = 1.1 * math.sqrt(2) * light.sigma_mm / dr.abs(slope)
         low, high = dr.erf(-middle / spread), dr.erf((length - middle) / spread)
         x = dr.clip((middle + spread * dr.erfinv(dr.lerp(low, high, u))), 0.0, length)
@@ -191,12 +197,19 @@ class SheetLobe:
 
     def draw(self, u: Point2f) -> tuple[Vector3f, Bool]:
         """Directions, and whether they are valid; u.x draws the angle and u.y the azimuth."""
-        below = self._share_left_out()
-        before, after = self.angles.heights(dr.lerp(below, 1.0, u.x))
+        return self.at_angles(self.angles.heights(self.share_below(u.x)), u.y)
+
+    def share_below(self, u: Float) -> Float:
+        """Share of all the table's directions that lies below the angle to be drawn."""
+        return dr.lerp(self._share_left_out(), 1.0, u)
+
+    def at_angles(self, heights: tuple[Float, Float], u: Float) -> tuple[Vector3f, Bool]:
+        """Directions, and whether they are valid, at angles given by 1 - cos and 1 + cos; u draws the azimuth."""
+        before, after = heights
         sine = dr.sqrt(before * after)
         reach = self._reach(sine)
-        on_side = u.y < self.share_on_side
-        v = dr.select(on_side, u.y / self.share_on_side, (1 - u.y) / (1 - self.share_on_side))
+        on_side = u < self.share_on_side
+        v = dr.select(on_side, u / self.share_on_side, (1 - u) / (1 - self.share_on_side))
         # The azimuth is the Gudermannian of an even number, whose sine is tanh and whose cosine is 1 / cosh.
         tanh, cosh = dr.tanh((2 * v - 1) * reach), dr.cosh((2 * v - 1) * reach)
         x = dr.select(on_side, sine / cosh, -sine / cosh)
@@ -206,7 +219,7 @@ class SheetLobe:
 
     def density(self, direction: Vector3f) -> Float:
         """Density in 1/sr with which `draw` chooses directions."""
-        before = 0.5 * dr.squared_norm(direction - self.towards)
+        before = one_minus_cosine(self.towards, direction)
         sine = dr.sqrt(dr.maximum(before * (2 - before), 0.0))
         slope = dr.dot(direction, self.side)
         share = dr.select(slope > 0, self.share_on_side, 1 - self.share_on_side) / (1 - self._share_left_out())

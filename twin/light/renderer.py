@@ -314,7 +314,8 @@ class Renderer:
         side = np.repeat([WALK_CELL_PX, NODE_SPACING_PX], [len(large), len(small)])
         each = self._walked(walker, row, column, side, seed=seed, walks=walks)
         in_large = (np.bincount(large, each[: len(large)]) / np.bincount(large)).reshape(rows, columns)
-        in_large = without_outliers(in_large, ~beside)
+        # Light from surface to surface is not smooth where water scatters none, nor has it rare bright samples.
+        in_large = without_outliers(in_large, ~beside if walker.scatters else np.zeros_like(beside))
         size = columns * WALK_CELL_PX, rows * WALK_CELL_PX
         smooth = cv2.resize(in_large, size, interpolation=cv2.INTER_LINEAR)[: camera.height_px, : camera.width_px]
         if len(lit_cells):

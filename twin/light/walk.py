@@ -30,7 +30,7 @@ from twin.backend.arrays import PCG32, Bool, BSDFPtr, Float, Point3f, SurfaceInt
 from twin.light.illumination import Light, SheetLobe
 from twin.light.pose import Rays, SensorPose
 from twin.light.sheet import SheetLight
-from twin.light.water import Scattering
+from twin.light.water import Scattering, one_minus_cosine, turned
 from twin.options import Effects
 from twin.scene.objects import Objects
 
@@ -84,13 +84,14 @@ class Walker:
     reach_mm: Float
 
     @property
-    def _scatters(self) -> bool:
+    def scatters(self) -> bool:
+        """Whether walks are scattered by the water."""
         return self.effects.multiple_scattering and self.scattering.coefficient > 0
 
     @property
     def finds_light(self) -> bool:
         """Whether any light on longer ways is rendered."""
-        return self._scatters or self.effects.secondary_light
+        return self.scatters or self.effects.secondary_light
 
     def radiance(self, bundle: Rays, cell: UInt32, cells: int, *, seed: int) -> np.ndarray:
         """Sum (cells,) over the rays of each cell of their weight times the light that came on a longer way."""
@@ -161,7 +162,7 @@ class Walker:
 
         found = mi.Float(0.0)
         for light in self.lights:
-            if self._scatters:
+            if self.scatters:
                 found += self._scattered_by_sheet(light, o, d, length, walks.away, rng.next_float32())
             found += dr.exp(-c * length) * self._lit_end(light, walks, si, bsdf, end, hit)
 
@@ -176,8 +177,8 @@ class Walker:
         strength = walks.strength * passed
         # It may find more light than one in any direction: scattered on, it may run towards the laser.
         promise = mi.Float(1.0)
-        for towards in towards_laser if self._scatters else ():
-            ahead = 4 * math.pi * self.scattering.phase(_one_minus_cosine(towards, d))
+        for towards in towards_laser if self.scatters else ():
+            ahead = 4 * math.pi * self.scattering.phase(one_minus_cosine(towards, d))
             promise = dr.maximum(promise, dr.select(in_water, ahead, 1.0))
         survival = dr.minimum(strength * promise / _SURVIVES_FROM, 1.0)
         alive = (strength > 0) & (rng.next_float32() < survival)
@@ -189,12 +190,12 @@ class Walker:
         def scattered(onward: Vector3f) -> tuple[Float, Float]:
             """Light that the vertex scatters from ``onward`` into the walk, per sr, and the density there."""
             reflectance, density = bsdf.eval_pdf(context, si, si.to_local(self.pose.direction(onward)), hit & ~in_water)
-            value = dr.select(in_water, self.scattering.phase(_one_minus_cosine(d, onward)), reflectance[0])
+            value = dr.select(in_water, self.scattering.phase(one_minus_cosine(d, onward)), reflectance[0])
             density = dr.select(in_water, value, density * (1 - mirror))
-            if self._scatters:
+            if self.scatters:
                 density *= 1 - _TOWARDS_LASER - _TOWARDS_SHEET
                 for towards, sheet in zip(towards_laser, sheets, strict=True):
-                    density += whole * of_laser * self.scattering.narrow.density(_one_minus_cosine(towards, onward))
+                    density += whole * of_laser * self.scattering.narrow.density(one_minus_cosine(towards, onward))
                     density += whole * of_sheet * sheet.density(onward)
             return value, density
 
@@ -209,17 +210,26 @@ class Walker:
         u1, u2 = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         specular = ~in_water & (choice < mirror)
         sample, _ = bsdf.sample(context, si, u1, u2, hit & ~in_water)
-        own = dr.select(in_water, self.scattering.sample(d, u2)[0], self.pose.object_direction(si.to_world(sample.wo)))
-        onward = own
-        if self._scatters:
-            first = 0.0
+        onward = self.pose.object_direction(si.to_world(sample.wo))
+        if self.scatters:
+            # All tables are read at once, whichever a direction is drawn from.
+            table, axis, share = self.scattering.angles, d, u2.x
+            laser, first = dr.full(mi.Bool, False, dr.width(which)), 0.0
+            by_sheet = []
             for towards, sheet in zip(towards_laser, sheets, strict=True):
-                about = self.scattering.narrow.turned(towards, u2)
-                onward = dr.select((which >= first) & (which < first + of_laser), about, onward)
+                about = (which >= first) & (which < first + of_laser)
                 first += of_laser
                 chosen = (which >= first) & (which < first + of_sheet)
                 first += of_sheet
-                drawn, valid = sheet.draw(u2)
+                table = table.or_where(about, self.scattering.narrow).or_where(chosen, sheet.angles)
+                axis = dr.select(about, towards, axis)
+                share = dr.select(chosen, sheet.share_below(u2.x), share)
+                laser |= about
+                by_sheet.append((sheet, chosen))
+            heights = table.heights(share)
+            onward = dr.select(in_water | laser, turned(axis, heights, u2.y), onward)
+            for sheet, chosen in by_sheet:
+                drawn, valid = sheet.at_angles(heights, u2.y)
                 onward = dr.select(chosen & valid, drawn, onward)
                 strength = dr.select(chosen & ~valid & ~specular, 0.0, strength)
         onward = dr.select(specular, self.pose.object_direction(si.to_world(mi.reflect(si.wi))), onward)
@@ -248,7 +258,7 @@ class Walker:
         here = light.at(p)
         active = active & (density > 0) & (here.irradiance > 0)
         lit = light.reaches(self.objects.scene, p, here, None, active)
-        source = here.irradiance * self.scattering.phase(_one_minus_cosine(-here.direction, d))
+        source = here.irradiance * self.scattering.phase(one_minus_cosine(-here.direction, d))
         value = self.scattering.b * source * dr.exp(-self.scattering.c * t) / density
         return dr.select(lit, value, 0.0)
 
@@ -307,7 +317,7 @@ class Walker:
         choice, near, u = rng.next_float32(), rng.next_float32(), rng.next_float32()
         c = self.scattering.c
         through = dr.exp(-c * length)
-        if not self._scatters:
+        if not self.scatters:
             return dr.full(mi.Bool, False, dr.width(hit)), length, dr.select(hit, through, 0.0)
         fall = dr.maximum(c, 4 / self.reach_mm)
         share = 1 - dr.exp(-fall * length)
@@ -327,8 +337,3 @@ class Walker:
             density += each / ((dr.abs(distance - t) + apart) * (before + after))
         scattered = self.scattering.b * dr.exp(-c * distance) / (density * likely)
         return in_water, dr.select(in_water, distance, length), dr.select(in_water, scattered, through / (1 - likely))
-
-
-def _one_minus_cosine(a: Vector3f, b: Vector3f) -> Float:
-    """1 - cos of the angle between unit vectors, exact for small angles too."""
-    return 0.5 * dr.squared_norm(a - b)

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, Point2f, UInt32, Vector3f, opaque, to_jit
+from twin.backend.arrays import Bool, Float, Point2f, UInt32, Vector3f, opaque, to_jit
 from twin.light.sheet import SheetLight
 from uwlts.model.phase_functions import Molecular, PhaseFunction, Scatterer
 from uwlts.model.sensor import Medium
@@ -104,12 +104,11 @@ class Scattering:
         self.b, self.c = opaque(self.coefficient), opaque(self.extinction)
         table = tabulated(medium.scatterers(wavelength_nm))
         self.backward_share = 1 - float(np.interp(math.pi / 2, node_angles(), table.cumulative))
-        self._angles = AngleTable(table)
         sine = np.sin(node_angles())
-        narrow = _normalised(table.log_density - np.log(sine), float(table.cumulative[0] / sine[0]))
-        self.over_sine = AngleTable(narrow)
-        halves = np.log(0.5 * (np.exp(table.log_density) + np.exp(narrow.log_density)))
-        self.narrow = AngleTable(_normalised(halves, float(table.cumulative[0] + narrow.cumulative[0]) / 2))
+        over_sine = _normalised(table.log_density - np.log(sine), float(table.cumulative[0] / sine[0]))
+        halves = np.log(0.5 * (np.exp(table.log_density) + np.exp(over_sine.log_density)))
+        narrow = _normalised(halves, float(table.cumulative[0] + over_sine.cumulative[0]) / 2)
+        self.angles, self.over_sine, self.narrow = AngleTable.together(table, over_sine, narrow)
 
     def phase(self, one_minus_cosine: Float) -> Float:
         """Phase function in 1/sr at 1 - cos of the scattering angle.
@@ -117,24 +116,43 @@ class Scattering:
         Compute it as |w1 - w2|^2 / 2 from the unit directions before and after: 1 minus their product loses small
         angles to the rounding of 32 bits.
         """
-        return self._angles.density(one_minus_cosine)
+        return self.angles.density(one_minus_cosine)
 
     def sample(self, direction: Vector3f, u: Point2f) -> tuple[Vector3f, Float]:
         """A direction after scattering and its density in 1/sr, which is the phase function there.
 
         The scattering angle grows with ``u.x``, the azimuth with ``u.y``.
         """
-        turned = self._angles.turned(direction, u)
+        turned = self.angles.turned(direction, u)
         return turned, self.phase(0.5 * dr.squared_norm(turned - direction))
 
 
+@dataclass(frozen=True)
 class AngleTable:
-    """A `PhaseTable` as kernels read it: the density of directions about an axis, evaluated and drawn from."""
+    """A `PhaseTable` as kernels read it: the density of directions about an axis, evaluated and drawn from.
 
-    def __init__(self, table: PhaseTable):
-        self._log_density = to_jit(mi.Float, table.log_density)
-        self._forward = opaque(table.cumulative[0] / FORWARD_SR)
-        self._cumulative = to_jit(mi.Float, table.cumulative)
+    Several lie in the same arrays, each from its own ``start`` on: of them, one can be chosen for each direction.
+    """
+
+    log_density: Float
+    cumulative: Float
+    forward: Float
+    start: UInt32
+
+    @classmethod
+    def together(cls, *tables: PhaseTable) -> list[AngleTable]:
+        """Tables that lie in the same arrays."""
+        log_density = to_jit(mi.Float, np.concatenate([each.log_density for each in tables]))
+        cumulative = to_jit(mi.Float, np.concatenate([each.cumulative for each in tables]))
+        return [
+            cls(log_density, cumulative, opaque(each.cumulative[0] / FORWARD_SR), mi.UInt32(k * NODES))
+            for k, each in enumerate(tables)
+        ]
+
+    def or_where(self, mask: Bool, other: AngleTable) -> AngleTable:
+        """This table, or another one that lies in the same arrays where ``mask`` is set."""
+        forward, start = (dr.select(mask, *pair) for pair in ((other.forward, self.forward), (other.start, self.start)))
+        return AngleTable(self.log_density, self.cumulative, forward, start)
 
     def density(self, one_minus_cosine: Float) -> Float:
         """Density in 1/sr at 1 - cos of the angle from the axis, the same at all azimuths."""
@@ -142,22 +160,22 @@ class AngleTable:
         cell, share = self._cell(before)
         low, high = self._ends(cell)
         density = dr.exp(dr.fma(high - low, share, low)) / (math.pi * before * (2 - before))
-        return dr.select(one_minus_cosine < FORWARD_END, self._forward, density)
+        return dr.select(one_minus_cosine < FORWARD_END, self.forward, density)
 
     def share_below(self, one_minus_cosine: Float) -> Float:
         """Share of directions before the table's node at or below 1 - cos of an angle."""
-        return dr.gather(mi.Float, self._cumulative, self._cell(dr.maximum(one_minus_cosine, FORWARD_END))[0])
+        return self._share(self._cell(dr.maximum(one_minus_cosine, FORWARD_END))[0])
 
     def heights(self, u: Float) -> tuple[Float, Float]:
         """1 - cos and 1 + cos of the angle below which the share ``u`` of directions lies."""
         node = mi.UInt32(0)
         step = NODES // 2
         while step:
-            node = dr.select(dr.gather(mi.Float, self._cumulative, node + step) <= u, node + step, node)
+            node = dr.select(self._share(node + step) <= u, node + step, node)
             step //= 2
         cell = dr.minimum(node, NODES - 2)
-        start, end = (dr.gather(mi.Float, self._cumulative, cell + side) for side in (0, 1))
-        share = dr.clip((u - start) / (end - start), 0.0, 1.0)
+        below, above = self._share(cell), self._share(cell + 1)
+        share = dr.clip((u - below) / (above - below), 0.0, 1.0)
         low, high = self._ends(cell)
         # The density exp(k t) over 0 < t < 1 has the inverse log(1 + share (exp(k) - 1)) / k, 0 / 0 for k = 0; to
         # three orders of k, which is below 0.05, it is this.
@@ -166,7 +184,7 @@ class AngleTable:
         ratio = dr.exp(FIRST_PLACE + STEP * (mi.Float(cell) + t))
         before, after = 2 * ratio / (1 + ratio), 2 / (1 + ratio)
         # Beyond either end of the table directions are even over a cap.
-        first, last = (dr.gather(mi.Float, self._cumulative, mi.UInt32(end)) for end in (0, NODES - 1))
+        first, last = (self._share(mi.UInt32(end)) for end in (0, NODES - 1))
         forward, backward = u < first, u >= last
         before = dr.select(forward, FORWARD_END * u / first, before)
         after = dr.select(backward, BACKWARD_END * (1 - u) / (1 - last), after)
@@ -174,11 +192,7 @@ class AngleTable:
 
     def turned(self, axis: Vector3f, u: Point2f) -> Vector3f:
         """Directions about an axis: the angle grows with ``u.x``, the azimuth with ``u.y``."""
-        before, after = self.heights(u.x)
-        sine = dr.sqrt(before * after)
-        sin_azimuth, cos_azimuth = dr.sincos(2 * math.pi * u.y)
-        turned = mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - before)
-        return dr.normalize(mi.Frame3f(axis).to_world(turned))
+        return turned(axis, self.heights(u.x), u.y)
 
     def _cell(self, before: Float) -> tuple[UInt32, Float]:
         """Cell of 1 - cos, which is within the table, and the place in the cell from 0 to 1."""
@@ -188,7 +202,26 @@ class AngleTable:
 
     def _ends(self, cell: UInt32) -> tuple[Float, Float]:
         """Logarithm of the density at both ends of a cell of the table."""
-        return dr.gather(mi.Float, self._log_density, cell), dr.gather(mi.Float, self._log_density, cell + 1)
+        place = self.start + cell
+        return dr.gather(mi.Float, self.log_density, place), dr.gather(mi.Float, self.log_density, place + 1)
+
+    def _share(self, node: UInt32) -> Float:
+        """Share of directions below a node."""
+        return dr.gather(mi.Float, self.cumulative, self.start + node)
+
+
+def turned(axis: Vector3f, heights: tuple[Float, Float], u: Float) -> Vector3f:
+    """Directions at angles from an axis of which 1 - cos and 1 + cos are given; the azimuth grows with ``u``."""
+    before, after = heights
+    sine = dr.sqrt(before * after)
+    sin_azimuth, cos_azimuth = dr.sincos(2 * math.pi * u)
+    direction = mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - before)
+    return dr.normalize(mi.Frame3f(axis).to_world(direction))
+
+
+def one_minus_cosine(a: Vector3f, b: Vector3f) -> Float:
+    """1 - cos of the angle between unit vectors, exact for small angles too."""
+    return 0.5 * dr.squared_norm(a - b)
 
 
 def single_scattering(

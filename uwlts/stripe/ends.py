@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from uwlts.model.stripe import Stripe, StripeStatus
@@ -17,8 +19,13 @@ _OK, _END = np.uint8(StripeStatus.OK), np.uint8(StripeStatus.END)
 
 def copied(stripe: Stripe) -> Stripe:
     """A stripe of its own arrays."""
-    arrays = (each.copy() for each in (stripe.centre_px, stripe.amplitude, stripe.width_px, stripe.status))
-    return Stripe(*arrays, stripe.stripe_along)
+    return replace(
+        stripe,
+        centre_px=stripe.centre_px.copy(),
+        amplitude=stripe.amplitude.copy(),
+        width_px=stripe.width_px.copy(),
+        status=stripe.status.copy(),
+    )
 
 
 def leave_ends_out(stripe: Stripe, *, lines: int, jump_px: float) -> Stripe:
