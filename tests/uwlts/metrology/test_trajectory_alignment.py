@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import uwlts
-from tests.uwlts.path_views import CROSSING_MM, ride
+from tests.uwlts.path_views import ride
 from uwlts.cli import app
 from uwlts.metrology.height_correlation import shifts_of_heights
 from uwlts.model.trajectory import Trajectory
@@ -108,12 +108,3 @@ def test_the_command_writes_a_trajectory_with_covariance(loop, tmp_path, monkeyp
     record = json.loads((tmp_path / "corrected.json").read_text())
     assert record["crossings"] and record["largest_shift_mm"] > 10
     assert len(uwlts.read_cloud("aligned.h5")) == len(cloud)
-
-
-@pytest.mark.slow
-def test_a_pass_of_15_m_with_300_mm_of_drift():
-    """Large drift: crossings are found, and the error of the path is at most a fifth of what it was."""
-    cloud, reported, true = ride(np.random.default_rng(SEED), CROSSING_MM, drift_mm=300.0, drift_deg=1.0)
-    found = uwlts.align_trajectory(cloud, reported, drift_mm=300.0, drift_deg=1.0)
-    assert len(found.crossings) >= 3
-    assert position_errors(found.trajectory, true) < position_errors(reported, true) / 5
