@@ -84,10 +84,3 @@ def ride(
     points = np.einsum("nij,nj->ni", reported[frame, :3, :3], local) + reported[frame, :3, 3]
     cloud = PointCloud(points, np.ones(len(points)), frame, line, time_s=times[frame])
     return cloud, Trajectory(times, reported), Trajectory(times, true)
-
-
-CROSSING_MM = np.array(
-    [[0, 0], [3000, 0], [3000, 1200], [600, 1200], [600, -300], [1500, -300], [1500, 2000], [2400, 2000], [2400, -300]],
-    float,
-)
-"""Of 15 m; it crosses itself at (600, 0), (1500, 0), (1500, 1200), (2400, 1200) and (2400, 0)."""
