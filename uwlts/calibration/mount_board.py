@@ -1,7 +1,7 @@
 """Mount of a calibrated sensor from images of a target from several poses of its platform (hand-eye calibration)."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,7 +11,9 @@ from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, t
 
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, stored_estimate
 from uwlts.calibration.mount_next_pose import missing_turns
+from uwlts.calibration.mount_sensor import with_sensor
 from uwlts.model.any_calibration import check_fits
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError, DescriptionError, TargetError
@@ -34,6 +36,8 @@ _NO_FIT = 0.1
 _OPEN_MM, _OPEN_RAD = 5.0, np.radians(1.0)
 """Standard uncertainties from which a mount counts as not determined."""
 _ROUNDS = 8
+_STEPS = np.array([1e-3] * 3 + [1e-6] * 3)
+"""Of shift (mm) and turn (rad) for differences."""
 _TRIPLES = 100
 """With a third of the images wrong, three right ones are missed by all of them once in 10^15 times."""
 
@@ -44,7 +48,8 @@ class BoardImage:
 
     ``camera_from_target`` (4, 4) in mm; ``covariance`` (6, 6) is of a shift of the target's middle (mm) and a turn
     about it (rad), in the camera's axes; ``points`` found, whose pixels miss by ``rms_px``; ``base_from_platform``
-    (4, 4).
+    (4, 4). ``by_sensor`` (6, Q) are derivatives of shift and turn by the parameters of the sensor's joint estimate,
+    where it has one.
     """
 
     name: str
@@ -53,10 +58,13 @@ class BoardImage:
     points: int
     rms_px: float
     base_from_platform: np.ndarray
+    by_sensor: np.ndarray | None = None
 
 
 def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses: np.ndarray | None = None) -> Mount:
     """``T_platform_sensor`` from images of a target at an unknown fixed place, the sensor's calibration held fixed.
+
+    What a joint estimate of the calibration leaves open becomes part of the covariance.
 
     Each image gives the target's pose before the camera, through window and medium. A closed form (Park and Martin,
     IEEE Trans. Robotics and Automation 10, 1994) starts a least-squares estimate of mount and target's place, weighted
@@ -80,7 +88,9 @@ def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses:
     CalibrationError
         Too few images show the target, or the poses do not determine the mount or contradict the images.
     """
-    target, images, reasons = _seen(captures, calibration, poses)
+    header = captures[0].header
+    known = None if calibration.joint is None else stored_estimate(calibration, header.sensor, header.medium)
+    target, images, reasons = _seen(captures, calibration, known, poses)
     middle = target.points_mm.mean(axis=0)
     rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in images])
     if missing := missing_turns(rotations, least_rad=_OPEN_RAD):
@@ -95,7 +105,9 @@ def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses:
             f"{len(left_out)} of {len(images)} left out. Are the poses T_base_platform, is their format right, are "
             "their units right, and do they come in the order of the images?"
         )
-    covariance = np.linalg.inv(used.information(state, scatter))
+    covariance, share = np.linalg.inv(used.information(state, scatter)), None
+    if known is not None:
+        covariance, share = with_sensor(covariance, used.by_sensor(state, scatter), state[0][:3, :3], known)
     missing = missing_turns(Rotation.from_matrix([each.base_from_platform[:3, :3] for each in used.images]))
     shift, turn = (float(np.sqrt(np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1])) for k in (0, 3))
     if shift > _OPEN_MM or turn > _OPEN_RAD:
@@ -125,6 +137,7 @@ def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses:
         pose_std_mm=float(scatter[0]),
         rms_mm=float(np.sqrt(np.mean(np.square(list(found.values()))))),
         held_out_rms_mm=float(np.sqrt(np.mean(np.square(list(held.values()))))),
+        sensor=share,
         poses=tuple(rows),
         weaknesses=tuple(missing),
         inputs={capture.path.name: sha256_of(capture.path) for capture in captures},
@@ -136,7 +149,7 @@ def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
 
 
 def _seen(
-    captures: Sequence[Capture], calibration: Calibration, poses: np.ndarray | None
+    captures: Sequence[Capture], calibration: Calibration, known: StoredEstimate | None, poses: np.ndarray | None
 ) -> tuple[Target, list[BoardImage], dict[str, str]]:
     """The target, its pose in every image that shows it, and why others do not."""
     images: list[BoardImage] = []
@@ -160,7 +173,7 @@ def _seen(
             if not np.isfinite(pose).all():
                 raise DescriptionError(f"{name} has no pose of the platform: give a table of poses, or import them")
             try:
-                images.append(_posed(name, image, targets[0], calibration, window, index, pose))
+                images.append(_posed(name, image, targets[0], calibration, known, window, index, pose))
             except (TargetError, CalibrationError) as error:
                 reasons[name] = f"no target: {error}"
     if poses is not None and taken != len(poses):
@@ -178,6 +191,7 @@ def _posed(
     image: np.ndarray,
     target: Target,
     calibration: Calibration,
+    known: StoredEstimate | None,
     window: WindowModel | None,
     index: float,
     base_from_platform: np.ndarray,
@@ -222,7 +236,28 @@ def _posed(
     )
     spread = max(float(np.sqrt(np.mean(fit.fun**2) * fit.fun.size / (fit.fun.size - 6))), _LEAST_PX)
     covariance = spread**2 * np.linalg.inv(fit.jac.T @ fit.jac)
-    return BoardImage(name, moved(fit.x), covariance, len(pixels), spread, base_from_platform)
+    by_sensor = None
+    if known is not None:
+        # The pose goes where the pixels stay as they are.
+        found, where = moved(fit.x), np.zeros(6)
+        by_pose = _differences(lambda step: projected(_moved_about(found, middle, step), view.points_mm), where, _STEPS)
+        placed = view.points_mm @ found[:3, :3].T + found[:3, 3]
+        std = np.sqrt(np.diag(known.covariance))
+        by_values = _differences(
+            lambda values: known.parameters.project(values, known.view, placed), known.values, 1e-2 * std
+        )
+        by_sensor = -np.linalg.lstsq(by_pose, by_values, rcond=None)[0]
+    return BoardImage(name, moved(fit.x), covariance, len(pixels), spread, base_from_platform, by_sensor)
+
+
+def _differences(values: Callable[[np.ndarray], np.ndarray], at: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Derivatives (N, K) of values, flattened, by central differences with steps (K,); 0 where a step is 0."""
+    columns = []
+    for number, size in enumerate(steps):
+        step = np.zeros(len(steps))
+        step[number] = size
+        columns.append((values(at + step) - values(at - step)).ravel() / (2 * size or 1.0))
+    return np.stack(columns, axis=1)
 
 
 _State = tuple[np.ndarray, np.ndarray]
@@ -284,13 +319,9 @@ class _Problem:
 
         ``scatter`` (3,) are those of the platform's positions (mm) and turns (rad), and the factor of the images'.
         """
-        mount, common = state
-        middle = common[:3] @ np.append(self.middle, 1.0)
-        turn = (self._platforms @ mount @ np.linalg.inv(self.camera_from_sensor))[:, :3, :3]
-        both = np.zeros((len(turn), 6, 6))
-        both[:, :3, :3] = both[:, 3:, 3:] = turn
+        both, middle = self._by_images(state[0]), state[1][:3] @ np.append(self.middle, 1.0)
         # A turn of the platform moves what is far from its origin.
-        lever = np.tile(np.eye(6, 3, -3), (len(turn), 1, 1))
+        lever = np.tile(np.eye(6, 3, -3), (len(both), 1, 1))
         for axis, unit in enumerate(np.eye(3)):
             lever[:, :3, axis] = np.cross(unit, middle - self._platforms[:, :3, 3])
         result = scatter[2] ** 2 * both @ self._covariances @ both.swapaxes(1, 2)
@@ -298,16 +329,24 @@ class _Problem:
         result[:, :3, :3] += scatter[0] ** 2 * np.eye(3)
         return result
 
+    def _by_images(self, mount: np.ndarray) -> np.ndarray:
+        """Derivatives (K, 6, 6) of the residuals by the errors of the images: these turned into the base frame."""
+        turn = (self._platforms @ mount @ np.linalg.inv(self.camera_from_sensor))[:, :3, :3]
+        both = np.zeros((len(turn), 6, 6))
+        both[:, :3, :3] = both[:, 3:, 3:] = turn
+        return both
+
+    def by_sensor(self, state: _State, scatter: np.ndarray) -> np.ndarray:
+        """Derivatives (12, Q) of the solution by the parameters of the sensor's calibration."""
+        by, inverse = self.jacobian(state), np.linalg.inv(self.covariances(state, scatter))
+        moved = self._by_images(state[0]) @ np.array([image.by_sensor for image in self.images])
+        information = np.einsum("kij,kil,klm->jm", by, inverse, by)
+        return -np.linalg.solve(information, np.einsum("kij,kil,klq->jq", by, inverse, moved))
+
     def jacobian(self, state: _State) -> np.ndarray:
         """Derivatives (K, 6, 12) by steps of the mount and of the target."""
-        steps = np.array([1e-3] * 3 + [1e-6] * 3 + [1e-3] * 3 + [1e-6] * 3)
-        columns = []
-        for number, size in enumerate(steps):
-            step = np.zeros(12)
-            step[number] = size
-            forth, back = (self.residuals(self.stepped(state, sign * step)) for sign in (1, -1))
-            columns.append((forth - back) / (2 * size))
-        return np.moveaxis(np.array(columns), 0, 2)
+        moved = _differences(lambda step: self.residuals(self.stepped(state, step)), np.zeros(12), np.tile(_STEPS, 2))
+        return moved.reshape(-1, 6, 12)
 
     def stepped(self, state: _State, step: np.ndarray) -> _State:
         """The state after a shift and a turn of the mount about the platform's axes, and of the target's middle."""

@@ -11,7 +11,6 @@ from functools import partial
 
 import numpy as np
 
-from uwlts.calibration.joint.derivatives import COLUMNS
 from uwlts.calibration.joint.evidence import STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, across_of
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, stored_estimate
@@ -19,7 +18,6 @@ from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import StageParameter
-from uwlts.model.stripe import pixels_of
 from uwlts.optics.brightness import BLUR_STD, beside_std
 from uwlts.optics.line_table import LineTable
 from uwlts.runtime.compiled import compiled
@@ -69,6 +67,7 @@ def point_uncertainty(
     *,
     blur_px: np.ndarray | None = None,
     beside_mm: np.ndarray | None = None,
+    mount_by: np.ndarray | None = None,
 ) -> PointUncertainty:
     """Uncertainty of the points that stripe centres (N,) of a capture give by a joint calibration.
 
@@ -76,7 +75,9 @@ def point_uncertainty(
     is part of it, about the middle of its positions; what poses add is not (`uwlts.measurement.moving`). The water may
     have drifted since the calibration, unless that was made from this very capture. ``blur_px`` (N,), how far blur may
     move the centres, and ``beside_mm`` (N, 3), how far points were moved to where their light comes from
-    (`uwlts.optics.brightness`), are each wrong by some share, the same for all points.
+    (`uwlts.optics.brightness`), are each wrong by some share, the same for all points. ``mount_by`` (6, P) are
+    derivatives of the mount by the parameters of the joint estimate (`uwlts.model.mount.SensorShare`), where the frames
+    carry poses of a platform: what the calibration does to points and mount then belongs together.
 
     Raises
     ------
@@ -95,7 +96,6 @@ def point_uncertainty(
     of_sensor = sensor_poses(capture)
     pose = of_sensor[:, :3, :3]
     posed = np.all(np.isfinite(of_sensor), axis=(1, 2), keepdims=True)
-    into_object = calibration.object_transform()[:3, :3].T
     pose_of = np.where(posed, pose, np.eye(3))
     root = covariance_root(known.covariance)
     by_stage_alone = ~posed[:, 0, 0]
@@ -103,10 +103,17 @@ def point_uncertainty(
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
     by_stage = stage_root(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
-    exact = partial(_derivatives, known, stripe_along=calibration.stripe_along, turn=into_object)
-    root, by_stage = _fewest_parts(exact, root, by_stage, line, centre_px, reach_mm=np.abs(stage).max(initial=0.0))
+    rigid = (
+        np.zeros((6, root.shape[1])) if mount_by is None else _in_sensor(mount_by, header) @ root[: mount_by.shape[1]]
+    )
+    exact = partial(_derivatives, known)
+    reach = np.abs(stage).max(initial=0.0)
+    root, rigid, by_stage = _fewest_parts(exact, root, rigid, by_stage, line, centre_px, reach_mm=reach)
     table = LineTable.about(
-        lambda *where: exact(root, *where).reshape(len(where[0]), -1), line, centre_px, tolerance=_TABLE_TOLERANCE_MM
+        lambda *where: exact(root, rigid, *where).reshape(len(where[0]), -1),
+        line,
+        centre_px,
+        tolerance=_TABLE_TOLERANCE_MM,
     )
     nothing = np.zeros((len(line), 3))
     beside = nothing if beside_mm is None else beside_std(header.sensor.uncertainty) * beside_mm
@@ -116,7 +123,7 @@ def point_uncertainty(
         here = slice(start, start + _BLOCK)
         parts, where = moved[here], (line[here], centre_px[here])
         if table is None:
-            parts[:] = exact(root, *where)
+            parts[:] = exact(root, rigid, *where)
         else:
             table.values(*where, out=parts.reshape(len(parts), -1))
         if posed.any():
@@ -156,56 +163,58 @@ def _add_parts(
 
 
 def _fewest_parts(
-    exact: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+    exact: Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray],
     root: np.ndarray,
+    rigid: np.ndarray,
     by_stage: np.ndarray,
     line: np.ndarray,
     centre_px: np.ndarray,
     *,
     reach_mm: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Independent parts ``root`` (P, R) and ``by_stage`` (R, 3) as few as move points the same, to `_NOTHING_MM`.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Independent parts ``root`` (P, R), ``rigid`` (6, R) and ``by_stage`` (R, 3), as few as move points the same.
+
+    Parts below `_NOTHING_MM` are none.
 
     Points move smoothly over the image, so that what some hundred places over all of it show holds for all of them.
     """
     if len(line) < _FEWEST_POINTS:
-        return root, by_stage
+        return root, rigid, by_stage
     lines, places = (np.linspace(values.min(), values.max(), _PLACES) for values in (line, centre_px))
     at = np.meshgrid(lines, places)
-    moved = exact(root, at[0].ravel(), at[1].ravel())[:, :, 2:]
+    moved = exact(root, rigid, at[0].ravel(), at[1].ravel())[:, :, 2:]
     if not np.isfinite(moved).all():
-        return root, by_stage
+        return root, rigid, by_stage
     together = np.vstack([moved.reshape(-1, root.shape[1]), reach_mm * by_stage.T])
     _, values, parts = np.linalg.svd(together, full_matrices=False)
     kept = parts[values > _NOTHING_MM].T
-    return root @ kept, kept.T @ by_stage
+    return root @ kept, rigid @ kept, kept.T @ by_stage
+
+
+def _in_sensor(mount_by: np.ndarray, header: CaptureHeader) -> np.ndarray:
+    """Derivatives (6, P) of a mount, shift and turn, along the axes of the sensor in place of the platform's."""
+    turn = np.array(header.T_platform_sensor)[:3, :3]
+    return np.vstack([turn.T @ mount_by[:3], turn.T @ mount_by[3:]])
 
 
 def _derivatives(
-    known: StoredEstimate,
-    root: np.ndarray,
-    line: np.ndarray,
-    centre_px: np.ndarray,
-    *,
-    stripe_along: str,
-    turn: np.ndarray,
+    known: StoredEstimate, root: np.ndarray, rigid: np.ndarray, line: np.ndarray, centre_px: np.ndarray
 ) -> np.ndarray:
     """Derivatives (N, 3, 2 + R) of points by the pixel across the stripe, 0, and independent parts of all parameters.
 
-    ``turn`` (3, 3) turns them from the camera's frame; they are NaN where a centre has no point.
+    In the OCS, which these parts move by ``rigid`` (6, R), shift and turn. NaN where a centre has no point.
     """
-    column = COLUMNS.index("v" if stripe_along == "width" else "u")
-    pixels = pixels_of(line, centre_px, stripe_along=stripe_along)
-    points = known.parameters.on_sheet(known.values, known.view, pixels)
     result = np.zeros((len(line), 3, 2 + root.shape[1]))
-    if points is None:
+    found = known.points_by(line, centre_px)
+    if found is None:
         result[:] = np.nan
         return result
-    result[:, :, 0] = points.by_rays[column].T
-    for axis in range(3):
-        by_global = known.parameters.by_global(points.by_rays[:, axis], known.view, points.by_sheet[:, axis])
-        result[:, axis, 2:] = by_global @ root
-    return np.einsum("ij,njr->nir", turn, result)
+    points, by = found
+    result[:, :, 0] = by[:, :, 0]
+    result[:, :, 2:] = by[:, :, 1:] @ root
+    if rigid.any():
+        result[:, :, 2:] += rigid[:3] + np.cross(rigid[3:].T, points[:, None]).swapaxes(1, 2)
+    return result
 
 
 def independent_patterns(moved: np.ndarray) -> np.ndarray:

@@ -5,13 +5,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import uwlts
+from tests.uwlts.joint_views import MEDIUM
+from tests.uwlts.sensor_profiles import half_way, joint_estimate, largest_parts
 from tests.virtual_sensors import scene_of
 from twin import render
-from uwlts.calibration.mount_board import BoardImage, _Problem
+from uwlts.calibration.mount_board import BoardImage, _posed, _Problem
+from uwlts.model.calibration import KnownMedium
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import BoardFound
 from uwlts.optics.nominal import nominal
 from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.targets import parse_target
 
 MIDDLE = np.array([60.0, 40.0, 0.0])
 
@@ -139,3 +143,32 @@ def test_wrong_evidence_is_refused(thesis, capture_path):
         uwlts.calibrate_mount(capture_path, np.tile(poses[0], (7, 1, 1)), calibration=calibration)
     with pytest.raises(DescriptionError, match="shows a target: give no radius"):
         uwlts.calibrate_mount(capture_path, calibration=calibration, radius_mm=3.0)
+
+
+def test_a_target_s_pose_follows_the_sensor(thesis, capture_path):
+    """The same image by other calibrations; corners that count less in the robust fit leave some per cent."""
+    known = joint_estimate(thesis)
+    with Capture(capture_path) as capture:
+        image, target = next(iter(capture.frames(laser_on=False)))[1], parse_target(capture.header.target)
+
+    def posed(values):
+        changed = known.calibration.model_copy(
+            update={
+                "camera": known.parameters.camera(values),
+                "window": known.parameters.window_model(values),
+                "media": (KnownMedium(medium=MEDIUM, index=known.parameters.medium_index(values, known.view)),),
+            }
+        )
+        return _posed("", image, target, changed, known, changed.window, changed.index_of(MEDIUM), np.eye(4))
+
+    own = posed(known.values)
+    middle, checked = target.points_mm.mean(axis=0), 0
+    for part in largest_parts(known, own.by_sensor):
+        ends = [posed(known.values + sign * part).camera_from_target for sign in (1, -1)]
+        for end in ends:
+            end[:3, 3] += end[:3, :3] @ middle
+        expected, found = half_way(*ends), own.by_sensor @ part
+        size = np.repeat([np.linalg.norm(expected[:3]), np.linalg.norm(expected[3:])], 3)
+        np.testing.assert_allclose(found / size, expected / size, atol=0.1)
+        checked += 1
+    assert checked == 3
