@@ -82,9 +82,9 @@ def calibrate_mount(
     pose_format, profile_unit, pose_unit
         How files are to be read; see `uwlts.storage.pose_files.read_poses`.
     axis
-        The platform is a rotary table whose axis is not known, and which turns the sphere: the direction of the
-        sensor's frame that is nearest to the axis about which its angles turn counter-clockwise. The mount then leads
-        to a frame whose z axis is the table's (`uwlts.storage.pose_files.read_poses`, format ``angle-deg``).
+        The platform is a rotary table whose axis is not known, and which turns the sphere or target: the direction of
+        the sensor's frame that is nearest to the axis about which its angles turn counter-clockwise. The mount then
+        leads to a frame whose z axis is the table's (`uwlts.storage.pose_files.read_poses`, format ``angle-deg``).
     scale
         Estimate by which factor the robot's lengths are too short.
     time
@@ -117,9 +117,9 @@ def calibrate_mount(
         assert not isinstance(table, str | Path)
         with Capture(profiles) as capture:
             if capture.header.target is not None and not capture.laser_on.all():
-                if radius_mm is not None or scale or time or axis is not None:
-                    raise DescriptionError("the capture shows a target: give no radius, axis, scale or time")
-                return mount_by_board([capture], known, table)
+                if radius_mm is not None or scale or time:
+                    raise DescriptionError("the capture shows a target: give no radius, scale or time")
+                return mount_by_board([capture], known, table, axis=axis)
             profiles = profiles_of(capture, known, table, times)
     captured = None
     if isinstance(profiles, CapturedProfiles):

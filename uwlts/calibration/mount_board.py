@@ -1,8 +1,11 @@
-"""Mount of a calibrated sensor from images of a target from several poses of its platform (hand-eye calibration)."""
+"""Mount of a calibrated sensor from images of a target from several poses of its platform (hand-eye calibration).
+
+Or the axis of a rotary table that turns the target.
+"""
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -22,6 +25,7 @@ from uwlts.optics.camera import directions, project_through_window
 from uwlts.optics.window import trace_window
 from uwlts.storage.capture import Capture
 from uwlts.storage.files import sha256_of
+from uwlts.storage.mount_files import SENSOR_AXES, SensorAxis, require_table
 from uwlts.targets import CircleTarget, Target, parse_target
 from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
@@ -61,7 +65,13 @@ class BoardImage:
     by_sensor: np.ndarray | None = None
 
 
-def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses: np.ndarray | None = None) -> Mount:
+def mount_by_board(
+    captures: Sequence[Capture],
+    calibration: Calibration,
+    poses: np.ndarray | None = None,
+    *,
+    axis: SensorAxis | None = None,
+) -> Mount:
     """``T_platform_sensor`` from images of a target at an unknown fixed place, the sensor's calibration held fixed.
 
     What a joint estimate of the calibration leaves open becomes part of the covariance.
@@ -80,6 +90,8 @@ def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses:
         Of the sensor.
     poses
         ``T_base_platform`` (P, 4, 4) of the images with the laser off, in their order, in place of the captures' own.
+    axis
+        The platform is a rotary table that turns the target, as for `uwlts.calibrate_mount`.
 
     Raises
     ------
@@ -93,9 +105,11 @@ def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses:
     target, images, reasons = _seen(captures, calibration, known, poses)
     middle = target.points_mm.mean(axis=0)
     rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in images])
-    if missing := missing_turns(rotations, least_rad=_OPEN_RAD):
+    if axis is not None:
+        require_table(np.array([image.base_from_platform for image in images]), axis=axis)
+    elif missing := missing_turns(rotations, least_rad=_OPEN_RAD):
         raise CalibrationError(f"the poses do not determine the mount: {'; '.join(missing)}")
-    problem = _Problem(images, calibration.object_transform(), middle)
+    problem = _Problem(images, calibration.object_transform(), middle, axis is not None)
     used, state, scatter = problem.robust()
     extent = float(np.linalg.norm(np.ptp(target.points_mm, axis=0)))
     left_out = [image for image in images if image not in used.images]
@@ -105,10 +119,17 @@ def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses:
             f"{len(left_out)} of {len(images)} left out. Are the poses T_base_platform, is their format right, are "
             "their units right, and do they come in the order of the images?"
         )
-    covariance, share = np.linalg.inv(used.information(state, scatter)), None
+    if axis is not None and state[0][2, :3] @ SENSOR_AXES[axis] <= 0:
+        raise CalibrationError(
+            f"the images turn about an axis that points away from {axis} of the sensor's frame, to "
+            f"({', '.join(f'{each:.2f}' for each in state[0][2, :3])}): are the angles counted the other way round?"
+        )
+    covariance, share = used.free @ np.linalg.inv(used.information(state, scatter)) @ used.free.T, None
     if known is not None:
         covariance, share = with_sensor(covariance, used.by_sensor(state, scatter), state[0][:3, :3], known)
-    missing = missing_turns(Rotation.from_matrix([each.base_from_platform[:3, :3] for each in used.images]))
+    missing = []
+    if axis is None:
+        missing = missing_turns(Rotation.from_matrix([each.base_from_platform[:3, :3] for each in used.images]))
     shift, turn = (float(np.sqrt(np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1])) for k in (0, 3))
     if shift > _OPEN_MM or turn > _OPEN_RAD:
         known = f"known to {shift:.2g} mm and {np.degrees(turn):.2g} deg only"
@@ -131,12 +152,13 @@ def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses:
     return Mount(
         T_platform_sensor=_rows(state[0]),
         covariance=tuple(tuple(row) for row in ((covariance + covariance.T) / 2)[:6, :6].tolist()),
-        coverage_factor=float(t.ppf(0.975, 6 * len(used.images) - 15)),
+        coverage_factor=float(t.ppf(0.975, 6 * len(used.images) - used.size - 3)),
         artefact=BoardFound(T_base_target=_rows(state[1])),
         point_std_mm=rms_px * distance / calibration.camera.fx_px,
         pose_std_mm=float(scatter[0]),
         rms_mm=float(np.sqrt(np.mean(np.square(list(found.values()))))),
         held_out_rms_mm=float(np.sqrt(np.mean(np.square(list(held.values()))))),
+        table=axis is not None,
         sensor=share,
         poses=tuple(rows),
         weaknesses=tuple(missing),
@@ -266,11 +288,26 @@ _State = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Images of a target, ``T_camera_sensor`` and the target's middle (3,) in its own frame."""
+    """Images of a target, ``T_camera_sensor`` and the target's middle (3,) in its own frame.
+
+    The parameters are steps of mount and target; on a rotary table (``table``) shift of the mount along its z axis and
+    turn about it change nothing, and are none.
+    """
 
     images: Sequence[BoardImage]
     camera_from_sensor: np.ndarray
     middle: np.ndarray
+    table: bool = False
+
+    @cached_property
+    def free(self) -> np.ndarray:
+        """Steps (12, size) of mount and target by the parameters."""
+        return np.delete(np.eye(12), (2, 5), axis=1) if self.table else np.eye(12)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.free.shape[1]
 
     @cached_property
     def _platforms(self) -> np.ndarray:
@@ -286,7 +323,7 @@ class _Problem:
 
     def without(self, number: int) -> "_Problem":
         kept = [image for k, image in enumerate(self.images) if k != number]
-        return _Problem(kept, self.camera_from_sensor, self.middle)
+        return replace(self, images=kept)
 
     def start(self) -> _State:
         """Mount and target by Park and Martin from the relative motions of all pairs of images."""
@@ -295,10 +332,15 @@ class _Problem:
         tools = np.linalg.inv(held[first]) @ held[second]
         boards = seen[first] @ np.linalg.inv(seen[second])
         by_tool, by_board = (Rotation.from_matrix(each[:, :3, :3]).as_rotvec() for each in (tools, boards))
+        if self.table:
+            # Turns about z alone: the sensor's x axis, made square to the axis, shall be the table's.
+            axis = by_board.T @ by_tool[:, 2]
+            by_tool, by_board = np.eye(3)[[2, 0]], np.array([axis, np.eye(3)[np.argmin(np.abs(axis))]])
         with warnings.catch_warnings():
             # Turns about one axis only: the covariance tells.
             warnings.simplefilter("ignore", UserWarning)
-            rotation = Rotation.align_vectors(by_tool, by_board)[0].as_matrix()
+            weights = [np.inf, 1.0] if self.table else None
+            rotation = Rotation.align_vectors(by_tool, by_board, weights)[0].as_matrix()
         known = boards[:, :3, 3] @ rotation.T - tools[:, :3, 3]
         unknown = (tools[:, :3, :3] - np.eye(3)).reshape(-1, 3)
         mount = _transform(rotation, np.linalg.lstsq(unknown, known.ravel(), rcond=None)[0])
@@ -341,21 +383,25 @@ class _Problem:
         by, inverse = self.jacobian(state), np.linalg.inv(self.covariances(state, scatter))
         moved = self._by_images(state[0]) @ np.array([image.by_sensor for image in self.images])
         information = np.einsum("kij,kil,klm->jm", by, inverse, by)
-        return -np.linalg.solve(information, np.einsum("kij,kil,klq->jq", by, inverse, moved))
+        return -self.free @ np.linalg.solve(information, np.einsum("kij,kil,klq->jq", by, inverse, moved))
 
     def jacobian(self, state: _State) -> np.ndarray:
-        """Derivatives (K, 6, 12) by steps of the mount and of the target."""
-        moved = _differences(lambda step: self.residuals(self.stepped(state, step)), np.zeros(12), np.tile(_STEPS, 2))
-        return moved.reshape(-1, 6, 12)
+        """Derivatives (K, 6, size) by the parameters."""
+        moved = _differences(lambda step: self.residuals(self._moved(state, step)), np.zeros(12), np.tile(_STEPS, 2))
+        return moved.reshape(-1, 6, 12) @ self.free
 
     def stepped(self, state: _State, step: np.ndarray) -> _State:
+        """The state after a step (size,) of the parameters."""
+        return self._moved(state, self.free @ step)
+
+    def _moved(self, state: _State, step: np.ndarray) -> _State:
         """The state after a shift and a turn of the mount about the platform's axes, and of the target's middle."""
         mount, common = state
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ mount[:3, :3]
         return _transform(turned, mount[:3, 3] + step[:3]), _moved_about(common, self.middle, step[6:])
 
     def information(self, state: _State, scatter: np.ndarray) -> np.ndarray:
-        """Information matrix (12, 12) of the steps."""
+        """Information matrix (size, size) of the parameters."""
         by, inverse = self.jacobian(state), np.linalg.inv(self.covariances(state, scatter))
         return np.einsum("kij,kil,klm->jm", by, inverse, by)
 
@@ -403,14 +449,14 @@ class _Problem:
         spread = [max(float(np.median(np.linalg.norm(left[:, k : k + 3], axis=1))), least) for k, least in _LEAST]
         fit = least_squares(
             lambda step: (self.residuals(self.stepped(state, step)) / np.repeat(spread, 3)).ravel(),
-            np.zeros(12),
-            x_scale=np.tile(np.repeat(spread, 3), 2),
+            np.zeros(self.size),
+            x_scale=np.tile(np.repeat(spread, 3), 2) @ self.free,
             loss="cauchy",
         )
         state, used = self.stepped(state, fit.x), self
         sizes = np.abs(self.residuals(state)).reshape(-1, 2, 3).max(axis=2) / spread
         rough = sizes.max(axis=1) < 6 * max(float(np.median(sizes.max(axis=1))), 1.0)
-        used = _Problem([image for image, good in zip(self.images, rough, strict=True) if good], *self._rest())
+        used = replace(self, images=[image for image, good in zip(self.images, rough, strict=True) if good])
         while True:
             used.require_enough(len(self.images))
             state, scatter = used.estimated(state, np.array([*spread, 1.0]))
@@ -420,16 +466,13 @@ class _Problem:
             used = used.without(int(np.argmax(excess)))
 
     def _only(self, numbers: np.ndarray) -> "_Problem":
-        return _Problem([self.images[k] for k in numbers], *self._rest())
+        return replace(self, images=[self.images[k] for k in numbers])
 
     def _typical_miss(self, state: _State) -> float:
         """Median distance by which images miss, of the target's middle and of what lies its distance aside, mm."""
         left = self.residuals(state)
         away = np.linalg.norm(self._sensor_from_target[:, :3, 3], axis=1) + 1.0
         return float(np.median(np.linalg.norm(left[:, :3], axis=1) + away * np.linalg.norm(left[:, 3:], axis=1)))
-
-    def _rest(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.camera_from_sensor, self.middle
 
     def require_enough(self, images: int) -> None:
         """CalibrationError with too few images."""
@@ -442,7 +485,7 @@ class _Problem:
     def surprise(self, image: BoardImage, state: _State, scatter: np.ndarray) -> float:
         """Squared residuals of an image over the variance with which these images predict them: chi-square of six."""
         state = self.solved(state, scatter)
-        other = _Problem([image], *self._rest())
+        other = replace(self, images=[image])
         by, left = other.jacobian(state)[0], other.residuals(state)[0]
         variance = other.covariances(state, scatter)[0] + by @ np.linalg.pinv(self.information(state, scatter)) @ by.T
         return float(left @ np.linalg.solve(variance, left))
@@ -450,7 +493,7 @@ class _Problem:
     def predicted_mm(self, image: BoardImage, scatter: np.ndarray) -> float:
         """How far an image shows the target's middle from where these images place it, mm."""
         state = self.solved(self.start(), scatter)
-        return float(_Problem([image], *self._rest()).offsets_mm(state)[0])
+        return float(replace(self, images=[image]).offsets_mm(state)[0])
 
     def offsets_mm(self, state: _State) -> np.ndarray:
         """Distances (K,) of the target's middle in each image from the common place."""

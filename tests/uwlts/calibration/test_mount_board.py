@@ -84,6 +84,40 @@ def test_the_covariance_is_that_of_the_errors():
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.35
 
 
+def table_images(rng, angles, *, position_mm=0.01, turn_rad=5e-5):
+    """Images of a target on a table that turns it, and the table's frame in the sensor's (4, 4)."""
+    std = np.array([0.02, 0.02, 0.15, 2e-3, 2e-3, 2e-4])
+    table, target = pose((130.0, 10.0, 0.0), (5.0, 20.0, 90.0)), pose((20.0, -15.0, 40.0), (30.0, -10.0, 25.0))
+    images = []
+    for number, angle in enumerate(angles):
+        step = std * rng.normal(size=6)
+        in_camera = CAMERA @ table @ pose((0, 0, np.degrees(angle)), (0, 0, 0)) @ target
+        turn = Rotation.from_rotvec(step[3:]).as_matrix() @ in_camera[:3, :3]
+        found = np.eye(4)
+        found[:3, :3], found[:3, 3] = turn, in_camera[:3, :3] @ MIDDLE + in_camera[:3, 3] + step[:3] - turn @ MIDDLE
+        platform = pose((0, 0, -np.degrees(angle)), (0, 0, 0))
+        images.append(BoardImage(f"image {number}", found, np.diag(std**2), 50, 0.1, platform))
+    return images, table
+
+
+def test_the_axis_of_a_rotary_table_is_found():
+    """Direction and place have two coordinates each; their chi-square with four degrees is below 36 but once in 3e6."""
+    images, table = table_images(np.random.default_rng(2), np.radians(np.linspace(-40, 40, 12)))
+    used, state, scatter = _Problem(images, CAMERA, MIDDLE, table=True).robust()
+    assert len(used.images) == 12 and used.size == 10
+    # Of the true axis in the table's frame as found, at the height of the sensor: what is free is zero there.
+    there = state[0] @ table
+    at = there[:3, 3] - there[:3, 2] * there[2, 3] / there[2, 2]
+    height = state[0][2, 3]
+    at += (height / there[2, 2]) * there[:3, 2]
+    off = np.array([*at[:2], -there[1, 2], there[0, 2]])
+    covariance = (used.free @ np.linalg.inv(used.information(state, scatter)) @ used.free.T)[:6, :6]
+    assert not covariance[[2, 5]].any()
+    kept = covariance[np.ix_([0, 1, 3, 4], [0, 1, 3, 4])]
+    assert off @ np.linalg.solve(kept, off) < 36
+    assert np.sqrt(np.diag(kept)).max() < 0.5
+
+
 def test_wrong_poses_are_left_out():
     problem = _Problem(simulated(np.random.default_rng(1), wrong=(3, 7)), CAMERA, MIDDLE)
     used, state, _ = problem.robust()
