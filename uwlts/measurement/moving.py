@@ -8,6 +8,7 @@ steps by the product. So the correlation of any two moments follows from the sta
 """
 
 from dataclasses import dataclass, replace
+from hashlib import sha256
 
 import numpy as np
 
@@ -126,8 +127,16 @@ def with_platform(
                     together.append(_moved(errors[image], points_mm, ride.poses[frame])[None])
         own = [_moved((roots[:, :, k] * apart[:, None])[image], points_mm, ride.poses[frame]) for k in range(6)]
         poses_mm = np.array(own, dtype=np.float32)
-    patterns = together[0] if len(together) == 1 else independent_patterns(np.concatenate(together))
-    return replace(uncertainty, patterns_mm=patterns, poses_mm=poses_mm)
+    if len(together) == 1:
+        return replace(uncertainty, poses_mm=poses_mm)
+    patterns, mixed = independent_patterns(np.concatenate(together))
+    count = len(uncertainty.patterns_mm)
+    shared = {name: mixed[:, :count] @ each for name, each in uncertainty.shared.items()}
+    if mount is not None:
+        covariance = np.array(mount.covariance) if mount_covariance is None else mount_covariance
+        digest = sha256(mount.transform().tobytes() + covariance.tobytes()).hexdigest()[:16]
+        shared[f"mount {digest}"] = mixed[:, count : count + len(together[1])]
+    return replace(uncertainty, patterns_mm=patterns, poses_mm=poses_mm, shared=shared)
 
 
 def _by_mount(points_mm: np.ndarray, poses: np.ndarray, place_mm: np.ndarray, covariance: np.ndarray) -> np.ndarray:

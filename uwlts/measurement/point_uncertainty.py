@@ -8,6 +8,7 @@ follows, correlations included, from calculating it again with each pattern adde
 
 from collections.abc import Callable
 from functools import partial
+from hashlib import sha256
 
 import numpy as np
 
@@ -108,7 +109,9 @@ def point_uncertainty(
     )
     exact = partial(_derivatives, known)
     reach = np.abs(stage).max(initial=0.0)
-    root, rigid, by_stage = _fewest_parts(exact, root, rigid, by_stage, line, centre_px, reach_mm=reach)
+    source = f"sensor {sha256(root.tobytes() + by_stage.tobytes()).hexdigest()[:16]}"
+    kept = _fewest_parts(exact, root, rigid, by_stage, line, centre_px, reach_mm=reach)
+    root, rigid, by_stage = root @ kept, rigid @ kept, kept.T @ by_stage
     table = LineTable.about(
         lambda *where: exact(root, rigid, *where).reshape(len(where[0]), -1),
         line,
@@ -133,7 +136,10 @@ def point_uncertainty(
         raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
     along = np.array(header.stage_direction)
     position = np.where(posed[frame, :, 0], 0.0, header.sensor.uncertainty.stage_position_mm * along)
-    return PointUncertainty(random, position.astype(np.float32), _patterns(moved.reshape(-1, moved.shape[2]).T))
+    patterns, mixed = _patterns(moved.reshape(-1, moved.shape[2]).T)
+    # All but blur and brightness is the sensor's and its stage's, whatever they scan in this medium.
+    shared = {source: mixed[:, 2:] @ kept.T}
+    return PointUncertainty(random, position.astype(np.float32), patterns, shared=shared)
 
 
 @compiled
@@ -171,24 +177,23 @@ def _fewest_parts(
     centre_px: np.ndarray,
     *,
     reach_mm: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Independent parts ``root`` (P, R), ``rigid`` (6, R) and ``by_stage`` (R, 3), as few as move points the same.
+) -> np.ndarray:
+    """Directions (R, K) in the space of independent parts ``root`` (P, R), ``rigid`` (6, R) and ``by_stage`` (R, 3).
 
-    Parts below `_NOTHING_MM` are none.
+    As few as move points the same. Parts below `_NOTHING_MM` are none.
 
     Points move smoothly over the image, so that what some hundred places over all of it show holds for all of them.
     """
     if len(line) < _FEWEST_POINTS:
-        return root, rigid, by_stage
+        return np.eye(root.shape[1])
     lines, places = (np.linspace(values.min(), values.max(), _PLACES) for values in (line, centre_px))
     at = np.meshgrid(lines, places)
     moved = exact(root, rigid, at[0].ravel(), at[1].ravel())[:, :, 2:]
     if not np.isfinite(moved).all():
-        return root, rigid, by_stage
+        return np.eye(root.shape[1])
     together = np.vstack([moved.reshape(-1, root.shape[1]), reach_mm * by_stage.T])
     _, values, parts = np.linalg.svd(together, full_matrices=False)
-    kept = parts[values > _NOTHING_MM].T
-    return root @ kept, rigid @ kept, kept.T @ by_stage
+    return parts[values > _NOTHING_MM].T
 
 
 def _in_sensor(mount_by: np.ndarray, header: CaptureHeader) -> np.ndarray:
@@ -217,19 +222,23 @@ def _derivatives(
     return result
 
 
-def independent_patterns(moved: np.ndarray) -> np.ndarray:
-    """Patterns (M, N, 3), orthogonal over the points, from any (R, N, 3) that together have their covariance."""
+def independent_patterns(moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Patterns (M, N, 3), orthogonal over the points, from any (R, N, 3) that together have their covariance.
+
+    And how much (M, R) of each of these every pattern has.
+    """
     return _patterns(moved.reshape(len(moved), -1))
 
 
-def _patterns(flat: np.ndarray) -> np.ndarray:
-    """Patterns (M, N, 3) as of `independent_patterns` from any (R, 3 N), in any order of memory."""
+def _patterns(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Patterns and their parts as of `independent_patterns` from any (R, 3 N), in any order of memory."""
     values, vectors = np.linalg.eigh(flat @ flat.T)
     order = np.argsort(values)[::-1]
     values, vectors = np.maximum(values[order], 0.0), vectors[:, order]
     left = 3.0 * np.append(np.cumsum(values[::-1])[::-1][1:], 0.0) / flat.shape[1]
     count = 1 + int(np.argmax(left <= _NEGLIGIBLE_MM**2))
-    return (vectors[:, :count].T @ flat).astype(np.float32).reshape(count, -1, 3)
+    mixed = vectors[:, :count].T
+    return (mixed @ flat).astype(np.float32).reshape(count, -1, 3), mixed
 
 
 def stage_root(known: StoredEstimate, calibration: Calibration, header: CaptureHeader, root: np.ndarray) -> np.ndarray:
