@@ -30,6 +30,7 @@ from uwlts.metrology.patches import (
     scatter,
     surface_patches,
 )
+from uwlts.metrology.path_uncertainty import along_corrected_path
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory
@@ -96,7 +97,8 @@ class AlignedTrajectory:
         Shift (mm) and turn (rad) that each pose was given.
     crossings : tuple of Crossing
     cloud : PointCloud
-        The cloud along the corrected path, without uncertainty: to have that, reconstruct it along the path anew.
+        The cloud along the corrected path. Its uncertainty is that of the corrected path, and what the given cloud's
+        holds of the calibrations of sensor and mount.
     """
 
     trajectory: Trajectory
@@ -532,15 +534,20 @@ class _Alignment:
         blocks = self.covariance.reshape(self.path.count, 6, self.path.count, 6)
         covariance = np.einsum("nc,cidj,nd->nij", basis, blocks, basis, optimize=True)
         covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
-        by_point = self.corrections(self.path.basis(times))
-        platform = trajectory.poses_at(times)[:, :3, 3]
-        points = Rotation.from_rotvec(by_point[:, 3:]).apply(cloud.points_mm - platform) + platform + by_point[:, :3]
+        moments, image = np.unique(times, return_inverse=True)
+        at_image = self.path.basis(moments)
+        by_point = self.corrections(at_image)[image]
+        platform = trajectory.poses_at(moments)[image, :3, 3]
+        levers = Rotation.from_rotvec(by_point[:, 3:]).apply(cloud.points_mm - platform)
+        known = cloud.uncertainty
+        if known is not None:
+            known = along_corrected_path(known, by_point[:, 3:], levers, image, at_image, self.covariance)
         crossings = tuple(self._crossing(pair) for pair in self.pairs)
         return AlignedTrajectory(
             Trajectory(trajectory.times_s, poses, covariance),
             correction,
             crossings,
-            replace(cloud, points_mm=points, uncertainty=None),
+            replace(cloud, points_mm=levers + platform + by_point[:, :3], uncertainty=known),
         )
 
     def _crossing(self, pair: tuple[int, int]) -> Crossing:
