@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import assert_never
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,19 +12,19 @@ from scipy.stats import chi2, t
 from uwlts.calibration.mount_board import mount_by_board
 from uwlts.calibration.mount_model import Motion, MountState, Problem, Scatter
 from uwlts.calibration.mount_next_pose import axis_words, missing_turns, next_pose
-from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLine, find_arc, find_line
+from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLine, find_arc, find_line, find_step
 from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of, with_sensor
-from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere, start_on_table
+from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere, start_of_step, start_on_table
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError, DescriptionError
-from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound
+from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound, StepFound
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture
-from uwlts.storage.mount_files import SENSOR_AXES, MountEvidence, SensorAxis, read_mount_evidence
+from uwlts.storage.mount_files import SENSOR_AXES, Artefact, MountEvidence, SensorAxis, read_mount_evidence
 from uwlts.storage.pose_files import PoseFormat, Unit, read_poses
 
-_FEWEST_POSES = {"sphere": 5, "plane": 8}
+_FEWEST_POSES = {"sphere": 5, "plane": 8, "step": 8}
 """Poses whose profiles have more numbers (three each, or two) than there are unknowns (nine or ten), with some over."""
 _MOST_POINTS = 100_000
 """Points of all profiles together; more take time and hardly lower the uncertainty, as poses err too."""
@@ -45,8 +45,9 @@ def calibrate_mount(
     profiles: str | Path | Sequence[np.ndarray] | CapturedProfiles,
     poses: str | Path | np.ndarray | None = None,
     *,
-    artefact: Literal["sphere", "plane"] = "sphere",
+    artefact: Artefact = "sphere",
     radius_mm: float | None = None,
+    height_mm: float | None = None,
     calibration: Calibration | str | Path | None = None,
     pose_format: PoseFormat = "matrix",
     profile_unit: Unit = "mm",
@@ -57,7 +58,7 @@ def calibrate_mount(
     profile_times_s: np.ndarray | None = None,
     pose_times_s: np.ndarray | None = None,
 ) -> Mount:
-    """Find ``T_platform_sensor`` of any laser profiler from profiles of a sphere or a plane at an unknown fixed place.
+    """Find ``T_platform_sensor`` of any laser profiler from profiles of an artefact at an unknown fixed place.
 
     The platform's poses ``T_base_platform`` are known, as a robot's flange's. The artefact's place and the mount are
     estimated together by least squares of the distances of all points from the artefact, weighted by the noise of the
@@ -74,8 +75,9 @@ def calibrate_mount(
         off show, else of an artefact that its laser images show.
     poses
         ``T_base_platform`` (P, 4, 4), mm, or a CSV file with one pose a line; not needed for a capture that holds them.
-    artefact, radius_mm
-        What is seen; the radius of the sphere where it is known.
+    artefact, radius_mm, height_mm
+        What is seen: a sphere, a plane, or a step, two parallel faces. The radius of the sphere or the height of the
+        step, where it is known.
     calibration
         Of the sensor that took the capture, held fixed; what a joint estimate leaves open becomes part of the mount's
         covariance. A target's images go to `uwlts.calibration.mount_board`.
@@ -117,8 +119,8 @@ def calibrate_mount(
         assert not isinstance(table, str | Path)
         with Capture(profiles) as capture:
             if capture.header.target is not None and not capture.laser_on.all():
-                if radius_mm is not None or scale or time:
-                    raise DescriptionError("the capture shows a target: give no radius, scale or time")
+                if radius_mm is not None or height_mm is not None or scale or time:
+                    raise DescriptionError("the capture shows a target: give no radius, height, scale or time")
                 return mount_by_board([capture], known, table, axis=axis)
             profiles = profiles_of(capture, known, table, times)
     captured = None
@@ -130,6 +132,7 @@ def calibrate_mount(
         poses,
         artefact=artefact,
         radius_mm=radius_mm,
+        height_mm=height_mm,
         pose_format=pose_format,
         profile_unit=profile_unit,
         pose_unit=pose_unit,
@@ -179,7 +182,7 @@ class _Calibration:
     def __init__(self, evidence: MountEvidence, captured: CapturedProfiles | None = None) -> None:
         self.evidence = evidence
         self.captured = captured
-        self.sphere = evidence.artefact == "sphere"
+        self.sphere, self.step = evidence.artefact == "sphere", evidence.artefact == "step"
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
         self.rows = [_thinned(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
@@ -196,9 +199,7 @@ class _Calibration:
                 self.reasons[number] = f"no {self.evidence.artefact} found in the profile"
         self._require_enough()
         kept = np.array([shape is not None for shape in shapes])
-        members = [
-            np.zeros(len(p), dtype=bool) if s is None else s.members for p, s in zip(self.flat, shapes, strict=True)
-        ]
+        members = [self._members(p, s) for p, s in zip(self.flat, shapes, strict=True)]
         whole = Problem(
             self.profiles,
             _motion(self.evidence),
@@ -208,8 +209,10 @@ class _Calibration:
             self.evidence.scale,
             self.evidence.time,
             self.evidence.axis is not None,
+            second=[np.zeros(len(each), dtype=bool) for each in self.profiles] if self.step else None,
+            height_mm=self.evidence.height_mm,
         )
-        problem = whole.selected(kept, [p[m] for p, m in zip(self.profiles, members, strict=True)])
+        problem = self._of_members(whole, kept, members, self._faces(shapes, members))
         arcs = [shape for shape in shapes if isinstance(shape, ProfileArc)]
         lines = [shape for shape in shapes if isinstance(shape, ProfileLine)]
         if self.evidence.axis is not None:
@@ -217,7 +220,7 @@ class _Calibration:
         elif self.sphere:
             state = start_of_sphere(problem, arcs, self.sheet, self.rng)
         else:
-            state = start_of_plane(problem, lines, self.sheet, self.rng)
+            state = (start_of_step if self.step else start_of_plane)(problem, lines, self.sheet, self.rng)
         misfit = misfits(problem, state)
         noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
         good = misfit < max(_LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
@@ -225,9 +228,9 @@ class _Calibration:
         # What the first search got wrong in single profiles is searched again near the artefact that the others show.
         for _ in range(2):
             state, scatter = _refined(problem.selected(good), state, scatter)
-            members = self._found_again(whole, state, scatter)
+            members, faces = self._found_again(whole, state, scatter)
             kept = np.array([np.count_nonzero(each) >= LEAST_POINTS for each in members])
-            problem = whole.selected(kept, [p[m] for p, m in zip(self.profiles, members, strict=True)])
+            problem = self._of_members(whole, kept, members, faces)
             good = np.ones(len(problem.points), dtype=bool)
             self._require_enough(np.flatnonzero(kept))
         while True:
@@ -253,7 +256,32 @@ class _Calibration:
         return self._summary(used, state, scatter, members)
 
     def _shape(self, points: np.ndarray) -> ProfileArc | ProfileLine | None:
-        return find_arc(points, self.evidence.radius_mm, self.rng) if self.sphere else find_line(points, self.rng)
+        match self.evidence.artefact:
+            case "sphere":
+                return find_arc(points, self.evidence.radius_mm, self.rng)
+            case "plane":
+                return find_line(points, self.rng)
+            case "step":
+                return find_step(points, self.evidence.height_mm, self.rng)
+            case _:
+                assert_never(self.evidence.artefact)
+
+    @staticmethod
+    def _members(points: np.ndarray, shape: ProfileArc | ProfileLine | None) -> np.ndarray:
+        return np.zeros(len(points), dtype=bool) if shape is None else shape.members
+
+    @staticmethod
+    def _faces(shapes: Sequence[ProfileArc | ProfileLine | None], members: list[np.ndarray]) -> list[np.ndarray]:
+        """Masks (N,) of the points on the second face of a step; nowhere set without one."""
+        found = [shape.second if isinstance(shape, ProfileLine) else None for shape in shapes]
+        return [np.zeros_like(own) if face is None else face for face, own in zip(found, members, strict=True)]
+
+    def _of_members(
+        self, whole: Problem, kept: np.ndarray, members: list[np.ndarray], faces: list[np.ndarray]
+    ) -> Problem:
+        points = [each[own] for each, own in zip(self.profiles, members, strict=True)]
+        second = [each[own] for each, own in zip(faces, members, strict=True)] if self.step else None
+        return whole.selected(kept, points, second)
 
     def _require_enough(self, numbers: np.ndarray | None = None) -> None:
         poses, needed = len(self.profiles), _FEWEST_POSES[self.evidence.artefact]
@@ -273,19 +301,27 @@ class _Calibration:
                 f"{scatter.pose_mm:.3g} mm (rms)"
             )
 
-    def _found_again(self, whole: Problem, state: MountState, scatter: Scatter) -> list[np.ndarray]:
-        """Masks of the points near the artefact as all poses show it, mm."""
-        off = np.abs(whole.distances(state))
+    def _found_again(
+        self, whole: Problem, state: MountState, scatter: Scatter
+    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Masks of the points near the artefact as all poses show it, and of those on the second face of a step."""
+        signed = whole.distances(state)
+        off = np.abs(signed)
+        if self.step:
+            off = np.minimum(off, np.abs(signed - state.artefact[4]))
         reach = 4 * np.hypot(scatter.point_mm, 2 * scatter.pose_mm)
-        found = []
+        found, faces = [], []
         for points, own in zip(self.flat, np.split(off, np.cumsum(whole.counts)[:-1]), strict=True):
             near = own < reach
-            mask = np.zeros(len(points), dtype=bool)
+            mask, face = np.zeros((2, len(points)), dtype=bool)
             shape = self._shape(points[near])
             if shape is not None:
-                mask[np.flatnonzero(near)[shape.members]] = True
+                mask[near] = shape.members
+                if isinstance(shape, ProfileLine) and shape.second is not None:
+                    face[near] = shape.second
             found.append(mask)
-        return found
+            faces.append(face)
+        return found, faces
 
     def _summary(self, used: Problem, state: MountState, scatter: Scatter, members: list[np.ndarray]) -> Mount:
         information = used.information(state, scatter)
@@ -311,16 +347,19 @@ class _Calibration:
                     reason=self.reasons.get(number),
                 )
             )
-        std, at = np.sqrt(np.diag(covariance)), 9 + (self.sphere and used.radius_mm is None)
-        found = (
-            SphereFound(
-                centre_mm=tuple(state.artefact[:3].tolist()),
-                radius_mm=float(state.artefact[3]),
-                radius_std_mm=float(std[9]) if used.radius_mm is None else None,
-            )
-            if self.sphere
-            else PlaneFound(normal=tuple(state.artefact[:3].tolist()), distance_mm=float(state.artefact[3]))
-        )
+        std, at = np.sqrt(np.diag(covariance)), 9 + used.size_unknown
+        x, y, z, *sizes = state.artefact.tolist()
+        size_std = float(std[9]) if used.size_unknown else None
+        match self.evidence.artefact:
+            case "sphere":
+                found = SphereFound(centre_mm=(x, y, z), radius_mm=sizes[0], radius_std_mm=size_std)
+            case "plane":
+                found = PlaneFound(normal=(x, y, z), distance_mm=sizes[0])
+            case "step":
+                distance, height = sizes
+                found = StepFound(normal=(x, y, z), distance_mm=distance, height_mm=height, height_std_mm=size_std)
+            case _:
+                assert_never(self.evidence.artefact)
         transform = np.eye(4)
         transform[:3, :3], transform[:3, 3] = Rotation.from_matrix(state.rotation).as_matrix(), state.translation
         weights = used.counts / used.counts.sum()
