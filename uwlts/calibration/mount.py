@@ -7,11 +7,12 @@ from typing import assert_never
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2, t
+from scipy.stats import chi2
 
 from uwlts.calibration.mount_board import mount_by_board
 from uwlts.calibration.mount_model import Motion, MountState, Problem, Scatter
 from uwlts.calibration.mount_next_pose import axis_words, missing_turns, next_pose
+from uwlts.calibration.mount_prediction import coverage_factor, held_out_mm, inverse, left_out_excess
 from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLine, find_arc, find_line, find_step
 from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of, with_sensor
 from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere, start_of_step, start_on_table
@@ -237,7 +238,7 @@ class _Calibration:
             used = problem.selected(good)
             state, scatter = _refined(used, state, scatter)
             limit = float(chi2.isf(_FALSE_ALARM / len(kept), used.per_pose))
-            excess = _left_out_excess(used, state, scatter)
+            excess = left_out_excess(used, state, scatter)
             if excess.max() <= limit:
                 break
             good[np.flatnonzero(good)[np.argmax(excess)]] = False
@@ -325,13 +326,13 @@ class _Calibration:
 
     def _summary(self, used: Problem, state: MountState, scatter: Scatter, members: list[np.ndarray]) -> Mount:
         information = used.information(state, scatter)
-        own = used.of_all(_inverse(information.sum(axis=0)))
+        own = used.of_all(inverse(information.sum(axis=0)))
         covariance, share = own, None
         if self.captured is not None and self.captured.known is not None:
             by_sensor = self._by_sensor(used, state, scatter, members)
             covariance, share = with_sensor(own, by_sensor, state.rotation, self.captured.known)
         self._require_determined(used, state, scatter, covariance)
-        held = _held_out(used, state, scatter, information)
+        held = held_out_mm(used, state, scatter, information)
         rms, numbers = misfits(used, state), [n for n in range(len(members)) if n not in self.reasons]
         order = {number: place for place, number in enumerate(numbers)}
         poses = []
@@ -366,7 +367,7 @@ class _Calibration:
         return Mount(
             T_platform_sensor=tuple(tuple(row) for row in transform.tolist()),
             covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
-            coverage_factor=_coverage_factor(used, state, scatter, own, covariance),
+            coverage_factor=coverage_factor(used, state, scatter, own, covariance),
             artefact=found,
             robot_scale=state.scale if used.scale else None,
             robot_scale_std=float(std[at]) if used.scale else None,
@@ -398,7 +399,7 @@ class _Calibration:
         whitened = used.whitening(state, scatter)
         derivatives, together = whitened(used.derivatives(state)), np.vstack(moved)
         off = whitened(together if self.sphere else used.on_lines(together))
-        return -used.free @ _inverse(derivatives.T @ derivatives) @ derivatives.T @ off
+        return -used.free @ inverse(derivatives.T @ derivatives) @ derivatives.T @ off
 
     def _require_determined(self, used: Problem, state: MountState, scatter: Scatter, covariance: np.ndarray) -> None:
         shift = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
@@ -468,72 +469,6 @@ def _refined(problem: Problem, state: MountState, scatter: Scatter) -> tuple[Mou
         if abs(scatter.pose_mm - before.pose_mm) <= 0.02 * before.pose_mm + 0.02 * before.point_mm:
             break
     return problem.solved(state, scatter), scatter
-
-
-def _inverse(information: np.ndarray) -> np.ndarray:
-    """Covariance of an information matrix; directions without information get huge variances."""
-    size = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
-    values, vectors = np.linalg.eigh(size[:, None] * information * size)
-    return size[:, None] * (vectors / np.maximum(values, 1e-13)) @ vectors.T * size
-
-
-def _each_left_out(
-    problem: Problem, state: MountState, scatter: Scatter, information: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For every pose the step of the parameters without it (a Gauss-Newton step), and their covariance then."""
-    whitened = problem.whitening(state, scatter)
-    split = np.cumsum(problem.counts)[:-1]
-    rows = np.split(whitened(problem.derivatives(state)), split)
-    distances = np.split(whitened(problem.distances(state)), split)
-    total, steps = information.sum(axis=0), []
-    gradient = sum(row.T @ own for row, own in zip(rows, distances, strict=True))
-    for row, own, one in zip(rows, distances, information, strict=True):
-        covariance = _inverse(total - one)
-        steps.append((-covariance @ (gradient - row.T @ own), covariance))
-    return steps
-
-
-def _held_out(problem: Problem, state: MountState, scatter: Scatter, information: np.ndarray) -> np.ndarray:
-    """Root mean square distance (P,) of each pose's points from the artefact by the mount of all other poses."""
-    left_out = _each_left_out(problem, state, scatter, information)
-    return np.array([misfits(problem, problem.stepped(state, step))[n] for n, (step, _) in enumerate(left_out)])
-
-
-def _left_out_excess(problem: Problem, state: MountState, scatter: Scatter) -> np.ndarray:
-    """How far each pose lies from what the others predict (P,), chi-square with as many degrees as its profile says."""
-    share = problem.noise_along(state)
-    derivatives, errors = problem.derivatives(state) / share, problem.errors(state) / share
-    split = np.cumsum(problem.counts)[:-1]
-    excess = []
-    left_out = _each_left_out(problem, state, scatter, problem.information(state, scatter))
-    moved = [np.split(problem.distances(state, step) / share[:, 0], split)[n] for n, (step, _) in enumerate(left_out)]
-    sizes = np.full(3, scatter.pose_mm) if problem.sphere else np.array([scatter.pose_mm, scatter.turn_rad])
-    for off, rows, error, (_, covariance) in zip(
-        moved, np.split(derivatives, split), np.split(errors, split), left_out, strict=True
-    ):
-        # All that poses, mount and artefact can do lies in what the errors of the pose span.
-        basis = np.linalg.qr(error)[0]
-        across, by_pose = basis.T @ rows, basis.T @ (error * sizes)
-        spread = across @ covariance @ across.T + by_pose @ by_pose.T + scatter.point_mm**2 * np.eye(basis.shape[1])
-        seen = basis.T @ off
-        excess.append(float(seen @ np.linalg.solve(spread, seen)))
-    return np.array(excess)
-
-
-def _coverage_factor(
-    problem: Problem, state: MountState, scatter: Scatter, own: np.ndarray, covariance: np.ndarray
-) -> float:
-    """Student's factor for 95 %, with degrees of freedom by Welch and Satterthwaite (GUM, G.4).
-
-    The shares of the variances that the points' noise and the sensor's calibration make are known from very many
-    points, the rest from the poses. ``own`` is the covariance without the calibration.
-    """
-    by_points = _inverse(problem.information(state, Scatter(scatter.point_mm, 0.0)).sum(axis=0))
-    total, by_poses = np.diag(covariance)[:6], np.maximum(np.diag(own - problem.of_all(by_points))[:6], 0.0)
-    share = 1 - float(np.mean(by_poses[total > 0] / total[total > 0]))
-    of_poses = max(problem.per_pose * len(problem.points) - problem.size, 1)
-    of_points = max(int(problem.counts.sum()) - problem.per_pose * len(problem.points), 1)
-    return float(t.ppf(0.975, 1 / (share**2 / of_points + (1 - share) ** 2 / of_poses)))
 
 
 def _weaknesses(problem: Problem, state: MountState, covariance: np.ndarray) -> list[str]:

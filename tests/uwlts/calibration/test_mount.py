@@ -319,10 +319,12 @@ def test_the_axis_of_a_rotary_table_is_found(tmp_path, rng):
     assert std[2] == std[5] == 0, "shift along the axis and turn about it are chosen"
     uwlts.write_mount(tmp_path / "mount.json", mount)
     assert read_mount(tmp_path / "mount.json") == mount
-    # The same profiles fit the mirrored table about an axis the other way round.
+    # The same profiles fit the table that is mirrored in the sheet, y -> -y: its axis, an axial vector, is
+    # (-x, y, -z), which lies 2 arccos |y| from the true one. Two errors of at most 5 standard deviations are apart.
     mirrored = uwlts.calibrate_mount(profiles, poses, radius_mm=RADIUS_MM, axis="z")
-    assert mirrored.rms_mm < 1.5 * mount.rms_mm
-    assert axis_errors(mirrored, table)[0] > 0.5
+    assert mirrored.rms_mm == pytest.approx(mount.rms_mm, rel=0.01)
+    apart = 2 * np.arccos(abs(table[1, 2]))
+    assert axis_errors(mirrored, table)[0] == pytest.approx(apart, abs=2 * 5 * np.linalg.norm(std[3:5]))
 
 
 def test_poses_that_are_no_turns_of_a_table_are_refused(rng):
