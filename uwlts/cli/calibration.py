@@ -230,8 +230,8 @@ def mount(
             axes), euler-zyx-deg (about the fixed axes) or another order, -rad for radians; angle-deg of a rotary table.
         profile_unit: Unit of the profiles.
         pose_unit: Unit of the positions.
-        axis: The sphere stands on a rotary table whose axis is not known: direction in the sensor's frame nearest to
-            the axis about which angles turn it counter-clockwise.
+        axis: The sphere or target stands on a rotary table whose axis is not known: direction in the sensor's frame
+            nearest to the axis about which angles turn it counter-clockwise.
         scale: Estimate the robot's scale too.
         time: Estimate the offset to add to the profiles' times (columns time_s; the poses are a trajectory).
     """
