@@ -63,7 +63,7 @@ def compare(
     Example: uwlts compare after.ply before.ply --out change.html
 
     Args:
-        cloud: Cloud of the surface (.ply or .h5).
+        cloud: Cloud of the surface (.ply, .h5, .copc.laz; of other programs .las, .e57, and text in mm).
         reference: Earlier cloud; a mesh (.stl, .obj, .off, or .ply with faces); or an ideal shape: plane, sphere or
             cylinder to fit one, or a TOML file with its kind and what is known of it (docs/how-to/compare-scans.md).
         out: Page to write, with the figures as JSON beside it.
@@ -106,7 +106,7 @@ def inspect(
     Example: uwlts inspect pipe.ply --wall-mm 9.5 --out pipe.json
 
     Args:
-        cloud: Cloud of the object (.ply or .h5).
+        cloud: Cloud of the object (.ply, .h5, .copc.laz; of other programs .las, .e57, and text in mm).
         kind: What the cloud shows.
         out: Findings to write (JSON), each value with its definition and its source.
         coloured: Also write the cloud with each point's distance from the undamaged surface to this file.
