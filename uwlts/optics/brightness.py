@@ -43,7 +43,7 @@ _LEAST_ACROSS = 0.3
 """Least cosine between the stage's motion and the sheet's normal for which a scan shows what lies beside the sheet."""
 
 _TABLE_TOLERANCE = 1e-6
-"""Error, in mm and mm per mm or px, of tabulated points and their derivatives."""
+"""Error of the tabulated shift per slope, mm^2, and of the largest thickness over the described one, per px."""
 
 _MOVED_MM, _MOVED_PX = 0.05, 0.5
 """Steps of sheet and pixel for the derivatives of the points: some sigma of the sheet, within one pixel."""
@@ -85,18 +85,18 @@ def beside_sheet(
     def exact(line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
         here = points(line, place_px)
         per_mm = (points(line, place_px, _MOVED_MM) - here) / _MOVED_MM
-        return np.hstack([here, per_mm, (points(line, place_px + _MOVED_PX) - here) / _MOVED_PX])
+        per_px = (points(line, place_px + _MOVED_PX) - here) / _MOVED_PX
+        in_camera = here @ frame[:3, :3].T + frame[:3, 3]
+        away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
+        sigma = sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
+        return np.column_stack([per_mm * (sigma**2)[:, None], per_px[:, 2] / (per_mm[:, 2] * sigma)])
 
     table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE)
     values = exact(line, centre_px) if table is None else table.values(line, centre_px)
-    # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
-    on_sheet, per_mm, per_px = values[:, :3], values[:, 3:6], values[:, 6:]
-    in_camera = on_sheet @ frame[:3, :3].T + frame[:3, 3]
-    away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
-    sigma = sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
     known = width_px[np.isfinite(width_px)]
-    thickest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA * np.abs(per_px[:, 2] / per_mm[:, 2])
-    return per_mm * (slopes / across * np.minimum(sigma, thickest) ** 2)[:, None]
+    # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
+    thickest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA * values[:, 3]
+    return values[:, :3] * (slopes / across * np.minimum(1.0, thickest**2))[:, None]
 
 
 def slopes_of_brightness(

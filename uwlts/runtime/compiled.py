@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from numba import njit
+from numba.core.dispatcher import Dispatcher
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
@@ -18,7 +19,7 @@ _FASTMATH = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 
 
 def compiled(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
-    """A function compiled by Numba. It may call such functions of its own package, and of no other.
+    """A function compiled by Numba. It may call such functions, of other packages only those that call none of another.
 
     Without a folder that can be written it is compiled anew in every process.
     """
@@ -26,7 +27,9 @@ def compiled(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, 
     try:
         kept: Any = njit(cache=True, **options)(function)
         # Numba takes a function as unchanged where its own file is; here a change of what it calls shows as well.
-        kept._cache._cache_file._source_stamp = _stamp(Path(inspect.getfile(function)).parent)
+        called = (function.__globals__.get(name) for name in function.__code__.co_names)
+        files = {inspect.getfile(each) for each in (function, *(c.py_func for c in called if isinstance(c, Dispatcher)))}
+        kept._cache._cache_file._source_stamp = tuple(map(_stamp, sorted({Path(file).parent for file in files})))
     except (RuntimeError, AttributeError):
         return njit(**options)(function)
     return kept
