@@ -117,17 +117,17 @@ def point_uncertainty(
             series = values[:, None], np.arange(len(values)), np.zeros(len(values))
         else:
             series = table.combined(of_axes).series(*where)
-        count = len(where[0])
-        random, sums = np.empty((count, 6), np.float32), np.empty((weights.shape[1], count, 3), np.float32)
-        of_images = pose_of, stage, frame[some]
-        each = noise[some], blur[some], beside[some]
-        _move(*series, *of_images, *each, weights[0], weights[1], by_stage.T @ weights[2:], random, sums)
+        count, number = len(where[0]), weights.shape[1]
+        random, sums = np.empty((count, 6), np.float32), np.empty((number, count, 3), np.float32)
+        each = (np.ascontiguousarray(values[some]) for values in (frame, noise, blur, beside))
+        added = weights[0], weights[1], np.ascontiguousarray(by_stage.T @ weights[2:])
+        _move(*series, pose_of, stage, *each, *added, np.empty(3 + 3 * number), random, sums)
         return random, sums
 
     # What moves all points together is smooth, so that some of them show which patterns hold nearly all of it.
     few = slice(None, None, max(1, len(line) // _SAMPLED))
     sampled = moved(few, np.eye(2 + len(by_stage)))[1]
-    random, patterns = moved(slice(None), _chief_patterns(sampled.reshape(len(sampled), -1).astype(np.float64)))
+    random, patterns = moved(slice(None), _chief_patterns(sampled.reshape(len(sampled), -1).astype(float)))
     if not np.isfinite(random).all():
         raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
     along = np.array(header.stage_direction)
@@ -149,19 +149,20 @@ def _move(
     of_blur: np.ndarray,
     of_beside: np.ndarray,
     of_stage: np.ndarray,
+    flat: np.ndarray,
     random: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Fill ``random`` (N, 6), in the order of `PAIRS`, and ``sums`` (M, N, 3).
+    """Fill ``random`` (N, 6), in the order of `PAIRS`, and ``sums`` (M, N, 3); ``flat`` (3 + 3 M,) is room to work in.
 
     ``series`` (L, n, 3 + 3 M) are of derivatives by the pixel across the stripe and of sums of the estimate's parts, in
     each axis; what images turn, blur, brightness beside the sheet (N, 3) and the stage add is ``of_...`` (M,) and
     (3, M) times that of the point.
     """
     count = sums.shape[0]
-    value = np.empty((3, 1 + count))
+    value = flat.reshape(3, 1 + count)
     for n in range(row.size):
-        sum_terms(series[row[n]], at[n], value.reshape(3 + 3 * count))
+        sum_terms(series[row[n]], at[n], flat)
         turn, far = turns[frame[n]], stage[frame[n]]
         for m in range(1 + count):
             a, b, c = value[0, m], value[1, m], value[2, m]
@@ -215,7 +216,7 @@ def _chief_patterns(moved: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(moved @ moved.T)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
     left = 3.0 * np.append(np.cumsum(values[::-1])[::-1][1:], 0.0) / moved.shape[1]
-    return vectors[:, : 1 + int(np.argmax(left <= _NEGLIGIBLE_MM**2))]
+    return np.ascontiguousarray(vectors[:, : 1 + int(np.argmax(left <= _NEGLIGIBLE_MM**2))])
 
 
 def stage_root(known: StoredEstimate, calibration: Calibration, header: CaptureHeader, root: np.ndarray) -> np.ndarray:

@@ -187,7 +187,8 @@ def _slopes(
     step = np.median(position[rows:] - position[:-rows]) / rows if rows else 0.0
     least = max(0.15 * step**2, _LEAST_APART_MM**2)
     by_position, by_column = np.zeros(shape), np.zeros(shape)
-    _fit_planes(there, z, np.ascontiguousarray(s, dtype=float), rows, columns, least, by_position, by_column)
+    room = np.empty((shape[0], 5, shape[1])), np.zeros((9, shape[1]))
+    _fit_planes(there, z, np.ascontiguousarray(s, dtype=float), rows, columns, least, *room, by_position, by_column)
     return by_position[row, column - first], by_column[row, column - first]
 
 
@@ -199,19 +200,22 @@ def _fit_planes(
     rows: int,
     columns: int,
     least: float,
+    along: np.ndarray,
+    total: np.ndarray,
     by_position: np.ndarray,
     by_column: np.ndarray,
 ) -> None:
     """Slopes (F, L) of planes through the values z (F, L) that are there, at positions s (F,), 0 where unknown.
 
-    The sums over the window are running ones, first along a row and then from row to row.
+    The sums over the window are running ones, first along a row, ``along`` (F, 5, L), and then from row to row,
+    ``total`` (9, L), zero at first.
     """
     count, width = there.shape
-    along = np.zeros((count, 5, width))
     for row in range(count):
         n, x1, x2, z1, xz = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(width + columns):
-            for at, sign in ((k, 1.0), (k - 2 * columns - 1, -1.0)):
+            for side in range(2):
+                at, sign = k - side * (2 * columns + 1), 1.0 - 2.0 * side
                 if 0 <= at < width and there[row, at]:
                     x, value = at - 0.5 * width, z[row, at]
                     n, x1, x2 = n + sign, x1 + sign * x, x2 + sign * x * x
@@ -220,9 +224,9 @@ def _fit_planes(
                 to = along[row, :, k - columns]
                 to[0], to[1], to[2], to[3], to[4] = n, x1, x2, z1, xz
     size = (2 * rows + 1) * (2 * columns + 1)
-    total = np.zeros((9, width))
     for k in range(count + rows):
-        for row, sign in ((k, 1.0), (k - 2 * rows - 1, -1.0)):
+        for side in range(2):
+            row, sign = k - side * (2 * rows + 1), 1.0 - 2.0 * side
             if 0 <= row < count:
                 for at in range(width):
                     n, x1, z1 = sign * along[row, 0, at], sign * along[row, 1, at], sign * along[row, 3, at]

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_part
 
 _NODES = (12, 24)
 """Numbers of nodes along either direction that are tried, one after another."""
@@ -110,7 +110,7 @@ def _sum_series(series: np.ndarray, row: np.ndarray, at: np.ndarray, result: np.
         sum_terms(series[row[n]], at[n], result[n])
 
 
-@compiled
+@compiled_part
 def sum_terms(terms: np.ndarray, x: float, sums: np.ndarray) -> None:
     """Sums (K,) of a line's terms (n, K) times Chebyshev polynomials, each by recurrence from the two before."""
     before, polynomial = x, 1.0

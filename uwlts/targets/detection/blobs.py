@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from uwlts.model.errors import ImageError
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_part
 
 # Sides of the square window over which the two local grey levels are taken. A window serves blobs from about a tenth
 # to three quarters of its side, so factors of four cover 4 px to 380 px with overlap.
@@ -137,7 +137,7 @@ def _widened(blocks):
     return cv2.resize(blocks, (BLOCK_PX * columns, rows), interpolation=cv2.INTER_LINEAR)
 
 
-@compiled
+@compiled_part
 def _between(count, v):
     """Rows of blocks, of so many, on either side of a row of pixels, and the share of the second one."""
     at = (v + 0.5) / BLOCK_PX - 0.5

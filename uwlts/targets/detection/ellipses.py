@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import KDTree
 
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_part
 from uwlts.targets.detection.blobs import Blobs, checked_grey, find_blobs, noise_level
 
 PASSES = 2
@@ -133,7 +133,7 @@ def _sum_shares(grey, centres, inner, outer, planes, result):
         result[n, 0], result[n, 1] = centre_u + sum_u / area, centre_v + sum_v / area
 
 
-@compiled
+@compiled_part
 def _run(q, centre_u, dv):
     """First and last u within an ellipse in a row; the first is after the last where the row misses it."""
     mixed = q[0, 1] * dv
@@ -333,7 +333,7 @@ def _interpolate(grey, points, values):
         values[n] = _bilinear(grey, points[n, 0], points[n, 1])
 
 
-@compiled
+@compiled_part
 def _bilinear(grey, u, v):
     height, width = grey.shape
     left, top = min(max(int(u), 0), width - 2), min(max(int(v), 0), height - 2)
