@@ -29,7 +29,9 @@ def compiled(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, 
         kept: Any = njit(cache=True, **_OPTIONS)(function)
         # Numba takes a function as unchanged where its own file is; here a change of what it calls shows as well.
         called = (function.__globals__.get(name) for name in function.__code__.co_names)
-        files = {inspect.getfile(each) for each in (function, *(c.py_func for c in called if isinstance(c, Dispatcher)))}
+        files = {
+            inspect.getfile(each) for each in (function, *(c.py_func for c in called if isinstance(c, Dispatcher)))
+        }
         kept._cache._cache_file._source_stamp = tuple(map(_stamp, sorted({Path(file).parent for file in files})))
     except (RuntimeError, AttributeError):
         return njit(**_OPTIONS)(function)

@@ -18,7 +18,7 @@ import numpy as np
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import Stripe, StripeStatus
-from uwlts.runtime.compiled import compiled, compiled_part
+from uwlts.runtime.compiled import compiled
 from uwlts.stripe.ends import leave_ends_out
 from uwlts.stripe.result import StripeCandidates
 
@@ -373,7 +373,7 @@ def _refuse_tails(line: np.ndarray, centre: np.ndarray, alone: np.ndarray, state
         first = last + 1
 
 
-@compiled_part
+@compiled
 def _refused_run(
     line: np.ndarray, centre: np.ndarray, state: np.ndarray, number: int, side: int, jump_px: float
 ) -> int:
@@ -386,7 +386,7 @@ def _refused_run(
     return abs(line[at] - line[number])
 
 
-@compiled_part
+@compiled
 def _linked(line: np.ndarray, centre: np.ndarray, one: int, other: int, jump_px: float) -> bool:
     """Whether two candidates may be of the same stripe."""
     return abs(centre[one] - centre[other]) <= jump_px + _SLACK_PX * max(abs(line[one] - line[other]) - 1, 0)
@@ -430,7 +430,7 @@ def _refuse_crossings(
             state[k] = _OPEN
 
 
-@compiled_part
+@compiled
 def _nearest_beside(line: np.ndarray, centre: np.ndarray, number: int) -> int:
     """Number of the candidate on the same line that is nearest; -1 where none is."""
     first, best = number, -1
@@ -443,7 +443,7 @@ def _nearest_beside(line: np.ndarray, centre: np.ndarray, number: int) -> int:
     return best
 
 
-@compiled_part
+@compiled
 def _pair_beside(
     line: np.ndarray,
     centre: np.ndarray,

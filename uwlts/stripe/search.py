@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from uwlts.model.stripe import StripeStatus
@@ -94,7 +92,7 @@ def search_all(
     Arguments as of `search`. Two stripes of which one reaches into the other's pixels cannot be measured: neither is
     there.
     """
-    rules = _rules(replace(options, peak=PeakRule.FIRST), coarse=coarse, fine=fine, clip=clip)
+    rules = _rules(options, coarse=coarse, fine=fine, clip=clip)._replace(order=FIRST)
     peaks = PeakWindow.empty(_MOST * len(lines), 2 * rules.half + rules.block, options.smoothing_px)
     kernel = low_pass(options.smoothing_px)
     smooth = np.empty(peaks.window.shape[1], np.float32)
