@@ -114,14 +114,14 @@ def point_uncertainty(
         of_axes, where = np.kron(np.eye(3), of_parts), (line[some], centre_px[some])
         if table is None:
             values = exact(*where) @ of_axes
-            series = values[:, None], np.arange(len(values)), np.zeros(len(values))
+            series, row, at = values[:, None], np.arange(len(values)), np.zeros(len(values))
         else:
-            series = table.combined(of_axes).series(*where)
-        count, number = len(where[0]), weights.shape[1]
-        random, sums = np.empty((count, 6), np.float32), np.empty((number, count, 3), np.float32)
-        each = (np.ascontiguousarray(values[some]) for values in (frame, noise, blur, beside))
-        added = weights[0], weights[1], np.ascontiguousarray(by_stage.T @ weights[2:])
-        _move(*series, pose_of, stage, *each, *added, np.empty(3 + 3 * number), random, sums)
+            series, row, at = table.combined(of_axes).series(*where)
+        random, sums = np.empty((len(row), 6), np.float32), np.empty((weights.shape[1], len(row), 3), np.float32)
+        image, error, by_blur, off = (np.ascontiguousarray(each[some]) for each in (frame, noise, blur, beside))
+        of_blur, of_beside, of_stage = weights[0], weights[1], np.ascontiguousarray(by_stage.T @ weights[2:])
+        room, images = np.empty(of_axes.shape[1]), (pose_of, stage, image)
+        _move(series, row, at, *images, error, by_blur, off, of_blur, of_beside, of_stage, room, random, sums)
         return random, sums
 
     # What moves all points together is smooth, so that some of them show which patterns hold nearly all of it.

@@ -43,7 +43,8 @@ def compiled_part(function: Callable[_Parameters, _Result]) -> Callable[_Paramet
 
     Without what converts arguments, and kept only within its callers, a short one takes half the time to compile.
     """
-    return njit(no_cpython_wrapper=True, **_OPTIONS)(function)
+    options: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True}
+    return njit(**options)(function)
 
 
 @cache

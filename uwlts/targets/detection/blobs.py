@@ -88,8 +88,8 @@ def find_blobs(image, noise):
         if window > WINDOWS_PX[0] and window > max(image.shape):
             break
         sides = np.empty((2, *smooth.shape), np.uint8)
-        levels = (_widened(blocks) for blocks in _local_levels(smooth, mean, window))
-        _set_sides(smooth, *levels, np.float32(floor), *sides)
+        threshold, contrast = map(_widened, _local_levels(smooth, mean, window))
+        _set_sides(smooth, threshold, contrast, np.float32(floor), sides[0], sides[1])
         for bright, side in zip((True, False), sides, strict=True):
             blobs = _ellipse_like(side, bright=bright)
             radii = np.sqrt(np.linalg.det(blobs.shapes))
@@ -104,7 +104,7 @@ def _local_levels(smooth, mean, window):
 
     ``mean`` is that of the blocks.
     """
-    threshold = mean = _local_mean(mean, window)
+    threshold = bright = dark = mean = _local_mean(mean, window)
     for _ in range(2):
         share, above = (_local_mean(values, window) for values in _above(smooth, threshold))
         share = np.clip(share, 1e-4, 1 - 1e-4)
@@ -119,7 +119,7 @@ def _local_mean(blocks, window):
 
 
 def _above(smooth, threshold):
-    """Of each block the share of its pixels above the threshold, interpolated between blocks, and their sum over all."""
+    """Of each block the share of pixels above the threshold, interpolated between blocks, and their sum over all."""
     share, above = np.empty_like(threshold), np.empty_like(threshold)
     wide = _widened(threshold)
     _sum_above(smooth, wide, np.empty((2, wide.shape[1]), np.float32), share, above)

@@ -81,7 +81,7 @@ def _level_planes(grey, centres, shapes, reaches):
 
 
 def _slopes(places, values, near):
-    """Slopes (N, 2) of planes through values (N,) at each of the places (N, 2) and at those near it, by number (N, K)."""
+    """Slopes (N, 2) of planes through values (N,) at each of the places (N, 2) and at those ``near`` it (N, K)."""
     alike = np.abs(values[near] - values[:, None]) <= MAX_LEVEL_DEPARTURE * np.abs(values[:, None])
     weights = alike / alike.sum(1, keepdims=True)
     at, level = places[near], values[near]
