@@ -7,10 +7,10 @@ follows, correlations included, from calculating it again with each pattern adde
 """
 
 from functools import partial
+from hashlib import sha256
 
 import numpy as np
 
-from uwlts.calibration.joint.derivatives import COLUMNS
 from uwlts.calibration.joint.evidence import STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, across_of
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, stored_estimate
@@ -18,7 +18,6 @@ from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import StageParameter
-from uwlts.model.stripe import pixels_of
 from uwlts.optics.brightness import BLUR_STD, beside_std
 from uwlts.optics.line_table import LineTable, sum_terms
 from uwlts.runtime.compiled import compiled
@@ -67,6 +66,7 @@ def point_uncertainty(
     *,
     blur_px: np.ndarray | None = None,
     beside_mm: np.ndarray | None = None,
+    mount_by: np.ndarray | None = None,
 ) -> PointUncertainty:
     """Uncertainty of the points that stripe centres (N,) of a capture give by a joint calibration.
 
@@ -74,7 +74,9 @@ def point_uncertainty(
     is part of it, about the middle of its positions; what poses add is not (`uwlts.measurement.moving`). The water may
     have drifted since the calibration, unless that was made from this very capture. ``blur_px`` (N,), how far blur may
     move the centres, and ``beside_mm`` (N, 3), how far points were moved to where their light comes from
-    (`uwlts.optics.brightness`), are each wrong by some share, the same for all points.
+    (`uwlts.optics.brightness`), are each wrong by some share, the same for all points. ``mount_by`` (6, P) are
+    derivatives of the mount by the parameters of the joint estimate (`uwlts.model.mount.SensorShare`), where the frames
+    carry poses of a platform: what the calibration does to points and mount then belongs together.
 
     Raises
     ------
@@ -93,7 +95,6 @@ def point_uncertainty(
     of_sensor = sensor_poses(capture)
     pose = of_sensor[:, :3, :3]
     posed = np.all(np.isfinite(of_sensor), axis=(1, 2), keepdims=True)
-    into_object = calibration.object_transform()[:3, :3].T
     pose_of = np.where(posed, pose, np.eye(3))
     root = covariance_root(known.covariance)
     by_stage_alone = ~posed[:, 0, 0]
@@ -101,7 +102,11 @@ def point_uncertainty(
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
     by_stage = stage_root(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
-    exact = partial(_derivatives, known, root, stripe_along=calibration.stripe_along, turn=into_object)
+    rigid = (
+        np.zeros((6, root.shape[1])) if mount_by is None else _in_sensor(mount_by, header) @ root[: mount_by.shape[1]]
+    )
+    source = f"sensor {sha256(root.tobytes() + by_stage.tobytes()).hexdigest()[:16]}"
+    exact = partial(_derivatives, known, root, rigid)
     table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE_MM)
     beside = np.zeros((len(line), 3)) if beside_mm is None else beside_std(header.sensor.uncertainty) * beside_mm
     blur = np.zeros(len(line)) if blur_px is None else BLUR_STD * blur_px
@@ -127,12 +132,14 @@ def point_uncertainty(
     # What moves all points together is smooth, so that some of them show which patterns hold nearly all of it.
     few = slice(None, None, max(1, len(line) // _SAMPLED))
     sampled = moved(few, np.eye(2 + len(by_stage)))[1]
-    random, patterns = moved(slice(None), _chief_patterns(sampled.reshape(len(sampled), -1).astype(float)))
+    weights = _chief_patterns(sampled.reshape(len(sampled), -1).astype(float))
+    random, patterns = moved(slice(None), weights)
     if not np.isfinite(random).all():
         raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
     along = np.array(header.stage_direction)
     position = np.where(posed[frame, :, 0], 0.0, header.sensor.uncertainty.stage_position_mm * along)
-    return PointUncertainty(random, position.astype(np.float32), patterns)
+    # All but blur and brightness is the sensor's and its stage's, whatever they scan in this medium.
+    return PointUncertainty(random, position.astype(np.float32), patterns, shared={source: weights[2:].T})
 
 
 @compiled
@@ -177,38 +184,41 @@ def _move(
                 sums[m, n, axis] = value[axis, 1 + m] + own + of_stage[axis, m] * far
 
 
+def _in_sensor(mount_by: np.ndarray, header: CaptureHeader) -> np.ndarray:
+    """Derivatives (6, P) of a mount, shift and turn, along the axes of the sensor in place of the platform's."""
+    turn = np.array(header.T_platform_sensor)[:3, :3]
+    return np.vstack([turn.T @ mount_by[:3], turn.T @ mount_by[3:]])
+
+
 def _derivatives(
-    known: StoredEstimate,
-    root: np.ndarray,
-    line: np.ndarray,
-    centre_px: np.ndarray,
-    *,
-    stripe_along: str,
-    turn: np.ndarray,
+    known: StoredEstimate, root: np.ndarray, rigid: np.ndarray, line: np.ndarray, centre_px: np.ndarray
 ) -> np.ndarray:
     """Derivatives (N, 3 (1 + R)), axis by axis, of points by the pixel across the stripe and independent parts.
 
-    The parts are ``root`` (P, R), those of all parameters. ``turn`` (3, 3) turns derivatives from the camera's frame;
-    they are NaN where a centre has no point.
+    In the OCS. The parts are ``root`` (P, R), those of all parameters, and move the OCS by ``rigid`` (6, R), shift and
+    turn. NaN where a centre has no point.
     """
-    column = COLUMNS.index("v" if stripe_along == "width" else "u")
-    pixels = pixels_of(line, centre_px, stripe_along=stripe_along)
-    points = known.parameters.on_sheet(known.values, known.view, pixels)
     result = np.empty((len(line), 3, 1 + root.shape[1]))
-    if points is None:
+    found = known.points_by(line, centre_px)
+    if found is None:
         result[:] = np.nan
     else:
-        result[:, :, 0] = points.by_rays[column].T
-        for axis in range(3):
-            by_global = known.parameters.by_global(points.by_rays[:, axis], known.view, points.by_sheet[:, axis])
-            result[:, axis, 1:] = by_global @ root
-    return np.einsum("ij,njr->nir", turn, result).reshape(len(line), -1)
+        points, by = found
+        result[:, :, 0] = by[:, :, 0]
+        result[:, :, 1:] = by[:, :, 1:] @ root
+        if rigid.any():
+            result[:, :, 1:] += rigid[:3] + np.cross(rigid[3:].T, points[:, None]).swapaxes(1, 2)
+    return result.reshape(len(line), -1)
 
 
-def independent_patterns(moved: np.ndarray) -> np.ndarray:
-    """Patterns (M, N, 3), orthogonal over the points, from any (R, N, 3) that together have their covariance."""
+def independent_patterns(moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Patterns (M, N, 3), orthogonal over the points, from any (R, N, 3) that together have their covariance.
+
+    And how much (M, R) of each of these every pattern has.
+    """
     flat = moved.reshape(len(moved), -1)
-    return (_chief_patterns(flat).T @ flat).astype(np.float32).reshape(-1, *moved.shape[1:])
+    weights = _chief_patterns(flat)
+    return (weights.T @ flat).astype(np.float32).reshape(-1, *moved.shape[1:]), weights.T
 
 
 def _chief_patterns(moved: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,8 @@ _PER_POINT = ("points_mm", "intensity", "frame", "line")
 _KINDS = dict(zip(_PER_POINT, (np.float64, np.float32, np.int32, np.int32), strict=True)) | {"deviation_mm": np.float32}
 _KINDS |= {"time_s": np.float64}
 _COMMENT = "uwlts-metadata"
+_UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
+_SHARED = "shared_errors"
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
 _FARTHEST_MM = 1e12
@@ -70,18 +72,22 @@ class PointUncertainty:
     poses_mm : (K, N, 3) float32 or None
         How each point moves for one standard deviation of each independent part of its image's pose, which is
         independent from image to image.
+    shared : dict of str to (M, Q) float64
+        What clouds have in common, by the name of a calibration of the sensor or its mount: each pattern holds so much
+        of Q independent parts of its errors, each of standard deviation one. Clouds that name the same share these.
     """
 
     random_mm2: np.ndarray
     position_mm: np.ndarray
     patterns_mm: np.ndarray
     poses_mm: np.ndarray | None = None
+    shared: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __getitem__(self, selection: Any) -> "PointUncertainty":
         """That of a selection of the points, by a slice, indices or a mask."""
         poses = None if self.poses_mm is None else self.poses_mm[:, selection]
         patterns = self.patterns_mm[:, selection]
-        return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], patterns, poses)
+        return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], patterns, poses, self.shared)
 
     def by_image_mm(self) -> np.ndarray:
         """All that moves the points of an image together and is independent from image to image (1 + K, N, 3)."""
@@ -229,7 +235,8 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
     vertices = np.empty(len(cloud), [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
     for name, values in columns.items():
         vertices[name] = values
-    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=_comments(cloud.metadata))
+    comments = _comments(_with_shared(cloud))
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
     with written_aside(path, overwrite=overwrite) as aside:
         ply.write(str(aside))
 
@@ -313,6 +320,7 @@ def joined(parts: Sequence[PointCloud]) -> PointCloud:
             np.concatenate([each.position_mm for each in known]),
             np.concatenate([each.patterns_mm for each in known], axis=1),
             np.concatenate(poses, axis=1) if len(poses) == len(parts) else None,
+            known[0].shared,
         )
         if len(known) == len(parts)
         else None,
@@ -401,6 +409,35 @@ def _pose_names(count: int) -> list[str]:
     return [f"pose{k}_{axis}" for k in range(count) for axis in "xyz"]
 
 
+def _with_shared(cloud: PointCloud) -> Table:
+    """Metadata in a file: with what the patterns share with other clouds."""
+    if cloud.uncertainty is None or not cloud.uncertainty.shared:
+        return cloud.metadata
+    return cloud.metadata | {
+        _SHARED: {name: np.round(each, 9).tolist() for name, each in cloud.uncertainty.shared.items()}
+    }
+
+
+def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Table, PointUncertainty | None]:
+    """Metadata and uncertainty of a cloud from those in a file; CaptureError where they do not fit together."""
+    if _SHARED not in metadata:
+        return metadata, known
+    rest = {name: each for name, each in metadata.items() if name != _SHARED}
+    if known is None:
+        return rest, None
+    try:
+        shared = {str(name): np.array(each, dtype=np.float64) for name, each in dict(metadata[_SHARED]).items()}
+    except (TypeError, ValueError) as error:
+        raise CaptureError(f"its metadata is damaged: {_SHARED} holds no numbers") from error
+    if any(
+        each.ndim != 2 or len(each) != len(known.patterns_mm) or not np.isfinite(each).all() for each in shared.values()
+    ):
+        raise CaptureError(
+            f"its metadata is damaged: {_SHARED} does not belong to its {len(known.patterns_mm)} patterns"
+        )
+    return rest, replace(known, shared=shared)
+
+
 def _as_json(metadata: Table) -> str:
     try:
         require_plain(metadata)
@@ -479,6 +516,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
             poses = np.stack([column(name, np.nan) for name in _pose_names(parts)]).reshape(parts, 3, -1)
             uncertainty = replace(uncertainty, poses_mm=np.ascontiguousarray(np.moveaxis(poses, 1, 2)))
     deviation = column("deviation", np.nan)
+    metadata, uncertainty = _without_shared(_metadata(ply.comments), uncertainty)
     cloud = PointCloud(
         points_mm=np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"]),
         intensity=column("intensity", np.nan),
@@ -487,7 +525,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         deviation_mm=None if np.isnan(deviation).all() else deviation,
         uncertainty=uncertainty,
         time_s=column("time", np.nan, np.float64) if "time" in known else None,
-        metadata=_metadata(ply.comments),
+        metadata=metadata,
     )
     return cloud, len(whole)
 
@@ -527,12 +565,12 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
     arrays = {name: getattr(cloud, name) for name in _PER_POINT}
     arrays |= {name: each for name in ("deviation_mm", "time_s") if (each := getattr(cloud, name)) is not None}
     if cloud.uncertainty is not None:
-        arrays |= {name: each for name, each in vars(cloud.uncertainty).items() if each is not None}
+        arrays |= {name: each for name in _UNCERTAINTY if (each := getattr(cloud.uncertainty, name)) is not None}
         arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()
     # In memory first: HDF5 does not survive a full disk.
     content = BytesIO()
     with h5py.File(content, "w", libver="latest") as file:
-        write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=cloud.metadata))
+        write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=_with_shared(cloud)))
         for name, data in arrays.items():
             file.create_dataset(name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True)
     with written_aside(path, overwrite=overwrite) as aside:
@@ -541,7 +579,7 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
 
 def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     require_regular_file(path, called="cloud")
-    names = [part.name for part in fields(PointUncertainty)]
+    names = _UNCERTAINTY
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, _CloudHeader, path=path, format=FORMAT, version=VERSION)
@@ -570,4 +608,5 @@ def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     if needed[0] in arrays:
         known = PointUncertainty(*(arrays[name] for name in needed), poses_mm=arrays.get("poses_mm"))
     per_point = {name: arrays[name] for name in _KINDS if name in arrays}
-    return PointCloud(**per_point, uncertainty=known, metadata=header.metadata), total
+    metadata, known = _without_shared(header.metadata, known)
+    return PointCloud(**per_point, uncertainty=known, metadata=metadata), total
