@@ -19,6 +19,7 @@ from uwlts.model.input_file import opened, parsed_json, require_plain, require_r
 from uwlts.model.sensor import Description, Table
 from uwlts.storage.copc_file import is_copc, read_copc
 from uwlts.storage.files import written_aside
+from uwlts.storage.foreign_clouds import FOREIGN_FORMATS, read_foreign
 from uwlts.storage.hdf5_file import find_dataset, format_of, read_array, read_label, write_label
 
 FORMAT = "uwlts-cloud"
@@ -48,6 +49,10 @@ _LONGEST_PLY_HEADER = 2**24
 _MOST_PROPERTIES = 1000
 _TYPE_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _TYPE_BYTES |= {f"{kind}{bits}": bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)}
+CLOUD_ENDINGS = (".ply", ".h5", ".copc.laz", *FOREIGN_FORMATS)
+"""Endings of the clouds that can be read."""
+_CLOUDS_ALONE = (".ply", ".xyz", ".las", ".e57")
+"""Endings of clouds and of nothing else that is measured."""
 _Rows = Callable[[int], slice]
 _PIECE = re.compile(rf"{_COMMENT} (\d+)/(\d+) (.*);")
 
@@ -194,6 +199,7 @@ class PointCloud:
             *(getattr(self, name)[selection] for name in _PER_POINT),
             deviation_mm=None if deviation is None else deviation[selection],
             uncertainty=None if known is None else known[selection],
+            time_s=None if self.time_s is None else self.time_s[selection],
             metadata=self.metadata,
         )
 
@@ -238,6 +244,7 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
 def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
     """Read a cloud from HDF5 (``.h5``), COPC (``.copc.laz``) or PLY, also another program's (x, y, z suffice).
 
+    Points of other programs may also come as text (``.xyz``, ``.csv`` and others, mm), LAS or E57 (m).
     Fields that CloudCompare has saved again (`scalar_intensity` and so on) are recognised. Missing intensity is NaN,
     missing frame and line are -1, a deviation that is missing or NaN throughout is None.
 
@@ -256,6 +263,9 @@ def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None)
     """
     if is_copc(path):
         return _read_copc(path, None, at_most)
+    if _is_foreign(path):
+        whole = _read_foreign(Path(path))
+        return whole.selected(_every(len(whole), at_most)), len(whole)
     return _read_rows(Path(path), lambda count: _every(count, at_most))
 
 
@@ -284,7 +294,7 @@ def cloud_parts(path: str | os.PathLike[str], most: int = POINTS_OF_PART) -> Ite
 
     Of HDF5 and binary PLY only one part is held in memory.
     """
-    if is_copc(path):
+    if is_copc(path) or _is_foreign(path):
         whole = read_cloud(path)
         yield from (whole.selected(slice(start, start + most)) for start in range(0, max(len(whole), 1), most))
         return
@@ -328,8 +338,32 @@ def _read_copc(
     return PointCloud(found.points_mm, found.intensity, frame, line, found.deviation_mm), found.total
 
 
+def _is_foreign(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() in FOREIGN_FORMATS
+
+
+def _read_foreign(path: Path) -> PointCloud:
+    found = read_foreign(path)
+    none, unknown = np.full(len(found.points_mm), np.nan), np.full(len(found.points_mm), NO_INDEX)
+    try:
+        return PointCloud(
+            found.points_mm,
+            none if found.intensity is None else found.intensity,
+            unknown if found.frame is None else found.frame,
+            unknown if found.line is None else found.line,
+            deviation_mm=found.deviation_mm,
+            time_s=found.time_s,
+        )
+    except CaptureError as error:
+        raise CaptureError(f"{path}: {error}") from error
+
+
 def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     """The rows of a file that are selected by the number of all, and that number."""
+    if path.suffix.lower() not in (".ply", ".h5"):
+        with opened(path, called="cloud") as file:
+            if not file.read(4).startswith(b"ply"):
+                raise CaptureError(f"{path} ends with none of {', '.join(CLOUD_ENDINGS)}, the formats of clouds")
     try:
         return _read_hdf5(path, rows) if _in_hdf5(path) else _read_ply(path, rows)
     except CaptureError as error:
@@ -343,7 +377,9 @@ def _every(count: int, at_most: int | None) -> slice:
 
 def is_cloud(path: str | os.PathLike[str]) -> bool:
     """Whether a file is a cloud: by its ending, where that is not the captures' as well, and else by its label."""
-    return format_of(Path(path)) == FORMAT if _in_hdf5(path) else is_copc(path) or Path(path).suffix.lower() == ".ply"
+    if _in_hdf5(path):
+        return format_of(Path(path)) == FORMAT
+    return is_copc(path) or Path(path).suffix.lower() in _CLOUDS_ALONE
 
 
 def _in_hdf5(path: str | os.PathLike[str]) -> bool:
