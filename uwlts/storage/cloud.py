@@ -30,6 +30,10 @@ POINTS_OF_PART = 1_000_000
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """The coordinates whose covariances are kept of the symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz."""
 
+FOOTPRINT, FOOTPRINT_STD = "footprint_mm", "footprint_std"
+"""Metadata of clouds of unmoved sensors: standard deviations of the part of a surface that a point is the mean of,
+across the sheet (X) and along the stripe (Y), mm, and the relative standard uncertainty of their squares."""
+
 NO_INDEX = -1
 """Frame and line of points whose file does not name them."""
 
