@@ -124,7 +124,7 @@ def with_platform(
         own = [_moved((roots[:, :, k] * apart[:, None])[image], points_mm, ride.poses[frame]) for k in range(6)]
         poses_mm = np.array(own, dtype=np.float32)
     patterns = together[0] if len(together) == 1 else independent_patterns(np.concatenate(together))
-    return replace(uncertainty, patterns_mm=patterns, poses_mm=poses_mm)
+    return replace(uncertainty, patterns_mm=patterns, poses_mm=poses_mm, shares=None)
 
 
 def _by_mount(points_mm: np.ndarray, poses: np.ndarray, mount: Mount) -> np.ndarray:

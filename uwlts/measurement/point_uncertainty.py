@@ -97,14 +97,19 @@ def point_uncertainty(
     posed = np.all(np.isfinite(of_sensor), axis=(1, 2), keepdims=True)
     into_object = calibration.object_transform()[:3, :3].T
     pose_of = np.where(posed, pose, np.eye(3))
-    root = covariance_root(known.covariance)
+    found = require_joint(calibration).covariance_matrix()
+    root = np.zeros((len(known.covariance), 1 + len(found)))
+    # What the medium's index adds to the estimate: its drift, or all of it in a medium that was not calibrated in.
+    root[:, 0] = np.sqrt(np.maximum(np.diag(known.covariance) - np.pad(np.diag(found), (0, len(root) - len(found))), 0))
+    root[: len(found), 1:] = covariance_root(found)
     by_stage_alone = ~posed[:, 0, 0]
     middle = np.mean(capture.stage_mm[by_stage_alone]) if by_stage_alone.any() else 0.0
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
     by_stage = stage_root(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
     exact = partial(_derivatives, known, stripe_along=calibration.stripe_along, turn=into_object)
-    root, by_stage = _fewest_parts(exact, root, by_stage, line, centre_px, reach_mm=np.abs(stage).max(initial=0.0))
+    kept = _fewest_parts(exact, root, by_stage, line, centre_px, reach_mm=np.abs(stage).max(initial=0.0))
+    root, by_stage = root @ kept, kept.T @ by_stage
     table = LineTable.about(
         lambda *where: exact(root, *where).reshape(len(where[0]), -1), line, centre_px, tolerance=_TABLE_TOLERANCE_MM
     )
@@ -126,7 +131,11 @@ def point_uncertainty(
         raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
     along = np.array(header.stage_direction)
     position = np.where(posed[frame, :, 0], 0.0, header.sensor.uncertainty.stage_position_mm * along)
-    return PointUncertainty(random, position.astype(np.float32), _patterns(moved.reshape(-1, moved.shape[2]).T))
+    patterns, ways = _patterns(moved.reshape(-1, moved.shape[2]).T)
+    # Of the water, of light beside the sheet, and of the calibration and stage; blur depends on what is scanned.
+    whole = ways[2:].T @ kept.T
+    shares = np.column_stack([whole[:, 0], ways[1], whole[:, 1:]])
+    return PointUncertainty(random, position.astype(np.float32), patterns, shares=shares)
 
 
 @compiled
@@ -163,22 +172,22 @@ def _fewest_parts(
     centre_px: np.ndarray,
     *,
     reach_mm: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Independent parts ``root`` (P, R) and ``by_stage`` (R, 3) as few as move points the same, to `_NOTHING_MM`.
+) -> np.ndarray:
+    """Combinations (R, K) of the independent parts ``root`` (P, R), ``by_stage`` (R, 3) that move points the same.
 
-    Points move smoothly over the image, so that what some hundred places over all of it show holds for all of them.
+    As few as `_NOTHING_MM` lets. Points move smoothly over the image, so that what some hundred places over all of it
+    show holds for all of them.
     """
     if len(line) < _FEWEST_POINTS:
-        return root, by_stage
+        return np.eye(root.shape[1])
     lines, places = (np.linspace(values.min(), values.max(), _PLACES) for values in (line, centre_px))
     at = np.meshgrid(lines, places)
     moved = exact(root, at[0].ravel(), at[1].ravel())[:, :, 2:]
     if not np.isfinite(moved).all():
-        return root, by_stage
+        return np.eye(root.shape[1])
     together = np.vstack([moved.reshape(-1, root.shape[1]), reach_mm * by_stage.T])
     _, values, parts = np.linalg.svd(together, full_matrices=False)
-    kept = parts[values > _NOTHING_MM].T
-    return root @ kept, kept.T @ by_stage
+    return parts[values > _NOTHING_MM].T
 
 
 def _derivatives(
@@ -210,17 +219,18 @@ def _derivatives(
 
 def independent_patterns(moved: np.ndarray) -> np.ndarray:
     """Patterns (M, N, 3), orthogonal over the points, from any (R, N, 3) that together have their covariance."""
-    return _patterns(moved.reshape(len(moved), -1))
+    return _patterns(moved.reshape(len(moved), -1))[0]
 
 
-def _patterns(flat: np.ndarray) -> np.ndarray:
-    """Patterns (M, N, 3) as of `independent_patterns` from any (R, 3 N), in any order of memory."""
+def _patterns(flat: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Patterns (M, N, 3) as of `independent_patterns` from any (R, 3 N), in any order of memory; their ways (R, M)."""
     values, vectors = np.linalg.eigh(flat @ flat.T)
     order = np.argsort(values)[::-1]
-    values, vectors = np.maximum(values[order], 0.0), vectors[:, order]
+    values = np.maximum(values[order], 0.0)
     left = 3.0 * np.append(np.cumsum(values[::-1])[::-1][1:], 0.0) / flat.shape[1]
     count = 1 + int(np.argmax(left <= _NEGLIGIBLE_MM**2))
-    return (vectors[:, :count].T @ flat).astype(np.float32).reshape(count, -1, 3)
+    ways = vectors[:, order[:count]]
+    return (ways.T @ flat).astype(np.float32).reshape(count, -1, 3), ways
 
 
 def stage_root(known: StoredEstimate, calibration: Calibration, header: CaptureHeader, root: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from uwlts.optics.reconstruction import MeasuredPoints, reconstruct_by_polynomia
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, FrameTable, opened_capture, sensor_poses
-from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
+from uwlts.storage.cloud import CALIBRATION, DIRECTION, FOOTPRINT, FOOTPRINT_STD, PointCloud
 from uwlts.storage.mount_files import read_mount
 from uwlts.stripe import FoundStripes, StripeSettings, find_stripes
 
@@ -187,7 +187,8 @@ def reconstruct_stripes(
             "medium": capture.header.medium_name,
             "medium_index": index,
             "artefact": capture.header.artefact,
-            "calibration": calibration_digest(calibration),
+            CALIBRATION: calibration_digest(calibration),
+            DIRECTION: list(capture.header.stage_direction),
             **(_footprint(capture, calibration, kept, index) if isinstance(calibration, Calibration) else {}),
         },
         stripe=sharp[good],

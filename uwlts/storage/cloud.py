@@ -30,6 +30,9 @@ POINTS_OF_PART = 1_000_000
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """The coordinates whose covariances are kept of the symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz."""
 
+CALIBRATION, DIRECTION = "calibration", "stage_direction"
+"""Metadata: digest of the calibration, and the direction of the stage's motion as the capture describes it."""
+
 FOOTPRINT, FOOTPRINT_STD = "footprint_mm", "footprint_std"
 """Metadata of clouds of unmoved sensors: standard deviations of the part of a surface that a point is the mean of,
 across the sheet (X) and along the stripe (Y), mm, and the relative standard uncertainty of their squares."""
@@ -41,7 +44,7 @@ _PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
 _PER_POINT = ("points_mm", "intensity", "frame", "line")
 _KINDS = dict(zip(_PER_POINT, (np.float64, np.float32, np.int32, np.int32), strict=True)) | {"deviation_mm": np.float32}
 _KINDS |= {"time_s": np.float64}
-_COMMENT = "uwlts-metadata"
+_COMMENT, _SHARES = "uwlts-metadata", "pattern_shares"
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
 _FARTHEST_MM = 1e12
@@ -69,18 +72,22 @@ class PointUncertainty:
     poses_mm : (K, N, 3) float32 or None
         How each point moves for one standard deviation of each independent part of its image's pose, which is
         independent from image to image.
+    shares : (M, S) float64 or None
+        What of each pattern is of each independent part of water (first), light beside the sheet, calibration and
+        stage. These parts are the same of all clouds of one calibration and direction of the stage.
     """
 
     random_mm2: np.ndarray
     position_mm: np.ndarray
     patterns_mm: np.ndarray
     poses_mm: np.ndarray | None = None
+    shares: np.ndarray | None = None
 
     def __getitem__(self, selection: Any) -> "PointUncertainty":
         """That of a selection of the points, by a slice, indices or a mask."""
         poses = None if self.poses_mm is None else self.poses_mm[:, selection]
         patterns = self.patterns_mm[:, selection]
-        return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], patterns, poses)
+        return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], patterns, poses, self.shares)
 
     def by_image_mm(self) -> np.ndarray:
         """All that moves the points of an image together and is independent from image to image (1 + K, N, 3)."""
@@ -180,6 +187,10 @@ class PointCloud:
             by_pose = None if known.poses_mm is None else known.poses_mm.shape[1:]
             if shapes != ((len(points), 6), points.shape, points.shape) or by_pose not in (None, points.shape):
                 raise CaptureError(f"the uncertainty of {len(points)} points has the shapes {shapes}")
+            if known.shares is not None and (known.shares.ndim != 2 or len(known.shares) != len(known.patterns_mm)):
+                raise CaptureError(
+                    f"shares of {len(known.patterns_mm)} patterns cannot have the shape {known.shares.shape}"
+                )
         _as_json(self.metadata)
 
     def __len__(self) -> int:
@@ -208,8 +219,8 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
     besides. In PLY the vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int), and
     perhaps time (double, s). Where the uncertainty is known there are its covariances in mm2, random_xx to random_zz
     and systematic_xx to systematic_zz, and in mm position_x to position_z, pattern0_x, pattern0_y and so on, and
-    perhaps pose0_x to pose5_z (`PointUncertainty`). The metadata is JSON in numbered comments,
-    short enough for every reader.
+    perhaps pose0_x to pose5_z (`PointUncertainty`). The metadata, with the shares of the patterns, is JSON in numbered
+    comments, short enough for every reader.
 
     Raises
     ------
@@ -227,7 +238,10 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
     vertices = np.empty(len(cloud), [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
     for name, values in columns.items():
         vertices[name] = values
-    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=_comments(cloud.metadata))
+    metadata = cloud.metadata
+    if cloud.uncertainty is not None and cloud.uncertainty.shares is not None:
+        metadata = metadata | {_SHARES: cloud.uncertainty.shares.tolist()}
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=_comments(metadata))
     with written_aside(path, overwrite=overwrite) as aside:
         ply.write(str(aside))
 
@@ -307,6 +321,7 @@ def joined(parts: Sequence[PointCloud]) -> PointCloud:
             np.concatenate([each.position_mm for each in known]),
             np.concatenate([each.patterns_mm for each in known], axis=1),
             np.concatenate(poses, axis=1) if len(poses) == len(parts) else None,
+            known[0].shares,
         )
         if len(known) == len(parts)
         else None,
@@ -446,6 +461,12 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         if parts and known.keys() >= set(_pose_names(parts)):
             poses = np.stack([column(name, np.nan) for name in _pose_names(parts)]).reshape(parts, 3, -1)
             uncertainty = replace(uncertainty, poses_mm=np.ascontiguousarray(np.moveaxis(poses, 1, 2)))
+    metadata = _metadata(ply.comments)
+    if (shares := metadata.pop(_SHARES, None)) is not None and uncertainty is not None:
+        try:
+            uncertainty = replace(uncertainty, shares=np.array(shares, dtype=np.float64))
+        except (TypeError, ValueError) as error:
+            raise CaptureError(f"its {_SHARES} are damaged: {error}") from error
     deviation = column("deviation", np.nan)
     cloud = PointCloud(
         points_mm=np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"]),
@@ -455,7 +476,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         deviation_mm=None if np.isnan(deviation).all() else deviation,
         uncertainty=uncertainty,
         time_s=column("time", np.nan, np.float64) if "time" in known else None,
-        metadata=_metadata(ply.comments),
+        metadata=metadata,
     )
     return cloud, len(whole)
 
@@ -518,6 +539,7 @@ def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
             chosen = rows(total)
             selection: dict[str, tuple[slice, ...]] = dict.fromkeys((*_KINDS, *names), (chosen,))
             selection["patterns_mm"] = selection["poses_mm"] = (slice(None), chosen)
+            selection["shares"] = (slice(None),)
             found = {name: read_array(file, name, path=path, selection=selection[name]) for name in selection}
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
         raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
@@ -530,12 +552,13 @@ def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         n for n in ("frame", "line") if n in arrays and (np.abs(arrays[n].astype(np.float64)) >= 2**31).any()
     ]:
         raise CaptureError(f"{path} is damaged: {', '.join(unusable)} has values of more than 32 bits")
-    needed = [name for name in names if name != "poses_mm"]
+    needed = [name for name in names if name not in ("poses_mm", "shares")]
     wanted = [*_PER_POINT, *(needed if any(name in arrays for name in names) else ())]
     if missing := [name for name in wanted if name not in arrays]:
         raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
     known = None
     if needed[0] in arrays:
-        known = PointUncertainty(*(arrays[name] for name in needed), poses_mm=arrays.get("poses_mm"))
+        others = {name: arrays.get(name) for name in ("poses_mm", "shares")}
+        known = PointUncertainty(*(arrays[name] for name in needed), **others)
     per_point = {name: arrays[name] for name in _KINDS if name in arrays}
     return PointCloud(**per_point, uncertainty=known, metadata=header.metadata), total

@@ -98,7 +98,9 @@ def field(rng, *, side=50.0, step=0.5, heights=None, correlated=True):
     noise = (drawn[:, :-2] + drawn[:, 1:-1] + drawn[:, 2:]) / np.sqrt(3) if correlated else drawn[:, 2:]
     shape = 0.0 if heights is None else heights(u, v)
     values = (shape + NOISE_MM * noise).ravel()
-    return UnrolledSurface(np.column_stack([u.ravel(), v.ravel()]), values, np.full(u.size, NOISE_MM), np.zeros((u.size, 2)))
+    return UnrolledSurface(
+        np.column_stack([u.ravel(), v.ravel()]), values, np.full(u.size, NOISE_MM), np.zeros((u.size, 2))
+    )
 
 
 @pytest.mark.slow
@@ -116,7 +118,10 @@ def test_outliers_and_holes_are_no_blemishes():
     wild = rng.choice(len(spoilt), 150, replace=False)
     spoilt[wild] -= rng.uniform(0.5, 5, 150)
     seen = np.hypot(*(surface.places - 25).T) > 6
-    search = search_blemishes(UnrolledSurface(surface.places[seen], spoilt[seen], surface.std[seen], surface.footprint_mm[seen]), false_alarm=1e-3)
+    search = search_blemishes(
+        UnrolledSurface(surface.places[seen], spoilt[seen], surface.std[seen], surface.footprint_mm[seen]),
+        false_alarm=1e-3,
+    )
     assert not search.indications
     kept = np.isin(np.flatnonzero(seen), wild)
     # Two wild neighbours in ten thousand points hide each other now and then.
