@@ -161,8 +161,8 @@ def _notes(cloud: PointCloud, form: PipeForm, search: BlemishSearch, false_alarm
     if not form.is_seen_round:
         seen = np.degrees(form.arc)
         notes.append(
-            f"{seen:.0f} deg of the circumference were seen: the ovality is not determined, and the diameter is that "
-            "of this arc"
+            f"{seen:.0f} deg of the circumference were seen: the ovality is not determined, and what it may do to the "
+            "diameter is in its interval"
         )
     level = float(np.nanmedian(search.level_mm)) if np.isfinite(search.level_mm).any() else np.nan
     notes.append(
