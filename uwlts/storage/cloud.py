@@ -31,6 +31,10 @@ POINTS_OF_PART = 1_000_000
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """The coordinates whose covariances are kept of the symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz."""
 
+FOOTPRINT, FOOTPRINT_STD = "footprint_mm", "footprint_std"
+"""Metadata of clouds of unmoved sensors: standard deviations of the part of a surface that a point is the mean of,
+across the sheet (X) and along the stripe (Y), mm, and the relative standard uncertainty of their squares."""
+
 NO_INDEX = -1
 """Frame and line of points whose file does not name them."""
 
@@ -41,6 +45,8 @@ _KINDS |= {"time_s": np.float64}
 _COMMENT = "uwlts-metadata"
 _UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
 _SHARED = "shared_errors"
+WATER = "water"
+"""With what the names of errors of a medium's index begin, which may drift between scans."""
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
 _FARTHEST_MM = 1e12
@@ -73,8 +79,9 @@ class PointUncertainty:
         How each point moves for one standard deviation of each independent part of its image's pose, which is
         independent from image to image.
     shared : dict of str to (M, Q) float64
-        What clouds have in common, by the name of a calibration of the sensor or its mount: each pattern holds so much
-        of Q independent parts of its errors, each of standard deviation one. Clouds that name the same share these.
+        What clouds have in common, by the name of a calibration of the sensor or its mount, or of the water it was
+        used in (`WATER`): each pattern holds so much of Q independent parts of its errors, each of standard deviation
+        one. Clouds that name the same share these.
     """
 
     random_mm2: np.ndarray
