@@ -69,7 +69,7 @@ def profiles_of(
     ).points_mm
     times = capture.time_s[laser]
     if poses is None:
-        own: np.ndarray = capture.pose[laser]
+        own = capture.pose[laser]
         poses, pose_times_s = own, times
         if missing := int(np.count_nonzero(~np.isfinite(own).all(axis=(1, 2)))):
             raise DescriptionError(

@@ -431,11 +431,11 @@ def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Ta
     rest = {name: each for name, each in metadata.items() if name != _SHARED}
     if known is None:
         return rest, None
-    found = metadata[_SHARED]
+    stated = metadata[_SHARED]
     try:
-        if not isinstance(found, dict):
-            raise TypeError(f"{_SHARED} is a {type(found).__name__}")
-        shared = {name: np.array(each, dtype=np.float64) for name, each in found.items()}
+        if not isinstance(stated, dict):
+            raise TypeError("not an object")
+        shared = {name: np.array(each, dtype=np.float64) for name, each in stated.items()}
     except (TypeError, ValueError) as error:
         raise CaptureError(f"its metadata is damaged: {_SHARED} holds no numbers") from error
     if any(
