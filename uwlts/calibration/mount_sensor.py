@@ -69,7 +69,7 @@ def profiles_of(
     ).points_mm
     times = capture.time_s[laser]
     if poses is None:
-        own = capture.pose[laser]
+        own: np.ndarray = capture.pose[laser]
         poses, pose_times_s = own, times
         if missing := int(np.count_nonzero(~np.isfinite(own).all(axis=(1, 2)))):
             raise DescriptionError(
@@ -81,6 +81,7 @@ def profiles_of(
         known = stored_estimate(calibration, capture.header.sensor, capture.header.medium)
     found = np.column_stack([stripes.line, stripes.centre_px])
     profiles, where = ([each[stripes.frame == frame] for frame in laser] for each in (points, found))
+    assert poses is not None
     return CapturedProfiles(profiles, where, times, poses, pose_times_s, known)
 
 
