@@ -79,6 +79,8 @@ _OK, _AMBIGUOUS = np.uint8(StripeStatus.OK), np.uint8(StripeStatus.AMBIGUOUS)
 class SeenStripes:
     """The stripe of an image, before ends are left out, and the candidates where there are several, None for no line.
 
+    Candidates without a width cannot be measured: two stripes that run into each other, or one too wide. The way goes on
+    through them, but their lines have no point.
     ``least`` is the least height of a stripe in grey levels, ``jump_px`` how far apart neighbouring lines' centres are
     on two stripes, ``end_lines`` as of `StripeOptions`.
     """
@@ -182,7 +184,7 @@ class _Paths:
         """The stripe of the taken candidates; lines without any that had one are AMBIGUOUS."""
         centre, amplitude = np.full(len(before.status), np.nan), np.full(len(before.status), np.nan, np.float32)
         width, status = amplitude.copy(), before.status.copy()
-        taken = self.state == _TAKEN
+        taken = (self.state == _TAKEN) & np.isfinite(self.width_px)
         status[self.line], lines = _AMBIGUOUS, self.line[taken]
         status[lines] = _OK
         centre[lines], amplitude[lines] = self.centre_px[taken], self.amplitude[taken]

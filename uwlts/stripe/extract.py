@@ -102,7 +102,7 @@ def see_stripes(
         heights = {"coarse": seen.coarse, "fine": seen.fine}
         of_rivals = with_rivals(found.profiles, seen.left, lines[clear], **heights, options=found.options)
         lines = np.sort(np.concatenate([of_rivals, lines[~clear]]))
-    rivals = found.candidates(lines, least=2) if len(lines) else None
+    rivals = found.candidates(lines, rivals=True) if len(lines) else None
     if rivals is not None and len(rivals.line) == 0:
         rivals = None
     return SeenStripes(found.stripe, rivals, seen.fine, jump_px, options.end_lines)
@@ -218,6 +218,7 @@ def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> tuple[_
     left = cv2.transpose(board)
     detection = _Detection(board, left, noise, coarse, fine, clip)
     status, wide, several, peak = search(profiles, left, coarse=coarse, fine=fine, options=options, clip=clip)
+    several |= wide
     # A plateau wider than the window does not even stick out.
     white = low.max(axis=0) >= clip
     wide |= white
@@ -258,31 +259,37 @@ class _Extracted:
         """The stripe without its ends."""
         return leave_ends_out(self.stripe, lines=self.options.end_lines, jump_px=self.options.half_window_px / 2)
 
-    def candidates(self, lines: np.ndarray, *, least: int = 1) -> StripeCandidates:
-        """All stripes on those of some lines (M,) that have at least so many."""
+    def candidates(self, lines: np.ndarray, *, rivals: bool = False) -> StripeCandidates:
+        """All stripes on some lines (M,).
+
+        With ``rivals`` those of lines with two or more alone, with what cannot be measured among them: its place is
+        rough, its width NaN.
+        """
         stripe, seen, options = self.stripe, self.detection, self.options
         count, along = len(stripe.status), stripe.stripe_along
         if seen is None:
             lines = np.intersect1d(lines, stripe.lines)
             centre, amplitude, width = (each[lines] for each in (stripe.centre_px, stripe.amplitude, stripe.width_px))
             return StripeCandidates(lines, centre, amplitude, width, np.zeros(len(lines)), count, along)
-        line, peak = np.empty(0, np.intp), None
+        line, clear, peak = np.empty(0, np.intp), np.empty(0, np.bool_), None
         if len(lines):
             board, heights = cv2.transpose(seen.board), {"coarse": seen.coarse, "fine": seen.fine}
-            line, peak = search_all(self.profiles, board, lines, **heights, options=options, clip=seen.clip)
-            if least > 1 and len(line):
-                enough = np.bincount(line)[line] >= least
-                line, peak = line[enough], peak.keep(enough)
-        if peak is None or len(line) == 0:
-            amplitude, width = np.empty((2, 0), np.float32)
-            return StripeCandidates(line, np.empty(0), amplitude, width, np.empty(0), count, along)
-        centre, amplitude = place_centre(options.method, peak)
-        place = peak.start + centre.astype(np.float64)
-        # A matched filter: the squared height over the noise, summed over the profile of a Gaussian.
-        certainty = 0.5 * math.sqrt(math.pi) * peak.kernel_sigma() * (amplitude / max(seen.noise, _LEAST_NOISE)) ** 2
-        width, order = peak.sigma * np.float32(FWHM_PER_SIGMA), np.lexsort((place, line))
-        place, amplitude, width, certainty = (values[order] for values in (place, amplitude, width, certainty))
-        return StripeCandidates(line[order], place, amplitude, width, certainty.astype(np.float64), count, along)
+            line, clear, peak = search_all(self.profiles, board, lines, **heights, options=options, clip=seen.clip)
+            kept = np.bincount(line, minlength=count)[line] >= 2 if rivals else clear
+            line, clear, peak = line[kept], clear[kept], peak.keep(kept)
+        place, amplitude = np.empty(len(line)), np.empty(len(line), np.float32)
+        width, certainty = np.full(len(line), np.nan, np.float32), np.zeros(len(line))
+        if peak is not None and len(line):
+            place[:], amplitude[:] = peak.start + peak.middle, peak.height
+            measured = peak.keep(clear)
+            centre, amplitude[clear] = place_centre(options.method, measured)
+            place[clear], width[clear] = measured.start + centre.astype(float), measured.sigma * FWHM_PER_SIGMA
+            # A matched filter: the squared height over the noise, summed over the profile of a Gaussian.
+            sharp = amplitude[clear] / max(seen.noise, _LEAST_NOISE)
+            certainty[clear] = 0.5 * math.sqrt(math.pi) * measured.kernel_sigma() * sharp**2
+        order = np.lexsort((place, line))
+        columns = (values[order] for values in (line, place, amplitude, width, certainty))
+        return StripeCandidates(*columns, count, along)
 
 
 @dataclass(frozen=True)
