@@ -24,6 +24,7 @@ from uwlts.stripe import StripeOptions, extract_candidates, find_stripes
 NEAR_PX, FRAMES, STEP_MM = 3.0, 5, 5.0
 BRIGHTEST = StripeOptions(peak="strongest", ambiguous_ratio=1.0)
 FAINTEST = StripeOptions(threshold_floor=0.5)
+LONGER_WAYS = ("haze", "multiple-scattering", "secondary-light")
 PICTURE = Path("docs/pictures/stripe-reflections.png")
 PICTURED = "inside corner, 12°"
 Thing = dict[str, Any]
@@ -190,16 +191,26 @@ class _Capture(SimpleNamespace):
 def rendered(of: Scene) -> Rendered:
     from twin.recording.studio import Studio, crossings
 
-    studio, images, lit, direct = Studio(load_sensor("thesis"), of, Options()), [], [], []
-    full_scale = 255 / studio.sensor.detector.full_well_e
+    studio, images, lit = Studio(load_sensor("thesis"), of, Options()), [], []
     for number, shot in enumerate(of.motion.shots()):
-        exposed, found = studio.exposed(shot, number), crossings(studio.renderer, studio.pose(shot))
-        images.append(exposed.image)
+        images.append(studio.image(shot, number))
+        found = crossings(studio.renderer, studio.pose(shot))
         shone = found.brightness > 0
         lit.append(np.column_stack([np.full(shone.sum(), number), found.line[shone], found.centre_px[shone]]))
-        own = extract_candidates(full_scale * exposed.direct, stripe_along="width", options=FAINTEST)
-        direct.append(np.column_stack([np.full(len(own.line), number), own.line, own.centre_px]))
-    return Rendered(np.stack(images), np.concatenate(lit), np.concatenate(direct))
+    return Rendered(np.stack(images), np.concatenate(lit), direct_light(of))
+
+
+def direct_light(of: Scene) -> np.ndarray:
+    """Image, line and place (M, 3) of the stripes of the light that comes straight from surfaces, without mirrors."""
+    from twin.recording.studio import Studio
+
+    studio = Studio(load_sensor("thesis"), of, Options.chosen(without=LONGER_WAYS))
+    full_scale, result = 255 / studio.sensor.detector.full_well_e, []
+    for number, shot in enumerate(of.motion.shots()):
+        light = full_scale * studio.exposed(shot, number).direct
+        own = extract_candidates(light, stripe_along="width", options=FAINTEST)
+        result.append(np.column_stack([np.full(len(own.line), number), own.line, own.centre_px]))
+    return np.concatenate(result)
 
 
 def wrong_and_lost(of: Rendered, options: StripeOptions) -> tuple[float, float, int]:

@@ -79,8 +79,9 @@ _OK, _AMBIGUOUS = np.uint8(StripeStatus.OK), np.uint8(StripeStatus.AMBIGUOUS)
 class SeenStripes:
     """The stripe of an image, before ends are left out, and the candidates where there are several, None for no line.
 
-    Candidates without a width cannot be measured: two stripes that run into each other, or one too wide. The way goes on
-    through them, but their lines have no point.
+    Candidates without a width cannot be measured: two stripes that run into each other, or one too wide. The path goes
+    on through them, but their lines have no point.
+
     ``least`` is the least height of a stripe in grey levels, ``jump_px`` how far apart neighbouring lines' centres are
     on two stripes, ``end_lines`` as of `StripeOptions`.
     """

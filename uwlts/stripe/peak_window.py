@@ -53,8 +53,8 @@ class Peak(NamedTuple):
     half-height width over 2.355 with the low-pass taken out (variances add); ``reach`` the whole number of pixels from
     ``middle`` to the first background pixel; ``base`` the background at ``middle`` and ``slope`` its rise per px, from
     the flanks beyond ``reach``; ``height`` that of the top above ``base``, or above the lowest surroundings where not
-    ``closed``: both half-height crossings lie in the window; ``crowded`` where something outside the crossings rises again
-    to the given share of the peak: above its half height, or out of a valley of half its own height.
+    ``closed``: both half-height crossings lie in the window; ``crowded`` where something outside the crossings rises
+    again to the given share of the peak: above its half height, or out of a valley of half its own height.
     """
 
     top: int
