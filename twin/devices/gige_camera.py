@@ -28,7 +28,7 @@ _OVERHEAD_BYTES = 36
 _LEADER, _TRAILER, _PAYLOAD, _IMAGE, _MONO8 = 1, 2, 3, 1, 0x01080001
 # Of profiles: the pixel format (GenICam Pixel Format Naming Convention), and chunks by numbers of the camera's own.
 _COORD3D_C16, _WITH_CHUNKS = 0x011000B8, 0x4000
-_IMAGE_CHUNK, _ENCODER_CHUNK, _TIME_CHUNK = 0x45430000, 0x45430001, 0x45430002
+_IMAGE_CHUNK, ENCODER_CHUNK, TIME_CHUNK = 0x45430000, 0x45430001, 0x45430002
 _CHUNK_BYTES, _ROW_BYTES = 3 * 8, 2 * 8
 """Room of the chunks behind an image: what names them, and what they hold of each row."""
 
@@ -326,7 +326,8 @@ class GigeCamera:
         for name, number in scan3d.items():
             entry = ElementTree.Element(f"{{{_GENAPI}}}EnumEntry", Name=name)
             ElementTree.SubElement(entry, f"{{{_GENAPI}}}Value").text = str(number)
-            formats.insert(0, entry)
+            # Before the first of the others, as the standard's schema wants it.
+            formats.insert([each.tag for each in formats].index(entry.tag), entry)
         if self._encoder is not None:
             payload.text += f" + {_CHUNK_BYTES} + HEIGHT * {_ROW_BYTES}"
         ElementTree.register_namespace("", _GENAPI)
@@ -380,9 +381,9 @@ class GigeCamera:
             chunks: dict[int, tuple[int, ...]] = {}
             if shot.counts and self._read(_Register.CHUNKS):
                 if self._read(_Register.ENCODER_CHUNK):
-                    chunks[_ENCODER_CHUNK] = shot.counts
+                    chunks[ENCODER_CHUNK] = shot.counts
                 if self._read(_Register.TIME_CHUNK):
-                    chunks[_TIME_CHUNK] = shot.times_ns
+                    chunks[TIME_CHUNK] = shot.times_ns
         if not dropped:
             size = packet_bytes & 0xFFFF
             packets = image_packets(
