@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from twin.options import Options, use_variant
+from twin.options import ALL, Options, use_variant
 from twin.scene.description import Scene, load_scene
 from uwlts.model.library import load_sensor
 from uwlts.stripe import StripeOptions, extract_candidates, find_stripes
@@ -204,7 +204,7 @@ def direct_light(of: Scene) -> np.ndarray:
     """Image, line and place (M, 3) of the stripes of the light that comes straight from surfaces, without mirrors."""
     from twin.recording.studio import Studio
 
-    studio = Studio(load_sensor("thesis"), of, Options.chosen(without=LONGER_WAYS))
+    studio = Studio(load_sensor("thesis"), of, Options(effects=ALL.without(*LONGER_WAYS)))
     full_scale, result = 255 / studio.sensor.detector.full_well_e, []
     for number, shot in enumerate(of.motion.shots()):
         light = full_scale * studio.exposed(shot, number).direct

@@ -22,14 +22,11 @@ from uwlts.runtime.compiled import compiled
 from uwlts.stripe.ends import leave_ends_out
 from uwlts.stripe.result import StripeCandidates
 
-_GAP = 12
-"""Lines that a dim stripe may be lost for and go on."""
+_GAP, _LONG_GAP = 12, 24
+"""Lines that a dim stripe may be lost for and go on, and those after which it is still met where it goes on straight."""
 
 _SLACK_PX = 2.0
 """How much farther a stripe may have moved for each line that it was lost for."""
-
-_TURN = 0.3
-"""Share of a new step in the slope with which a stripe is expected to go on."""
 
 _SMOOTH_PX, _ROUGH, _ROUGHEST = 1.5, 0.03, 0.15
 """Departure from the straight way that noise explains, cost in jumps of each px beyond it, and the highest: stripes are
@@ -39,13 +36,18 @@ _SKIPPED, _LOST = 0.1, 0.005
 """Cost, in jumps, of a line whose candidates the path passes by: of a clear stripe, and of a faint one, which noise may
 hide."""
 
-_FAINT = 4.0
-"""Height, in least heights of a stripe, below which one is faint."""
+_FAINT, _CLEAR = 4.0, 12.0
+"""Mean heights, in least heights of a stripe, up to which one is faint and from which it is clear."""
 
-_BEHIND, _DIMMER, _OCTAVES = 0.002, 0.002, 3.0
-"""Cost, in jumps, of each candidate nearer to the sensor on the same line, and of each halving of the brightness below
-the line's brightest, up to so many: they decide between paths with equally many jumps. A surface hides what lies behind
-it, so that what is seen behind is a reflection; reflections are dimmer than what they show."""
+_BEHIND, _DIMMER, _OCTAVES, _SOME_LINES = 0.35, 0.15, 3.0, 20.0
+"""Cost, in jumps, of a stripe with another one nearer to the sensor on its lines, and of each halving of the brightness
+below the brightest, up to so many; less on fewer lines than so many. They decide between paths with equally many jumps.
+A surface hides what lies behind it, so that what is seen behind is a reflection; reflections are dimmer than what they
+show, but brighter than the own stripe of a mirror."""
+
+_BEHIND_CORNER = 1.5
+"""The same for a stripe behind one that it meets: both begin in a corner, and the nearer one is the surface in which the
+other one is seen."""
 
 _MARGIN = 0.3
 """Jumps by which a path has to be the better one."""
@@ -217,38 +219,95 @@ def path_margins(
     ``line`` (M,) grows; ``farther`` is as of `farther`, 0 where unknown. Neighbours more than ``jump_px`` apart are
     a jump. ``vote`` (M,) is added to the cost of each candidate.
     """
-    skipped = np.where(amplitude < _FAINT * least, _LOST, _SKIPPED)
-    cost = vote + _own_cost(line, centre_px, amplitude, farther)
-    through = np.empty(len(line))
-    _least_cost(line, centre_px, cost, skipped, jump_px, through)
-    backwards = np.empty(len(line))
-    _least_cost(
-        line.max() - line[::-1], centre_px[::-1].copy(), cost[::-1].copy(), skipped[::-1].copy(), jump_px, backwards
-    )
+    stripe, mean = np.empty(len(line), np.intp), np.empty(len(line))
+    _number_stripes(line, centre_px, jump_px, stripe)
+    _average(line, amplitude, stripe, mean)
+    height = np.minimum(amplitude, mean) / least
+    clear = np.clip((height - _FAINT) / (_CLEAR - _FAINT), 0.0, 1.0)
+    skipped = _LOST + (_SKIPPED - _LOST) * clear
+    cost = vote + _own_cost(line, centre_px, amplitude, stripe, farther)
+    before, after = np.empty((2, len(line)))
+    _slopes(line, centre_px, stripe, before, after)
+    through, backwards = np.empty((2, len(line)))
+    _least_cost(line, centre_px, before, after, cost, skipped, jump_px, through)
+    turned = (values[::-1].copy() for values in (line.max() - line, centre_px, -after, -before, cost, skipped))
+    _least_cost(*turned, jump_px, backwards)
     through += backwards[::-1] - cost
     return through - through.min()
 
 
-def _own_cost(line: np.ndarray, centre_px: np.ndarray, amplitude: np.ndarray, farther: int) -> np.ndarray:
-    """Cost (M,) of candidates by the others on their lines."""
+def _own_cost(
+    line: np.ndarray, centre_px: np.ndarray, amplitude: np.ndarray, stripe: np.ndarray, farther: int
+) -> np.ndarray:
+    """Cost (M,) of candidates by the others on their lines; that of a stripe does not grow with its length."""
     _, group, count = np.unique(line, return_inverse=True, return_counts=True)
     brightest = np.zeros(len(count))
     np.maximum.at(brightest, group, amplitude)
     dimmer = np.clip(np.log2(brightest[group] / np.maximum(amplitude, 1e-6)), 0.0, _OCTAVES)
-    order = np.lexsort((farther * centre_px, line))
-    rank = np.empty(len(line))
-    rank[order] = np.arange(len(line)) - (np.cumsum(count) - count)[group[order]]
-    return _DIMMER * dimmer + _BEHIND * (rank if farther else 0.0)
+    behind, rivals = np.zeros(len(line)), np.bincount(stripe, count[group] > 1, minlength=len(line))
+    if farther:
+        order = np.lexsort((farther * centre_px, line))
+        apart = np.full(len(line), np.nan)
+        apart[order[1:]] = np.where(np.diff(line[order]) == 0, np.abs(np.diff(centre_px[order])), np.nan)
+        hidden = np.isfinite(apart)
+        for number in np.flatnonzero(np.bincount(stripe, hidden) > 0):
+            own = np.flatnonzero(hidden & (stripe == number))
+            behind[own] = _BEHIND_CORNER if _meets(line[own], apart[own]) else _BEHIND
+    return (_DIMMER * dimmer + behind) / np.maximum(rivals[stripe], _SOME_LINES)
+
+
+def _meets(line: np.ndarray, apart_px: np.ndarray) -> bool:
+    """Whether distances (K,) of a stripe from the one before it shrink to nothing beyond one of its ends."""
+    if len(line) < _CROSSING_LINES:
+        return False
+    for end, inwards in ((slice(None, _CROSSING_LINES), 1), (slice(-_CROSSING_LINES, None), -1)):
+        lines, apart = line[end], apart_px[end]
+        growth, at_end = np.polyfit(inwards * (lines - lines[0 if inwards > 0 else -1]), apart, 1)
+        if growth > _OPENING and at_end <= _LONGEST_CROSSING * growth:
+            return True
+    return False
+
+
+@compiled
+def _number_stripes(line: np.ndarray, centre: np.ndarray, jump_px: float, stripe: np.ndarray) -> None:
+    """Number (M,) of the stripe of each candidate: that of the nearest one before it that no other one goes on from."""
+    first = 0
+    goes_on = np.zeros(line.size, np.bool_)
+    for k in range(line.size):
+        while line[k] - line[first] > _GAP:
+            first += 1
+        before, nearest, j = -1, np.inf, k - 1
+        while j >= first:
+            away = abs(centre[j] - centre[k])
+            if line[j] < line[k] and not goes_on[j] and away < nearest and _linked(line, centre, k, j, jump_px):
+                before, nearest = j, away
+            j -= 1
+            # The latest line counts.
+            if before >= 0 and j >= 0 and line[j] < line[before]:
+                break
+        stripe[k] = k if before < 0 else stripe[before]
+        if before >= 0:
+            goes_on[before] = True
 
 
 @compiled
 def _least_cost(
-    line: np.ndarray, centre: np.ndarray, cost: np.ndarray, skipped: np.ndarray, jump_px: float, result: np.ndarray
+    line: np.ndarray,
+    centre: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
+    cost: np.ndarray,
+    skipped: np.ndarray,
+    jump_px: float,
+    result: np.ndarray,
 ) -> None:
-    """Cost (M,) of the best path that ends in each candidate, its own included."""
+    """Cost (M,) of the best path that ends in each candidate, its own included.
+
+    ``before`` and ``after`` are the slopes of its stripe on either side of each.
+    """
     count = line.size
     # What it costs to pass by, from the first line on: the number of lines with candidates before each one.
-    lines_before, slope = np.zeros(count), np.zeros(count)
+    lines_before = np.zeros(count)
     for k in range(1, count):
         lines_before[k] = lines_before[k - 1] + (1.0 if line[k] != line[k - 1] else 0.0)
     elsewhere, best_of_line, first = 0.0, np.inf, 0
@@ -256,7 +315,7 @@ def _least_cost(
         if k > 0 and line[k] != line[k - 1]:
             elsewhere = min(elsewhere + _SKIPPED, best_of_line + 1.0)
             best_of_line = np.inf
-        while line[k] - line[first] > _GAP:
+        while line[k] - line[first] > _LONG_GAP:
             first += 1
         best = elsewhere
         for j in range(first, k):
@@ -264,14 +323,42 @@ def _least_cost(
             if apart == 0:
                 break
             moved, allowed = centre[k] - centre[j], jump_px + _SLACK_PX * (apart - 1)
-            off = min(abs(moved), abs(moved - slope[j] * apart))
-            if off <= allowed:
+            straight = min(abs(moved - before[j] * apart), abs(moved - after[k] * apart))
+            off = min(abs(moved), straight)
+            if off <= allowed if apart <= _GAP else straight <= jump_px:
                 way = result[j] + min(skipped[j], skipped[k]) * (lines_before[k] - lines_before[j] - 1.0)
                 way += min(max(off - _SMOOTH_PX, 0.0) * _ROUGH, _ROUGHEST)
-                if way < best:
-                    best, slope[k] = way, slope[j] + _TURN * (moved / apart - slope[j])
+                best = min(best, way)
         result[k] = best + cost[k]
         best_of_line = min(best_of_line, result[k])
+
+
+@compiled
+def _slopes(line: np.ndarray, centre: np.ndarray, stripe: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
+    """Slopes (M,) of the stripe of each candidate on the lines before and after it, by least squares; 0 at its ends."""
+    for side, result in ((-1, before), (1, after)):
+        for k in range(line.size):
+            products, squares, j = 0.0, 0.0, k + side
+            while 0 <= j < line.size and abs(line[j] - line[k]) <= _GAP:
+                if stripe[j] == stripe[k]:
+                    away = float(line[j] - line[k])
+                    products, squares = products + away * (centre[j] - centre[k]), squares + away * away
+                j += side
+            result[k] = products / squares if squares > 0.0 else 0.0
+
+
+@compiled
+def _average(line: np.ndarray, amplitude: np.ndarray, stripe: np.ndarray, mean: np.ndarray) -> None:
+    """Mean height (M,) of each candidate and those of its stripe on the lines beside it."""
+    for k in range(line.size):
+        total, count = amplitude[k] * 1.0, 1
+        for side in (-1, 1):
+            j = k + side
+            while 0 <= j < line.size and abs(line[j] - line[k]) <= _GAP:
+                if stripe[j] == stripe[k]:
+                    total, count = total + amplitude[j], count + 1
+                j += side
+        mean[k] = total / count
 
 
 @compiled
