@@ -28,6 +28,9 @@ _GAP, _LONG_GAP = 12, 24
 _SLACK_PX = 2.0
 """How much farther a stripe may have moved for each line that it was lost for."""
 
+_TURN = 0.3
+"""Share of a new step in the slope with which a stripe is expected to go on."""
+
 _SMOOTH_PX, _ROUGH, _ROUGHEST = 1.5, 0.03, 0.15
 """Departure from the straight way that noise explains, cost in jumps of each px beyond it, and the highest: stripes are
 smooth, and chains of speckles are not."""
@@ -131,12 +134,17 @@ def _chosen(image: SeenStripes, path: _Paths | None, *, beside: Sequence[_Paths 
 
 @dataclass(eq=False)
 class _Paths:
-    """Candidates (M,) of an image on all of its lines, which of them are alone on theirs, and the state of each."""
+    """Candidates (M,) of an image on all of its lines.
+
+    ``number`` is that of the stripe of each (`_number_stripes`), ``alone`` which are alone on their lines, ``state``
+    what is decided.
+    """
 
     line: np.ndarray
     centre_px: np.ndarray
     amplitude: np.ndarray
     width_px: np.ndarray
+    number: np.ndarray
     alone: np.ndarray
     state: np.ndarray
     least: float
@@ -158,8 +166,9 @@ class _Paths:
         _keep_stripes(line, centre, amplitude, kept)
         line, centre, amplitude, width = (values[kept] for values in (line, centre, amplitude, width))
         single = np.bincount(line)[line] == 1
-        state = np.full(len(line), _OPEN, np.int8)
-        return cls(line, centre, amplitude, width, single, state, least, jump_px)
+        number, state = np.empty(len(line), np.intp), np.full(len(line), _OPEN, np.int8)
+        _number_stripes(line, centre, jump_px, number)
+        return cls(line, centre, amplitude, width, number, single, state, least, jump_px)
 
     def decide(self, farther: int, vote: np.ndarray) -> None:
         """Take the candidates that the best path goes through, if it is clearly the best."""
@@ -167,14 +176,14 @@ class _Paths:
             self.line,
             self.centre_px,
             self.amplitude,
+            self.number,
             farther=farther,
             jump_px=self.jump_px,
             least=self.least,
             vote=vote,
         )
         _take(self.line, margin, self.alone, self.state)
-        _refuse_between(self.line, self.centre_px, self.alone, self.state, self.jump_px)
-        _refuse_tails(self.line, self.centre_px, self.alone, self.state, self.jump_px)
+        _refuse_alone(self.line, self.number, self.alone, self.state)
         _refuse_crossings(self.line, self.centre_px, self.amplitude, self.state, self.jump_px)
 
     def vote(self, other: _Paths) -> np.ndarray:
@@ -208,6 +217,7 @@ def path_margins(
     line: np.ndarray,
     centre_px: np.ndarray,
     amplitude: np.ndarray,
+    stripe: np.ndarray,
     *,
     farther: int,
     jump_px: float,
@@ -216,11 +226,10 @@ def path_margins(
 ) -> np.ndarray:
     """Cost (M,), in jumps beyond the best path, of the best path through each candidate (M,) of an image.
 
-    ``line`` (M,) grows; ``farther`` is as of `farther`, 0 where unknown. Neighbours more than ``jump_px`` apart are
+    ``line`` (M,) grows; ``stripe`` (M,) numbers the stripes that they belong to; ``farther`` is as of `farther`, 0 where unknown. Neighbours more than ``jump_px`` apart are
     a jump. ``vote`` (M,) is added to the cost of each candidate.
     """
-    stripe, mean = np.empty(len(line), np.intp), np.empty(len(line))
-    _number_stripes(line, centre_px, jump_px, stripe)
+    mean = np.empty(len(line))
     _average(line, amplitude, stripe, mean)
     height = np.minimum(amplitude, mean) / least
     clear = np.clip((height - _FAINT) / (_CLEAR - _FAINT), 0.0, 1.0)
@@ -270,24 +279,25 @@ def _meets(line: np.ndarray, apart_px: np.ndarray) -> bool:
 
 @compiled
 def _number_stripes(line: np.ndarray, centre: np.ndarray, jump_px: float, stripe: np.ndarray) -> None:
-    """Number (M,) of the stripe of each candidate: that of the nearest one before it that no other one goes on from."""
-    first = 0
-    goes_on = np.zeros(line.size, np.bool_)
+    """Number (M,) of the stripe of each candidate: that of the one before it that it goes on from most straight.
+
+    Only one goes on from each.
+    """
+    first, goes_on, slope = 0, np.zeros(line.size, np.bool_), np.zeros(line.size)
     for k in range(line.size):
         while line[k] - line[first] > _GAP:
             first += 1
         before, nearest, j = -1, np.inf, k - 1
-        while j >= first:
-            away = abs(centre[j] - centre[k])
+        while j >= first and (before < 0 or line[j] == line[before]):
+            away = abs(centre[k] - centre[j] - slope[j] * (line[k] - line[j]))
             if line[j] < line[k] and not goes_on[j] and away < nearest and _linked(line, centre, k, j, jump_px):
                 before, nearest = j, away
             j -= 1
-            # The latest line counts.
-            if before >= 0 and j >= 0 and line[j] < line[before]:
-                break
         stripe[k] = k if before < 0 else stripe[before]
         if before >= 0:
             goes_on[before] = True
+            step = (centre[k] - centre[before]) / (line[k] - line[before])
+            slope[k] = slope[before] + _TURN * (step - slope[before])
 
 
 @compiled
@@ -422,58 +432,39 @@ def _take(line: np.ndarray, margin: np.ndarray, alone: np.ndarray, state: np.nda
 
 
 @compiled
-def _refuse_between(line: np.ndarray, centre: np.ndarray, alone: np.ndarray, state: np.ndarray, jump_px: float) -> None:
-    """Refuse candidates that are alone between refused ones of the same stripe: where noise hides the true one."""
-    for k in range(line.size):
-        if alone[k]:
-            refused = True
-            for side in (-1, 1):
-                j, beside = k + side, False
-                while 0 <= j < line.size and abs(line[j] - line[k]) <= _GAP:
-                    if not alone[j] and _linked(line, centre, k, j, jump_px):
-                        beside = state[j] != _TAKEN
-                        break
-                    j += side
-                refused &= beside
-            state[k] = _REFUSED if refused else _TAKEN
+def _refuse_alone(line: np.ndarray, stripe: np.ndarray, alone: np.ndarray, state: np.ndarray) -> None:
+    """Refuse candidates that are alone, as noise hides the true one, between refused ones of the same stripe.
 
-
-@compiled
-def _refuse_tails(line: np.ndarray, centre: np.ndarray, alone: np.ndarray, state: np.ndarray, jump_px: float) -> None:
-    """Refuse candidates that are alone and go on from a longer refused stripe only, where the true one is dark."""
-    first, count = 0, line.size
-    while first < count:
-        if not alone[first] or state[first] != _TAKEN:
-            first += 1
+    So are those at the end of a stripe that is refused on more lines than they are.
+    """
+    count = line.size
+    # Of each candidate the next ones of its stripe, -1 for none.
+    before, after, last = np.full(count, -1), np.full(count, -1), np.full(count, -1)
+    for k in range(count):
+        before[k] = last[stripe[k]]
+        if before[k] >= 0:
+            after[before[k]] = k
+        last[stripe[k]] = k
+    for k in range(count):
+        if not alone[k] or (before[k] >= 0 and alone[before[k]]):
             continue
-        last = first
-        while last + 1 < count and alone[last + 1] and _linked(line, centre, last, last + 1, jump_px):
-            last += 1
-        longest, safe = 0, False
-        for end, side in ((first, -1), (last, 1)):
-            j = end + side
-            while 0 <= j < count and abs(line[j] - line[end]) <= _GAP:
-                if _linked(line, centre, end, j, jump_px):
-                    safe |= state[j] == _TAKEN
-                    if state[j] != _TAKEN:
-                        longest = max(longest, _refused_run(line, centre, state, j, side, jump_px))
-                j += side
-        if not safe and longest > last - first:
-            state[first : last + 1] = _REFUSED
-        first = last + 1
-
-
-@compiled
-def _refused_run(
-    line: np.ndarray, centre: np.ndarray, state: np.ndarray, number: int, side: int, jump_px: float
-) -> int:
-    """Lines over which a refused stripe goes on to a side."""
-    at, j = number, number + side
-    while 0 <= j < line.size and abs(line[j] - line[at]) <= _GAP:
-        if state[j] != _TAKEN and line[j] != line[at] and _linked(line, centre, at, j, jump_px):
-            at = j
-        j += side
-    return abs(line[at] - line[number])
+        end = k
+        while after[end] >= 0 and alone[after[end]]:
+            end = after[end]
+        refused, known = 0, 0
+        for first, onwards in ((before[k], before), (after[end], after)):
+            j = first
+            while j >= 0 and (alone[j] or state[j] != _TAKEN):
+                refused, j = refused + (0 if alone[j] else 1), onwards[j]
+            known += 1 if first >= 0 else 0
+            if first >= 0 and state[first] == _TAKEN:
+                refused = -count
+        lines = line[end] - line[k] + 1
+        state_of_run = _REFUSED if refused > lines or (known == 2 and refused > 0 and lines <= 2 * _GAP) else _TAKEN
+        j = k
+        while j >= 0 and alone[j]:
+            state[j] = state_of_run
+            j = after[j]
 
 
 @compiled
