@@ -71,6 +71,27 @@ def test_a_reflection_below_a_mirrors_faint_stripe_is_left_out():
     assert len(stripes.line) > 0.9 * LINES
 
 
+def test_a_reflection_beside_a_stripe_that_is_too_wide_is_not_taken():
+    """On some lines the stripe is a glare that cannot be measured; something dim and sharp stands beside it."""
+    floor, glare, spot = on(0, LINES, 150 + 0 * X), on(150, 230, 150 + 0 * X), on(155, 225, 260 + 0 * X)
+    rows = np.arange(LENGTH)[:, None]
+    wide = np.nan_to_num(200 * np.exp(-0.5 * ((rows - glare) / 18.0) ** 2))
+    image = np.clip(drawn((floor, 60), (spot, 20)) + wide, 0, 255).astype(np.uint8)
+    stripes, brightest = found(image), found(image, options=BRIGHTEST)
+    assert np.abs(stripes.centre_px - 150).max() < 3 and len(stripes.line) > LINES - 90
+    assert np.count_nonzero(np.abs(brightest.centre_px - 150) > 3) > 50
+
+
+def test_a_faint_wall_that_meets_the_floor_is_the_surface_and_what_goes_straight_on_is_not():
+    """The wall is too faint over its last half, where the reflected floor stands alone."""
+    wall = on(200, 240, 220 - 1.5 * (X - 200))
+    reflected = on(200, 280, 240 - 0.1 * X)
+    stripes = found(drawn((FLOOR, 120), (wall, 12), (TOP, 100), (reflected, 110)))
+    true = np.fmax(np.fmax(FLOOR, wall), TOP)[stripes.line]
+    assert not (np.abs(stripes.centre_px - true) > 3).any()
+    assert not np.isin(stripes.line, np.arange(245, 280)).any() and len(stripes.line) > 280
+
+
 def test_a_dimmer_stripe_before_the_floor_that_nothing_joins_is_a_reflection():
     """A wall that faces the camera shows the floor nearer than it is, and dimmer."""
     floor, ghost = on(0, LINES, 200 + 0.05 * X), on(30, 350, 120 + 0.05 * X)
