@@ -138,7 +138,8 @@ def drawn(seed: int) -> tuple[str, Scene]:
                 size = between(20, 80), between(15, 50), between(10, 40)
                 things.append(block(size, at, finish=finish))
     else:
-        shine = {"mirror": between(0.3, 0.8), "reflectance": between(0.1, 0.5)}
+        share = between(0.3, 0.8)
+        shine = {"mirror": share, "reflectance": min(between(0.1, 0.5), round(0.95 - share, 2))}
         if rng.random() < 0.5:
             shine["finish"] = "diffuse"
         side = "x" if "along" in kind else ("y", "-y")[rng.integers(2)]

@@ -23,7 +23,7 @@ from uwlts.stripe.ends import leave_ends_out
 from uwlts.stripe.result import StripeCandidates
 
 _GAP, _LONG_GAP = 12, 24
-"""Lines that a dim stripe may be lost for and go on, and those after which it is still met where it goes on straight."""
+"""Lines that a dim stripe may be lost for and go on; and those after which it still does where it goes on straight."""
 
 _SLACK_PX = 2.0
 """How much farther a stripe may have moved for each line that it was lost for."""
@@ -49,8 +49,8 @@ A surface hides what lies behind it, so that what is seen behind is a reflection
 show, but brighter than the own stripe of a mirror."""
 
 _BEHIND_CORNER = 1.5
-"""The same for a stripe behind one that it meets: both begin in a corner, and the nearer one is the surface in which the
-other one is seen."""
+"""The same for a stripe behind one that it meets: both begin in a corner, and the nearer one is the surface in which
+the other one is seen."""
 
 _MARGIN = 0.3
 """Jumps by which a path has to be the better one."""
@@ -226,8 +226,9 @@ def path_margins(
 ) -> np.ndarray:
     """Cost (M,), in jumps beyond the best path, of the best path through each candidate (M,) of an image.
 
-    ``line`` (M,) grows; ``stripe`` (M,) numbers the stripes that they belong to; ``farther`` is as of `farther`, 0 where unknown. Neighbours more than ``jump_px`` apart are
-    a jump. ``vote`` (M,) is added to the cost of each candidate.
+    ``line`` (M,) grows; ``stripe`` (M,) numbers the stripes that they belong to; ``farther`` is as of `farther`, 0
+    where unknown. Neighbours more than ``jump_px`` apart are a jump. ``vote`` (M,) is added to the cost of each
+    candidate.
     """
     mean = np.empty(len(line))
     _average(line, amplitude, stripe, mean)

@@ -96,8 +96,8 @@ def see_stripes(
     seen, jump_px = found.detection, found.options.half_window_px / 2
     if seen is None or options.peak is not PeakRule.DIRECT:
         return SeenStripes(found.stripe, None, options.threshold_floor, jump_px, options.end_lines)
-    lines = np.flatnonzero(found.several)
-    clear = found.stripe.status[lines] == _OK
+    lines = np.flatnonzero(found.several | found.glare)
+    clear = (found.stripe.status[lines] == _OK) & ~found.glare[lines]
     if clear.any():
         heights = {"coarse": seen.coarse, "fine": seen.fine}
         of_rivals = with_rivals(found.profiles, seen.left, lines[clear], **heights, options=found.options)
@@ -143,14 +143,14 @@ def _extracted(
         kernel = (1, count) if stripe_along == "height" else (count, 1)
         signal = cv2.blur(signal.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
     profiles = _as_profiles(signal, stripe_along=stripe_along)
-    found, several, detection = _found(profiles, options, clip)
+    found, several, glare, detection = _found(profiles, options, clip)
     # A wider window is taken only if it measures what was too wide.
     wider, widest = options, min(options.widest_window_px, length // 4)
     while found.too_wide() and 2 * wider.half_window_px <= widest:
         wider = wider.doubled()
-        measured, seen_several, seen = _found(profiles, wider, clip)
+        measured, *seen = _found(profiles, wider, clip)
         if not measured.too_wide():
-            found, options, several, detection = measured, wider, seen_several, seen
+            found, options, (several, glare, detection) = measured, wider, seen
 
     none = found.status == _NO_STRIPE
     if none.any():
@@ -160,7 +160,7 @@ def _extracted(
             white = low.max(axis=0) >= clip
         found.status[none & white] = _SATURATED
     stripe = Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
-    return _Extracted(stripe, several, profiles, options, detection)
+    return _Extracted(stripe, several, glare, profiles, options, detection)
 
 
 def stripe_in(
@@ -201,11 +201,17 @@ def _found_by_model(profiles: np.ndarray, options: StripeOptions, clip: float) -
     return found
 
 
-def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> tuple[_Lines, np.ndarray, _Detection | None]:
-    """The stripe on each of the profiles (N, L), with one size of window, and which lines (L,) may hold several."""
+def _found(
+    profiles: np.ndarray, options: StripeOptions, clip: float
+) -> tuple[_Lines, np.ndarray, np.ndarray, _Detection | None]:
+    """The stripe on each of the profiles (N, L), with one size of window.
+
+    And which lines (L,) may hold several, and which something bright that is too wide to be measured.
+    """
     if options.method == LEARNED:
         found = _found_by_model(profiles, options, clip if math.isfinite(clip) else max(float(profiles.max()), 1.0))
-        return found, np.zeros(len(found.status), bool), None
+        nothing = np.zeros(len(found.status), bool)
+        return found, nothing, nothing, None
     block = options.half_window_px // 2
     high, low = block_extremes(profiles, block)
     # Blocks more at either end of the lines, so that what one window covers can be crossed out without a check.
@@ -218,7 +224,7 @@ def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> tuple[_
     left = cv2.transpose(board)
     detection = _Detection(board, left, noise, coarse, fine, clip)
     status, wide, several, peak = search(profiles, left, coarse=coarse, fine=fine, options=options, clip=clip)
-    several |= wide
+    glare = wide.copy()
     # A plateau wider than the window does not even stick out.
     white = low.max(axis=0) >= clip
     wide |= white
@@ -229,7 +235,7 @@ def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> tuple[_
         centre, found.amplitude[good] = place_centre(options.method, peak)
         found.centre[good] = peak.start + centre.astype(np.float64)
         found.width[good] = peak.sigma * FWHM_PER_SIGMA
-    return found, several, detection
+    return found, several, glare, detection
 
 
 @dataclass(frozen=True)
@@ -247,10 +253,15 @@ class _Detection:
 
 @dataclass(frozen=True)
 class _Extracted:
-    """The stripe of an image, which lines (L,) may hold several, and how it was sought on the profiles (N, L)."""
+    """The stripe of an image, and how it was sought on the profiles (N, L).
+
+    ``several`` (L,) marks the lines that may hold more than one, ``glare`` (L,) those with something bright that is too
+    wide to be measured.
+    """
 
     stripe: Stripe
     several: np.ndarray
+    glare: np.ndarray
     profiles: np.ndarray
     options: StripeOptions
     detection: _Detection | None
