@@ -66,6 +66,9 @@ _CROSSING_LINES, _FEWEST_LINES, _OPENING = 12, 6, 0.2
 """Lines, at most and at least, from which two stripes' distance shows where they cross, and its least growth per
 line."""
 
+_CORNER_LINES = 30
+"""The same lines, at most, for a corner: some show another stripe."""
+
 _BESIDE, _AS_BRIGHT, _LONGEST_CROSSING = 4.0, 0.5, 24
 """Distance, in jumps' lengths, within which stripes may run into each other; share of the brightness from which the
 other one matters; and most lines of a crossing."""
@@ -267,13 +270,18 @@ def _own_cost(
 
 
 def _meets(line: np.ndarray, apart_px: np.ndarray) -> bool:
-    """Whether distances (K,) of a stripe from the one before it shrink to nothing beyond one of its ends."""
+    """Whether distances (K,) of a stripe from the one before it shrink to nothing beyond one of its ends.
+
+    By the median slope (Theil and Sen), as the one before it may be lost on lines where still another one is seen.
+    """
     if len(line) < _CROSSING_LINES:
         return False
-    for end, inwards in ((slice(None, _CROSSING_LINES), 1), (slice(-_CROSSING_LINES, None), -1)):
+    for end, inwards in ((slice(None, _CORNER_LINES), 1), (slice(-_CORNER_LINES, None), -1)):
         lines, apart = line[end], apart_px[end]
-        growth, at_end = np.polyfit(inwards * (lines - lines[0 if inwards > 0 else -1]), apart, 1)
-        if growth > _OPENING and at_end <= _LONGEST_CROSSING * growth:
+        away = inwards * (lines - lines[0 if inwards > 0 else -1])
+        one, other = np.triu_indices(len(lines), 1)
+        growth = float(np.median((apart[other] - apart[one]) / (away[other] - away[one])))
+        if growth > _OPENING and np.median(apart - growth * away) <= _LONGEST_CROSSING * growth:
             return True
     return False
 
