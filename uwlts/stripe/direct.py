@@ -35,7 +35,7 @@ _SMOOTH_PX, _ROUGH, _ROUGHEST = 1.5, 0.03, 0.15
 """Departure from the straight way that noise explains, cost in jumps of each px beyond it, and the highest: stripes are
 smooth, and chains of speckles are not."""
 
-_SKIPPED, _LOST = 0.1, 0.005
+_SKIPPED, _LOST = 0.03, 0.005
 """Cost, in jumps, of a line whose candidates the path passes by: of a clear stripe, and of a faint one, which noise may
 hide."""
 
