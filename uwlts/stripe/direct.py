@@ -18,7 +18,7 @@ import numpy as np
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import Stripe, StripeStatus
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_part
 from uwlts.stripe.ends import leave_ends_out
 from uwlts.stripe.result import StripeCandidates
 
@@ -476,7 +476,7 @@ def _refuse_alone(line: np.ndarray, stripe: np.ndarray, alone: np.ndarray, state
             j = after[j]
 
 
-@compiled
+@compiled_part
 def _linked(line: np.ndarray, centre: np.ndarray, one: int, other: int, jump_px: float) -> bool:
     """Whether two candidates may be of the same stripe."""
     return abs(centre[one] - centre[other]) <= jump_px + _SLACK_PX * max(abs(line[one] - line[other]) - 1, 0)
@@ -520,7 +520,7 @@ def _refuse_crossings(
             state[k] = _OPEN
 
 
-@compiled
+@compiled_part
 def _nearest_beside(line: np.ndarray, centre: np.ndarray, number: int) -> int:
     """Number of the candidate on the same line that is nearest; -1 where none is."""
     first, best = number, -1
@@ -533,7 +533,7 @@ def _nearest_beside(line: np.ndarray, centre: np.ndarray, number: int) -> int:
     return best
 
 
-@compiled
+@compiled_part
 def _pair_beside(
     line: np.ndarray,
     centre: np.ndarray,
