@@ -243,8 +243,8 @@ def path_margins(
     _slopes(line, centre_px, stripe, before, after)
     through, backwards = np.empty((2, len(line)))
     _least_cost(line, centre_px, before, after, cost, skipped, jump_px, through)
-    turned = (values[::-1].copy() for values in (line.max() - line, centre_px, -after, -before, cost, skipped))
-    _least_cost(*turned, jump_px, backwards)
+    turned = [values[::-1].copy() for values in (line.max() - line, centre_px, -after, -before, cost, skipped)]
+    _least_cost(*turned, jump_px=jump_px, result=backwards)
     through += backwards[::-1] - cost
     return through - through.min()
 

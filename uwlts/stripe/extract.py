@@ -151,9 +151,9 @@ def _extracted(
     wider, widest = options, min(options.widest_window_px, length // 4)
     while found.too_wide() and 2 * wider.half_window_px <= widest:
         wider = wider.doubled()
-        measured, *seen = _found(profiles, wider, clip)
-        if not measured.too_wide():
-            found, options, (several, glare, detection) = measured, wider, seen
+        found_wider = _found(profiles, wider, clip)
+        if not found_wider[0].too_wide():
+            options, (found, several, glare, detection) = wider, found_wider
 
     none = found.status == _NO_STRIPE
     if none.any():
@@ -309,8 +309,8 @@ class _Extracted:
             sharp = amplitude[clear] / max(seen.noise, _LEAST_NOISE)
             certainty[clear] = 0.5 * math.sqrt(math.pi) * measured.kernel_sigma() * sharp**2
         order = np.lexsort((place, line))
-        columns = (values[order] for values in (line, place, amplitude, width, certainty))
-        return StripeCandidates(*columns, count, along)
+        line, place, certainty = line[order], place[order], certainty[order]
+        return StripeCandidates(line, place, amplitude[order], width[order], certainty, count, along)
 
 
 @dataclass(frozen=True)
