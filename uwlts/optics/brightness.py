@@ -43,7 +43,7 @@ _LEAST_ACROSS = 0.3
 """Least cosine between the stage's motion and the sheet's normal for which a scan shows what lies beside the sheet."""
 
 _TABLE_TOLERANCE = 1e-6
-"""Error, in mm and mm per mm or px, of tabulated points and their derivatives."""
+"""Error of the tabulated shift per slope, mm^2, and of the largest thickness over the described one, per px."""
 
 _MOVED_MM, _MOVED_PX = 0.05, 0.5
 """Steps of sheet and pixel for the derivatives of the points: some sigma of the sheet, within one pixel."""
@@ -85,18 +85,18 @@ def beside_sheet(
     def exact(line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
         here = points(line, place_px)
         per_mm = (points(line, place_px, _MOVED_MM) - here) / _MOVED_MM
-        return np.hstack([here, per_mm, (points(line, place_px + _MOVED_PX) - here) / _MOVED_PX])
+        per_px = (points(line, place_px + _MOVED_PX) - here) / _MOVED_PX
+        in_camera = here @ frame[:3, :3].T + frame[:3, 3]
+        away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
+        sigma = sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
+        return np.column_stack([per_mm * (sigma**2)[:, None], per_px[:, 2] / (per_mm[:, 2] * sigma)])
 
     table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE)
     values = exact(line, centre_px) if table is None else table.values(line, centre_px)
-    # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
-    on_sheet, per_mm, per_px = values[:, :3], values[:, 3:6], values[:, 6:]
-    in_camera = on_sheet @ frame[:3, :3].T + frame[:3, 3]
-    away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
-    sigma = sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
     known = width_px[np.isfinite(width_px)]
-    thickest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA * np.abs(per_px[:, 2] / per_mm[:, 2])
-    return per_mm * (slopes / across * np.minimum(sigma, thickest) ** 2)[:, None]
+    # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
+    thickest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA * values[:, 3]
+    return values[:, :3] * (slopes / across * np.minimum(1.0, thickest**2))[:, None]
 
 
 def slopes_of_brightness(
@@ -187,7 +187,8 @@ def _slopes(
     step = np.median(position[rows:] - position[:-rows]) / rows if rows else 0.0
     least = max(0.15 * step**2, _LEAST_APART_MM**2)
     by_position, by_column = np.zeros(shape), np.zeros(shape)
-    _fit_planes(there, z, np.ascontiguousarray(s, dtype=float), rows, columns, least, by_position, by_column)
+    room = np.empty((shape[0], 5, shape[1])), np.zeros((9, shape[1]))
+    _fit_planes(there, z, np.ascontiguousarray(s, dtype=float), rows, columns, least, *room, by_position, by_column)
     return by_position[row, column - first], by_column[row, column - first]
 
 
@@ -199,19 +200,22 @@ def _fit_planes(
     rows: int,
     columns: int,
     least: float,
+    along: np.ndarray,
+    total: np.ndarray,
     by_position: np.ndarray,
     by_column: np.ndarray,
 ) -> None:
     """Slopes (F, L) of planes through the values z (F, L) that are there, at positions s (F,), 0 where unknown.
 
-    The sums over the window are running ones, first along a row and then from row to row.
+    The sums over the window are running ones, first along a row, ``along`` (F, 5, L), and then from row to row,
+    ``total`` (9, L), zero at first.
     """
     count, width = there.shape
-    along = np.zeros((count, 5, width))
     for row in range(count):
         n, x1, x2, z1, xz = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(width + columns):
-            for at, sign in ((k, 1.0), (k - 2 * columns - 1, -1.0)):
+            for side in range(2):
+                at, sign = k - side * (2 * columns + 1), 1.0 - 2.0 * side
                 if 0 <= at < width and there[row, at]:
                     x, value = at - 0.5 * width, z[row, at]
                     n, x1, x2 = n + sign, x1 + sign * x, x2 + sign * x * x
@@ -220,9 +224,9 @@ def _fit_planes(
                 to = along[row, :, k - columns]
                 to[0], to[1], to[2], to[3], to[4] = n, x1, x2, z1, xz
     size = (2 * rows + 1) * (2 * columns + 1)
-    total = np.zeros((9, width))
     for k in range(count + rows):
-        for row, sign in ((k, 1.0), (k - 2 * rows - 1, -1.0)):
+        for side in range(2):
+            row, sign = k - side * (2 * rows + 1), 1.0 - 2.0 * side
             if 0 <= row < count:
                 for at in range(width):
                     n, x1, z1 = sign * along[row, 0, at], sign * along[row, 1, at], sign * along[row, 3, at]
