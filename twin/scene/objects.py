@@ -53,7 +53,7 @@ class Objects:
 
     scene: mi.Scene
     mirrors: tuple[MirrorFace, ...]
-    coherent: bool
+    coherent: Bool
     _facts: dict[str, Float]
 
     def mirror_share(self, si: SurfaceInteraction3f) -> Float:
