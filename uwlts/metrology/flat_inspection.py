@@ -47,6 +47,8 @@ _SAME_SHARE = 0.2
 _REFINED = 4
 _FLAT_CELLS = 24
 """Across the face; the means of cells are its smoothed form."""
+_EDGE_LINES = 4
+"""Lines next to an edge that do not count for the flatness: the camera's blur mixes in what lies beyond."""
 _DRAWS, _SEED = 48, 635
 
 _facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
@@ -302,16 +304,17 @@ def _inspection(
 
 def _flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> FeatureValue:
     """Range of the means of small cells of the face, less what noise alone adds to it (by drawing it again)."""
+    inner = _away_from_edges(cloud, used)
     local = (cloud.points_mm[used] - face.point_mm) @ face.axes[:2].T
     cell = float(np.ptp(local, axis=0).max()) / _FLAT_CELLS
     index = np.unique(np.floor(local / cell).astype(int), axis=0, return_inverse=True)[1].ravel()
-    count = np.bincount(index)
+    count = np.bincount(index[inner], minlength=int(index.max()) + 1)
     full = count >= max(8, 0.2 * np.median(count))
     design = np.column_stack([np.ones(len(local)), local])
 
     def means(distances: np.ndarray) -> np.ndarray:
         left = distances - design @ (face.rows @ distances)
-        return np.bincount(index, left)[full] / count[full]
+        return np.bincount(index[inner], left[inner], len(count))[full] / count[full]
 
     found = means(face.residuals_mm)
     errors = normal_errors(cloud, used, np.broadcast_to(face.axes[2], (len(used), 3)))
@@ -327,6 +330,20 @@ def _flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> FeatureValue:
         common = float(np.sqrt(sum((np.ptp(found + means(p)) - value) ** 2 for p in errors.patterns_mm)))
     random = float(np.hypot(np.std(drawn), bias))
     return plain_value(FeatureKind.FLANGE, "flatness", max(value - bias, 0.0), random, common, least=0.0)
+
+
+def _away_from_edges(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
+    """Which of the points (N,) have enough lines beside them that were seen, on both sides; all without lines."""
+    if np.any(cloud.frame[used] < 0) or np.any(cloud.line[used] < 0):
+        return np.ones(len(used), bool)
+    order = np.lexsort((cloud.line[used], cloud.frame[used]))
+    frame, line = cloud.frame[used][order], cloud.line[used][order]
+    # Single lost lines are no edge.
+    run = np.cumsum(np.append(0, (np.diff(frame) != 0) | (np.diff(line) >= _LEAST_GAP)))
+    first, last = np.searchsorted(run, run), np.searchsorted(run, run, side="right") - 1
+    inner = np.empty(len(used), bool)
+    inner[order] = (line - line[first] >= _EDGE_LINES) & (line[last] - line >= _EDGE_LINES)
+    return inner
 
 
 def _gaps(cloud: PointCloud, face: _Face, used: np.ndarray) -> list[_Edges]:
