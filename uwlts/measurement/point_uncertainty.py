@@ -135,7 +135,7 @@ def point_uncertainty(
     # Of the water, of light beside the sheet, and of the calibration and stage; blur depends on what is scanned.
     whole = ways[2:].T @ kept.T
     shares = np.column_stack([whole[:, 0], ways[1], whole[:, 1:]])
-    return PointUncertainty(random, position.astype(np.float32), patterns, shares=shares)
+    return PointUncertainty(random, position.astype(np.float32), patterns, shares=shares.astype(np.float32))
 
 
 @compiled

@@ -72,7 +72,7 @@ class PointUncertainty:
     poses_mm : (K, N, 3) float32 or None
         How each point moves for one standard deviation of each independent part of its image's pose, which is
         independent from image to image.
-    shares : (M, S) float64 or None
+    shares : (M, S) float32 or None
         What of each pattern is of each independent part of water (first), light beside the sheet, calibration and
         stage. These parts are the same of all clouds of one calibration and direction of the stage.
     """
@@ -464,7 +464,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     metadata = _metadata(ply.comments)
     if (shares := metadata.pop(_SHARES, None)) is not None and uncertainty is not None:
         try:
-            uncertainty = replace(uncertainty, shares=np.array(shares, dtype=np.float64))
+            uncertainty = replace(uncertainty, shares=np.array(shares, dtype=np.float32))
         except (TypeError, ValueError) as error:
             raise CaptureError(f"its {_SHARES} are damaged: {error}") from error
     deviation = column("deviation", np.nan)

@@ -338,6 +338,24 @@ def test_what_blur_and_light_beside_the_sheet_leave_moves_all_points_together(ca
     np.testing.assert_allclose(known.systematic_mm2() - plain.systematic_mm2(), expected, atol=1e-7, rtol=1e-2)
 
 
+def test_clouds_of_one_calibration_say_what_they_share(calibration, stripes, thesis, tmp_path):
+    """Covariances between the two images by their own patterns' shares and by those of both as one cloud."""
+    frame, line, centre = stripes
+    near, far = frame == 0, frame == 1
+    with capture_of(tmp_path, thesis, MEDIUM) as capture:
+        both = point_uncertainty(capture, calibration, frame, line, centre)
+        first, second = (point_uncertainty(capture, calibration, *(each[s] for each in stripes)) for s in (near, far))
+    pick = np.arange(0, near.sum(), 120)
+    together = np.einsum("mni,mni->ni", both.patterns_mm[:, near][:, pick], both.patterns_mm[:, far][:, pick])
+    shared = first.shares @ second.shares.T
+    by_shares = np.einsum("mk,mni,kni->ni", shared, first.patterns_mm[:, pick], second.patterns_mm[:, pick])
+    size = np.sqrt(np.sum(first.patterns_mm[:, pick] ** 2, axis=0) * np.sum(second.patterns_mm[:, pick] ** 2, axis=0))
+    # Patterns of less than 0.05 um are left out of each.
+    np.testing.assert_allclose(by_shares / size, together / size, atol=2e-3)
+    # No pattern shares more than itself.
+    assert np.linalg.norm(first.shares, axis=1).max() < 1 + 1e-9
+
+
 def test_water_does_not_drift_before_its_own_scan(calibration, stripes, thesis, tmp_path):
     frame, line, centre = stripes
     drifting = thesis.model_copy(update={"uncertainty": thesis.uncertainty.model_copy(update={"drift_k": 30.0})})

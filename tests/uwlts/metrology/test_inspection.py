@@ -5,6 +5,7 @@ their probability of a false alarm.
 """
 
 import json
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from uwlts.metrology.blemish_search import UnrolledSurface, search_blemishes
 from uwlts.metrology.features import DEFINITIONS, FeatureKind
 from uwlts.metrology.pipe_form import fit_pipe, pipe_features
 from uwlts.model.errors import EvaluationError
-from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty
 
 NOISE_MM, IMAGE_MM = 0.02, 0.004
 RADIUS_MM = 150.0
@@ -224,6 +225,31 @@ def test_depths_are_within_their_intervals():
     assert all(pit["depth"].systematic < 0.2 * pit["depth"].random for pit in pits)
 
 
+def test_what_the_footprint_of_points_smooths_is_put_back():
+    """25 pits of 2.5 mm diameter and 0.5 mm depth; as if points had no footprint they are a tenth too shallow."""
+    sizes, places = (0.22, 0.2), list(product(np.arange(-12, 13, 6.0), np.arange(-12, 13, 6.0)))
+    nodes, weights = np.polynomial.hermite_e.hermegauss(7)
+
+    def radius(x, angle):
+        result = np.full(np.shape(x), RADIUS_MM)
+        for (a, wa), (b, wb) in product(zip(nodes, weights, strict=True), repeat=2):
+            seen = x + a * sizes[0], RADIUS_MM * angle + b * sizes[1]
+            result = result + wa * wb / (2 * np.pi) * sum(bell(*seen, at, 2.5, 0.5) for at in places)
+        return result
+
+    cloud = pipe_scan(np.random.default_rng(15), half_arc=0.12, along=(-16, 16, 0.4), around_mm=0.15, radius=radius)
+    known = replace(cloud, metadata={FOOTPRINT: list(sizes), FOOTPRINT_STD: 0.2})
+    means = []
+    for each in (cloud, known):
+        pits = uwlts.inspect(each).of(FeatureKind.PIT)
+        assert len(pits) == len(places)
+        means.append(np.mean([pit["depth"].value for pit in pits]))
+    inside = [pit["depth"].low <= 0.5 <= pit["depth"].high for pit in pits]
+    # Fewer than 18 of 25 intervals of 95 % hold the truth once in 10,000 times.
+    assert np.count_nonzero(inside) >= 18
+    assert means[0] < 0.475 < 0.485 < means[1] < 0.515
+
+
 def flat_scan(rng, height, kept, *, along=(-30, 30, 0.5), across=(-60, 60, 900), **options):
     """A flat thing that faces -z, scanned along x in profiles across it; ``kept`` says where there is something."""
     x, y = np.arange(*along), np.linspace(*across)
@@ -309,10 +335,7 @@ def test_a_weld_is_measured(undercut, offset):
     weld = uwlts.inspect(cloud, "weld").features[0]
     within(weld, {"height": 2.0, "misalignment": offset})
     if undercut:
-        # The bottom of a groove is cut by the local quadratic, by less than a twentieth.
-        for name in ("undercut left", "undercut right", "largest undercut"):
-            gate = GATE * weld[name].uncertainty + 0.05 * undercut
-            assert weld[name].value == pytest.approx(undercut, abs=gate), name
+        within(weld, dict.fromkeys(("undercut left", "undercut right", "largest undercut"), undercut))
     else:
         assert max(weld["undercut left"].value, weld["undercut right"].value) < 2 * NOISE_MM
         # From 10 to 50 % of the height the flank's slope is 0.8 mm over (0.827 - 0.541) of 6 mm.

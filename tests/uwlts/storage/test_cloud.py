@@ -41,6 +41,7 @@ def some_cloud(count: int = 40, **changes) -> PointCloud:
 def some_uncertainty(count: int = 40, patterns: int = 3) -> PointUncertainty:
     rng = np.random.default_rng(5)
     shapes = {"random_mm2": (count, 6), "patterns_mm": (patterns, count, 3), "poses_mm": (6, count, 3)}
+    shapes["shares"] = (patterns, 5)
     names = [part.name for part in fields(PointUncertainty)]
     return PointUncertainty(**{n: rng.normal(size=shapes.get(n, (count, 3))).astype(np.float32) for n in names})
 
