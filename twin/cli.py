@@ -28,7 +28,7 @@ app = App(
     name="twin",
     help="Digital twin of an underwater laser triangulation sensor.",
     version=uwlts.__version__,
-    help_format="plaintext",
+    help_format="markdown",
 )
 _SHOWING = ("show_progress", "report")
 """Parameters of functions by which commands show their progress."""

@@ -7,7 +7,7 @@ tilt that all points share. Prints the rows of the table in docs/how-to/compare-
 import numpy as np
 
 import uwlts
-from uwlts.storage.cloud import CALIBRATION, DIRECTION, PointCloud, PointUncertainty
+from uwlts.storage.cloud import PointCloud, PointUncertainty
 
 NOISE_MM, SHIFT_MM, TILT, STAGE_MM = 0.03, 0.04, 1e-3, 0.02
 SIDE_MM, STEP_MM, PAIRS = 60.0, 0.5, 10
@@ -39,11 +39,8 @@ def scanned(rng: np.random.Generator, surface, *, common: bool, calibration: np.
     z = surface(x, y) + NOISE_MM * rng.normal(size=count) + STAGE_MM * rng.normal(size=len(axis))[image]
     errors = rng.normal(size=2) if calibration is None else calibration
     z += np.tensordot(errors, patterns[:, :, 2], axes=1)
-    known = PointUncertainty(random, position, patterns, shares=np.hstack([np.zeros((2, 1)), np.eye(2)]))
-    named = {CALIBRATION: str(errors), DIRECTION: [1.0, 0.0, 0.0]}
-    return PointCloud(
-        np.column_stack([x, y, z]), np.ones(count), image, np.zeros(count, int), uncertainty=known, metadata=named
-    )
+    known = PointUncertainty(random, position, patterns, shared={f"sensor {errors}": np.eye(2)})
+    return PointCloud(np.column_stack([x, y, z]), np.ones(count), image, np.zeros(count, int), uncertainty=known)
 
 
 def main() -> None:

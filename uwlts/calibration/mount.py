@@ -13,18 +13,16 @@ from uwlts.calibration.mount_board import mount_by_board
 from uwlts.calibration.mount_model import Motion, MountState, Problem, Scatter
 from uwlts.calibration.mount_next_pose import axis_words, missing_turns, next_pose
 from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLine, find_arc, find_line
+from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of, with_sensor
 from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere, start_on_table
-from uwlts.model.any_calibration import check_fits
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound
 from uwlts.model.trajectory import Trajectory
-from uwlts.optics.reconstruction import reconstruct_profile
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.mount_files import SENSOR_AXES, MountEvidence, SensorAxis, read_mount_evidence
 from uwlts.storage.pose_files import PoseFormat, Unit, read_poses
-from uwlts.stripe import find_stripes
 
 _FEWEST_POSES = {"sphere": 5, "plane": 8}
 """Poses whose profiles have more numbers (three each, or two) than there are unknowns (nine or ten), with some over."""
@@ -44,7 +42,7 @@ _WEAK = 5.0
 
 
 def calibrate_mount(
-    profiles: str | Path | Sequence[np.ndarray],
+    profiles: str | Path | Sequence[np.ndarray] | CapturedProfiles,
     poses: str | Path | np.ndarray | None = None,
     *,
     artefact: Literal["sphere", "plane"] = "sphere",
@@ -79,13 +77,14 @@ def calibrate_mount(
     artefact, radius_mm
         What is seen; the radius of the sphere where it is known.
     calibration
-        Of the sensor that took the capture, held fixed. A target's images go to `uwlts.calibration.mount_board`.
+        Of the sensor that took the capture, held fixed; what a joint estimate leaves open becomes part of the mount's
+        covariance. A target's images go to `uwlts.calibration.mount_board`.
     pose_format, profile_unit, pose_unit
         How files are to be read; see `uwlts.storage.pose_files.read_poses`.
     axis
-        The platform is a rotary table whose axis is not known, and which turns the sphere: the direction of the
-        sensor's frame that is nearest to the axis about which its angles turn counter-clockwise. The mount then leads
-        to a frame whose z axis is the table's (`uwlts.storage.pose_files.read_poses`, format ``angle-deg``).
+        The platform is a rotary table whose axis is not known, and which turns the sphere or target: the direction of
+        the sensor's frame that is nearest to the axis about which its angles turn counter-clockwise. The mount then
+        leads to a frame whose z axis is the table's (`uwlts.storage.pose_files.read_poses`, format ``angle-deg``).
     scale
         Estimate by which factor the robot's lengths are too short.
     time
@@ -118,11 +117,14 @@ def calibrate_mount(
         assert not isinstance(table, str | Path)
         with Capture(profiles) as capture:
             if capture.header.target is not None and not capture.laser_on.all():
-                if radius_mm is not None or scale or time or axis is not None:
-                    raise DescriptionError("the capture shows a target: give no radius, axis, scale or time")
-                return mount_by_board([capture], known, table)
-            profiles, table, profile_times_s, pose_times_s = profiles_of(capture, known, table, times)
-        poses = table
+                if radius_mm is not None or scale or time:
+                    raise DescriptionError("the capture shows a target: give no radius, scale or time")
+                return mount_by_board([capture], known, table, axis=axis)
+            profiles = profiles_of(capture, known, table, times)
+    captured = None
+    if isinstance(profiles, CapturedProfiles):
+        captured, poses = profiles, profiles.poses
+        profiles, profile_times_s, pose_times_s = captured.profiles, captured.times_s, captured.pose_times_s
     evidence = read_mount_evidence(
         profiles,
         poses,
@@ -138,41 +140,9 @@ def calibrate_mount(
         pose_times_s=pose_times_s,
     )
     try:
-        return _Calibration(evidence).result()
+        return _Calibration(evidence, captured).result()
     except _NoFit as error:
         raise CalibrationError(f"{error}. {_advice(evidence)}") from error
-
-
-def profiles_of(
-    capture: Capture, calibration: Calibration, poses: np.ndarray | None, pose_times_s: np.ndarray | None
-) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray | None]:
-    """Profiles (N, 3) in the sensor's frame of all laser images, poses, and the times of both.
-
-    The poses are those given, else the capture's own.
-    """
-    check_fits(capture.header, calibration, source=capture.path.name)
-    if not capture.header.sensor.camera.window.mounted:
-        calibration = calibration.model_copy(update={"window": None})
-    stripes, laser = find_stripes(capture), np.flatnonzero(capture.laser_on)
-    points = reconstruct_profile(
-        calibration,
-        stripes.line,
-        stripes.centre_px,
-        medium_index=calibration.index_of(capture.header.medium),
-        stage_mm=0.0,
-        stage_direction=np.array([1.0, 0.0, 0.0]),
-    ).points_mm
-    profiles = [points[stripes.frame == frame] for frame in laser]
-    times = capture.time_s[laser]
-    if poses is not None:
-        return profiles, poses, times, pose_times_s
-    own = capture.pose[laser]
-    if missing := int(np.count_nonzero(~np.isfinite(own).all(axis=(1, 2)))):
-        raise DescriptionError(
-            f"{missing} of {len(laser)} laser images of {capture.path.name} have no pose of the platform: give a table "
-            "of poses, or import them"
-        )
-    return profiles, own, times, times
 
 
 class _NoFit(CalibrationError):
@@ -206,12 +176,14 @@ def _advice(evidence: MountEvidence) -> str:
 class _Calibration:
     """The steps of one calibration, in the order in which `result` needs them."""
 
-    def __init__(self, evidence: MountEvidence) -> None:
+    def __init__(self, evidence: MountEvidence, captured: CapturedProfiles | None = None) -> None:
         self.evidence = evidence
+        self.captured = captured
         self.sphere = evidence.artefact == "sphere"
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
-        self.profiles = [_thinned(_seen(profile), most) for profile in evidence.profiles]
+        self.rows = [_thinned(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
+        self.profiles = [_in_space(each[rows]) for each, rows in zip(evidence.profiles, self.rows, strict=True)]
         self.sheet = _sheet_frame(self.profiles)
         self.flat = [((each - self.sheet[:3, 3]) @ self.sheet[:3, :3])[:, [0, 2]] for each in self.profiles]
         self.reasons: dict[int, str] = {}
@@ -317,10 +289,14 @@ class _Calibration:
 
     def _summary(self, used: Problem, state: MountState, scatter: Scatter, members: list[np.ndarray]) -> Mount:
         information = used.information(state, scatter)
-        covariance = used.of_all(_inverse(information.sum(axis=0)))
+        own = used.of_all(_inverse(information.sum(axis=0)))
+        covariance, share = own, None
+        if self.captured is not None and self.captured.known is not None:
+            by_sensor = self._by_sensor(used, state, scatter, members)
+            covariance, share = with_sensor(own, by_sensor, state.rotation, self.captured.known)
         self._require_determined(used, state, scatter, covariance)
         held = _held_out(used, state, scatter, information)
-        own, numbers = misfits(used, state), [n for n in range(len(members)) if n not in self.reasons]
+        rms, numbers = misfits(used, state), [n for n in range(len(members)) if n not in self.reasons]
         order = {number: place for place, number in enumerate(numbers)}
         poses = []
         for number, name in enumerate(self.evidence.names):
@@ -330,7 +306,7 @@ class _Calibration:
                     name=name,
                     points=seen if place is not None else 0,
                     points_left_out=len(self.profiles[number]) - (seen if place is not None else 0),
-                    rms_mm=None if place is None else float(own[place]),
+                    rms_mm=None if place is None else float(rms[place]),
                     held_out_mm=None if place is None else float(held[place]),
                     reason=self.reasons.get(number),
                 )
@@ -351,7 +327,7 @@ class _Calibration:
         return Mount(
             T_platform_sensor=tuple(tuple(row) for row in transform.tolist()),
             covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
-            coverage_factor=_coverage_factor(used, state, scatter, covariance),
+            coverage_factor=_coverage_factor(used, state, scatter, own, covariance),
             artefact=found,
             robot_scale=state.scale if used.scale else None,
             robot_scale_std=float(std[at]) if used.scale else None,
@@ -359,14 +335,31 @@ class _Calibration:
             time_offset_std_s=float(std[at + used.scale]) if used.time else None,
             point_std_mm=scatter.point_mm,
             pose_std_mm=scatter.pose_mm,
-            rms_mm=float(np.sqrt(weights @ own**2)),
+            rms_mm=float(np.sqrt(weights @ rms**2)),
             held_out_rms_mm=float(np.sqrt(weights @ held**2)),
             poses=tuple(poses),
             weaknesses=tuple(_weaknesses(used, state, covariance)),
             table=used.table,
+            sensor=share,
             next_pose=next_pose(used, state, scatter, self.sheet, [self.evidence.names[n] for n in numbers]),
             inputs=self.evidence.digests,
         )
+
+    def _by_sensor(self, used: Problem, state: MountState, scatter: Scatter, members: list[np.ndarray]) -> np.ndarray:
+        """Derivatives (K, Q) of all values by the parameters of the sensor's calibration, which move the profiles.
+
+        The solution of weighted least squares moves by -(J^T W J)^-1 J^T W d where the distances move by d.
+        """
+        assert self.captured is not None
+        normals, moved = used.normals(state), []
+        numbers = [n for n in range(len(members)) if n not in self.reasons]
+        for number, own in zip(numbers, np.split(normals, np.cumsum(used.counts)[:-1]), strict=True):
+            by = self.captured.moved(number, self.rows[number][members[number]])
+            moved.append(np.einsum("ni,niq->nq", own, by))
+        whitened = used.whitening(state, scatter)
+        derivatives, together = whitened(used.derivatives(state)), np.vstack(moved)
+        off = whitened(together if self.sphere else used.on_lines(together))
+        return -used.free @ _inverse(derivatives.T @ derivatives) @ derivatives.T @ off
 
     def _require_determined(self, used: Problem, state: MountState, scatter: Scatter, covariance: np.ndarray) -> None:
         shift = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
@@ -384,9 +377,8 @@ class _Calibration:
         )
 
 
-def _seen(profile: np.ndarray) -> np.ndarray:
-    """Points (N, 3) that were seen, of a profile (N, 2) or (N, 3)."""
-    points = profile[np.isfinite(profile).all(axis=1)]
+def _in_space(points: np.ndarray) -> np.ndarray:
+    """Points (N, 3) of a profile (N, 2) or (N, 3)."""
     return points if points.shape[1] == 3 else np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]])
 
 
@@ -489,14 +481,17 @@ def _left_out_excess(problem: Problem, state: MountState, scatter: Scatter) -> n
     return np.array(excess)
 
 
-def _coverage_factor(problem: Problem, state: MountState, scatter: Scatter, covariance: np.ndarray) -> float:
+def _coverage_factor(
+    problem: Problem, state: MountState, scatter: Scatter, own: np.ndarray, covariance: np.ndarray
+) -> float:
     """Student's factor for 95 %, with degrees of freedom by Welch and Satterthwaite (GUM, G.4).
 
-    The share of the variances that the points' noise makes is known from very many points, the rest from the poses.
+    The shares of the variances that the points' noise and the sensor's calibration make are known from very many
+    points, the rest from the poses. ``own`` is the covariance without the calibration.
     """
     by_points = _inverse(problem.information(state, Scatter(scatter.point_mm, 0.0)).sum(axis=0))
-    known = np.diag(covariance)[:6] > 0
-    share = min(float(np.mean(np.diag(problem.of_all(by_points))[:6][known] / np.diag(covariance)[:6][known])), 1.0)
+    total, by_poses = np.diag(covariance)[:6], np.maximum(np.diag(own - problem.of_all(by_points))[:6], 0.0)
+    share = 1 - float(np.mean(by_poses[total > 0] / total[total > 0]))
     of_poses = max(problem.per_pose * len(problem.points) - problem.size, 1)
     of_points = max(int(problem.counts.sum()) - problem.per_pose * len(problem.points), 1)
     return float(t.ppf(0.975, 1 / (share**2 / of_points + (1 - share) ** 2 / of_poses)))

@@ -145,23 +145,30 @@ class Problem:
         """
         base = self._base(state)
         if self.sphere:
-            away = base - state.artefact[:3]
-            return away / np.linalg.norm(away, axis=1, keepdims=True)
+            return self._normals(base, state)
         return np.column_stack([np.ones(len(base)), self._along])
 
     def derivatives(self, state: MountState) -> np.ndarray:
         """Derivatives (N, size) of the distances at a state by the parameters."""
         return self._derivatives(state) @ self.free
 
+    def normals(self, state: MountState) -> np.ndarray:
+        """Derivatives (N, 3) of the distances by the points, along the axes of the sensor."""
+        rotations = self.motion(state.offset_s)[0]
+        return np.einsum("nij,ni->nj", rotations[self.poses], self._normals(self._base(state), state)) @ state.rotation
+
+    def _normals(self, base: np.ndarray, state: MountState) -> np.ndarray:
+        """Normals (N, 3) of the artefact at points of the base frame, away from the sphere's centre."""
+        if not self.sphere:
+            return np.broadcast_to(state.artefact[:3], base.shape)
+        away = base - state.artefact[:3]
+        return away / np.linalg.norm(away, axis=1, keepdims=True)
+
     def _derivatives(self, state: MountState) -> np.ndarray:
         """Derivatives (N, K) by all values."""
         rotations, positions = self.motion(state.offset_s)
         turned, base = self._all @ state.rotation.T, self._base(state)
-        if self.sphere:
-            away = base - state.artefact[:3]
-            normals = away / np.linalg.norm(away, axis=1, keepdims=True)
-        else:
-            normals = np.broadcast_to(state.artefact[:3], base.shape)
+        normals = self._normals(base, state)
         in_platform = np.einsum("nij,ni->nj", rotations[self.poses], normals)
         columns = [in_platform, np.cross(turned, in_platform)]
         if self.sphere:
@@ -178,7 +185,7 @@ class Problem:
         derivatives = np.hstack(columns)
         if self.sphere:
             return derivatives
-        return self._on_lines(derivatives)
+        return self.on_lines(derivatives)
 
     @cached_property
     def _along(self) -> np.ndarray:
@@ -195,7 +202,7 @@ class Problem:
         every = np.column_stack([np.ones(len(self._along)), self._along])
         return [np.linalg.qr(each)[0] for each in np.split(every, np.cumsum(self.counts)[:-1])]
 
-    def _on_lines(self, values: np.ndarray) -> np.ndarray:
+    def on_lines(self, values: np.ndarray) -> np.ndarray:
         """Values (N, ...) beside a plane as those of the lines of the profiles.
 
         With the points' own noise in them, a plane far from the true one would seem to explain this noise.
@@ -246,7 +253,7 @@ class Problem:
 
         def misfit(step: np.ndarray) -> np.ndarray:
             off = self.distances(state, step)
-            return whitened(off if self.sphere else self._on_lines(off))
+            return whitened(off if self.sphere else self.on_lines(off))
 
         found = least_squares(
             misfit,

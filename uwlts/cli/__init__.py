@@ -3,11 +3,11 @@
 import sys
 
 # Importing them adds their commands.
-from uwlts.cli import calibration, measuring
+from uwlts.cli import calibration, describing, findings, measuring, recording
 from uwlts.cli.options import app
 from uwlts.runtime.console import run
 
-__all__ = ["app", "calibration", "main", "measuring"]
+__all__ = ["app", "calibration", "describing", "findings", "main", "measuring", "recording"]
 
 
 def main() -> None:

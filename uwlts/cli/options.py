@@ -14,7 +14,7 @@ app = App(
     name="uwlts",
     help="Software of an underwater laser triangulation sensor.",
     version=uwlts.__version__,
-    help_format="plaintext",
+    help_format="markdown",
 )
 
 Flag = Annotated[bool, Parameter(negative="")]

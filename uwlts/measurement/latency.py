@@ -14,8 +14,9 @@ from uwlts.model.errors import EvaluationError
 
 _LARGEST_S = 0.5
 """Latency that is looked for at most: that of slow drivers."""
-_MOST_BENT_PX = 2.0
-"""A motion of the stripe that changes by more from one frame to the next is an edge."""
+_MOST_BENT_PX, _MOST_BENT = 2.0, 0.5
+"""Largest change of the stripe's motion from one frame to the next, in px or as a share of the motion. Beyond is an
+edge, unless the motion changes alike beside it. (At a jump it changes by twice its mean, and next by the opposite.)"""
 _FEWEST = 200
 """Pairs of stripe centres with relief from which the latency is estimated."""
 _GRAIN = 2.0
@@ -111,10 +112,13 @@ class _Surface:
     def of(cls, position: np.ndarray, centre: np.ndarray) -> "_Surface":
         apart = position[2:] - position[:-2]
         slope = np.full_like(centre, np.nan)
-        slope[1:-1] = (centre[2:] - centre[:-2]) / apart[:, None]
-        bend = np.full_like(centre, np.nan)
-        bend[1:-1] = centre[2:] - 2 * centre[1:-1] + centre[:-2]
-        return cls(position, centre, np.where(np.abs(bend) < _MOST_BENT_PX, slope, np.nan))
+        across = centre[2:] - centre[:-2]
+        bend = centre[2:] - 2 * centre[1:-1] + centre[:-2]
+        odd = np.abs(bend)
+        odd[1:-1] = np.fmin(odd[1:-1], np.abs(bend[1:-1] - (bend[2:] + bend[:-2]) / 2))
+        smooth = odd < np.maximum(_MOST_BENT_PX, _MOST_BENT * np.abs(across) / 2)
+        slope[1:-1] = np.where(smooth, across / apart[:, None], np.nan)
+        return cls(position, centre, slope)
 
     @property
     def step_mm(self) -> float:

@@ -26,7 +26,7 @@ from uwlts.metrology.point_spacing import disc_of
 from uwlts.metrology.registration import Registration, SampledSurface, register_to_surface
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
-from uwlts.storage.cloud import CALIBRATION, DIRECTION, PAIRS, PointCloud, PointUncertainty, read_cloud
+from uwlts.storage.cloud import PAIRS, WATER, PointCloud, PointUncertainty, read_cloud
 from uwlts.storage.pose_files import Unit
 
 _MOST_PLACES = 20_000
@@ -204,8 +204,8 @@ def compare_clouds(
     Leroux, ISPRS J. 82, 2013). The variance of the distance is that of M3C2-EP (Winiwarter, Anders and Höfle, ISPRS J.
     178, 2021) with the parts that this sensor's points have: noise of single points, or their roughness where that is
     larger, over their number; the stage's position of each image; and what all points share by calibration, which no
-    averaging lowers. Of two clouds of one calibration (by its digest) and one direction of the stage, what both share
-    of calibration, stage and sheet cancels in the difference. The water's index, which may have drifted between them,
+    averaging lowers. Of two clouds of one calibration, medium and direction of the stage, what both share of
+    calibration, stage and sheet cancels in the difference. The water's index, which may have drifted between them,
     does not, unless ``same_water`` says so. A registration, or the fit of an ideal shape, adds its own, and takes up
     what of the shared errors looks like a movement.
 
@@ -322,7 +322,7 @@ def _against_points(
     # A mesh is what it is: between its samples nothing scatters.
     variance = here.variance_mm2 + (0.0 if surface.meshed else there.variance_mm2)
     variance += np.sum(here.patterns_mm**2, axis=1) + np.sum(there.patterns_mm**2, axis=1)
-    if known is not None and other is not None and _of_one_calibration(new.metadata, surface.metadata):
+    if known is not None and other is not None:
         variance -= 2 * _common(here.patterns_mm, known, there.patterns_mm, other, same_water=same_water)
     words = "mesh" if surface.meshed else "cloud"
     return _Sides(places, normals, here.mean_mm - there.mean_mm, variance, found, found, words)
@@ -366,19 +366,15 @@ def _against_shape(
     return _Sides(places, normals, here.mean_mm, variance, found, moved, placed.words())
 
 
-def _of_one_calibration(metadata: Table, other: Table) -> bool:
-    """Whether two clouds name the same calibration and direction of the stage."""
-    return all(metadata.get(key) is not None and metadata[key] == other.get(key) for key in (CALIBRATION, DIRECTION))
-
-
 def _common(
     here: np.ndarray, known: PointUncertainty, there: np.ndarray, other: PointUncertainty, *, same_water: bool
 ) -> np.ndarray:
-    """Covariance (P,) of the means of two clouds of one calibration by the moves (P, M) by the patterns of each."""
-    if known.shares is None or other.shares is None or known.shares.shape[1] != other.shares.shape[1]:
-        return np.zeros(len(here))
-    first = 0 if same_water else 1
-    return np.sum((here @ known.shares[:, first:]) * (there @ other.shares[:, first:]), axis=1)
+    """Covariance (P,) of the means of two clouds by what both share, from the moves (P, M) by the patterns of each."""
+    result = np.zeros(len(here))
+    for name in known.shared.keys() & other.shared.keys():
+        if same_water or not name.startswith(WATER):
+            result += np.sum((here @ known.shared[name]) * (there @ other.shared[name]), axis=1)
+    return result
 
 
 def _areas(places: np.ndarray) -> np.ndarray:
@@ -420,4 +416,4 @@ def _moved(
     patterns = patterns + np.array(followed, np.float32).reshape(patterns.shape)
     poses = None if known.poses_mm is None else known.poses_mm @ rotation.T
     position = known.position_mm @ rotation.T
-    return points, PointUncertainty(pairs, position, patterns.astype(np.float32), poses, known.shares)
+    return points, PointUncertainty(pairs, position, patterns.astype(np.float32), poses, known.shared)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from uwlts.metrology.ideal_shapes import KINDS, IdealShape, read_shape
 from uwlts.metrology.point_spacing import POINTS_PER_DISC
 from uwlts.model.errors import CaptureError, DescriptionError, EvaluationError, problems_of
 from uwlts.model.input_file import MOST_TOML_BYTES, parsed_toml, read_text, require_regular_file
-from uwlts.model.sensor import Description, Positive, Table, Vector
+from uwlts.model.sensor import Description, Positive, Vector
 from uwlts.storage.cloud import PointCloud, PointUncertainty, read_cloud
 from uwlts.storage.pose_files import MM_PER_UNIT, Unit, checked_unit
 
@@ -31,13 +31,12 @@ Reference = PointCloud | IdealShape | str | os.PathLike[str]
 
 @dataclass(frozen=True, eq=False)
 class ReferencePoints:
-    """Points (M, 3) of a cloud and its metadata, or samples of a mesh and its normals, and how well they are known."""
+    """Points (M, 3) of a cloud, or samples of a mesh with its normals, and how well they are known."""
 
     points_mm: np.ndarray
     normals: np.ndarray | None = None
     uncertainty: PointUncertainty | None = None
     frame: np.ndarray | None = None
-    metadata: Table = field(default_factory=dict)
 
     @property
     def meshed(self) -> bool:
@@ -98,9 +97,7 @@ def read_reference(reference: Reference, *, unit: Unit, disc_mm: float) -> Refer
         return reference
     if scale != 1.0 and reference.uncertainty is not None:
         raise EvaluationError("a cloud with uncertainties is in mm: its unit cannot be m")
-    return ReferencePoints(
-        scale * reference.points_mm, None, reference.uncertainty, reference.frame, reference.metadata
-    )
+    return ReferencePoints(scale * reference.points_mm, None, reference.uncertainty, reference.frame)
 
 
 def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray] | None:

@@ -44,7 +44,7 @@ _LEAST_ACROSS = 0.3
 """Least cosine between the stage's motion and the sheet's normal for which a scan shows what lies beside the sheet."""
 
 _TABLE_TOLERANCE = 1e-6
-"""Error, in mm and mm per mm or px, of tabulated points and their derivatives."""
+"""Error of the tabulated shift per slope, mm^2, and of the largest thickness over the described one, per px."""
 
 _MOST_FOR_FOOTPRINT = 1000
 _PIXEL_VARIANCE = 1.0 / 12.0
@@ -76,15 +76,20 @@ def beside_sheet(
     across = float(np.array(calibration.sheet.normal) @ frame[:3, :3] @ direction)
     if abs(across) < _LEAST_ACROSS or not slopes.any():
         return np.zeros((len(slopes), 3))
-    exact = _on_sheet(calibration, sensor, medium_index=medium_index)
+    on_sheet = _on_sheet(calibration, sensor, medium_index=medium_index)
+
+    def exact(line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
+        values = on_sheet(line, place_px)
+        sigma = _sigma_at(values[:, :3], calibration, sensor, medium_index=medium_index)
+        per_mm, per_px = values[:, 3:6], values[:, 6:]
+        return np.column_stack([per_mm * (sigma**2)[:, None], per_px[:, 2] / (per_mm[:, 2] * sigma)])
+
     table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE)
     values = exact(line, centre_px) if table is None else table.values(line, centre_px)
-    # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
-    per_mm, per_px = values[:, 3:6], values[:, 6:]
-    sigma = _sigma_at(values[:, :3], calibration, sensor, medium_index=medium_index)
     known = width_px[np.isfinite(width_px)]
-    thickest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA * np.abs(per_px[:, 2] / per_mm[:, 2])
-    return per_mm * (slopes / across * np.minimum(sigma, thickest) ** 2)[:, None]
+    # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
+    thickest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA * values[:, 3]
+    return values[:, :3] * (slopes / across * np.minimum(1.0, thickest**2))[:, None]
 
 
 def footprint_mm(

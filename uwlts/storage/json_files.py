@@ -78,6 +78,12 @@ def write_model(path: str | Path, model: BaseModel, *, format: str, version: int
         aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
+def write_record(path: str | Path, record: object, *, overwrite: bool) -> None:
+    """Write the record of a result as indented JSON, whole or not at all; OutputError where that fails."""
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_text(json_text(record, indent=1), encoding="utf-8")
+
+
 def differences(there: object, now: object) -> str:
     """Words for the entries in which two JSON values differ, each with both values; empty where they are the same.
 

@@ -141,7 +141,11 @@ def read_mount_evidence(
     checked = [_checked_profile(profile, number) for number, profile in enumerate(profiles)]
     matrices = checked_matrices(np.asarray(poses, dtype=np.float64), "poses")
     if axis is not None:
-        _require_table(matrices, axis=axis, artefact=artefact, scale=scale)
+        if artefact != "sphere" or scale:
+            raise DescriptionError(
+                "by profiles the axis of a rotary table follows from a sphere on it, which has no scale to find"
+            )
+        require_table(matrices, axis=axis)
     if time and (profile_times_s is None or pose_times_s is None):
         raise DescriptionError("a time offset needs the times of profiles and poses: give both a column time_s")
     if profile_times_s is not None and pose_times_s is not None and (time or len(matrices) != len(checked)):
@@ -171,12 +175,10 @@ def read_mount_evidence(
     )
 
 
-def _require_table(poses: np.ndarray, *, axis: str, artefact: str, scale: bool) -> None:
-    """DescriptionError where poses are not turns of a table about its z axis, or something else is wrong with it."""
+def require_table(poses: np.ndarray, *, axis: str) -> None:
+    """DescriptionError where poses (P, 4, 4) are not turns of a table about its z axis, or the axis is none."""
     if axis not in SENSOR_AXES:
         raise DescriptionError(f"the axis is {axis!r}; expected one of {', '.join(SENSOR_AXES)} of the sensor's frame")
-    if artefact != "sphere" or scale:
-        raise DescriptionError("the axis of a rotary table follows from a sphere on it, which has no scale to find")
     turns = np.linalg.inv(poses[0]) @ poses
     if max(np.abs(turns[:, 2] - (0, 0, 1, 0)).max(), np.abs(turns[:, :2, 3]).max()) > _ON_AXIS:
         raise DescriptionError(

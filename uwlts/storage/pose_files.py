@@ -73,7 +73,7 @@ def read_columns(path: Path, digests: dict[str, str], *, named: bool = True) -> 
             convert_options=csv.ConvertOptions(
                 column_types=dict.fromkeys(names, pa.float64()),
                 null_values=["", "NaN", "nan", "NAN", "-nan", "null", "None"],
-                decimal_point="," if delimiter == b";" and b"," in b"".join(lines[:100]) else ".",
+                decimal_point="," if delimiter == b";" and any(b"," in line for line in lines) else ".",
             ),
         )
     except (pa.ArrowInvalid, pa.ArrowException) as error:

@@ -161,7 +161,8 @@ def written(folder, campaign: Campaign, *, decimal: str = ".") -> None:
         rows = [
             mark.join("" if np.isnan(v) else f"{v:.5f}".replace(".", decimal) for v in row) for row in profile.tolist()
         ]
-        text = "\n".join([mark.join(("x [mm]", "z [mm]")), *rows]) + "\n"
+        # A side without points is long enough to hide the decimal commas from a look at the first lines.
+        text = "\n".join([mark.join(("x [mm]", "z [mm]")), *[mark] * 200, *rows]) + "\n"
         (folder / "profiles" / f"pose-{number + 1}.csv").write_text(text)
 
 

@@ -14,7 +14,7 @@ import uwlts
 from uwlts.cli import app
 from uwlts.metrology.registration import SampledSurface, register_to_surface
 from uwlts.model.errors import CaptureError, DescriptionError, EvaluationError, OutputError
-from uwlts.storage.cloud import CALIBRATION, DIRECTION, PointCloud, PointUncertainty
+from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty
 
 NOISE_MM, SHIFT_MM, TILT, STAGE_MM = 0.03, 0.04, 1e-3, 0.02
 SIDE_MM, STEP_MM = 60.0, 0.5
@@ -49,14 +49,14 @@ def scanned(rng, *, change=None, common=True, surface=height, calibration=None):
     random[:, 5] = NOISE_MM**2
     seen = points.copy()
     seen[:, 2] += NOISE_MM * rng.normal(size=count) + STAGE_MM * rng.normal(size=image.max() + 1)[image]
-    errors, shares, named = rng.normal(size=2), None, {}
+    errors, shared = rng.normal(size=2), {}
     if calibration is not None:
         # The patterns are any independent ones: here shift and tilt, each partly by the water.
         shares = np.array([[0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
-        errors, named = shares @ calibration, {CALIBRATION: "0" * 64, DIRECTION: [1.0, 0.0, 0.0]}
+        errors, shared = shares @ calibration, {f"{WATER} 1": shares[:, :1], "sensor 1": shares[:, 1:]}
     seen[:, 2] += np.tensordot(errors, patterns[:, :, 2], axes=1)
-    known = PointUncertainty(random, position, patterns, shares=shares)
-    return PointCloud(seen, np.ones(count), image, np.zeros(count, int), uncertainty=known, metadata=named)
+    known = PointUncertainty(random, position, patterns, shared=shared)
+    return PointCloud(seen, np.ones(count), image, np.zeros(count, int), uncertainty=known)
 
 
 def test_nothing_is_claimed_where_nothing_changed():
@@ -88,7 +88,8 @@ def test_what_one_calibration_shares_cancels():
     rng = np.random.default_rng(4)
     calibration = rng.normal(size=3)
     cloud, other = (scanned(rng, calibration=calibration) for _ in range(2))
-    foreign = replace(other, metadata={CALIBRATION: "1" * 64, DIRECTION: [1.0, 0.0, 0.0]})
+    renamed = {name.replace("1", "2"): parts for name, parts in other.uncertainty.shared.items()}
+    foreign = replace(other, uncertainty=replace(other.uncertainty, shared=renamed))
     quiet = uwlts.compare_clouds(*(scanned(rng, common=False) for _ in range(2)))
     found = [
         uwlts.compare_clouds(cloud, *pair, same_water=same)
