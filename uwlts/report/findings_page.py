@@ -43,7 +43,7 @@ from uwlts.report.page_toolkit import (
 from uwlts.report.pdf import print_pdf, refuse_unsuitable_pdf
 from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import load_calibration
-from uwlts.storage.cloud import CALIBRATION, PointCloud, read_cloud
+from uwlts.storage.cloud import PointCloud, read_cloud
 from uwlts.storage.files import refuse_unsuitable, sha256_of
 from uwlts.storage.json_files import json_text
 
@@ -204,7 +204,7 @@ def _sources(
 
 def _artefact_check(path: str | Path, cloud: PointCloud) -> _ArtefactCheck:
     """Figures of an artefact that was measured by the calibration that the cloud names."""
-    record, named = read_evaluation(path), cloud.metadata.get(CALIBRATION)
+    record, named = read_evaluation(path), cloud.metadata.get("calibration")
     if record.artefact is None or record.evaluation is None:
         raise EvaluationError(f"{path} is the evaluation of no artefact: give those of spheres, a step or a plane")
     if named is None or record.calibration != named:
