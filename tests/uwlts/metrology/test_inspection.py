@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import uwlts
 from uwlts.cli import app
@@ -316,6 +317,23 @@ def test_a_gap_is_measured():
     # Square to the middle line, which leans by 0.02.
     within(gap, {"width": 3.0 * np.cos(0.02), "parallelism": np.degrees(0.008), "flush": 0.3})
     assert gap["width"].random < 0.03 and gap["width"].uncertainty < 0.2
+
+
+def test_blur_beyond_an_edge_shows_in_the_brightness():
+    """A gap of 3 mm whose edges are blurred, and seen down to a fourth of the brightness: 0.13 mm beyond each."""
+    blur = 0.2
+
+    def brightness(y):
+        return norm.cdf((np.abs(y) - 1.5) / blur)
+
+    cloud = flat_scan(
+        np.random.default_rng(16), lambda x, y: 0 * y, lambda x, y: brightness(y) > 0.25, across=(-15, 15, 250)
+    )
+    stripes = replace(cloud, intensity=100 * brightness(cloud.points_mm[:, 1]))
+    known = replace(stripes, metadata={FOOTPRINT: [0.15, blur], FOOTPRINT_STD: 0.2})
+    narrow, right = (uwlts.inspect(each, "gap").features[0]["width"].value for each in (stripes, known))
+    # Half of a line's spacing of 0.12 mm on either side is all that is known without.
+    assert narrow < 2.93 and right == pytest.approx(3.0, abs=0.03)
 
 
 def weld_height(x, y, *, undercut, offset):
