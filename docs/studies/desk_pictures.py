@@ -79,10 +79,7 @@ def drive(page: Page, tank: Path, pictures: Path) -> None:
     press(page, "fit")
     page.wait_for_timeout(1500)
     page.screenshot(path=pictures / "desk-scan.png")
-    (scan,) = page.locator(".log").get_by_text(re.compile(r"wrote .*\.h5")).all_inner_texts() or [
-        page.locator(".log").get_by_text(re.compile(r"wrote .*\.h5")).first.inner_text()
-    ]
-    print(scan, flush=True)
+    page.locator(".log").get_by_text(re.compile(r"wrote .*\.h5")).wait_for()
     tab(page, "Files")
     press(page, "reconstruct")
     page.locator(".log").get_by_text(re.compile(r"wrote .*\.ply")).wait_for()
