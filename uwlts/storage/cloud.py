@@ -420,9 +420,8 @@ def _with_shared(cloud: PointCloud) -> Table:
     """Metadata in a file: with what the patterns share with other clouds."""
     if cloud.uncertainty is None or not cloud.uncertainty.shared:
         return cloud.metadata
-    return cloud.metadata | {
-        _SHARED: {name: np.round(each, 9).tolist() for name, each in cloud.uncertainty.shared.items()}
-    }
+    shared: Table = {name: np.round(each, 9).tolist() for name, each in cloud.uncertainty.shared.items()}
+    return {**cloud.metadata, _SHARED: shared}
 
 
 def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Table, PointUncertainty | None]:
@@ -432,8 +431,11 @@ def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Ta
     rest = {name: each for name, each in metadata.items() if name != _SHARED}
     if known is None:
         return rest, None
+    stated = metadata[_SHARED]
     try:
-        shared = {str(name): np.array(each, dtype=np.float64) for name, each in dict(metadata[_SHARED]).items()}
+        if not isinstance(stated, dict):
+            raise TypeError("not an object")
+        shared = {name: np.array(each, dtype=np.float64) for name, each in stated.items()}
     except (TypeError, ValueError) as error:
         raise CaptureError(f"its metadata is damaged: {_SHARED} holds no numbers") from error
     if any(
