@@ -43,7 +43,9 @@ def render(kind: str, water: str, out: Path, *, seed: int) -> None:
         walker = Walker(renderer.objects, renderer.scattering, renderer.effects, pose, direct, renderer._reach_mm)
         height, width = (size // WALK_CELL_PX for size in frames[0].scattered.shape)
         row, column = (g.ravel() for g in np.indices((height, width)))
-        walked = renderer._walked(walker, row, column, WALK_CELL_PX, seed=90001 + seed, walks=REFERENCE_WALKS)
+        walked = renderer._walked(
+            walker, row, column, np.full(row.size, WALK_CELL_PX), seed=90001 + seed, walks=REFERENCE_WALKS
+        )
         scattered = walked.reshape(1, height, width)
     np.savez(out, scattered=scattered, direct=frames[0].direct())
 
