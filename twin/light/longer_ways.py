@@ -30,8 +30,10 @@ SPREAD_MM = (0.3, 1.2, 5.0, 20.0, 80.0)
 """Distances from the sheet over which the light that water scatters upon surfaces falls off to 1 / e."""
 TOLERANCE = 2.5e-4
 """Noise that is left, as a share of the stripe's peak: a fifth of the rounding to 8 bits of a peak at 200."""
+NOISE_SHARES = (0.05, 0.2)
+"""The same as a share of the light, of that which the water scatters and of the steeper one from surface to surface."""
 _NARROWEST_CELLS = 0.7
-"""Standard deviation of the least blurred images of stripe and haze; each further one is twice as wide."""
+"""Standard deviation of the least blurred images of stripe and haze; each further one is three times as wide."""
 _WALKS_BESIDE_STRIPE = 8
 _CELLS_BESIDE_STRIPE = 2
 """So many times more walks are taken in so many cells beside the stripe, where light is bright and steep."""
@@ -68,9 +70,8 @@ def light_on_longer_ways(view: CameraView, walker: Walker, sources: Sources, *, 
     row_in_stripe, column_in_stripe = np.nonzero(sources.lit)
     large = np.repeat(np.arange(rows * columns), times.ravel())
     small = np.repeat(np.arange(len(row_in_stripe)), times_in_stripe)
-    cells, inside = np.zeros(rows * columns), np.zeros(len(row_in_stripe))
-    in_large, in_small = Findings(rows, columns), Findings(1, len(row_in_stripe))
-    for cell, scattered, reflected in walked(
+    kinds = [(Findings(rows, columns), Findings(1, len(row_in_stripe))) for _ in NOISE_SHARES]
+    for cell, *parts in walked(
         view,
         walker,
         np.concatenate([large // columns * WALK_CELL_PX, row_in_stripe[small] * NODE_SPACING_PX]),
@@ -81,21 +82,24 @@ def light_on_longer_ways(view: CameraView, walker: Walker, sources: Sources, *, 
     ):
         is_large = cell < len(large)
         of_large, of_small = large[cell[is_large]], small[cell[~is_large] - len(large)]
-        cells += np.bincount(of_large, reflected[is_large], cells.size)
-        inside += np.bincount(of_small, reflected[~is_large], inside.size)
-        in_large.add(of_large, scattered[is_large])
-        in_small.add(of_small, scattered[~is_large])
-    # Light from surface to surface may be steep, and has no rare bright samples.
-    cells, inside = cells.reshape(rows, columns) / (walks * times), inside / (walks * times_in_stripe)
+        for (in_large, in_small), light in zip(kinds, parts, strict=True):
+            in_large.add(of_large, light[is_large])
+            in_small.add(of_small, light[~is_large])
+    cells, inside = np.zeros((rows, columns)), np.zeros(len(row_in_stripe))
     if walker.scatters:
         features = _features(sources, rows, columns)
+        place = [_in_large_cells(each) for each in (row_in_stripe, column_in_stripe)]
+        fine = _features_in_stripe(sources, features, *place)
         tolerance = TOLERANCE * float(sources.stripe.max(initial=0.0))
-        estimate = estimated(in_large, walks * times, features, tolerance=tolerance)
-        cells += estimate.cells
-        if inside.size:
-            place = [_in_large_cells(each) for each in (row_in_stripe, column_in_stripe)]
-            fine = _features_in_stripe(sources, features, *place)
+        for (in_large, in_small), noise_share in zip(kinds, NOISE_SHARES, strict=True):
+            estimate = estimated(in_large, walks * times, features, tolerance=tolerance, noise_share=noise_share)
+            cells += estimate.cells
             inside += estimate.at(*place, fine, in_small, walks * times_in_stripe)
+    else:
+        # Without rare bright samples, light from surface to surface is left as steep as it may be.
+        for in_large, in_small in kinds:
+            cells += in_large.total() / (walks * times)
+            inside += in_small.total()[0] / (walks * times_in_stripe)
     size = columns * WALK_CELL_PX, rows * WALK_CELL_PX
     image = cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
     in_cells = np.zeros(sources.lit.shape, np.float32)
@@ -139,7 +143,7 @@ def _features(sources: Sources, rows: int, columns: int) -> np.ndarray:
     surfaces = [_in_cells(image, rows, columns) for image in sources.surfaces]
     widths = [_NARROWEST_CELLS]
     while widths[-1] < 0.2 * max(rows, columns):
-        widths.append(2 * widths[-1])
+        widths.append(3 * widths[-1])
     blurs = [blurred(source, width) for source in (stripe, haze) for width in widths]
     return np.stack([np.ones_like(haze), haze, *surfaces, *blurs])
 

@@ -22,8 +22,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-NOISE_SHARE = 0.05
-"""Largest noise to be left, as a share of the light in the cell."""
 _AT_ONCE = 2**22
 """So many findings are kept before they are sorted; they take some 50 MB."""
 _CLASS_BITS = 2
@@ -113,6 +111,7 @@ class Estimate:
     weights: np.ndarray
     portions: np.ndarray
     tolerance: float
+    noise_share: float
 
     def at(
         self, rows: np.ndarray, columns: np.ndarray, features: np.ndarray, findings: Findings, walks: int
@@ -124,33 +123,37 @@ class Estimate:
         """
         ratio = np.divide(self.cells, self.described, out=np.ones_like(self.cells), where=self.described > 0)
         expected = interpolated(ratio, rows, columns) * (self.weights @ features)
-        allowed = np.maximum(self.tolerance, NOISE_SHARE * expected.sum(axis=0))
+        allowed = np.maximum(self.tolerance, self.noise_share * expected.sum(axis=0))
         light = np.zeros_like(allowed)
         for kinds, each, portion in zip(self.classes, expected, self.portions / walks, strict=True):
             light += np.where(_quiet(each, portion, allowed), findings.light(kinds).ravel() / walks, each)
         return light
 
 
-def estimated(findings: Findings, walks: np.ndarray, features: np.ndarray, *, tolerance: float) -> Estimate:
+def estimated(
+    findings: Findings, walks: np.ndarray, features: np.ndarray, *, tolerance: float, noise_share: float
+) -> Estimate:
     """Light in cells that were given ``walks`` (rows, columns) each, described by features (J, rows, columns).
 
-    Noise of up to ``tolerance``, or `NOISE_SHARE` of the light where that is more, is left.
+    Noise of up to ``tolerance``, or the share ``noise_share`` of the light where that is more, is left.
     """
     mean_walks = float(walks.mean())
     exposure = (walks / mean_walks).astype(np.float32)
     total = findings.total()
-    faint = _FAINT_SHARE * max(tolerance * mean_walks, NOISE_SHARE * float(total.mean()))
+    faint = _FAINT_SHARE * max(tolerance * mean_walks, noise_share * float(total.mean()))
     classes = [kinds for kinds in findings.classes(faint) if findings.squares(kinds) > 0]
     light = np.array([findings.light(kinds) / mean_walks for kinds in classes], np.float32).reshape(-1, *total.shape)
     portions = np.array([findings.squares(kinds) / findings.light(kinds).sum() for kinds in classes])
     weights = _weights(light, features, exposure)
     each_described = (weights @ features.reshape(len(features), -1)).reshape(light.shape)
     described = each_described.sum(axis=0)
-    allowed = np.maximum(tolerance, NOISE_SHARE * described)
+    allowed = np.maximum(tolerance, noise_share * described)
     cells = np.zeros(total.shape, np.float32)
     for found, expected, portion in zip(light, each_described, portions / mean_walks, strict=True):
         cells += _corrected(found, expected, exposure, portion, allowed)
-    return Estimate(cells, described, classes, weights, portions, tolerance)
+    # Over all walks, nothing is added or lost.
+    cells *= light.sum(dtype=float) / max((exposure * cells).sum(dtype=float), float(np.finfo(np.float32).tiny))
+    return Estimate(cells, described, classes, weights, portions, tolerance, noise_share)
 
 
 def _corrected(
