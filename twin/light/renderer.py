@@ -294,9 +294,11 @@ class Renderer:
         parts = []
         for light in sources:
             here = light.at(end)
-            active = segment.valid & light.may_reach(end, here)
+            within = light.at(mi.Point3f(end - here.normal * here.distance_mm))
+            active = segment.valid & (within.irradiance > 0)
             towards = segment.si.to_local(pose.direction(-here.direction))
-            sent = light.power_w * seen * bsdf.eval(mi.BSDFContext(), segment.si, towards, active)[0]
+            sent = bsdf.eval(mi.BSDFContext(), segment.si, towards, active)[0]
+            sent *= seen * within.irradiance * within.sigma_mm
             parts.append(falling_off(sent, here.distance_mm, active))
         return [sum(each, mi.Float(0.0)) for each in zip(*parts, strict=True)]
 
