@@ -88,13 +88,13 @@ def light_on_longer_ways(view: CameraView, walker: Walker, sources: Sources, *, 
     cells, inside = np.zeros((rows, columns)), np.zeros(len(row_in_stripe))
     if walker.scatters:
         features = _features(sources, rows, columns)
-        place = [_in_large_cells(each) for each in (row_in_stripe, column_in_stripe)]
-        fine = _features_in_stripe(sources, features, *place)
+        place_row, place_column = _in_large_cells(row_in_stripe), _in_large_cells(column_in_stripe)
+        fine = _features_in_stripe(sources, features, place_row, place_column)
         tolerance = TOLERANCE * float(sources.stripe.max(initial=0.0))
         for (in_large, in_small), noise_share in zip(kinds, NOISE_SHARES, strict=True):
             estimate = estimated(in_large, walks * times, features, tolerance=tolerance, noise_share=noise_share)
             cells += estimate.cells
-            inside += estimate.at(*place, fine, in_small, walks * times_in_stripe)
+            inside += estimate.at(place_row, place_column, fine, in_small, walks * times_in_stripe)
     else:
         # Without rare bright samples, light from surface to surface is left as steep as it may be.
         for in_large, in_small in kinds:
@@ -104,7 +104,7 @@ def light_on_longer_ways(view: CameraView, walker: Walker, sources: Sources, *, 
     image = cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
     in_cells = np.zeros(sources.lit.shape, np.float32)
     in_cells[sources.lit] = inside
-    return np.where(*(_repeated(each, height, width) for each in (sources.lit, in_cells)), image)
+    return np.where(_repeated(sources.lit, height, width), _repeated(in_cells, height, width), image)
 
 
 def walked(

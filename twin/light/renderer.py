@@ -119,7 +119,7 @@ class Renderer:
         self._mirrors = self.objects.mirrors if effects.secondary_light else ()
         # Through the water to the stand-off and back, light is scattered so many times.
         scatterings = 2 * self.scattering.coefficient * self.design.standoff_mm
-        self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 5.5 * scatterings)
+        self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 4 * scatterings * (1 + scatterings))
         self._scatters = self.scattering.coefficient > 0 and (effects.haze or effects.multiple_scattering)
         self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
 

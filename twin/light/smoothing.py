@@ -4,9 +4,9 @@ Most light of a walk is small; now and then one finds very much. So walks are so
 found, each four times brighter than the one below, and the light of each class is estimated on its own, the more widely
 the fewer walks it rests on:
 
-- The class as a whole is described by a sum of features: the stripe and the haze, which are known without noise, each
-  blurred over several widths, as scattering blurs them. The weights, none negative, are those of the largest likelihood
-  of counts, found by expectation and maximisation (Shepp and Vardi 1982, Eq. 2.13), which keeps the sum of all light.
+- The class as a whole is described by a sum of features, images without noise of what sends the light. The weights,
+  none negative, are those of the largest likelihood of counts, found by expectation and maximisation (Shepp and Vardi
+  1982, Eq. 2.13), which keeps the sum of all light.
 - Where more walks are at hand, they correct that locally: by the ratio of what they found to what the features
   predict, both summed under a Gaussian that is just wide enough for a noise below the tolerance.
 - Where they suffice, each cell keeps what its own walks found.
@@ -21,6 +21,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 _AT_ONCE = 2**22
 """So many findings are kept before they are sorted; they take some 50 MB."""
@@ -36,8 +37,6 @@ _PORTION = 1.0
 """What one walk adds in one place may be so many times the tolerance."""
 _WIDTHS = (0.7, 1.4, 2.8, 5.6)
 """Standard deviations in cells of the local corrections."""
-_LEAST_BLUR = 0.7
-"""Standard deviation in cells of the least blurred feature; each further one is twice as wide."""
 _STEPS = 40
 """Further steps of the likelihood change the light by less than its noise."""
 
@@ -85,10 +84,12 @@ class Findings:
 
     def light(self, kinds: range) -> np.ndarray:
         """Light (rows, columns) of the walks of some classes."""
+        self._sort()
         return sum((self._light[kind] for kind in kinds if kind in self._light), np.zeros(self.shape))
 
     def squares(self, kinds: range) -> float:
         """Sum of the squares of what each of these walks found."""
+        self._sort()
         return sum(self._squares.get(kind, 0.0) for kind in kinds)
 
     def total(self) -> np.ndarray:
@@ -206,14 +207,13 @@ def _in_blocks(cells: np.ndarray) -> np.ndarray:
     """Means (K, B) over blocks of about 2 x 2 cells (K, rows, columns)."""
     rows, columns = cells.shape[1:]
     size = max(1, columns // 2), max(1, rows // 2)
-    return np.stack([cv2.resize(each, size, interpolation=cv2.INTER_AREA).ravel() for each in cells])
+    blocks = [cv2.resize(each, size, interpolation=cv2.INTER_AREA).ravel() for each in cells]
+    return np.array(blocks, np.float32).reshape(len(cells), size[0] * size[1])
 
 
 def interpolated(cells: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Cells (rows, columns) linearly between their middles at places (P,)."""
-    place = (np.ascontiguousarray(each, np.float32)[None] for each in (columns, rows))
-    # OpenCV takes at most 2^15 places along a side.
-    return cv2.remap(cells.astype(np.float32), *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+    return map_coordinates(cells, [rows, columns], order=1, mode="nearest")
 
 
 def blurred(cells: np.ndarray, sigma: float) -> np.ndarray:
