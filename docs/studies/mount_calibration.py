@@ -1,5 +1,12 @@
-"""Mounts calibrated from simulated profiles of a sphere: errors, coverage, and points on a sphere that was held out."""
+"""Mounts calibrated from simulated profiles of a sphere: errors, coverage, and points on a sphere that was held out.
 
+    python docs/studies/mount_calibration.py 60
+    python docs/studies/mount_calibration.py 40 --sensors
+
+The second draws a sensor for each campaign from the covariance of its calibration (`tests/uwlts/sensor_profiles.py`).
+"""
+
+import argparse
 import sys
 from pathlib import Path
 
@@ -9,7 +16,9 @@ from stripe_tables import table
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from tests.uwlts.mount_views import MOUNT, RADIUS_MM, Campaign, errors_of, sphere_campaign
+from tests.uwlts.sensor_profiles import captured_by, joint_estimate
 from uwlts.calibration.mount import calibrate_mount
+from uwlts.model.library import load_sensor
 from uwlts.model.mount import Mount, SphereFound
 
 
@@ -37,7 +46,26 @@ def held_out_ratio(mount: Mount, campaign: Campaign) -> float:
     return rms(mount.transform()) / rms(MOUNT)
 
 
-def main(campaigns: int = 200) -> None:
+def by_sensors(campaigns: int) -> None:
+    """Print the errors and coverage of mounts of sensors that differ from their calibration."""
+    known, rows = joint_estimate(load_sensor("thesis")), []
+    for seed in range(campaigns):
+        rng = np.random.default_rng(seed)
+        values = rng.multivariate_normal(known.values, known.covariance, method="svd")
+        mount = calibrate_mount(captured_by(known, values, rng), radius_mm=19.05)
+        assert mount.sensor is not None
+        shift, turn = errors_of(mount.transform())
+        apart = np.sqrt(np.diag(mount.sensor.covariance_apart))
+        within = [np.mean(np.abs([*shift, *turn]) < mount.coverage_factor * std) for std in (mount.std(), apart)]
+        rows.append((np.linalg.norm(shift), np.degrees(np.linalg.norm(turn)), *within))
+    shifts, turns, own, exact = np.transpose(rows)
+    print(
+        f"{campaigns} campaigns: shift {np.median(shifts):.3f} mm, turn {np.median(turns):.4f} deg (median); "
+        f"within 95 % intervals {100 * own.mean():.1f} %, with the sensor taken as exact {100 * exact.mean():.1f} %"
+    )
+
+
+def main(campaigns: int) -> None:
     """Print the table of the documentation."""
     rows = []
     for poses, robot, noise, radius in [
@@ -80,4 +108,8 @@ def _of(campaign: Campaign) -> tuple[list[np.ndarray], np.ndarray]:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+    parser = argparse.ArgumentParser()
+    parser.add_argument("campaigns", type=int)
+    parser.add_argument("--sensors", action="store_true")
+    given = parser.parse_args()
+    (by_sensors if given.sensors else main)(given.campaigns)

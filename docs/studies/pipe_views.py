@@ -1,10 +1,10 @@
 """A 300 mm pipe from five sides: diameter, ovality and closure of the registered scans against the truth.
 
-    python -m docs.studies.pipe_views --campaigns 5
+    python -m docs.studies.pipe_views --campaigns 5 --one-sensor
 
 Scans are those of `tests/uwlts/pipe_views.py`: an oval pipe, noise of 0.02 mm along the rays, errors that all points of
 a scan share (scale, bow and tilt of 0.03 mm at the ends of the stripe, times ``--systematic``), and a start that is
-wrong by up to 2 mm and 0.5 deg.
+wrong by up to 2 mm and 0.5 deg. These errors are those of each scan, or of all scans of a campaign (``--one-sensor``).
 """
 
 import argparse
@@ -21,11 +21,12 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--campaigns", type=int, default=5)
     parser.add_argument("--systematic", type=float, default=0.3)
+    parser.add_argument("--one-sensor", action="store_true")
     given = parser.parse_args()
     rows = []
     for campaign in range(given.campaigns):
         rng = np.random.default_rng(campaign)
-        scans, _, wrong = views(rng, radius=oval, systematic=given.systematic)
+        scans, _, wrong = views(rng, radius=oval, systematic=given.systematic, one_sensor=given.one_sensor)
         found = uwlts.register(scans, poses=wrong)
         pipe = evaluate_pipe(found.cloud.points_mm, PipeStandard(diameter_mm=2 * RADIUS_MM))
         closures = [pair.closure_mm for pair in found.pairs if pair.closure_mm is not None]

@@ -1,8 +1,9 @@
 """Mounts from rendered robot campaigns: errors, coverage, and points on the sphere from poses that were held out.
 
-Of each campaign the robot's capture of a sphere and its truth are read; the sensor's calibration is given:
+Sensors, their calibrations and the robot's captures of a sphere, with their truth, are those of `moving_recordings.py`:
 
-    python docs/studies/robot_campaigns.py calibration.json FOLDER/robot-*.h5
+    python docs/studies/moving_recordings.py FOLDER robot-sphere --sensors 1 2 3 4 5 --seeds 0 1
+    python docs/studies/robot_campaigns.py FOLDER
 """
 
 import sys
@@ -15,7 +16,7 @@ from stripe_tables import table
 import uwlts
 from twin.scene.description import Scene
 from twin.scene.platforms import Robot
-from uwlts.calibration.mount import profiles_of
+from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of
 from uwlts.metrology.fits import fit_sphere
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount, SphereFound
@@ -25,11 +26,10 @@ FOR_THE_MOUNT = 15
 RADIUS_MM = 19.05
 
 
-def scatter_mm(profiles: list[np.ndarray], poses: np.ndarray, mount: np.ndarray, centre_mm: np.ndarray) -> float:
+def scatter_mm(captured: CapturedProfiles, mount: np.ndarray, centre_mm: np.ndarray) -> float:
     """Root mean square distance of the points on a sphere of known radius from that which fits them best."""
-    points = np.vstack(
-        [p @ (pose @ mount)[:3, :3].T + (pose @ mount)[:3, 3] for p, pose in zip(profiles, poses, strict=True)]
-    )
+    placed = captured.poses @ mount
+    points = np.vstack([p @ pose[:3, :3].T + pose[:3, 3] for p, pose in zip(captured.profiles, placed, strict=True)])
     for _ in range(5):
         near = np.abs(np.linalg.norm(points - centre_mm, axis=1) - RADIUS_MM) < 0.5
         fit = fit_sphere(points[near], RADIUS_MM)
@@ -37,50 +37,55 @@ def scatter_mm(profiles: list[np.ndarray], poses: np.ndarray, mount: np.ndarray,
     return float(np.sqrt(np.mean(fit.residuals_mm**2)))
 
 
-def main(calibration_path: str, *paths: str) -> None:
+def errors(mount: Mount, true: np.ndarray) -> np.ndarray:
+    """Error (6,) of translation, mm, and rotation, rad, about the platform's axes."""
+    found = mount.transform()
+    turn = Rotation.from_matrix(true[:3, :3] @ found[:3, :3].T).as_rotvec()
+    return np.append(true[:3, 3] - found[:3, 3], turn)
+
+
+def main(folder: Path) -> None:
     """Print the table of the documentation."""
-    calibration = uwlts.load_calibration(calibration_path)
-    assert isinstance(calibration, Calibration)
-    figures: dict[str, list[tuple[float, float, float, float, float]]] = {}
-    within: dict[str, list[np.ndarray]] = {}
-    for path in paths:
+    figures: dict[str, list[tuple[float, ...]]] = {}
+    for path in sorted(folder.glob("sensor-*/robot-sphere-*.h5")):
+        if ".truth." in path.name:
+            continue
+        calibration = uwlts.load_calibration(path.parent / "calibration.json")
+        assert isinstance(calibration, Calibration)
         header, truth = read_truth(truth_path(path))
         motion = Scene.model_validate(header.scene).motion
         assert isinstance(motion, Robot) and truth.pose is not None
         true = (motion.true_mount or motion.mount).matrix()
         with uwlts.open_capture(path) as capture:
-            profiles, reported, _, _ = profiles_of(capture, calibration, None, None)
-        for name, poses in {"ideal": truth.pose @ np.linalg.inv(true), "as reported": reported}.items():
-            mount = uwlts.calibrate_mount(profiles[:FOR_THE_MOUNT], poses[:FOR_THE_MOUNT], radius_mm=RADIUS_MM)
-            shift, turn = errors(mount, true)
-            assert isinstance(mount.artefact, SphereFound)
-            centre = np.array(mount.artefact.centre_mm)
-            held = profiles[FOR_THE_MOUNT:], poses[FOR_THE_MOUNT:]
-            ratio = scatter_mm(*held, mount.transform(), centre) / scatter_mm(*held, true, centre)
-            row = (
-                np.linalg.norm(shift),
-                np.degrees(np.linalg.norm(turn)),
-                ratio,
-                mount.point_std_mm,
-                mount.pose_std_mm,
+            reported = profiles_of(capture, calibration, None, None)
+        ideal = profiles_of_poses(reported, truth.pose @ np.linalg.inv(true))
+        for name, captured in {"ideal": ideal, "as reported": reported}.items():
+            first, held = (
+                captured.selected(each) for each in np.split(np.arange(len(captured.poses)), [FOR_THE_MOUNT])
             )
+            mount = uwlts.calibrate_mount(first, radius_mm=RADIUS_MM)
+            assert isinstance(mount.artefact, SphereFound) and mount.sensor is not None
+            off, centre = errors(mount, true), np.array(mount.artefact.centre_mm)
+            ratio = scatter_mm(held, mount.transform(), centre) / scatter_mm(held, true, centre)
+            sizes = np.linalg.norm(off[:3]), np.degrees(np.linalg.norm(off[3:]))
+            apart = np.sqrt(np.diag(mount.sensor.covariance_apart))
+            within = [np.mean(np.abs(off) < mount.coverage_factor * std) for std in (mount.std(), apart)]
+            row = (*sizes, ratio, mount.point_std_mm, mount.pose_std_mm, *within)
             figures.setdefault(name, []).append(tuple(map(float, row)))
-            within.setdefault(name, []).append(np.abs([*shift, *turn]) < mount.coverage_factor * mount.std())
-            print(path, name, row, within[name][-1], file=sys.stderr)
+            print(path, name, np.round(row, 4), np.round(off / mount.std(), 2), mount.std(), file=sys.stderr)
     rows = []
     for name, values in figures.items():
         mean = np.mean(values, axis=0)
         cells = [f"{mean[0]:.3f}", f"{mean[1]:.4f}", f"{mean[2]:.3f}", f"{mean[3]:.3f}", f"{mean[4]:.3f}"]
-        rows.append([name, str(len(values)), *cells, f"{100 * np.mean(within[name]):.0f} %"])
+        rows.append([name, str(len(values)), *cells, *(f"{100 * share:.0f} %" for share in mean[5:])])
     head = ["robot", "campaigns", "shift mm", "turn deg", "held-out over the robot's own", "noise mm", "robot mm"]
-    print(table([*head, "within 95 % interval"], rows))
+    print(table([*head, "within 95 % interval", "sensor taken as exact"], rows))
 
 
-def errors(mount: Mount, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Error of translation (3,), mm, and rotation (3,), rad, about the platform's axes."""
-    found = mount.transform()
-    return true[:3, 3] - found[:3, 3], Rotation.from_matrix(true[:3, :3] @ found[:3, :3].T).as_rotvec()
+def profiles_of_poses(captured: CapturedProfiles, poses: np.ndarray) -> CapturedProfiles:
+    """The same profiles with other poses."""
+    return CapturedProfiles(**{**vars(captured), "poses": poses})
 
 
 if __name__ == "__main__":
-    main(*map(str, map(Path, sys.argv[1:])))
+    main(Path(sys.argv[1]))

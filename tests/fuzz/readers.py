@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import cv2
+import laspy
 import numpy as np
 import trimesh
 
@@ -132,6 +133,16 @@ def _plain_cloud(path: Path) -> None:
 def _text_cloud(path: Path) -> None:
     names = "".join(f"property float {axis}\n" for axis in "xyz")
     path.write_text(f"ply\nformat ascii 1.0\nelement vertex 3\n{names}end_header\n1 2 3\n4 5 6\n7 8 9\n")
+
+
+def _foreign(path: Path) -> None:
+    export_cloud(some_cloud(), path)
+
+
+def _las(path: Path) -> None:
+    table = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
+    table.x, table.y, table.z = 1e-3 * some_cloud().points_mm.T
+    table.write(path)
 
 
 def _sensor_with(path: Path) -> None:
@@ -298,6 +309,10 @@ READERS = {
         Reader("cloud-ply", ".ply", "lines", _cloud, read_cloud),
         Reader("cloud-text", ".ply", "lines", _text_cloud, read_cloud),
         Reader("export", ".ply", "lines", _plain_cloud, _exported),
+        *(
+            Reader(f"cloud-{kind}", f".{kind}", form, make, read_cloud)
+            for kind, form, make in (("xyz", "lines", _foreign), ("las", "bytes", _las), ("e57", "bytes", _foreign))
+        ),
         Reader("sensor", ".toml", "toml", _shipped("sensors/thesis.toml"), load_sensor),
         Reader("sensor-shown", ".toml", "toml", _shipped("sensors/thesis.toml"), describe),
         Reader("scene", ".toml", "toml", _shipped("spheres.toml"), load_scene),

@@ -64,11 +64,13 @@ def scan_from(
     radius: Radius = oval,
     noise_mm: float = NOISE_MM,
     systematic: float = 0.0,
+    amounts: np.ndarray | None = None,
 ) -> PointCloud:
     """What a sensor at a pose sees while it goes along its X: a fan in its YZ plane, noise along the rays.
 
     ``systematic`` scales errors that all points share: a scale along Y, a bow of the sheet and a tilt, each of standard
-    deviation one in units that are stated as patterns.
+    deviation one in units that are stated as patterns. ``amounts`` (3,) are those of a calibration that scans have in
+    common; else they are drawn.
     """
     fan = np.radians(np.linspace(-FAN_DEG / 2, FAN_DEG / 2, RAYS))
     rays = np.column_stack([np.zeros(RAYS), np.sin(fan), np.cos(fan)])
@@ -110,17 +112,29 @@ def scan_from(
         ),
         np.zeros((count, 3)),
         max(systematic, 1e-3) * patterns,
+        shared={} if amounts is None else {"sensor": np.eye(3)},
     )
     moved = local + noise_mm * rng.standard_normal(count)[:, None] * beam
-    moved += systematic * np.tensordot(rng.standard_normal(3), patterns, axes=1)
+    moved += systematic * np.tensordot(rng.standard_normal(3) if amounts is None else amounts, patterns, axes=1)
     return PointCloud(moved, np.full(count, 100.0), frame, line, uncertainty=known, metadata={"medium": "water"})
 
 
 def views(
-    rng: np.random.Generator, *, count: int = 5, shift_mm: float = 2.0, turn_deg: float = 0.5, **how: object
+    rng: np.random.Generator,
+    *,
+    count: int = 5,
+    shift_mm: float = 2.0,
+    turn_deg: float = 0.5,
+    one_sensor: bool = False,
+    **how: object,
 ) -> tuple[list[PointCloud], np.ndarray, np.ndarray]:
-    """Scans from ``count`` sides, their true poses (N, 4, 4) in the frame of the first, and wrong poses."""
+    """Scans from ``count`` sides, their true poses (N, 4, 4) in the frame of the first, and wrong poses.
+
+    ``one_sensor``: all are by one calibration, else each by its own.
+    """
     true = np.array([side_pose(angle) for angle in 2 * np.pi * np.arange(count) / count])
+    if one_sensor:
+        how["amounts"] = rng.standard_normal(3)
     scans = [scan_from(pose, rng, **how) for pose in true]
     true = np.linalg.inv(true[0]) @ true
     wrong = true.copy()

@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from twin.design.figures import FIGURES
@@ -74,6 +75,14 @@ class Variable(Description):
     def taken(self, value: Value) -> Value:
         """The value as a design takes it: rounded if it has to be whole."""
         return round(float(value)) if self.whole and self.values is None else value
+
+    def drawn(self, shares: np.ndarray) -> list[Value]:
+        """Values at shares (N,) as designs take them: as of `at` and `taken`."""
+        if self.values is not None or self.scale == "log":
+            return [self.taken(self.at(share)) for share in shares.tolist()]
+        least, most = self.ends()
+        values = least + shares * (most - least)
+        return np.rint(values).astype(int).tolist() if self.whole else values.tolist()
 
     def grid(self) -> list[Value]:
         """All values of a grid."""

@@ -139,11 +139,13 @@ def _parameters(study: Study, designs: Sequence[Design]) -> tuple[SensorArrays |
         sensor = sensor_of(study, design, described=described)
         return numbers_of(sensor, study.medium_of(sensor))
 
-    values = np.array([[float(design.values[path]) for path in alone] for design in designs])
-    values = values.reshape(len(designs), len(alone))
+    values = np.empty((len(designs), len(alone)))
+    for k, path in enumerate(alone):
+        values[:, k] = [float(design.values[path]) for design in designs]
+    besides = [name for name in study.free() if name not in alone]
     alike: dict[tuple[Value, ...], list[int]] = {}
     for place, design in enumerate(designs):
-        alike.setdefault(tuple(v for path, v in design.values.items() if path not in alone), []).append(place)
+        alike.setdefault(tuple([design.values[name] for name in besides]), []).append(place)
     for places in alike.values():
         first, ends = designs[places[0]], zip(values[places].min(axis=0), values[places].max(axis=0), strict=True)
         corners = list(product(*(dict.fromkeys(map(float, pair)) for pair in ends)))
@@ -227,7 +229,7 @@ def designs_of(study: Study, first: int, count: int) -> list[Design]:
     if study.sampling.kind == "grid":
         grids = [variable.grid() for variable in free.values()]
         places = np.unravel_index(np.array(numbers), [len(grid) for grid in grids])
-        chosen = ([grid[k] for grid, k in zip(grids, row, strict=True)] for row in zip(*places, strict=True))
+        columns = [[grid[k] for k in row.tolist()] for grid, row in zip(grids, places, strict=True)]
     else:
         variables, seed = len(free), study.sampling.seed
         if study.sampling.kind == "random":
@@ -240,7 +242,7 @@ def designs_of(study: Study, first: int, count: int) -> list[Design]:
                 if numbers.start > 0:
                     sequence.fast_forward(numbers.start)
                 shares = sequence.random(len(numbers))
-        chosen = ([v.taken(v.at(float(s))) for v, s in zip(free.values(), row, strict=True)] for row in shares)
-    return [
-        Design(number, dict(zip(free, values, strict=True))) for number, values in zip(numbers, chosen, strict=True)
-    ]
+        columns = [v.drawn(s) for v, s in zip(free.values(), shares.reshape(-1, variables).T, strict=True)]
+    # Tuples of values, one after the other: names are put to them last.
+    rows = zip(*columns, strict=True)
+    return [Design(number, dict(zip(free, row, strict=True))) for number, row in zip(numbers, rows, strict=True)]

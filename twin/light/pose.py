@@ -72,6 +72,15 @@ class SensorPose:
             if rate := float(np.linalg.norm(turn)):
                 self._axis, self._rate = mi.Vector3f(opaque_point(turn / rate)), opaque(rate)
 
+    def equals(self, other: SensorPose) -> bool:
+        """Whether the sensor stands and travels as at another pose."""
+        if not np.array_equal(self.scene_from_object, other.scene_from_object):
+            return False
+        if self.travel is None or other.travel is None:
+            return self.travel is other.travel
+        pairs = zip(vars(self.travel).values(), vars(other.travel).values(), strict=True)
+        return all(np.array_equal(mine, theirs) for mine, theirs in pairs)
+
     def moved(self, after_s: float) -> SensorPose:
         """The pose after a time, standing still."""
         assert self.travel is not None

@@ -122,6 +122,8 @@ class Renderer:
         self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 4 * scatterings * (1 + scatterings))
         self._scatters = self.scattering.coefficient > 0 and (effects.haze or effects.multiple_scattering)
         self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
+        # Where the first laser's own stripe is, of the last frame: its truth asks for the same.
+        self._own_stripe: tuple[SensorPose, np.ndarray] | None = None
 
     def irradiance(
         self, light: LightName, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
@@ -189,20 +191,22 @@ class Renderer:
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of the pixels whose chief rays meet the first laser's own stripe."""
-        bundle, shape = self.view.grid(NODE_SPACING_PX)
-        direct, _ = lights(self._sheets[:1], pose)
-        near = [
-            near_sheet(self._sigmas(light, next(self._segments(moment, bundle, None))).numpy().reshape(shape))
-            for moment, (light, *_) in self._moments(pose, direct)
-        ]
-        rows, columns = np.nonzero(self._repeated(np.any(near, axis=0)))
+        if self._own_stripe is None or not pose.equals(self._own_stripe[0]):
+            bundle, shape = self.view.grid(NODE_SPACING_PX)
+            direct, _ = lights(self._sheets[:1], pose)
+            near = [
+                near_sheet(self._sigmas(light, next(self._segments(moment, bundle, None))).numpy().reshape(shape))
+                for moment, (light, *_) in self._moments(pose, direct)
+            ]
+            self._own_stripe = pose, np.any(near, axis=0)
+        rows, columns = np.nonzero(self._repeated(self._own_stripe[1]))
         return rows, columns
 
-    def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> Float:
-        """Irradiance of the first laser's light per ray in W/mm2: the lit surface seen straight, nothing around it."""
+    def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> tuple[Float, RaySegment]:
+        """Irradiance of the first laser's light per ray in W/mm2, of the surface seen straight alone, and the rays."""
         direct, _ = lights(self._sheets[:1], pose)
         segment = next(self._segments(pose, bundle, after_s))
-        return segment.weight * self._radiance(pose, segment, direct, after_s)
+        return segment.weight * self._radiance(pose, segment, direct, after_s), segment
 
     # --- the lit surface ----------------------------------------------------------------------------------------------
 
@@ -233,7 +237,7 @@ class Renderer:
         """Cells (rows, columns) close to the lit stripe, the haze (H, W) in W/mm2, and the surfaces of `Sources`."""
         bundle, shape = self.view.grid(NODE_SPACING_PX)
         lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
-        reach = np.zeros_like(lit, np.float32)
+        own, reach = lit.copy(), np.zeros_like(lit, np.float32)
         image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
         surfaces: list[Float] = []
         for moment, sources in self._moments(pose, direct + mirrored):
@@ -248,15 +252,20 @@ class Renderer:
                         haze += bundle.weight * self._haze(light, segment, sigmas)
                 reached = [light.may_reach(segment.end(), light.at(segment.end())) for light in sources]
                 dr.eval(depth, haze, surfaces, *across, *reached)
-                near = np.zeros_like(lit)
-                for sigmas, there in zip(across, reached, strict=True):
-                    near |= near_sheet(sigmas.numpy().reshape(shape), there.numpy().reshape(shape))
+                stripes = [
+                    near_sheet(sigmas.numpy().reshape(shape), there.numpy().reshape(shape))
+                    for sigmas, there in zip(across, reached, strict=True)
+                ]
+                near = np.any(stripes, axis=0)
+                if index == 0:
+                    own |= stripes[0]
                 if self.effects.defocus and near.any():
                     blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
                     reach = np.maximum(reach, np.where(near, over_corners(np.maximum, blur), 0))
                 lit |= near
             if moment is pose and dr.width(haze) > 1:
                 image = self._repeated(0.25 * over_corners(np.add, haze.numpy().reshape(shape)))
+        self._own_stripe = pose, own
         over_cells = [0.25 * over_corners(np.add, each.numpy().reshape(shape)) for each in surfaces]
         return widened(lit, reach), image, np.array(over_cells).reshape(-1, *lit.shape)
 

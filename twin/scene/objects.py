@@ -47,11 +47,13 @@ class Objects:
     """All objects in scene coordinates, with properties of the places hit that Mitsuba's shapes do not provide.
 
     ``scene`` holds what scatters light; ``mirrors`` are the faces that reflect beside that. Tables give a fact of each
-    shape at its number in Dr.Jit's registry, which counts through all scenes of the process.
+    shape at its number in Dr.Jit's registry, which counts through all scenes of the process. With ``coherent`` rays
+    that lie side by side are best followed together: through facets, not through spheres and cylinders.
     """
 
     scene: mi.Scene
     mirrors: tuple[MirrorFace, ...]
+    coherent: bool
     _facts: dict[str, Float]
 
     def mirror_share(self, si: SurfaceInteraction3f) -> Float:
@@ -128,6 +130,7 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
     whole = mi.load_dict(whole | {f"object_{i}": shape for i, shape in enumerate(shapes)}, optimize=False)
     return Objects(
         scene=whole,
+        coherent=any(shape.is_mesh() for shape in shapes),
         mirrors=tuple(face for thing, pose in placed if gloss for face in _mirror_faces(thing, pose)),
         _facts={key: _by_registry(shapes, np.array(values, float)) for key, values in facts.items()},
     )

@@ -3,18 +3,23 @@
 A rough surface in coherent light forms on the image sensor a circular complex Gaussian field whose spatial frequencies
 end at the lens's aperture. Its intensity is summed over the pixels and over what does not interfere: the polarisations
 and, for a laser of some line width, its colours. What is left is a factor of mean 1 for every pixel of the image.
+
+Such a sum is one of independent exponential variables with weights l_i of sum 1: the eigenvalues of the coherence over
+the pixel, times those of the colours, times the shares of the polarisations (Goodman, Speckle Phenomena in Optics,
+Sec. 4.7). Its variance is sum l_i^2 and its third cumulant 2 sum l_i^3; both sums are products of those of the three
+causes. One exponential pattern is computed, with the correlation that sums over pixels have, and brought to a
+distribution with these cumulants: drawing every variable takes a hundred times as long where a pixel holds many grains.
 """
 
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import cache
 from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import fft
+from scipy import fft, ndimage, special
 from scipy.special import j1
 
 from uwlts.model.errors import DesignError, ImageError, RangeError
@@ -24,22 +29,26 @@ from uwlts.model.sensor import Camera
 _TILE_PX = 64
 _TILE_GRAINS = 16
 
-# Finest grain that is computed, as a part of a pixel, and widest, in pixels.
-_FINEST_PX = 1 / 6
+# Widest grain in pixels.
 _WIDEST_PX = 64.0
+# Up to this grain, in pixels, a field has the correlation of sums over pixels (to 0.01); wider grains are those of a
+# lens whose grain squared is larger by so many pixels squared (to 0.025 at first, to 0.005 from 4 pixels on).
+_FINE_PX, _WIDENED_PX2 = 1.25, 0.75
+# Finest grain, in pixels, whose sums' correlation is computed: that of neighbours is 0.02, and less for finer ones.
+_UNCORRELATED_PX = 0.1
+# Finest grain, in pixels, whose sums' third cumulant is computed: what it exceeds that of equal variables by comes from
+# the pixel's border, and so goes with the grain.
+_BORDER_PX = 0.3
 
 # Renewal length by the resolution cell: the field's correlation then falls to one half where that of a moved Airy
 # pattern does (see `renewal_correlation`).
 _RENEWAL_CELLS = 0.9
 _RENEWAL_GROUPS = 8
 
-# Independent patterns that stand for the colours of a laser: at most so many, none below this part of the first.
-_LOOKS = 4
-_FAINTEST_LOOK = 0.01
 _LEAST_CONTRAST = 1e-4
 
-# Patterns made at a time: each needs some ten megabytes, with a fast lens a hundred.
-_THREADS = 2
+# Nodes of the table of distributions: half the skewness, and the cube root of an exponential variable up to 27.
+_SKEWS, _ROOTS, _LARGEST_ROOT = 65, 513, 3.0
 
 
 class Speckle:
@@ -71,8 +80,8 @@ class Speckle:
         self.renewal_mm = _RENEWAL_CELLS * grain_mm / magnification
         self._seed = seed
         self._along_width = camera.stripe_along == "width"
-        self._tile = _Tile(camera.lines(), max(grain_px, _FINEST_PX))
-        self._strength = 1.0 if grain_px >= _FINEST_PX else pixel_contrast(grain_px) / pixel_contrast(_FINEST_PX)
+        self._pixel = pixel_contrast(grain_px) ** 2, _third_of_pixel(grain_px)
+        self._tile = _Tile(camera.lines(), grain_px)
 
     def factors(
         self,
@@ -90,9 +99,10 @@ class Speckle:
         polarisation P of the scattered light, (P,) or one for all, 0 to 1: 1 for bare metal, about 0 for paint and
         plastics, in which light is scattered many times. ``coherence``, (P,) or one for all, is the contrast of the
         unintegrated pattern of one polarisation, 0 to 1 (see the function `coherence`), below 1e-4 taken for that; it
-        multiplies the contrast, as averaging over the pixel's area does (`pixel_contrast`). For how the pattern changes
-        with the travel see `renewal_correlation`. ImageError where a pixel lies outside the image, RangeError where
-        travel, polarisation or coherence is not finite or outside its range.
+        multiplies the contrast, as averaging over the pixel's area does (`pixel_contrast`). All have the same grains:
+        where many patterns add up, the correlation from pixel to pixel is smaller than that of one by at most a fifth
+        of itself. For how the pattern changes with the travel see `renewal_correlation`. ImageError where a pixel lies
+        outside the image, RangeError where travel, polarisation or coherence is not finite or outside its range.
         """
         # Small integers would overflow where a pixel's place in the tile is counted.
         rows, columns = (np.asarray(values).astype(np.intp, casting="same_kind") for values in (rows, columns))
@@ -104,24 +114,18 @@ class Speckle:
                 f"row {rows[worst]}, column {columns[worst]} lies outside the image of {height} rows and {width} "
                 "columns: ask for pixels of the image only"
             )
-        travel = float(_within("the travel in mm", travel_mm, -math.inf, math.inf))
-        polarised = _within("the degree of polarisation", polarisation, 0.0, 1.0)
-        looks = _look_weights(self._strength * _within("the coherence", coherence, 0.0, 1.0))
-        shares = [(1 + polarised) / 2, (1 - polarised) / 2]
-        weights = dict(enumerate((look * share).astype(np.float32) for look in looks for share in shares))
-        weights = {number: weight for number, weight in weights.items() if np.any(weight > 0)}
+        position = float(_within("the travel in mm", travel_mm, -math.inf, math.inf)) / self.renewal_mm
+        polarised = np.square(_within("the degree of polarisation", polarisation, 0.0, 1.0))
+        coherent = np.square(np.maximum(_within("the coherence", coherence, 0.0, 1.0), _LEAST_CONTRAST))
+        squares, cubes = self._pixel
+        # Of the colours of a Gaussian line (`coherence`), whose weights go as r^k, C^2 = (1 - r) / (1 + r).
+        variance = squares * coherent * (1 + polarised) / 2
+        cubes = cubes * 4 * np.square(coherent) / (3 + np.square(coherent)) * (1 + 3 * polarised) / 4
         along, across = (columns, rows) if self._along_width else (rows, columns)
-        place = along * self._tile.across_px + across % self._tile.across_px
-        result = np.full(rows.shape, 1 - looks.sum(axis=0), np.float32)
-        with ThreadPoolExecutor(_THREADS) as pool:
-            patterns = pool.map(partial(self._pattern, position=travel / self.renewal_mm), weights)
-            for weight, pattern in zip(weights.values(), patterns, strict=True):
-                result += weight * pattern.ravel()[place]
-        return result
-
-    def _pattern(self, number: int, *, position: float) -> np.ndarray:
-        """Intensity (along, across) of one of the independent patterns, ``position`` in renewal lengths."""
-        return self._tile.intensity(_amplitudes(self._tile.size, self._seed, number, position))
+        pattern = self._tile.intensity(_amplitudes(self._tile.size, self._seed, position))
+        intensity = pattern[across % self._tile.across_px, along]
+        factors = 1 + np.sqrt(variance) * _shaped(intensity, cubes / variance**1.5)
+        return np.maximum(factors, 0.0).astype(np.float32)
 
 
 def coherence(
@@ -178,55 +182,121 @@ def renewal_correlation(lag: ArrayLike) -> np.ndarray:
 
 
 class _Tile:
-    """Periodic piece of the pattern, as long as the stripe, from amplitudes of the spatial frequencies of the aperture.
-
-    The lens passes frequencies within a disc of diameter 1 / (lambda N (1 + m)) (Goodman, Introduction to Fourier
-    Optics, Sec. 6.2). Moving the disc off the origin changes only the field's phase, so it starts at frequency zero.
-    """
+    """Periodic piece of the pattern, as long as the stripe, from amplitudes of spatial frequencies."""
 
     def __init__(self, along_px: int, grain_px: float) -> None:
         least = math.ceil(_TILE_GRAINS * grain_px)
         apart = math.ceil(2 * grain_px)  # the ends of the stripe are neighbours in the tile
         self.across_px = cast(int, fft.next_fast_len(max(_TILE_PX, least)))
-        self.along_px = cast(int, fft.next_fast_len(max(along_px + apart, least)))
-        # Sums of so many samples per pixel, corrected as in `_over_pixels`, meet `pixel_contrast` to 1 %.
-        self._samples = math.ceil(1.2 / grain_px + 0.7)
-        across, along = (_frequencies(length / grain_px) for length in (self.across_px, self.along_px))
-        disc = np.hypot(across[:, None], along) <= 0.5
-        self._box = disc.shape
-        self._bins = np.flatnonzero(disc)
-        self.size = len(self._bins)
+        along_px = cast(int, fft.next_fast_len(max(along_px + apart, least)))
+        if grain_px <= _FINE_PX:
+            power = _power_of_sums(self.across_px, along_px, grain_px)
+        else:
+            # The lens passes frequencies within a disc of diameter 1 / (lambda N (1 + m)) (Goodman, Introduction to
+            # Fourier Optics, Sec. 6.2).
+            radius = 0.5 / math.sqrt(grain_px**2 + _WIDENED_PX2)
+            power = np.hypot(fft.fftfreq(self.across_px)[:, None], fft.fftfreq(along_px)) <= radius
+        self._shape, self._bins = power.shape, np.flatnonzero(power)
+        self._amplitude = np.sqrt(power.ravel()[self._bins] / power.sum()).astype(np.float32)
+        self.size = self._bins.size
 
     def intensity(self, amplitudes: np.ndarray) -> np.ndarray:
-        """Intensity (along, across) averaged over pixels; its mean is the mean square of the amplitudes (size,)."""
-        spectrum = np.zeros(self._box, np.complex64)
-        spectrum.ravel()[self._bins] = amplitudes * np.float32(1 / math.sqrt(self.size))
-        rows, columns = self._samples * self.across_px, self._samples * self.along_px
-        field = np.asarray(fft.ifft(spectrum, columns, axis=1, norm="forward"))
-        field = np.asarray(fft.ifft(field, rows, axis=0, norm="forward", overwrite_x=True))
-        fine = np.square(np.real(field)) + np.square(np.imag(field))
-        return _over_pixels(np.ascontiguousarray(_over_pixels(fine, self._samples).T), self._samples)
+        """Intensity (across, along), exponential, whose mean is the mean square of the amplitudes (size,)."""
+        spectrum = np.zeros(self._shape, np.complex64)
+        spectrum.ravel()[self._bins] = amplitudes * self._amplitude
+        field = np.asarray(fft.ifft2(spectrum, norm="forward", overwrite_x=True))
+        return np.square(np.real(field)) + np.square(np.imag(field))
 
 
-def _frequencies(grains: float) -> np.ndarray:
-    """Frequencies within the disc's diameter in units of it, centred, of a period that is so many grains long."""
-    most = math.floor(grains / 2)
-    return np.arange(-most, most + 1) / grains
+def _power_of_sums(across_px: int, along_px: int, grain_px: float) -> np.ndarray:
+    """Relative power (across, along) of a field whose intensities are correlated as fine grains' sums over pixels.
 
-
-def _over_pixels(fine: np.ndarray, samples: int) -> np.ndarray:
-    """Means (R, C) over pixels of so many rows each of ``fine`` (samples R, C), which is periodic.
-
-    The mean of f over an interval h is f + f'' h^2 / 24 at its middle, but for the fourth derivative. Of the second
-    differences that stand for f'', only those at the pixel's ends are left in the sum. No weight is negative.
+    The correlation of fields is the root of that of their intensities. The intensities are still to be reshaped, which
+    takes a share of their correlation: it is made up for, for light of one colour and polarisation.
     """
-    cells = fine.reshape(-1, samples, fine.shape[1])
-    first, last = cells[:, 0], cells[:, -1]
-    ends = np.roll(first, -1, axis=0) - last + np.roll(last, 1, axis=0) - first
-    return (cells.sum(axis=1) + ends / 24) / samples
+    correlation = _correlation_of_sums(grain_px)
+    wanted = correlation / correlation[0, 0]
+    # By Mehler's formula for exponential variables, whose polynomials are Laguerre's, the n-th term of what they are
+    # reshaped to is correlated by the n-th power.
+    nodes, weights = np.polynomial.laguerre.laggauss(48)
+    shaped = _shaped(nodes, _third_of_pixel(grain_px) / pixel_contrast(grain_px) ** 3)
+    terms = np.square((weights * shaped) @ np.polynomial.laguerre.lagvander(nodes, 12))[1:]
+    drawn = np.linspace(0, 1, 1001)
+    reshaped = np.polynomial.polynomial.polyval(drawn, np.concatenate([[0.0], terms / terms.sum()]))
+    field = np.sqrt(np.interp(wanted, reshaped, drawn))
+
+    def waves(length: int) -> np.ndarray:
+        lags = np.arange(len(field))
+        return np.cos(2 * math.pi / length * np.arange(length)[:, None] * lags) * np.where(lags > 0, 2.0, 1.0)
+
+    return np.maximum(waves(across_px) @ field @ waves(along_px).T, 0.0)
 
 
-def _amplitudes(size: int, seed: int, pattern: int, position: float) -> np.ndarray:
+def _correlation_of_sums(grain_px: float) -> np.ndarray:
+    """Covariance (L, L) of intensities summed over two pixels that lie so many rows and columns apart.
+
+    It is the mean of |2 J1(z) / z|^2, as in `pixel_contrast`, over pairs of points of both pixels.
+    """
+    grain = max(grain_px, _UNCORRELATED_PX)
+    reach = math.ceil(4 + 4 * grain)
+    nodes, weights = np.polynomial.legendre.leggauss(5 + math.ceil(4 / grain))
+    part, weights = (1 + nodes) / 2, weights / 2
+    count = len(part)
+    places = (np.arange(-1, reach + 1)[:, None] + part).ravel()
+    # Points so far apart are found within two pixels more often, then less often, the farther they are apart.
+    pairs = np.zeros((reach + 1, places.size))
+    for lag, row in enumerate(pairs):
+        row[lag * count : (lag + 2) * count] = np.concatenate([weights * part, weights * (1 - part)])
+    return pairs @ _airy(np.hypot(places[:, None], places) / grain) ** 2 @ pairs.T
+
+
+@cache
+def _third_of_pixel(grain_px: float) -> float:
+    """Half the third cumulant of a coherent, polarised pattern averaged over square pixels; see `pixel_contrast`.
+
+    It is the mean of 2 J1(z) / z over the three pairs of triples of points of the pixel, times each other.
+    """
+    grain = max(grain_px, _BORDER_PX)
+    nodes, weights = np.polynomial.legendre.leggauss(max(7, math.ceil(5 / grain)))
+    x, y = (each.ravel() for each in np.meshgrid(nodes / 2, nodes / 2))
+    root = np.sqrt(np.outer(weights, weights).ravel() / 4)
+    coherence = root[:, None] * _airy(np.hypot(x[:, None] - x, y[:, None] - y) / grain) * root
+    twice = coherence @ coherence
+    excess = float(np.sum(twice * coherence) / np.trace(twice) ** 2) - 1
+    return pixel_contrast(grain_px) ** 4 * (1 + excess * min(1.0, grain_px / _BORDER_PX))
+
+
+def _airy(grains: np.ndarray) -> np.ndarray:
+    """Correlation 2 J1(z) / z of the field at distances in grains."""
+    z = math.pi * np.maximum(grains, 1e-9)
+    return 2 * j1(z) / z
+
+
+def _shaped(exponential: np.ndarray, skew: ArrayLike) -> np.ndarray:
+    """Numbers (P,) of mean 0, variance 1 and of half the skewness ``skew``, 0 to 1, that grow with exponential ones."""
+    places = np.empty((2, len(exponential)))
+    places[0], places[1] = np.multiply(skew, _SKEWS - 1), np.cbrt(exponential) * ((_ROOTS - 1) / _LARGEST_ROOT)
+    return ndimage.map_coordinates(_shapes(), places, order=1, mode="nearest")
+
+
+@cache
+def _shapes() -> np.ndarray:
+    """Quantiles (skews, roots) of distributions of mean 0 and variance 1 at those of an exponential variable.
+
+    ``skews`` are halves of the skewness from 0 to 1, ``roots`` cube roots of the exponential variable. The
+    distributions are Pearson's of type III, shifted gamma distributions, which stand for sums of exponential variables
+    with the same three cumulants (Buckley and Eagleson, Austral. J. Statist. 30A, 150, 1988). They are exact for equal
+    variables, and never reach below what sums can.
+    """
+    roots = np.linspace(0, _LARGEST_ROOT, _ROOTS)
+    above = np.exp(-(roots**3))
+    shape = 1 / np.square(np.linspace(0, 1, _SKEWS)[1:, None])
+    normal = -special.ndtri(above)
+    normal[0] = 2 * normal[1] - normal[2]  # not minus infinity
+    return np.vstack([normal, (special.gammainccinv(shape, above) - shape) / np.sqrt(shape)])
+
+
+def _amplitudes(size: int, seed: int, position: float) -> np.ndarray:
     """Circular complex Gaussian amplitudes (size,), complex64, of mean square 1 at a position in renewal lengths.
 
     Independent draws belong to the nodes of a lattice; between two nodes their cosine and sine weighted sum is taken.
@@ -238,34 +308,18 @@ def _amplitudes(size: int, seed: int, pattern: int, position: float) -> np.ndarr
         shifted = position + group / _RENEWAL_GROUPS
         node = math.floor(shifted)
         angle = math.pi / 2 * (shifted - node)
-        part[:] = math.cos(angle) * _draw(part.size, seed, pattern, group, node)
-        part += math.sin(angle) * _draw(part.size, seed, pattern, group, node + 1)
+        part[:] = math.cos(angle) * _draw(part.size, seed, group, node)
+        part += math.sin(angle) * _draw(part.size, seed, group, node + 1)
     return result
 
 
-def _draw(size: int, seed: int, pattern: int, group: int, node: int) -> np.ndarray:
+def _draw(size: int, seed: int, group: int, node: int) -> np.ndarray:
     """Circular complex Gaussian numbers (size,) of mean square 1 that belong to a lattice node of either sign."""
-    key = (pattern, group, 2 * node if node >= 0 else -2 * node - 1)
+    key = (group, 2 * node if node >= 0 else -2 * node - 1)
     rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=key)))
     parts = rng.standard_normal(2 * size, dtype=np.float32)
     parts *= np.float32(math.sqrt(0.5))
     return parts.view(np.complex64)
-
-
-def _look_weights(contrast: np.ndarray) -> np.ndarray:
-    """Weights (looks, ...) of independent patterns that together have a contrast; what they lack to 1 is even.
-
-    The colours of a Gaussian line, correlated by a Gaussian, add up to independent patterns with the weights
-    (1 - r) r^k, k = 0, 1, ... (eigenvalues by Mehler's formula; Rasmussen and Williams, Gaussian Processes for Machine
-    Learning, Sec. 4.3.1), whose squares add up to C^2 = (1 - r) / (1 + r). The faint rest is replaced by its mean, and
-    the others made up for its contrast. How many are kept depends on the pixel alone, not on its company.
-    """
-    squared = np.maximum(contrast, _LEAST_CONTRAST) ** 2
-    ratio = (1 - squared) / (1 + squared)
-    order = np.arange(_LOOKS).reshape(-1, *[1] * np.ndim(ratio))
-    kept = ratio**order >= _FAINTEST_LOOK
-    scale = (1 - ratio) / np.sqrt(1 - ratio ** (2 * kept.sum(axis=0)))
-    return np.where(kept, scale * ratio**order, 0.0)
 
 
 def _within(name: str, value: ArrayLike, least: float, most: float) -> np.ndarray:

@@ -3,30 +3,29 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import assert_never
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2, t
+from scipy.stats import chi2
 
 from uwlts.calibration.mount_board import mount_by_board
 from uwlts.calibration.mount_model import Motion, MountState, Problem, Scatter
 from uwlts.calibration.mount_next_pose import axis_words, missing_turns, next_pose
-from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLine, find_arc, find_line
-from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere, start_on_table
-from uwlts.model.any_calibration import check_fits
+from uwlts.calibration.mount_prediction import coverage_factor, held_out_mm, inverse, left_out_excess
+from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLine, find_arc, find_line, find_step
+from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of, with_sensor
+from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere, start_of_step, start_on_table
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError, DescriptionError
-from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound
+from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound, StepFound
 from uwlts.model.trajectory import Trajectory
-from uwlts.optics.reconstruction import reconstruct_profile
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture
-from uwlts.storage.mount_files import SENSOR_AXES, MountEvidence, SensorAxis, read_mount_evidence
+from uwlts.storage.mount_files import SENSOR_AXES, Artefact, MountEvidence, SensorAxis, read_mount_evidence
 from uwlts.storage.pose_files import PoseFormat, Unit, read_poses
-from uwlts.stripe import find_stripes
 
-_FEWEST_POSES = {"sphere": 5, "plane": 8}
+_FEWEST_POSES = {"sphere": 5, "plane": 8, "step": 8}
 """Poses whose profiles have more numbers (three each, or two) than there are unknowns (nine or ten), with some over."""
 _MOST_POINTS = 100_000
 """Points of all profiles together; more take time and hardly lower the uncertainty, as poses err too."""
@@ -44,11 +43,12 @@ _WEAK = 5.0
 
 
 def calibrate_mount(
-    profiles: str | Path | Sequence[np.ndarray],
+    profiles: str | Path | Sequence[np.ndarray] | CapturedProfiles,
     poses: str | Path | np.ndarray | None = None,
     *,
-    artefact: Literal["sphere", "plane"] = "sphere",
+    artefact: Artefact = "sphere",
     radius_mm: float | None = None,
+    height_mm: float | None = None,
     calibration: Calibration | str | Path | None = None,
     pose_format: PoseFormat = "matrix",
     profile_unit: Unit = "mm",
@@ -59,7 +59,7 @@ def calibrate_mount(
     profile_times_s: np.ndarray | None = None,
     pose_times_s: np.ndarray | None = None,
 ) -> Mount:
-    """Find ``T_platform_sensor`` of any laser profiler from profiles of a sphere or a plane at an unknown fixed place.
+    """Find ``T_platform_sensor`` of any laser profiler from profiles of an artefact at an unknown fixed place.
 
     The platform's poses ``T_base_platform`` are known, as a robot's flange's. The artefact's place and the mount are
     estimated together by least squares of the distances of all points from the artefact, weighted by the noise of the
@@ -76,16 +76,18 @@ def calibrate_mount(
         off show, else of an artefact that its laser images show.
     poses
         ``T_base_platform`` (P, 4, 4), mm, or a CSV file with one pose a line; not needed for a capture that holds them.
-    artefact, radius_mm
-        What is seen; the radius of the sphere where it is known.
+    artefact, radius_mm, height_mm
+        What is seen: a sphere, a plane, or a step, two parallel faces. The radius of the sphere or the height of the
+        step, where it is known.
     calibration
-        Of the sensor that took the capture, held fixed. A target's images go to `uwlts.calibration.mount_board`.
+        Of the sensor that took the capture, held fixed; what a joint estimate leaves open becomes part of the mount's
+        covariance. A target's images go to `uwlts.calibration.mount_board`.
     pose_format, profile_unit, pose_unit
         How files are to be read; see `uwlts.storage.pose_files.read_poses`.
     axis
-        The platform is a rotary table whose axis is not known, and which turns the sphere: the direction of the
-        sensor's frame that is nearest to the axis about which its angles turn counter-clockwise. The mount then leads
-        to a frame whose z axis is the table's (`uwlts.storage.pose_files.read_poses`, format ``angle-deg``).
+        The platform is a rotary table whose axis is not known, and which turns the sphere or target: the direction of
+        the sensor's frame that is nearest to the axis about which its angles turn counter-clockwise. The mount then
+        leads to a frame whose z axis is the table's (`uwlts.storage.pose_files.read_poses`, format ``angle-deg``).
     scale
         Estimate by which factor the robot's lengths are too short.
     time
@@ -118,16 +120,20 @@ def calibrate_mount(
         assert not isinstance(table, str | Path)
         with Capture(profiles) as capture:
             if capture.header.target is not None and not capture.laser_on.all():
-                if radius_mm is not None or scale or time or axis is not None:
-                    raise DescriptionError("the capture shows a target: give no radius, axis, scale or time")
-                return mount_by_board([capture], known, table)
-            profiles, table, profile_times_s, pose_times_s = profiles_of(capture, known, table, times)
-        poses = table
+                if radius_mm is not None or height_mm is not None or scale or time:
+                    raise DescriptionError("the capture shows a target: give no radius, height, scale or time")
+                return mount_by_board([capture], known, table, axis=axis)
+            profiles = profiles_of(capture, known, table, times)
+    captured = None
+    if isinstance(profiles, CapturedProfiles):
+        captured, poses = profiles, profiles.poses
+        profiles, profile_times_s, pose_times_s = captured.profiles, captured.times_s, captured.pose_times_s
     evidence = read_mount_evidence(
         profiles,
         poses,
         artefact=artefact,
         radius_mm=radius_mm,
+        height_mm=height_mm,
         pose_format=pose_format,
         profile_unit=profile_unit,
         pose_unit=pose_unit,
@@ -138,41 +144,9 @@ def calibrate_mount(
         pose_times_s=pose_times_s,
     )
     try:
-        return _Calibration(evidence).result()
+        return _Calibration(evidence, captured).result()
     except _NoFit as error:
         raise CalibrationError(f"{error}. {_advice(evidence)}") from error
-
-
-def profiles_of(
-    capture: Capture, calibration: Calibration, poses: np.ndarray | None, pose_times_s: np.ndarray | None
-) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray | None]:
-    """Profiles (N, 3) in the sensor's frame of all laser images, poses, and the times of both.
-
-    The poses are those given, else the capture's own.
-    """
-    check_fits(capture.header, calibration, source=capture.path.name)
-    if not capture.header.sensor.camera.window.mounted:
-        calibration = calibration.model_copy(update={"window": None})
-    stripes, laser = find_stripes(capture), np.flatnonzero(capture.laser_on)
-    points = reconstruct_profile(
-        calibration,
-        stripes.line,
-        stripes.centre_px,
-        medium_index=calibration.index_of(capture.header.medium),
-        stage_mm=0.0,
-        stage_direction=np.array([1.0, 0.0, 0.0]),
-    ).points_mm
-    profiles = [points[stripes.frame == frame] for frame in laser]
-    times = capture.time_s[laser]
-    if poses is not None:
-        return profiles, poses, times, pose_times_s
-    own = capture.pose[laser]
-    if missing := int(np.count_nonzero(~np.isfinite(own).all(axis=(1, 2)))):
-        raise DescriptionError(
-            f"{missing} of {len(laser)} laser images of {capture.path.name} have no pose of the platform: give a table "
-            "of poses, or import them"
-        )
-    return profiles, own, times, times
 
 
 class _NoFit(CalibrationError):
@@ -206,12 +180,14 @@ def _advice(evidence: MountEvidence) -> str:
 class _Calibration:
     """The steps of one calibration, in the order in which `result` needs them."""
 
-    def __init__(self, evidence: MountEvidence) -> None:
+    def __init__(self, evidence: MountEvidence, captured: CapturedProfiles | None = None) -> None:
         self.evidence = evidence
-        self.sphere = evidence.artefact == "sphere"
+        self.captured = captured
+        self.sphere, self.step = evidence.artefact == "sphere", evidence.artefact == "step"
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
-        self.profiles = [_thinned(_seen(profile), most) for profile in evidence.profiles]
+        self.rows = [_thinned(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
+        self.profiles = [_in_space(each[rows]) for each, rows in zip(evidence.profiles, self.rows, strict=True)]
         self.sheet = _sheet_frame(self.profiles)
         self.flat = [((each - self.sheet[:3, 3]) @ self.sheet[:3, :3])[:, [0, 2]] for each in self.profiles]
         self.reasons: dict[int, str] = {}
@@ -224,9 +200,7 @@ class _Calibration:
                 self.reasons[number] = f"no {self.evidence.artefact} found in the profile"
         self._require_enough()
         kept = np.array([shape is not None for shape in shapes])
-        members = [
-            np.zeros(len(p), dtype=bool) if s is None else s.members for p, s in zip(self.flat, shapes, strict=True)
-        ]
+        members = [self._members(p, s) for p, s in zip(self.flat, shapes, strict=True)]
         whole = Problem(
             self.profiles,
             _motion(self.evidence),
@@ -236,8 +210,10 @@ class _Calibration:
             self.evidence.scale,
             self.evidence.time,
             self.evidence.axis is not None,
+            second=[np.zeros(len(each), dtype=bool) for each in self.profiles] if self.step else None,
+            height_mm=self.evidence.height_mm,
         )
-        problem = whole.selected(kept, [p[m] for p, m in zip(self.profiles, members, strict=True)])
+        problem = self._of_members(whole, kept, members, self._faces(shapes, members))
         arcs = [shape for shape in shapes if isinstance(shape, ProfileArc)]
         lines = [shape for shape in shapes if isinstance(shape, ProfileLine)]
         if self.evidence.axis is not None:
@@ -245,7 +221,7 @@ class _Calibration:
         elif self.sphere:
             state = start_of_sphere(problem, arcs, self.sheet, self.rng)
         else:
-            state = start_of_plane(problem, lines, self.sheet, self.rng)
+            state = (start_of_step if self.step else start_of_plane)(problem, lines, self.sheet, self.rng)
         misfit = misfits(problem, state)
         noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
         good = misfit < max(_LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
@@ -253,16 +229,16 @@ class _Calibration:
         # What the first search got wrong in single profiles is searched again near the artefact that the others show.
         for _ in range(2):
             state, scatter = _refined(problem.selected(good), state, scatter)
-            members = self._found_again(whole, state, scatter)
+            members, faces = self._found_again(whole, state, scatter)
             kept = np.array([np.count_nonzero(each) >= LEAST_POINTS for each in members])
-            problem = whole.selected(kept, [p[m] for p, m in zip(self.profiles, members, strict=True)])
+            problem = self._of_members(whole, kept, members, faces)
             good = np.ones(len(problem.points), dtype=bool)
             self._require_enough(np.flatnonzero(kept))
         while True:
             used = problem.selected(good)
             state, scatter = _refined(used, state, scatter)
             limit = float(chi2.isf(_FALSE_ALARM / len(kept), used.per_pose))
-            excess = _left_out_excess(used, state, scatter)
+            excess = left_out_excess(used, state, scatter)
             if excess.max() <= limit:
                 break
             good[np.flatnonzero(good)[np.argmax(excess)]] = False
@@ -281,7 +257,32 @@ class _Calibration:
         return self._summary(used, state, scatter, members)
 
     def _shape(self, points: np.ndarray) -> ProfileArc | ProfileLine | None:
-        return find_arc(points, self.evidence.radius_mm, self.rng) if self.sphere else find_line(points, self.rng)
+        match self.evidence.artefact:
+            case "sphere":
+                return find_arc(points, self.evidence.radius_mm, self.rng)
+            case "plane":
+                return find_line(points, self.rng)
+            case "step":
+                return find_step(points, self.evidence.height_mm, self.rng)
+            case _:
+                assert_never(self.evidence.artefact)
+
+    @staticmethod
+    def _members(points: np.ndarray, shape: ProfileArc | ProfileLine | None) -> np.ndarray:
+        return np.zeros(len(points), dtype=bool) if shape is None else shape.members
+
+    @staticmethod
+    def _faces(shapes: Sequence[ProfileArc | ProfileLine | None], members: list[np.ndarray]) -> list[np.ndarray]:
+        """Masks (N,) of the points on the second face of a step; nowhere set without one."""
+        found = [shape.second if isinstance(shape, ProfileLine) else None for shape in shapes]
+        return [np.zeros_like(own) if face is None else face for face, own in zip(found, members, strict=True)]
+
+    def _of_members(
+        self, whole: Problem, kept: np.ndarray, members: list[np.ndarray], faces: list[np.ndarray]
+    ) -> Problem:
+        points = [each[own] for each, own in zip(self.profiles, members, strict=True)]
+        second = [each[own] for each, own in zip(faces, members, strict=True)] if self.step else None
+        return whole.selected(kept, points, second)
 
     def _require_enough(self, numbers: np.ndarray | None = None) -> None:
         poses, needed = len(self.profiles), _FEWEST_POSES[self.evidence.artefact]
@@ -301,26 +302,38 @@ class _Calibration:
                 f"{scatter.pose_mm:.3g} mm (rms)"
             )
 
-    def _found_again(self, whole: Problem, state: MountState, scatter: Scatter) -> list[np.ndarray]:
-        """Masks of the points near the artefact as all poses show it, mm."""
-        off = np.abs(whole.distances(state))
+    def _found_again(
+        self, whole: Problem, state: MountState, scatter: Scatter
+    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Masks of the points near the artefact as all poses show it, and of those on the second face of a step."""
+        signed = whole.distances(state)
+        off = np.abs(signed)
+        if self.step:
+            off = np.minimum(off, np.abs(signed - state.artefact[4]))
         reach = 4 * np.hypot(scatter.point_mm, 2 * scatter.pose_mm)
-        found = []
+        found, faces = [], []
         for points, own in zip(self.flat, np.split(off, np.cumsum(whole.counts)[:-1]), strict=True):
             near = own < reach
-            mask = np.zeros(len(points), dtype=bool)
+            mask, face = np.zeros((2, len(points)), dtype=bool)
             shape = self._shape(points[near])
             if shape is not None:
-                mask[np.flatnonzero(near)[shape.members]] = True
+                mask[near] = shape.members
+                if isinstance(shape, ProfileLine) and shape.second is not None:
+                    face[near] = shape.second
             found.append(mask)
-        return found
+            faces.append(face)
+        return found, faces
 
     def _summary(self, used: Problem, state: MountState, scatter: Scatter, members: list[np.ndarray]) -> Mount:
         information = used.information(state, scatter)
-        covariance = used.of_all(_inverse(information.sum(axis=0)))
+        own = used.of_all(inverse(information.sum(axis=0)))
+        covariance, share = own, None
+        if self.captured is not None and self.captured.known is not None:
+            by_sensor = self._by_sensor(used, state, scatter, members)
+            covariance, share = with_sensor(own, by_sensor, state.rotation, self.captured.known)
         self._require_determined(used, state, scatter, covariance)
-        held = _held_out(used, state, scatter, information)
-        own, numbers = misfits(used, state), [n for n in range(len(members)) if n not in self.reasons]
+        held = held_out_mm(used, state, scatter, information)
+        rms, numbers = misfits(used, state), [n for n in range(len(members)) if n not in self.reasons]
         order = {number: place for place, number in enumerate(numbers)}
         poses = []
         for number, name in enumerate(self.evidence.names):
@@ -330,28 +343,31 @@ class _Calibration:
                     name=name,
                     points=seen if place is not None else 0,
                     points_left_out=len(self.profiles[number]) - (seen if place is not None else 0),
-                    rms_mm=None if place is None else float(own[place]),
+                    rms_mm=None if place is None else float(rms[place]),
                     held_out_mm=None if place is None else float(held[place]),
                     reason=self.reasons.get(number),
                 )
             )
-        std, at = np.sqrt(np.diag(covariance)), 9 + (self.sphere and used.radius_mm is None)
-        found = (
-            SphereFound(
-                centre_mm=tuple(state.artefact[:3].tolist()),
-                radius_mm=float(state.artefact[3]),
-                radius_std_mm=float(std[9]) if used.radius_mm is None else None,
-            )
-            if self.sphere
-            else PlaneFound(normal=tuple(state.artefact[:3].tolist()), distance_mm=float(state.artefact[3]))
-        )
+        std, at = np.sqrt(np.diag(covariance)), 9 + used.size_unknown
+        x, y, z, *sizes = state.artefact.tolist()
+        size_std = float(std[9]) if used.size_unknown else None
+        match self.evidence.artefact:
+            case "sphere":
+                found = SphereFound(centre_mm=(x, y, z), radius_mm=sizes[0], radius_std_mm=size_std)
+            case "plane":
+                found = PlaneFound(normal=(x, y, z), distance_mm=sizes[0])
+            case "step":
+                distance, height = sizes
+                found = StepFound(normal=(x, y, z), distance_mm=distance, height_mm=height, height_std_mm=size_std)
+            case _:
+                assert_never(self.evidence.artefact)
         transform = np.eye(4)
         transform[:3, :3], transform[:3, 3] = Rotation.from_matrix(state.rotation).as_matrix(), state.translation
         weights = used.counts / used.counts.sum()
         return Mount(
             T_platform_sensor=tuple(tuple(row) for row in transform.tolist()),
             covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
-            coverage_factor=_coverage_factor(used, state, scatter, covariance),
+            coverage_factor=coverage_factor(used, state, scatter, own, covariance),
             artefact=found,
             robot_scale=state.scale if used.scale else None,
             robot_scale_std=float(std[at]) if used.scale else None,
@@ -359,14 +375,31 @@ class _Calibration:
             time_offset_std_s=float(std[at + used.scale]) if used.time else None,
             point_std_mm=scatter.point_mm,
             pose_std_mm=scatter.pose_mm,
-            rms_mm=float(np.sqrt(weights @ own**2)),
+            rms_mm=float(np.sqrt(weights @ rms**2)),
             held_out_rms_mm=float(np.sqrt(weights @ held**2)),
             poses=tuple(poses),
             weaknesses=tuple(_weaknesses(used, state, covariance)),
             table=used.table,
+            sensor=share,
             next_pose=next_pose(used, state, scatter, self.sheet, [self.evidence.names[n] for n in numbers]),
             inputs=self.evidence.digests,
         )
+
+    def _by_sensor(self, used: Problem, state: MountState, scatter: Scatter, members: list[np.ndarray]) -> np.ndarray:
+        """Derivatives (K, Q) of all values by the parameters of the sensor's calibration, which move the profiles.
+
+        The solution of weighted least squares moves by -(J^T W J)^-1 J^T W d where the distances move by d.
+        """
+        assert self.captured is not None
+        normals, moved = used.normals(state), []
+        numbers = [n for n in range(len(members)) if n not in self.reasons]
+        for number, own in zip(numbers, np.split(normals, np.cumsum(used.counts)[:-1]), strict=True):
+            by = self.captured.moved(number, self.rows[number][members[number]])
+            moved.append(np.einsum("ni,niq->nq", own, by))
+        whitened = used.whitening(state, scatter)
+        derivatives, together = whitened(used.derivatives(state)), np.vstack(moved)
+        off = whitened(together if self.sphere else used.on_lines(together))
+        return -used.free @ inverse(derivatives.T @ derivatives) @ derivatives.T @ off
 
     def _require_determined(self, used: Problem, state: MountState, scatter: Scatter, covariance: np.ndarray) -> None:
         shift = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
@@ -384,9 +417,8 @@ class _Calibration:
         )
 
 
-def _seen(profile: np.ndarray) -> np.ndarray:
-    """Points (N, 3) that were seen, of a profile (N, 2) or (N, 3)."""
-    points = profile[np.isfinite(profile).all(axis=1)]
+def _in_space(points: np.ndarray) -> np.ndarray:
+    """Points (N, 3) of a profile (N, 2) or (N, 3)."""
     return points if points.shape[1] == 3 else np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]])
 
 
@@ -437,69 +469,6 @@ def _refined(problem: Problem, state: MountState, scatter: Scatter) -> tuple[Mou
         if abs(scatter.pose_mm - before.pose_mm) <= 0.02 * before.pose_mm + 0.02 * before.point_mm:
             break
     return problem.solved(state, scatter), scatter
-
-
-def _inverse(information: np.ndarray) -> np.ndarray:
-    """Covariance of an information matrix; directions without information get huge variances."""
-    size = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
-    values, vectors = np.linalg.eigh(size[:, None] * information * size)
-    return size[:, None] * (vectors / np.maximum(values, 1e-13)) @ vectors.T * size
-
-
-def _each_left_out(
-    problem: Problem, state: MountState, scatter: Scatter, information: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For every pose the step of the parameters without it (a Gauss-Newton step), and their covariance then."""
-    whitened = problem.whitening(state, scatter)
-    split = np.cumsum(problem.counts)[:-1]
-    rows = np.split(whitened(problem.derivatives(state)), split)
-    distances = np.split(whitened(problem.distances(state)), split)
-    total, steps = information.sum(axis=0), []
-    gradient = sum(row.T @ own for row, own in zip(rows, distances, strict=True))
-    for row, own, one in zip(rows, distances, information, strict=True):
-        covariance = _inverse(total - one)
-        steps.append((-covariance @ (gradient - row.T @ own), covariance))
-    return steps
-
-
-def _held_out(problem: Problem, state: MountState, scatter: Scatter, information: np.ndarray) -> np.ndarray:
-    """Root mean square distance (P,) of each pose's points from the artefact by the mount of all other poses."""
-    left_out = _each_left_out(problem, state, scatter, information)
-    return np.array([misfits(problem, problem.stepped(state, step))[n] for n, (step, _) in enumerate(left_out)])
-
-
-def _left_out_excess(problem: Problem, state: MountState, scatter: Scatter) -> np.ndarray:
-    """How far each pose lies from what the others predict (P,), chi-square with as many degrees as its profile says."""
-    share = problem.noise_along(state)
-    derivatives, errors = problem.derivatives(state) / share, problem.errors(state) / share
-    split = np.cumsum(problem.counts)[:-1]
-    excess = []
-    left_out = _each_left_out(problem, state, scatter, problem.information(state, scatter))
-    moved = [np.split(problem.distances(state, step) / share[:, 0], split)[n] for n, (step, _) in enumerate(left_out)]
-    sizes = np.full(3, scatter.pose_mm) if problem.sphere else np.array([scatter.pose_mm, scatter.turn_rad])
-    for off, rows, error, (_, covariance) in zip(
-        moved, np.split(derivatives, split), np.split(errors, split), left_out, strict=True
-    ):
-        # All that poses, mount and artefact can do lies in what the errors of the pose span.
-        basis = np.linalg.qr(error)[0]
-        across, by_pose = basis.T @ rows, basis.T @ (error * sizes)
-        spread = across @ covariance @ across.T + by_pose @ by_pose.T + scatter.point_mm**2 * np.eye(basis.shape[1])
-        seen = basis.T @ off
-        excess.append(float(seen @ np.linalg.solve(spread, seen)))
-    return np.array(excess)
-
-
-def _coverage_factor(problem: Problem, state: MountState, scatter: Scatter, covariance: np.ndarray) -> float:
-    """Student's factor for 95 %, with degrees of freedom by Welch and Satterthwaite (GUM, G.4).
-
-    The share of the variances that the points' noise makes is known from very many points, the rest from the poses.
-    """
-    by_points = _inverse(problem.information(state, Scatter(scatter.point_mm, 0.0)).sum(axis=0))
-    known = np.diag(covariance)[:6] > 0
-    share = min(float(np.mean(np.diag(problem.of_all(by_points))[:6][known] / np.diag(covariance)[:6][known])), 1.0)
-    of_poses = max(problem.per_pose * len(problem.points) - problem.size, 1)
-    of_points = max(int(problem.counts.sum()) - problem.per_pose * len(problem.points), 1)
-    return float(t.ppf(0.975, 1 / (share**2 / of_points + (1 - share) ** 2 / of_poses)))
 
 
 def _weaknesses(problem: Problem, state: MountState, covariance: np.ndarray) -> list[str]:

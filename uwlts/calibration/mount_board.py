@@ -1,34 +1,39 @@
-"""Mount of a calibrated sensor from images of a target from several poses of its platform (hand-eye calibration)."""
+"""Mount of a calibrated sensor from images of a target from several poses of its platform (hand-eye calibration).
+
+Or the axis of a rotary table that turns the target.
+"""
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, t
 
+from uwlts.calibration.joint.stored_estimate import stored_estimate
+from uwlts.calibration.mount_board_images import (
+    FEWEST_IMAGES,
+    POSE_STEPS,
+    BoardImage,
+    board_images,
+    differences,
+    moved_about,
+    rigid_transform,
+)
 from uwlts.calibration.mount_next_pose import missing_turns
-from uwlts.model.any_calibration import check_fits
-from uwlts.model.calibration import Calibration, WindowModel
-from uwlts.model.errors import CalibrationError, DescriptionError, TargetError
+from uwlts.calibration.mount_sensor import with_sensor
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CalibrationError
 from uwlts.model.mount import BoardFound, Mount, MountPose
-from uwlts.optics.camera import directions, project_through_window
-from uwlts.optics.window import trace_window
 from uwlts.storage.capture import Capture
 from uwlts.storage.files import sha256_of
-from uwlts.targets import CircleTarget, Target, parse_target
-from uwlts.targets.detection.ellipse_bias import circle_centre_bias
+from uwlts.storage.mount_files import SENSOR_AXES, SensorAxis, require_table
 
-_FEWEST_IMAGES = 4
-"""Three poses with turns about two axes determine the mount; one more shows whether they agree."""
 _FALSE_ALARM = 1e-3
 """Probability that any image of a campaign without wrong ones is left out."""
-_LEAST_PX = 1e-3
-"""No corner or circle is found closer."""
 _NO_FIT = 0.1
 """Share of the target's extent by which platforms do not err; a wrong format of the poses gives more."""
 _OPEN_MM, _OPEN_RAD = 5.0, np.radians(1.0)
@@ -38,25 +43,16 @@ _TRIPLES = 100
 """With a third of the images wrong, three right ones are missed by all of them once in 10^15 times."""
 
 
-@dataclass(frozen=True, eq=False)
-class BoardImage:
-    """An image of the target: its pose as the camera sees it, and that of the platform.
-
-    ``camera_from_target`` (4, 4) in mm; ``covariance`` (6, 6) is of a shift of the target's middle (mm) and a turn
-    about it (rad), in the camera's axes; ``points`` found, whose pixels miss by ``rms_px``; ``base_from_platform``
-    (4, 4).
-    """
-
-    name: str
-    camera_from_target: np.ndarray
-    covariance: np.ndarray
-    points: int
-    rms_px: float
-    base_from_platform: np.ndarray
-
-
-def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses: np.ndarray | None = None) -> Mount:
+def mount_by_board(
+    captures: Sequence[Capture],
+    calibration: Calibration,
+    poses: np.ndarray | None = None,
+    *,
+    axis: SensorAxis | None = None,
+) -> Mount:
     """``T_platform_sensor`` from images of a target at an unknown fixed place, the sensor's calibration held fixed.
+
+    What a joint estimate of the calibration leaves open becomes part of the covariance.
 
     Each image gives the target's pose before the camera, through window and medium. A closed form (Park and Martin,
     IEEE Trans. Robotics and Automation 10, 1994) starts a least-squares estimate of mount and target's place, weighted
@@ -72,6 +68,8 @@ def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses:
         Of the sensor.
     poses
         ``T_base_platform`` (P, 4, 4) of the images with the laser off, in their order, in place of the captures' own.
+    axis
+        The platform is a rotary table that turns the target, as for `uwlts.calibrate_mount`.
 
     Raises
     ------
@@ -80,12 +78,16 @@ def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses:
     CalibrationError
         Too few images show the target, or the poses do not determine the mount or contradict the images.
     """
-    target, images, reasons = _seen(captures, calibration, poses)
+    header = captures[0].header
+    known = None if calibration.joint is None else stored_estimate(calibration, header.sensor, header.medium)
+    target, images, reasons = board_images(captures, calibration, known, poses)
     middle = target.points_mm.mean(axis=0)
     rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in images])
-    if missing := missing_turns(rotations, least_rad=_OPEN_RAD):
+    if axis is not None:
+        require_table(np.array([image.base_from_platform for image in images]), axis=axis)
+    elif missing := missing_turns(rotations, least_rad=_OPEN_RAD):
         raise CalibrationError(f"the poses do not determine the mount: {'; '.join(missing)}")
-    problem = _Problem(images, calibration.object_transform(), middle)
+    problem = _Problem(images, calibration.object_transform(), middle, axis is not None)
     used, state, scatter = problem.robust()
     extent = float(np.linalg.norm(np.ptp(target.points_mm, axis=0)))
     left_out = [image for image in images if image not in used.images]
@@ -95,8 +97,17 @@ def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses:
             f"{len(left_out)} of {len(images)} left out. Are the poses T_base_platform, is their format right, are "
             "their units right, and do they come in the order of the images?"
         )
-    covariance = np.linalg.inv(used.information(state, scatter))
-    missing = missing_turns(Rotation.from_matrix([each.base_from_platform[:3, :3] for each in used.images]))
+    if axis is not None and state[0][2, :3] @ SENSOR_AXES[axis] <= 0:
+        raise CalibrationError(
+            f"the images turn about an axis that points away from {axis} of the sensor's frame, to "
+            f"({', '.join(f'{each:.2f}' for each in state[0][2, :3])}): are the angles counted the other way round?"
+        )
+    covariance, share = used.free @ np.linalg.inv(used.information(state, scatter)) @ used.free.T, None
+    if known is not None:
+        covariance, share = with_sensor(covariance, used.by_sensor(state, scatter), state[0][:3, :3], known)
+    missing = []
+    if axis is None:
+        missing = missing_turns(Rotation.from_matrix([each.base_from_platform[:3, :3] for each in used.images]))
     shift, turn = (float(np.sqrt(np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1])) for k in (0, 3))
     if shift > _OPEN_MM or turn > _OPEN_RAD:
         known = f"known to {shift:.2g} mm and {np.degrees(turn):.2g} deg only"
@@ -119,12 +130,14 @@ def mount_by_board(captures: Sequence[Capture], calibration: Calibration, poses:
     return Mount(
         T_platform_sensor=_rows(state[0]),
         covariance=tuple(tuple(row) for row in ((covariance + covariance.T) / 2)[:6, :6].tolist()),
-        coverage_factor=float(t.ppf(0.975, 6 * len(used.images) - 15)),
+        coverage_factor=float(t.ppf(0.975, 6 * len(used.images) - used.size - 3)),
         artefact=BoardFound(T_base_target=_rows(state[1])),
         point_std_mm=rms_px * distance / calibration.camera.fx_px,
         pose_std_mm=float(scatter[0]),
         rms_mm=float(np.sqrt(np.mean(np.square(list(found.values()))))),
         held_out_rms_mm=float(np.sqrt(np.mean(np.square(list(held.values()))))),
+        table=axis is not None,
+        sensor=share,
         poses=tuple(rows),
         weaknesses=tuple(missing),
         inputs={capture.path.name: sha256_of(capture.path) for capture in captures},
@@ -135,107 +148,32 @@ def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in matrix.tolist())
 
 
-def _seen(
-    captures: Sequence[Capture], calibration: Calibration, poses: np.ndarray | None
-) -> tuple[Target, list[BoardImage], dict[str, str]]:
-    """The target, its pose in every image that shows it, and why others do not."""
-    images: list[BoardImage] = []
-    reasons: dict[str, str] = {}
-    targets, taken = [], 0
-    for capture in captures:
-        check_fits(capture.header, calibration, source=capture.path.name)
-        if capture.header.target is None:
-            raise DescriptionError(f"{capture.path.name} does not describe its target")
-        targets.append(parse_target(capture.header.target))
-        if targets[-1] != targets[0]:
-            raise DescriptionError("the captures show different targets: calibrate with one target, at one place")
-        index = calibration.index_of(capture.header.medium)
-        window = calibration.window if capture.header.sensor.camera.window.mounted else None
-        for frame, image in capture.frames(laser_on=False):
-            name = f"{capture.path.stem}, frame {frame}"
-            pose = capture.pose[frame] if poses is None else poses[taken] if taken < len(poses) else None
-            taken += 1
-            if pose is None:
-                continue
-            if not np.isfinite(pose).all():
-                raise DescriptionError(f"{name} has no pose of the platform: give a table of poses, or import them")
-            try:
-                images.append(_posed(name, image, targets[0], calibration, window, index, pose))
-            except (TargetError, CalibrationError) as error:
-                reasons[name] = f"no target: {error}"
-    if poses is not None and taken != len(poses):
-        raise DescriptionError(f"there are {len(poses)} poses for {taken} images with the laser off: expected one each")
-    if len(images) < _FEWEST_IMAGES:
-        why = next(iter(reasons.values()), "there are no images with the laser off")
-        raise CalibrationError(
-            f"{len(images)} of {taken} images show the target; at least {_FEWEST_IMAGES} are needed ({why})"
-        )
-    return targets[0], images, reasons
-
-
-def _posed(
-    name: str,
-    image: np.ndarray,
-    target: Target,
-    calibration: Calibration,
-    window: WindowModel | None,
-    index: float,
-    base_from_platform: np.ndarray,
-) -> BoardImage:
-    """The target's pose in one image by least squares of its points' pixels."""
-    camera, view = calibration.camera, target.detect(image)
-    if len(view.points_mm) < 6:
-        raise CalibrationError(f"{len(view.points_mm)} points found; at least 6 are needed")
-    rays = trace_window(directions(camera, view.pixels), window, medium_index=index)
-    slopes = rays.directions[:, :2] / rays.directions[:, 2:]
-    good, turn, shift = cv2.solvePnP(view.points_mm, slopes, np.eye(3), None)
-    if not good or not np.isfinite(shift).all():
-        raise CalibrationError("its points fit no pose")
-    middle = target.points_mm.mean(axis=0)
-    start = _transform(cv2.Rodrigues(turn)[0], shift.ravel())
-
-    def moved(step: np.ndarray) -> np.ndarray:
-        return _moved_about(start, middle, step)
-
-    def projected(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-        seen = points @ pose[:3, :3].T + pose[:3, 3]
-        return project_through_window(camera, window, seen, medium_index=index)
-
-    pixels = view.pixels
-    if isinstance(target, CircleTarget):
-        bias = circle_centre_bias(
-            lambda points: projected(start, points),
-            view.points_mm,
-            diameter_mm=target.diameter_mm,
-            axis_u=(1.0, 0.0, 0.0),
-            axis_v=(0.0, 1.0, 0.0),
-        )
-        pixels = pixels - bias
-    if not np.isfinite(projected(start, view.points_mm)).all():
-        raise CalibrationError("it would lie before the window")
-    fit = least_squares(
-        lambda step: (projected(moved(step), view.points_mm) - pixels).ravel(),
-        np.zeros(6),
-        x_scale=[1.0, 1.0, 1.0, 1e-2, 1e-2, 1e-2],
-        loss="soft_l1",
-        f_scale=0.5,
-    )
-    spread = max(float(np.sqrt(np.mean(fit.fun**2) * fit.fun.size / (fit.fun.size - 6))), _LEAST_PX)
-    covariance = spread**2 * np.linalg.inv(fit.jac.T @ fit.jac)
-    return BoardImage(name, moved(fit.x), covariance, len(pixels), spread, base_from_platform)
-
-
 _State = tuple[np.ndarray, np.ndarray]
 """``T_platform_sensor`` and ``T_base_target``, (4, 4) each."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Images of a target, ``T_camera_sensor`` and the target's middle (3,) in its own frame."""
+    """Images of a target, ``T_camera_sensor`` and the target's middle (3,) in its own frame.
+
+    The parameters are steps of mount and target; on a rotary table (``table``) shift of the mount along its z axis and
+    turn about it change nothing, and are none.
+    """
 
     images: Sequence[BoardImage]
     camera_from_sensor: np.ndarray
     middle: np.ndarray
+    table: bool = False
+
+    @cached_property
+    def free(self) -> np.ndarray:
+        """Steps (12, size) of mount and target by the parameters."""
+        return np.delete(np.eye(12), (2, 5), axis=1) if self.table else np.eye(12)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.free.shape[1]
 
     @cached_property
     def _platforms(self) -> np.ndarray:
@@ -251,7 +189,7 @@ class _Problem:
 
     def without(self, number: int) -> "_Problem":
         kept = [image for k, image in enumerate(self.images) if k != number]
-        return _Problem(kept, self.camera_from_sensor, self.middle)
+        return replace(self, images=kept)
 
     def start(self) -> _State:
         """Mount and target by Park and Martin from the relative motions of all pairs of images."""
@@ -260,17 +198,22 @@ class _Problem:
         tools = np.linalg.inv(held[first]) @ held[second]
         boards = seen[first] @ np.linalg.inv(seen[second])
         by_tool, by_board = (Rotation.from_matrix(each[:, :3, :3]).as_rotvec() for each in (tools, boards))
+        if self.table:
+            # Turns about z alone: the sensor's x axis, made square to the axis, shall be the table's.
+            axis = by_board.T @ by_tool[:, 2]
+            by_tool, by_board = np.eye(3)[[2, 0]], np.array([axis, np.eye(3)[np.argmin(np.abs(axis))]])
         with warnings.catch_warnings():
             # Turns about one axis only: the covariance tells.
             warnings.simplefilter("ignore", UserWarning)
-            rotation = Rotation.align_vectors(by_tool, by_board)[0].as_matrix()
+            weights = [np.inf, 1.0] if self.table else None
+            rotation = Rotation.align_vectors(by_tool, by_board, weights)[0].as_matrix()
         known = boards[:, :3, 3] @ rotation.T - tools[:, :3, 3]
         unknown = (tools[:, :3, :3] - np.eye(3)).reshape(-1, 3)
-        mount = _transform(rotation, np.linalg.lstsq(unknown, known.ravel(), rcond=None)[0])
+        mount = rigid_transform(rotation, np.linalg.lstsq(unknown, known.ravel(), rcond=None)[0])
         places = held @ mount @ seen
         turns = Rotation.from_matrix(places[:, :3, :3]).mean().as_matrix()
         middles = places[:, :3, :3] @ self.middle + places[:, :3, 3]
-        return mount, _transform(turns, np.median(middles, axis=0) - turns @ self.middle)
+        return mount, rigid_transform(turns, np.median(middles, axis=0) - turns @ self.middle)
 
     def residuals(self, state: _State) -> np.ndarray:
         """Per image (K, 6): where its target lies beside the common one, shift of the middle in mm and turn in rad."""
@@ -284,13 +227,9 @@ class _Problem:
 
         ``scatter`` (3,) are those of the platform's positions (mm) and turns (rad), and the factor of the images'.
         """
-        mount, common = state
-        middle = common[:3] @ np.append(self.middle, 1.0)
-        turn = (self._platforms @ mount @ np.linalg.inv(self.camera_from_sensor))[:, :3, :3]
-        both = np.zeros((len(turn), 6, 6))
-        both[:, :3, :3] = both[:, 3:, 3:] = turn
+        both, middle = self._by_images(state[0]), state[1][:3] @ np.append(self.middle, 1.0)
         # A turn of the platform moves what is far from its origin.
-        lever = np.tile(np.eye(6, 3, -3), (len(turn), 1, 1))
+        lever = np.tile(np.eye(6, 3, -3), (len(both), 1, 1))
         for axis, unit in enumerate(np.eye(3)):
             lever[:, :3, axis] = np.cross(unit, middle - self._platforms[:, :3, 3])
         result = scatter[2] ** 2 * both @ self._covariances @ both.swapaxes(1, 2)
@@ -298,25 +237,37 @@ class _Problem:
         result[:, :3, :3] += scatter[0] ** 2 * np.eye(3)
         return result
 
+    def _by_images(self, mount: np.ndarray) -> np.ndarray:
+        """Derivatives (K, 6, 6) of the residuals by the errors of the images: these turned into the base frame."""
+        turn = (self._platforms @ mount @ np.linalg.inv(self.camera_from_sensor))[:, :3, :3]
+        both = np.zeros((len(turn), 6, 6))
+        both[:, :3, :3] = both[:, 3:, 3:] = turn
+        return both
+
+    def by_sensor(self, state: _State, scatter: np.ndarray) -> np.ndarray:
+        """Derivatives (12, Q) of the solution by the parameters of the sensor's calibration."""
+        by, inverse = self.jacobian(state), np.linalg.inv(self.covariances(state, scatter))
+        moved = self._by_images(state[0]) @ np.array([image.by_sensor for image in self.images])
+        information = np.einsum("kij,kil,klm->jm", by, inverse, by)
+        return -self.free @ np.linalg.solve(information, np.einsum("kij,kil,klq->jq", by, inverse, moved))
+
     def jacobian(self, state: _State) -> np.ndarray:
-        """Derivatives (K, 6, 12) by steps of the mount and of the target."""
-        steps = np.array([1e-3] * 3 + [1e-6] * 3 + [1e-3] * 3 + [1e-6] * 3)
-        columns = []
-        for number, size in enumerate(steps):
-            step = np.zeros(12)
-            step[number] = size
-            forth, back = (self.residuals(self.stepped(state, sign * step)) for sign in (1, -1))
-            columns.append((forth - back) / (2 * size))
-        return np.moveaxis(np.array(columns), 0, 2)
+        """Derivatives (K, 6, size) by the parameters."""
+        moved = differences(lambda step: self.residuals(self._moved(state, step)), np.zeros(12), np.tile(POSE_STEPS, 2))
+        return moved.reshape(-1, 6, 12) @ self.free
 
     def stepped(self, state: _State, step: np.ndarray) -> _State:
+        """The state after a step (size,) of the parameters."""
+        return self._moved(state, self.free @ step)
+
+    def _moved(self, state: _State, step: np.ndarray) -> _State:
         """The state after a shift and a turn of the mount about the platform's axes, and of the target's middle."""
         mount, common = state
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ mount[:3, :3]
-        return _transform(turned, mount[:3, 3] + step[:3]), _moved_about(common, self.middle, step[6:])
+        return rigid_transform(turned, mount[:3, 3] + step[:3]), moved_about(common, self.middle, step[6:])
 
     def information(self, state: _State, scatter: np.ndarray) -> np.ndarray:
-        """Information matrix (12, 12) of the steps."""
+        """Information matrix (size, size) of the parameters."""
         by, inverse = self.jacobian(state), np.linalg.inv(self.covariances(state, scatter))
         return np.einsum("kij,kil,klm->jm", by, inverse, by)
 
@@ -364,14 +315,14 @@ class _Problem:
         spread = [max(float(np.median(np.linalg.norm(left[:, k : k + 3], axis=1))), least) for k, least in _LEAST]
         fit = least_squares(
             lambda step: (self.residuals(self.stepped(state, step)) / np.repeat(spread, 3)).ravel(),
-            np.zeros(12),
-            x_scale=np.tile(np.repeat(spread, 3), 2),
+            np.zeros(self.size),
+            x_scale=np.tile(np.repeat(spread, 3), 2) @ self.free,
             loss="cauchy",
         )
         state, used = self.stepped(state, fit.x), self
         sizes = np.abs(self.residuals(state)).reshape(-1, 2, 3).max(axis=2) / spread
         rough = sizes.max(axis=1) < 6 * max(float(np.median(sizes.max(axis=1))), 1.0)
-        used = _Problem([image for image, good in zip(self.images, rough, strict=True) if good], *self._rest())
+        used = replace(self, images=[image for image, good in zip(self.images, rough, strict=True) if good])
         while True:
             used.require_enough(len(self.images))
             state, scatter = used.estimated(state, np.array([*spread, 1.0]))
@@ -381,7 +332,7 @@ class _Problem:
             used = used.without(int(np.argmax(excess)))
 
     def _only(self, numbers: np.ndarray) -> "_Problem":
-        return _Problem([self.images[k] for k in numbers], *self._rest())
+        return replace(self, images=[self.images[k] for k in numbers])
 
     def _typical_miss(self, state: _State) -> float:
         """Median distance by which images miss, of the target's middle and of what lies its distance aside, mm."""
@@ -389,21 +340,18 @@ class _Problem:
         away = np.linalg.norm(self._sensor_from_target[:, :3, 3], axis=1) + 1.0
         return float(np.median(np.linalg.norm(left[:, :3], axis=1) + away * np.linalg.norm(left[:, 3:], axis=1)))
 
-    def _rest(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.camera_from_sensor, self.middle
-
     def require_enough(self, images: int) -> None:
         """CalibrationError with too few images."""
-        if len(self.images) < _FEWEST_IMAGES:
+        if len(self.images) < FEWEST_IMAGES:
             raise CalibrationError(
-                f"{len(self.images)} of {images} images of the target agree with the poses; at least {_FEWEST_IMAGES} "
+                f"{len(self.images)} of {images} images of the target agree with the poses; at least {FEWEST_IMAGES} "
                 "are needed. Are the poses T_base_platform, is their format right, do they come in the images' order?"
             )
 
     def surprise(self, image: BoardImage, state: _State, scatter: np.ndarray) -> float:
         """Squared residuals of an image over the variance with which these images predict them: chi-square of six."""
         state = self.solved(state, scatter)
-        other = _Problem([image], *self._rest())
+        other = replace(self, images=[image])
         by, left = other.jacobian(state)[0], other.residuals(state)[0]
         variance = other.covariances(state, scatter)[0] + by @ np.linalg.pinv(self.information(state, scatter)) @ by.T
         return float(left @ np.linalg.solve(variance, left))
@@ -411,7 +359,7 @@ class _Problem:
     def predicted_mm(self, image: BoardImage, scatter: np.ndarray) -> float:
         """How far an image shows the target's middle from where these images place it, mm."""
         state = self.solved(self.start(), scatter)
-        return float(_Problem([image], *self._rest()).offsets_mm(state)[0])
+        return float(replace(self, images=[image]).offsets_mm(state)[0])
 
     def offsets_mm(self, state: _State) -> np.ndarray:
         """Distances (K,) of the target's middle in each image from the common place."""
@@ -422,16 +370,3 @@ _BOUNDS = (1e-4, 1e3), (1e-7, 1.0), (1.0, 100.0)
 """Of the scatter: mm, rad, and the factor of the images'."""
 _LEAST = ((0, 1e-3), (3, 1e-6))
 """First component of shift and turn, and the least scatter that counts, mm and rad."""
-
-
-def _transform(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, shift
-    return result
-
-
-def _moved_about(pose: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """A pose (4, 4) after a shift (3,) of the place of a point ``middle`` and a turn (3,) about it."""
-    rotation = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
-    place = pose[:3, :3] @ middle + pose[:3, 3] + step[:3]
-    return _transform(rotation, place - rotation @ middle)

@@ -89,7 +89,7 @@ def schur_least_squares(
     local : sequence of (b,); starts of the groups
     soft_limit : residual vectors r count as 2 s^2 (sqrt(1 + |r|^2 / s^2) - 1), the "soft L1" loss with this s;
         quadratic without it
-    smallest_gain : the iteration ends when a step lowers the cost by less than this share of it
+    smallest_gain : the iteration ends with a step that lowers the cost, or is to lower it, by less than this share
     damping : of the first step, as a share of the squared lengths of the derivatives; none is needed near the solution
     enough_rounds : the iteration ends after so many rounds, settled or not
 
@@ -109,6 +109,9 @@ def schur_least_squares(
         size = max(float(np.max(np.abs(step * scale), initial=0.0)) for step, scale in steps)
         # Scaled steps are in the unit of the residuals, summed over all of them.
         small = size <= _SMALLEST_STEP * np.sqrt(normal.count())
+        if not small and _expected_gain(normal, global_step, local_steps) <= smallest_gain * normal.cost:
+            # So near the solution the linear model tells what another look at all residuals would.
+            return _solution(tried_global, tried_local, normal, rounds, "cost settled")
         tried = _assembled(model, tried_global, tried_local, soft_limit)
         if tried is not None and tried.cost <= normal.cost:
             gain = normal.cost - tried.cost
@@ -184,6 +187,13 @@ def _step(normal: _Normal, damping: float) -> tuple[np.ndarray, list[np.ndarray]
         for group, inverse in zip(normal.groups, inverses, strict=True)
     ]
     return step / normal.scale, local
+
+
+def _expected_gain(normal: _Normal, global_step: np.ndarray, local_steps: list[np.ndarray]) -> float:
+    """By how much a step is to lower the cost if residuals were linear, and damping small."""
+    groups = zip(normal.groups, local_steps, strict=True)
+    slopes = [normal.gradient @ (normal.scale * global_step), *(g.gradient @ (g.scale * step) for g, step in groups)]
+    return -float(sum(slopes))
 
 
 def _solution(

@@ -84,7 +84,7 @@ def export(
     Example: uwlts export scan.ply --out scan.laz
 
     Args:
-        file: Capture (.h5) or cloud (.ply, .h5 or .copc.laz).
+        file: Capture (.h5) or cloud (.ply, .h5, .copc.laz; of other programs .xyz, .las, .e57).
         out: New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
             .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers, written a part at a time).
         images: Format of a capture's images; both keep all bits.

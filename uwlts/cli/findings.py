@@ -55,6 +55,7 @@ def compare(
     datums: Path | None = None,
     disc_mm: float | None = None,
     deep_mm: float | None = None,
+    same_water: Flag = False,
     unit: Literal["mm", "m"] = "mm",
     overwrite: Overwrite = False,
 ) -> None:
@@ -63,7 +64,7 @@ def compare(
     Example: uwlts compare after.ply before.ply --out change.html
 
     Args:
-        cloud: Cloud of the surface (.ply or .h5).
+        cloud: Cloud of the surface (.ply, .h5, .copc.laz; of other programs .las, .e57, and text in mm).
         reference: Earlier cloud; a mesh (.stl, .obj, .off, or .ply with faces); or an ideal shape: plane, sphere or
             cylinder to fit one, or a TOML file with its kind and what is known of it (docs/how-to/compare-scans.md).
         out: Page to write, with the figures as JSON beside it.
@@ -72,6 +73,7 @@ def compare(
         datums: TOML file with spheres that hold what has not changed; only points in them count for the registration.
         disc_mm: Diameter over which points are averaged; about 30 points unless given.
         deep_mm: Largest distance that is looked for; three diameters unless given.
+        same_water: Both clouds were scanned in water of the same temperature and salinity.
         unit: Unit of the reference.
     """
     from uwlts.report.page_toolkit import refuse_unsuitable_page
@@ -80,7 +82,14 @@ def compare(
     if coloured:
         refuse_unsuitable(coloured, overwrite=overwrite)
     change = uwlts.compare_clouds(
-        cloud, reference, register=register, datums=datums, disc_mm=disc_mm, deep_mm=deep_mm, unit=unit
+        cloud,
+        reference,
+        register=register,
+        datums=datums,
+        disc_mm=disc_mm,
+        deep_mm=deep_mm,
+        same_water=same_water,
+        unit=unit,
     )
     show(change.lines())
     title = f"{cloud.name} against {Path(reference).name}"
@@ -106,7 +115,7 @@ def inspect(
     Example: uwlts inspect pipe.ply --wall-mm 9.5 --out pipe.json
 
     Args:
-        cloud: Cloud of the object (.ply or .h5).
+        cloud: Cloud of the object (.ply, .h5, .copc.laz; of other programs .las, .e57, and text in mm).
         kind: What the cloud shows.
         out: Findings to write (JSON), each value with its definition and its source.
         coloured: Also write the cloud with each point's distance from the undamaged surface to this file.

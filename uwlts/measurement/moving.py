@@ -8,6 +8,7 @@ steps by the product. So the correlation of any two moments follows from the sta
 """
 
 from dataclasses import dataclass, replace
+from hashlib import sha256
 
 import numpy as np
 
@@ -96,16 +97,19 @@ def with_platform(
     ride: Ride,
     mount: Mount | None,
     *,
+    mount_covariance: np.ndarray | None = None,
     correlation_s: float | None = None,
 ) -> PointUncertainty:
     """The uncertainty of points (N, 3) of images (N,) in the base frame with those of mount, time offset and poses.
 
+    ``mount_covariance`` (6, 6) replaces the mount's own, where ``uncertainty`` holds a part of it already.
     ``correlation_s`` is the time over which errors of poses stay alike, 0 where each errs by itself; by default 0
     without and as of a navigation filter with a trajectory. Images without a covariance have none of their pose.
     """
     together, poses_mm = [uncertainty.patterns_mm], uncertainty.poses_mm
     if mount is not None:
-        together.append(_by_mount(points_mm, ride.poses[frame], mount))
+        covariance = np.array(mount.covariance) if mount_covariance is None else mount_covariance
+        together.append(_by_mount(points_mm, ride.poses[frame], mount.transform()[:3, 3], covariance))
         if ride.rates is not None and mount.time_offset_std_s:
             moved = _moved(ride.rates[frame] * mount.time_offset_std_s, points_mm, ride.poses[frame])
             together.append(moved[None])
@@ -123,20 +127,28 @@ def with_platform(
                     together.append(_moved(errors[image], points_mm, ride.poses[frame])[None])
         own = [_moved((roots[:, :, k] * apart[:, None])[image], points_mm, ride.poses[frame]) for k in range(6)]
         poses_mm = np.array(own, dtype=np.float32)
-    patterns = together[0] if len(together) == 1 else independent_patterns(np.concatenate(together))
-    return replace(uncertainty, patterns_mm=patterns, poses_mm=poses_mm)
+    if len(together) == 1:
+        return replace(uncertainty, poses_mm=poses_mm)
+    patterns, mixed = independent_patterns(np.concatenate(together))
+    count = len(uncertainty.patterns_mm)
+    shared = {name: mixed[:, :count] @ each for name, each in uncertainty.shared.items()}
+    if mount is not None:
+        covariance = np.array(mount.covariance) if mount_covariance is None else mount_covariance
+        digest = sha256(mount.transform().tobytes() + covariance.tobytes()).hexdigest()[:16]
+        shared[f"mount {digest}"] = mixed[:, count : count + len(together[1])]
+    return replace(uncertainty, patterns_mm=patterns, poses_mm=poses_mm, shared=shared)
 
 
-def _by_mount(points_mm: np.ndarray, poses: np.ndarray, mount: Mount) -> np.ndarray:
+def _by_mount(points_mm: np.ndarray, poses: np.ndarray, place_mm: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """How points (N, 3) move (6, N, 3) by independent parts of the mount's error; ``poses`` are the platform's of each.
 
     A shift d and a turn w of the mount, both in the platform's frame, move a point p of the platform by
-    d + w x (p - t), t being the sensor's place there.
+    d + w x (p - t), t being the sensor's place there, ``place_mm`` (3,).
     """
     rotations = poses[:, :3, :3]
-    from_sensor = np.einsum("nji,nj->ni", rotations, points_mm - poses[:, :3, 3]) - mount.transform()[:3, 3]
+    from_sensor = np.einsum("nji,nj->ni", rotations, points_mm - poses[:, :3, 3]) - place_mm
     moved = []
-    for shift, turn in covariance_root(np.array(mount.covariance)).T.reshape(-1, 2, 3):
+    for shift, turn in covariance_root(covariance).T.reshape(-1, 2, 3):
         moved.append(np.einsum("nij,nj->ni", rotations, shift + np.cross(turn, from_sensor)))
     return np.array(moved)
 

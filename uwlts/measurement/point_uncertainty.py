@@ -6,33 +6,31 @@ by one standard deviation of something that is independent of all other patterns
 follows, correlations included, from calculating it again with each pattern added.
 """
 
-from collections.abc import Callable
 from functools import partial
+from hashlib import sha256
 
 import numpy as np
 
-from uwlts.calibration.joint.derivatives import COLUMNS
 from uwlts.calibration.joint.evidence import STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, across_of
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, stored_estimate
 from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import StageParameter
-from uwlts.model.stripe import pixels_of
 from uwlts.optics.brightness import BLUR_STD, beside_std
-from uwlts.optics.line_table import LineTable
+from uwlts.optics.line_table import LineTable, sum_terms
 from uwlts.runtime.compiled import compiled
 from uwlts.storage.capture import Capture, CaptureHeader, FrameTable, sensor_poses
-from uwlts.storage.cloud import PointUncertainty
+from uwlts.storage.cloud import WATER, PointUncertainty
 from uwlts.storage.files import sha256_of
 
-_BLOCK = 20000
 # Patterns that together move the points by no more than this (root mean square) are left out.
 _NEGLIGIBLE_MM = 5e-5
 _FEWEST_NEIGHBOURS = 10
-# Parts of the parameters that move no point by more than this (root sum of squares over places) are joined with others.
-_NOTHING_MM, _PLACES, _FEWEST_POINTS = 1e-7, 10, 2000
+# Points by which patterns are chosen: their root mean square is within some percent that of all.
+_SAMPLED = 500
 _TABLE_TOLERANCE_MM = 1e-6
 
 
@@ -69,6 +67,7 @@ def point_uncertainty(
     *,
     blur_px: np.ndarray | None = None,
     beside_mm: np.ndarray | None = None,
+    mount_by: np.ndarray | None = None,
 ) -> PointUncertainty:
     """Uncertainty of the points that stripe centres (N,) of a capture give by a joint calibration.
 
@@ -76,7 +75,9 @@ def point_uncertainty(
     is part of it, about the middle of its positions; what poses add is not (`uwlts.measurement.moving`). The water may
     have drifted since the calibration, unless that was made from this very capture. ``blur_px`` (N,), how far blur may
     move the centres, and ``beside_mm`` (N, 3), how far points were moved to where their light comes from
-    (`uwlts.optics.brightness`), are each wrong by some share, the same for all points.
+    (`uwlts.optics.brightness`), are each wrong by some share, the same for all points. ``mount_by`` (6, P) are
+    derivatives of the mount by the parameters of the joint estimate (`uwlts.model.mount.SensorShare`), where the frames
+    carry poses of a platform: what the calibration does to points and mount then belongs together.
 
     Raises
     ------
@@ -95,132 +96,145 @@ def point_uncertainty(
     of_sensor = sensor_poses(capture)
     pose = of_sensor[:, :3, :3]
     posed = np.all(np.isfinite(of_sensor), axis=(1, 2), keepdims=True)
-    into_object = calibration.object_transform()[:3, :3].T
     pose_of = np.where(posed, pose, np.eye(3))
-    root = covariance_root(known.covariance)
+    found = require_joint(calibration).covariance_matrix()
+    root = np.zeros((len(known.covariance), 1 + len(found)))
+    # What the medium's index adds to the estimate: its drift, or all of it in a medium that was not calibrated in.
+    root[:, 0] = np.sqrt(np.maximum(np.diag(known.covariance) - np.pad(np.diag(found), (0, len(root) - len(found))), 0))
+    root[: len(found), 1:] = covariance_root(found)
     by_stage_alone = ~posed[:, 0, 0]
     middle = np.mean(capture.stage_mm[by_stage_alone]) if by_stage_alone.any() else 0.0
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
     by_stage = stage_root(known, calibration, header, root)
     root = np.hstack([root, np.zeros((len(root), len(by_stage) - root.shape[1]))])
-    exact = partial(_derivatives, known, stripe_along=calibration.stripe_along, turn=into_object)
-    root, by_stage = _fewest_parts(exact, root, by_stage, line, centre_px, reach_mm=np.abs(stage).max(initial=0.0))
-    table = LineTable.about(
-        lambda *where: exact(root, *where).reshape(len(where[0]), -1), line, centre_px, tolerance=_TABLE_TOLERANCE_MM
+    rigid = (
+        np.zeros((6, root.shape[1])) if mount_by is None else _in_sensor(mount_by, header) @ root[: mount_by.shape[1]]
     )
-    nothing = np.zeros((len(line), 3))
-    beside = nothing if beside_mm is None else beside_std(header.sensor.uncertainty) * beside_mm
-    blur = nothing[:, 0] if blur_px is None else BLUR_STD * blur_px
-    random, moved = np.empty((len(line), 6), np.float32), np.empty((len(line), 3, 2 + root.shape[1]))
-    for start in range(0, len(line), _BLOCK):
-        here = slice(start, start + _BLOCK)
-        parts, where = moved[here], (line[here], centre_px[here])
+    exact = partial(_derivatives, known, root, rigid)
+    table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE_MM)
+    beside = np.zeros((len(line), 3)) if beside_mm is None else beside_std(header.sensor.uncertainty) * beside_mm
+    blur = np.zeros(len(line)) if blur_px is None else BLUR_STD * blur_px
+
+    def moved(some: slice, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Covariance by noise (n, 6) of some points, and sums (M, n, 3) of their parts with weights (2 + R, M)."""
+        # In each axis the derivative by the pixel first, as it is.
+        of_parts = np.zeros((1 + len(by_stage), 1 + weights.shape[1]))
+        of_parts[0, 0], of_parts[1:, 1:] = 1.0, weights[2:]
+        of_axes, where = np.kron(np.eye(3), of_parts), (line[some], centre_px[some])
         if table is None:
-            parts[:] = exact(root, *where)
+            values = exact(*where) @ of_axes
+            series, row, at = values[:, None], np.arange(len(values)), np.zeros(len(values))
         else:
-            table.values(*where, out=parts.reshape(len(parts), -1))
-        if posed.any():
-            parts[:] = pose_of[frame[here]] @ parts
-        _add_parts(parts, noise[here], stage[frame[here]], by_stage, blur[here], beside[here], random[here])
+            series, row, at = table.combined(of_axes).series(*where)
+        random, sums = np.empty((len(row), 6), np.float32), np.empty((weights.shape[1], len(row), 3), np.float32)
+        image, error, by_blur, off = (np.ascontiguousarray(each[some]) for each in (frame, noise, blur, beside))
+        of_blur, of_beside, of_stage = weights[0], weights[1], np.ascontiguousarray(by_stage.T @ weights[2:])
+        room, images = np.empty(of_axes.shape[1]), (pose_of, stage, image)
+        _move(series, row, at, *images, error, by_blur, off, of_blur, of_beside, of_stage, room, random, sums)
+        return random, sums
+
+    # What moves all points together is smooth, so that some of them show which patterns hold nearly all of it.
+    few = slice(None, None, max(1, len(line) // _SAMPLED))
+    sampled = moved(few, np.eye(2 + len(by_stage)))[1]
+    weights = _chief_patterns(sampled.reshape(len(sampled), -1).astype(float))
+    random, patterns = moved(slice(None), weights)
     if not np.isfinite(random).all():
         raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
     along = np.array(header.stage_direction)
     position = np.where(posed[frame, :, 0], 0.0, header.sensor.uncertainty.stage_position_mm * along)
-    return PointUncertainty(random, position.astype(np.float32), _patterns(moved.reshape(-1, moved.shape[2]).T))
+    # All but blur is the sensor's, its stage's and its water's, whatever they scan in this medium.
+    source = f"{calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
+    name = sha256(source.encode()).hexdigest()[:16]
+    of_sensor_parts = np.delete(weights, [0, 2], axis=0)
+    shared = {f"{WATER} {name}": weights[2:3].T, f"sensor {name}": of_sensor_parts.T}
+    return PointUncertainty(random, position.astype(np.float32), patterns, shared=shared)
 
 
 @compiled
-def _add_parts(
-    parts: np.ndarray,
-    noise: np.ndarray,
+def _move(
+    series: np.ndarray,
+    row: np.ndarray,
+    at: np.ndarray,
+    turns: np.ndarray,
     stage: np.ndarray,
-    by_stage: np.ndarray,
+    frame: np.ndarray,
+    noise: np.ndarray,
     blur: np.ndarray,
     beside: np.ndarray,
+    of_blur: np.ndarray,
+    of_beside: np.ndarray,
+    of_stage: np.ndarray,
+    flat: np.ndarray,
     random: np.ndarray,
+    sums: np.ndarray,
 ) -> None:
-    """Add to ``parts`` (N, 3, 2 + R) what stage, blur and brightness beside the sheet do; fill ``random`` (N, 6).
+    """Fill ``random`` (N, 6), in the order of `PAIRS`, and ``sums`` (M, N, 3); ``flat`` (3 + 3 M,) is room to work in.
 
-    The first two parts, derivatives by the pixel across the stripe and room, become those of blur and brightness.
+    ``series`` (L, n, 3 + 3 M) are of derivatives by the pixel across the stripe and of sums of the estimate's parts, in
+    each axis; what images turn, blur, brightness beside the sheet (N, 3) and the stage add is ``of_...`` (M,) and
+    (3, M) times that of the point.
     """
-    # In the order of `PAIRS`.
-    for n in range(parts.shape[0]):
-        x, y, z = parts[n, 0, 0] * noise[n], parts[n, 1, 0] * noise[n], parts[n, 2, 0] * noise[n]
+    count = sums.shape[0]
+    value = flat.reshape(3, 1 + count)
+    for n in range(row.size):
+        sum_terms(series[row[n]], at[n], flat)
+        turn, far = turns[frame[n]], stage[frame[n]]
+        for m in range(1 + count):
+            a, b, c = value[0, m], value[1, m], value[2, m]
+            for axis in range(3):
+                value[axis, m] = turn[axis, 0] * a + turn[axis, 1] * b + turn[axis, 2] * c
+        x, y, z = value[0, 0] * noise[n], value[1, 0] * noise[n], value[2, 0] * noise[n]
         random[n, 0], random[n, 1], random[n, 2] = x * x, x * y, x * z
         random[n, 3], random[n, 4], random[n, 5] = y * y, y * z, z * z
-        for axis in range(3):
-            parts[n, axis, 0] *= blur[n]
-            parts[n, axis, 1] = beside[n, axis]
-            for r in range(by_stage.shape[0]):
-                parts[n, axis, 2 + r] += by_stage[r, axis] * stage[n]
+        for m in range(count):
+            for axis in range(3):
+                own = value[axis, 0] * blur[n] * of_blur[m] + beside[n, axis] * of_beside[m]
+                sums[m, n, axis] = value[axis, 1 + m] + own + of_stage[axis, m] * far
 
 
-def _fewest_parts(
-    exact: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
-    root: np.ndarray,
-    by_stage: np.ndarray,
-    line: np.ndarray,
-    centre_px: np.ndarray,
-    *,
-    reach_mm: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Independent parts ``root`` (P, R) and ``by_stage`` (R, 3) as few as move points the same, to `_NOTHING_MM`.
-
-    Points move smoothly over the image, so that what some hundred places over all of it show holds for all of them.
-    """
-    if len(line) < _FEWEST_POINTS:
-        return root, by_stage
-    lines, places = (np.linspace(values.min(), values.max(), _PLACES) for values in (line, centre_px))
-    at = np.meshgrid(lines, places)
-    moved = exact(root, at[0].ravel(), at[1].ravel())[:, :, 2:]
-    if not np.isfinite(moved).all():
-        return root, by_stage
-    together = np.vstack([moved.reshape(-1, root.shape[1]), reach_mm * by_stage.T])
-    _, values, parts = np.linalg.svd(together, full_matrices=False)
-    kept = parts[values > _NOTHING_MM].T
-    return root @ kept, kept.T @ by_stage
+def _in_sensor(mount_by: np.ndarray, header: CaptureHeader) -> np.ndarray:
+    """Derivatives (6, P) of a mount, shift and turn, along the axes of the sensor in place of the platform's."""
+    turn = np.array(header.T_platform_sensor)[:3, :3]
+    return np.vstack([turn.T @ mount_by[:3], turn.T @ mount_by[3:]])
 
 
 def _derivatives(
-    known: StoredEstimate,
-    root: np.ndarray,
-    line: np.ndarray,
-    centre_px: np.ndarray,
-    *,
-    stripe_along: str,
-    turn: np.ndarray,
+    known: StoredEstimate, root: np.ndarray, rigid: np.ndarray, line: np.ndarray, centre_px: np.ndarray
 ) -> np.ndarray:
-    """Derivatives (N, 3, 2 + R) of points by the pixel across the stripe, 0, and independent parts of all parameters.
+    """Derivatives (N, 3 (1 + R)), axis by axis, of points by the pixel across the stripe and independent parts.
 
-    ``turn`` (3, 3) turns them from the camera's frame; they are NaN where a centre has no point.
+    In the OCS. The parts are ``root`` (P, R), those of all parameters, and move the OCS by ``rigid`` (6, R), shift and
+    turn. NaN where a centre has no point.
     """
-    column = COLUMNS.index("v" if stripe_along == "width" else "u")
-    pixels = pixels_of(line, centre_px, stripe_along=stripe_along)
-    points = known.parameters.on_sheet(known.values, known.view, pixels)
-    result = np.zeros((len(line), 3, 2 + root.shape[1]))
-    if points is None:
+    result = np.empty((len(line), 3, 1 + root.shape[1]))
+    found = known.points_by(line, centre_px)
+    if found is None:
         result[:] = np.nan
-        return result
-    result[:, :, 0] = points.by_rays[column].T
-    for axis in range(3):
-        by_global = known.parameters.by_global(points.by_rays[:, axis], known.view, points.by_sheet[:, axis])
-        result[:, axis, 2:] = by_global @ root
-    return np.einsum("ij,njr->nir", turn, result)
+    else:
+        points, by = found
+        result[:, :, 0] = by[:, :, 0]
+        result[:, :, 1:] = by[:, :, 1:] @ root
+        if rigid.any():
+            result[:, :, 1:] += rigid[:3] + np.cross(rigid[3:].T, points[:, None]).swapaxes(1, 2)
+    return result.reshape(len(line), -1)
 
 
-def independent_patterns(moved: np.ndarray) -> np.ndarray:
-    """Patterns (M, N, 3), orthogonal over the points, from any (R, N, 3) that together have their covariance."""
-    return _patterns(moved.reshape(len(moved), -1))
+def independent_patterns(moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Patterns (M, N, 3), orthogonal over the points, from any (R, N, 3) that together have their covariance.
+
+    And how much (M, R) of each of these every pattern has.
+    """
+    flat = moved.reshape(len(moved), -1)
+    weights = _chief_patterns(flat)
+    return (weights.T @ flat).astype(np.float32).reshape(-1, *moved.shape[1:]), weights.T
 
 
-def _patterns(flat: np.ndarray) -> np.ndarray:
-    """Patterns (M, N, 3) as of `independent_patterns` from any (R, 3 N), in any order of memory."""
-    values, vectors = np.linalg.eigh(flat @ flat.T)
-    order = np.argsort(values)[::-1]
-    values, vectors = np.maximum(values[order], 0.0), vectors[:, order]
-    left = 3.0 * np.append(np.cumsum(values[::-1])[::-1][1:], 0.0) / flat.shape[1]
-    count = 1 + int(np.argmax(left <= _NEGLIGIBLE_MM**2))
-    return (vectors[:, :count].T @ flat).astype(np.float32).reshape(count, -1, 3)
+def _chief_patterns(moved: np.ndarray) -> np.ndarray:
+    """Weights (R, M) of moves (R, 3 N) for as few patterns as hold all but what is negligible."""
+    values, vectors = np.linalg.eigh(moved @ moved.T)
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    left = 3.0 * np.append(np.cumsum(values[::-1])[::-1][1:], 0.0) / moved.shape[1]
+    return np.ascontiguousarray(vectors[:, : 1 + int(np.argmax(left <= _NEGLIGIBLE_MM**2))])
 
 
 def stage_root(known: StoredEstimate, calibration: Calibration, header: CaptureHeader, root: np.ndarray) -> np.ndarray:

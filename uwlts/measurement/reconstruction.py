@@ -13,13 +13,14 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount
 from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory
-from uwlts.optics.brightness import beside_sheet, sharp_lines, slopes_of_brightness
+from uwlts.optics.brightness import beside_sheet, beside_std, footprint_mm, sharp_lines, slopes_of_brightness
 from uwlts.optics.reconstruction import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, FrameTable, opened_capture, sensor_poses
-from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
 from uwlts.storage.mount_files import read_mount
 from uwlts.stripe import FoundStripes, StripeSettings, find_stripes
 
@@ -113,13 +114,17 @@ def reconstruct(
         ride = platform_ride(scan, trajectory, mount=mount, clock_offset_s=clock_offset_s)
         stripes = find_stripes(scan, options=stripe, progress=progress)
         table = carried(scan, ride, mount)
-        cloud = reconstruct_stripes(table, stripes, calibration, index=index, with_uncertainty=known)
+        apart, common = (None, None) if mount is None else mount.apart_from(calibration_digest(calibration))
+        cloud = reconstruct_stripes(
+            table, stripes, calibration, index=index, with_uncertainty=known, mount_by=common if known else None
+        )
         warnings = cloud.warnings
         if mount is None and scan.header.T_platform_sensor is not None:
             warnings = [*warnings, "the mount is that of the drawing: calibrate it (uwlts mount) and give --mount"]
         own = cloud.uncertainty
         if own is not None:
-            own = with_platform(own, cloud.points_mm, cloud.frame, ride, mount, correlation_s=pose_correlation_s)
+            where = cloud.points_mm, cloud.frame, ride
+            own = with_platform(own, *where, mount, mount_covariance=apart, correlation_s=pose_correlation_s)
         return replace(cloud, uncertainty=own, warnings=warnings, time_s=scan.time_s[cloud.frame])
 
 
@@ -130,12 +135,14 @@ def reconstruct_stripes(
     *,
     index: float | None = None,
     with_uncertainty: bool = False,
+    mount_by: np.ndarray | None = None,
 ) -> ScanCloud:
     """Point cloud of a capture in the OCS, with the stage's motion added (or the pose, where a frame has one).
 
     ``index`` replaces the refractive index that follows from the capture's medium. ``with_uncertainty`` adds the
-    uncertainty of the points by a joint calibration. Without a mounted window the calibration's is left out. Points
-    that a calibration by polynomials does not reach are left out and counted in ``rays_by_status``.
+    uncertainty of the points by a joint calibration, ``mount_by`` as in `point_uncertainty`. Without a mounted window
+    the calibration's is left out. Points that a calibration by polynomials does not reach are left out and counted in
+    ``rays_by_status``.
 
     By a joint calibration points are taken where the light comes from, beside the sheet's middle where the surface
     shines brighter there (`uwlts.optics.brightness`), and lines are left out, counted as ``blurred``, where blur may
@@ -172,7 +179,7 @@ def reconstruct_stripes(
         if exact is None:
             raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (--water or --joint)")
         where = kept.frame, kept.line, kept.centre_px
-        known = point_uncertainty(capture, exact, *where, blur_px=blur[good], beside_mm=beside[good])
+        known = point_uncertainty(capture, exact, *where, blur_px=blur[good], beside_mm=beside[good], mount_by=mount_by)
     rays = np.bincount(found.status, minlength=len(RayStatus))
     return ScanCloud(
         points_mm=points[good],
@@ -187,6 +194,7 @@ def reconstruct_stripes(
             "medium_index": index,
             "artefact": capture.header.artefact,
             "calibration": calibration_digest(calibration),
+            **(_footprint(capture, calibration, kept, index) if isinstance(calibration, Calibration) else {}),
         },
         stripe=sharp[good],
         lines_by_status=lines,
@@ -228,6 +236,15 @@ def _beside(capture: Capture | FrameTable, calibration: Calibration, stripes: Fo
     where = (capture.header.sensor, stripes.line, stripes.centre_px, stripes.width_px, slopes)
     direction = capture.header.stage_direction
     return beside_sheet(calibration, *where, medium_index=index, stage_direction=direction)
+
+
+def _footprint(capture: Capture | FrameTable, calibration: Calibration, kept: FoundStripes, index: float) -> Table:
+    """Metadata of how much of the surface a point is the mean of; none of clouds of moved sensors."""
+    if np.isfinite(capture.pose).any() or not np.isfinite(kept.width_px).any():
+        return {}
+    sensor = capture.header.sensor
+    size = footprint_mm(calibration, sensor, kept.line, kept.centre_px, kept.width_px, medium_index=index)
+    return {FOOTPRINT: list(size), FOOTPRINT_STD: beside_std(sensor.uncertainty)}
 
 
 def _posed(points: np.ndarray, capture: Capture | FrameTable, frame: np.ndarray) -> np.ndarray:

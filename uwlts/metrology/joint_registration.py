@@ -1,7 +1,8 @@
 """Joint least squares for the poses of scans: distances between their surfaces, common spheres, patterns, and a prior.
 
 Unknown are the pose of every scan but the first, as a shift (mm) and a turn (rad) about the scan's middle in the common
-frame, and how much of each of its systematic patterns every scan has.
+frame, and how much of each of its systematic patterns every scan has. Scans by one calibration of the sensor, or one of
+its mount, have these errors in common: their patterns are correlated beforehand as far as they consist of them.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ _FEWEST = 12
 """Patches of an overlap; a movement has six parameters."""
 _NOISE = 5.0
 """Times the information that the noise of normals alone would give: a direction with less is open."""
+_OWN_PART = 1e-4
+"""Variance of a pattern that no other scan has, of one: a hundredth of its errors, as temperature and load change."""
 _ROUNDING = 1e-9
 """Of the information of the best determined direction: less is rounding."""
 _SPHERE_REACH = 0.25
@@ -83,6 +86,7 @@ class JointRegistration:
         *,
         start_std: tuple[float, float] | None,
         sphere_mm: float | None,
+        shared: Sequence[dict[str, np.ndarray]] | None = None,
     ) -> None:
         self.patches, self.markers, self.start = patches, markers, poses
         self.poses = poses.copy()
@@ -96,6 +100,7 @@ class JointRegistration:
         # Turns in units of the shift that they give to the usual point.
         turns = np.repeat(np.array([[1.0, 1 / size] for size in self.sizes[1:]]).ravel(), 3)
         self.units = np.append(turns, np.ones(ends[-1] - ends[0]))
+        self.alike = _alike(self.patterns, shared or [{}] * len(patches))
 
     @property
     def unknown_poses(self) -> int:
@@ -144,8 +149,8 @@ class JointRegistration:
         scale = np.outer(self.units, self.units)
         normal, gradient = normal * scale, gradient * self.units
         spurious *= scale[:count, :count]
-        beside = normal[count:, count:] + np.eye(unknown - count)
-        gradient[count:] += np.concatenate(self.patterns)
+        beside = normal[count:, count:] + self.alike
+        gradient[count:] += self.alike @ np.concatenate(self.patterns)
         within = np.linalg.solve(beside, normal[count:, :count])
         reduced = normal[:count, :count] - normal[:count, count:] @ within
         reduced = (reduced + reduced.T) / 2
@@ -238,7 +243,7 @@ class JointRegistration:
             std = found.std_mm * spread
             u = np.clip(found.distance_mm / std / _TUKEY, -1, 1)
             # Both directions count by half, and K scans of one place have K (K - 1) / 2 pairs and K - 1 differences.
-            each = 1 / (others[source][found.source] * self.patches[source].shared)
+            each = 1 / (others[source][found.source] * self.patches[source].alike(len(found.source)))
             weight = (1 - u * u) ** 2 / std**2 * each
             block = np.zeros((len(weight), unknown))
             for number, rows, sign in ((source, found.source, 1.0), (target, found.target, -1.0)):
@@ -298,6 +303,19 @@ class JointRegistration:
         turned = Rotation.from_matrix(self.poses[1:, :3, :3] @ self.start[1:, :3, :3].transpose(0, 2, 1)).as_rotvec()
         before = np.einsum("nij,nj->ni", self.start[1:, :3, :3], self.local_middles[1:]) + self.start[1:, :3, 3]
         return np.hstack([self.middles_mm[1:] - before, turned]).ravel()
+
+
+def _alike(patterns: Sequence[np.ndarray], shared: Sequence[dict[str, np.ndarray]]) -> np.ndarray:
+    """Information (U, U) beforehand on the patterns of all scans, each of variance one."""
+    ends = np.cumsum([0, *map(len, patterns)])
+    covariance = (1 + _OWN_PART) * np.eye(ends[-1])
+    for a, b in permutations(range(len(patterns)), 2):
+        for name in shared[a].keys() & shared[b].keys():
+            if shared[a][name].shape[1] == shared[b][name].shape[1]:
+                covariance[ends[a] : ends[a + 1], ends[b] : ends[b + 1]] += shared[a][name] @ shared[b][name].T
+    # What rounds wrong, or contradicts itself, counts as apart.
+    least = float(np.linalg.eigvalsh(covariance)[0]) if len(covariance) else 1.0
+    return np.linalg.inv(covariance + max(_OWN_PART - least, 0.0) * np.eye(ends[-1]))
 
 
 def _usual_distance(points: np.ndarray) -> float:

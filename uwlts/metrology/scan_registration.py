@@ -3,7 +3,8 @@
 Residuals are distances of patches of one scan from the surface of another (`uwlts.metrology.patches`), and differences
 of the centres of spheres that several scans show. Unknown are the pose of every scan but the first, and how much of
 each of its systematic patterns a scan has (`PointUncertainty`), which are known beforehand to be of standard deviation
-one. Tukey's biweight leaves out what fits no surface.
+one, and the same in all scans as far as they come from one calibration. Tukey's biweight leaves out what fits no
+surface.
 """
 
 from __future__ import annotations
@@ -210,7 +211,7 @@ def register(
     patches = []
     for number, (name, scan) in enumerate(zip(names, scans, strict=True)):
         try:
-            patches.append(surface_patches(scan.points_mm, scan.uncertainty))
+            patches.append(surface_patches(scan.points_mm, scan.uncertainty, frame=scan.frame))
         except EvaluationError as error:
             raise EvaluationError(f"{name}: {error}") from error
         progress(number + 1, steps)
@@ -221,7 +222,8 @@ def register(
         else _given(poses, len(scans))
     )
     std = None if start_std_mm is None or start_std_deg is None else (start_std_mm, float(np.radians(start_std_deg)))
-    joint = JointRegistration(patches, markers, start, start_std=std, sphere_mm=sphere_mm)
+    shared = [{} if scan.uncertainty is None else scan.uncertainty.shared for scan in scans]
+    joint = JointRegistration(patches, markers, start, start_std=std, sphere_mm=sphere_mm, shared=shared)
     least = 2 * max(each.radius_mm for each in patches)
     reach = least if search else reach_mm or _REACH * float(np.median([_size(scan) for scan in scans]))
     for done in range(_ROUNDS):

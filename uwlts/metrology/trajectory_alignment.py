@@ -1,8 +1,11 @@
 """Self-consistency of a scan along a path: a smooth correction of the path, by surfaces that it shows more than once.
 
 Unknown is a correction of every pose, a shift (mm) and a turn (rad) in the base frame about the platform, as a cubic
-B-spline in time. Known beforehand is how a navigation drifts: half of its variance as a steady rate, half as a random
-walk, from an exact start. Residuals are distances between patches of the surface where the path crosses itself.
+B-spline in time. Known beforehand is by how much a navigation drifts from an exact start: by a steady rate (a bias of
+velocity or gyroscope), by a rate that wanders (its instability), and by a random walk (noise of the velocity). Which
+shares of the variance these have is what makes the evidence likeliest (empirical Bayes: MacKay, Neural Computation 4,
+1992): a random walk also bends what is seen within a crossing. Residuals are distances between patches of the surface
+where the path crosses itself.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from uwlts.metrology.patches import (
     scatter,
     surface_patches,
 )
+from uwlts.metrology.path_uncertainty import along_corrected_path
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory
@@ -37,6 +41,16 @@ _VOXEL = 0.4
 """Of the radius of patches: points for a search by features."""
 _INTERVALS = 100
 """Of the spline: between two knots a random walk goes a tenth of the drift of the whole path."""
+_SMOOTH, _ROUGH = (0.3, 0.01), (0.2, 0.4)
+"""Shares of wandering rate and random walk with which crossings are searched, the second where there are none else."""
+_SHARES = [
+    (wander, walk)
+    for wander in (0.003, 0.01, 0.03, 0.1, 0.3, 0.6)
+    for walk in (1e-5, 1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6)
+    if wander + walk <= 0.9
+]
+_LEARNED = 4
+"""Times the shares are estimated: matches and weights follow them."""
 _FEWEST = 30
 """Patches of a piece, and of a crossing."""
 _ROUNDS = 15
@@ -83,7 +97,8 @@ class AlignedTrajectory:
         Shift (mm) and turn (rad) that each pose was given.
     crossings : tuple of Crossing
     cloud : PointCloud
-        The cloud along the corrected path, without uncertainty: to have that, reconstruct it along the path anew.
+        The cloud along the corrected path. Its uncertainty is that of the corrected path, and what the given cloud's
+        holds of the calibrations of sensor and mount.
     """
 
     trajectory: Trajectory
@@ -158,16 +173,20 @@ def align_trajectory(
     times = cloud.time_s + clock_offset_s
     path = _Path.of(trajectory, _drift(trajectory, drift_mm, drift_deg), times)
     pieces = _pieces(cloud, times, path)
-    joint = _Alignment(pieces, path)
-    for number in range(len(pieces)):
-        joint.close_with_earlier(number)
-        progress(number + 1, len(pieces))
-    if not joint.pairs:
+    for shares in (_SMOOTH, _ROUGH):
+        joint = _Alignment(pieces, path, shares)
+        for number in range(len(pieces)):
+            joint.close_with_earlier(number)
+            progress(number + 1, len(pieces))
+        if joint.pairs:
+            joint.settle()
+        if joint.pairs:
+            break
+    else:
         raise EvaluationError(
             f"the path shows no surface twice, within {_SIGMAS:g} standard deviations of its drift, that tells where "
             "it is: cross an earlier part of the path over a surface with features"
         )
-    joint.settle()
     return joint.result(cloud, trajectory, times)
 
 
@@ -212,12 +231,18 @@ class _Path:
         inside = np.clip(times, self.first_s, self.last_s)
         return BSpline.design_matrix(inside, self.knots, 3).toarray()
 
-    def information(self) -> np.ndarray:
-        """Inverse covariance (6 C, 6 C) of the coefficients, ordered coefficient by coefficient."""
+    def information(self, shares: tuple[float, float]) -> np.ndarray:
+        """Inverse covariance (6 C, 6 C) of the coefficients, ordered coefficient by coefficient.
+
+        ``shares`` of the variance at the end are those of a wandering rate and of a random walk.
+        """
         # A coefficient stands for the correction at the mean of its knots (Greville).
         at = np.array([self.knots[k + 1 : k + 4].mean() for k in range(self.count)])
         t = (at - self.first_s) / (self.last_s - self.first_s)
-        shape = 0.5 * np.outer(t, t) + 0.5 * np.minimum(t[:, None], t)
+        first, second = np.minimum(t[:, None], t), np.maximum(t[:, None], t)
+        # A rate that walks at random, from zero: the integral of a random walk.
+        wandering = first**2 * (3 * second - first) / 2
+        shape = (1 - sum(shares)) * np.outer(t, t) + shares[0] * wandering + shares[1] * first
         parts = []
         for size, exact in zip(self.drift, (_EXACT_MM, _EXACT_RAD), strict=True):
             parts += [np.linalg.inv(size**2 * shape + (exact**2 + 1e-10 * size**2) * np.eye(len(t)))] * 3
@@ -286,9 +311,9 @@ def _pieces(cloud: PointCloud, times: np.ndarray, path: _Path) -> list[_Piece]:
 class _Alignment:
     """Coefficients of the correction, and the pairs of pieces that cross."""
 
-    def __init__(self, pieces: list[_Piece], path: _Path) -> None:
-        self.pieces, self.path = pieces, path
-        self.prior = path.information()
+    def __init__(self, pieces: list[_Piece], path: _Path, shares: tuple[float, float]) -> None:
+        self.pieces, self.path, self.shares = pieces, path, shares
+        self.prior = path.information(shares)
         self.coefficients = np.zeros(6 * path.count)
         self.covariance = np.linalg.inv(self.prior)
         self.bases = [path.basis(piece.times_s) for piece in pieces]
@@ -392,26 +417,64 @@ class _Alignment:
             largest = self._round(seed if done == 0 else {}, reach_mm=self._reach())
             if largest < _STILL_MM and done > 1:
                 break
-        a, b = self.pairs[-1]
-        found = distances_between(self.moved(b), np.eye(4), self.moved(a), np.eye(4), reach_mm=self._reach())
-        fits = np.abs(found.distance_mm) < 5 * found.std_mm
-        if np.count_nonzero(fits) >= _FEWEST and np.mean(fits) > _SHARE:
+        if self._agrees(self.pairs[-1]):
             return True
         self.coefficients, self.covariance = before
         return False
 
+    def _agrees(self, pair: tuple[int, int]) -> bool:
+        a, b = pair
+        found = distances_between(self.moved(b), np.eye(4), self.moved(a), np.eye(4), reach_mm=self._reach())
+        fits = np.abs(found.distance_mm) < 5 * found.std_mm
+        return bool(np.count_nonzero(fits) >= _FEWEST and np.mean(fits) > _SHARE)
+
     def settle(self) -> None:
+        """Estimate the path and the shares of its drift by turns; pairs that do not agree then are given up."""
+        for _ in range(_LEARNED):
+            self._settled()
+            if (shares := self._likeliest()) == self.shares:
+                break
+            self.shares, self.prior = shares, self.path.information(shares)
+        self._settled()
+        if len(agreeing := [pair for pair in self.pairs if self._agrees(pair)]) < len(self.pairs):
+            self.pairs = agreeing
+            self._settled()
+
+    def _settled(self) -> None:
         """Estimate until nothing moves any more."""
         for _ in range(_ROUNDS):
             if self._round({}, reach_mm=self._reach()) < _STILL_MM:
                 break
+
+    def _likeliest(self) -> tuple[float, float]:
+        """Shares of the drift with which the matches as they are now are likeliest."""
+        normal, gradient = self._evidence({}, reach_mm=self._reach())
+        at = normal @ self.coefficients - gradient
+
+        def likelihood(shares: tuple[float, float]) -> float:
+            """Twice the logarithm, but for what all shares have in common: the path is integrated out."""
+            prior = self.path.information(shares)
+            together = normal + prior
+            sizes = [np.linalg.slogdet(each)[1] for each in (prior, together)]
+            return float(at @ np.linalg.solve(together, at) + sizes[0] - sizes[1])
+
+        return max(_SHARES, key=likelihood)
 
     def _reach(self) -> float:
         return 2 * self.pieces[0].patches.radius_mm
 
     def _round(self, seed: dict[tuple[int, int], np.ndarray], *, reach_mm: float) -> float:
         """One step of least squares; returns the largest shift of a coefficient."""
-        normal, gradient = self.prior.copy(), self.prior @ self.coefficients
+        normal, gradient = self._evidence(seed, reach_mm=reach_mm)
+        normal, gradient = normal + self.prior, gradient + self.prior @ self.coefficients
+        step = -np.linalg.solve(normal, gradient)
+        self.coefficients = self.coefficients + step
+        self.covariance = np.linalg.inv(normal)
+        return float(np.abs(step.reshape(-1, 6)[:, :3]).max())
+
+    def _evidence(self, seed: dict[tuple[int, int], np.ndarray], *, reach_mm: float) -> tuple[np.ndarray, np.ndarray]:
+        """Normal matrix and gradient of the distances between all pairs, without what is known beforehand."""
+        normal, gradient = np.zeros_like(self.prior), np.zeros_like(self.coefficients)
         for pair in self.pairs:
             a, b = pair
             moved, pose = (self.moved(a), self.moved(b)), seed.get(pair, np.eye(4))
@@ -430,10 +493,7 @@ class _Alignment:
                 weight = robust / (std * spread) ** 2 / (2 * moved[source == b].shared)
                 normal += rows.T @ (weight[:, None] * rows)
                 gradient += rows.T @ (weight * residual)
-        step = -np.linalg.solve(normal, gradient)
-        self.coefficients = self.coefficients + step
-        self.covariance = np.linalg.inv(normal)
-        return float(np.abs(step.reshape(-1, 6)[:, :3]).max())
+        return normal, gradient
 
     def _residuals(
         self,
@@ -474,15 +534,20 @@ class _Alignment:
         blocks = self.covariance.reshape(self.path.count, 6, self.path.count, 6)
         covariance = np.einsum("nc,cidj,nd->nij", basis, blocks, basis, optimize=True)
         covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
-        by_point = self.corrections(self.path.basis(times))
-        platform = trajectory.poses_at(times)[:, :3, 3]
-        points = Rotation.from_rotvec(by_point[:, 3:]).apply(cloud.points_mm - platform) + platform + by_point[:, :3]
+        moments, image = np.unique(times, return_inverse=True)
+        at_image = self.path.basis(moments)
+        by_point = self.corrections(at_image)[image]
+        platform = trajectory.poses_at(moments)[image, :3, 3]
+        levers = Rotation.from_rotvec(by_point[:, 3:]).apply(cloud.points_mm - platform)
+        known = cloud.uncertainty
+        if known is not None:
+            known = along_corrected_path(known, by_point[:, 3:], levers, image, at_image, self.covariance)
         crossings = tuple(self._crossing(pair) for pair in self.pairs)
         return AlignedTrajectory(
             Trajectory(trajectory.times_s, poses, covariance),
             correction,
             crossings,
-            replace(cloud, points_mm=points, uncertainty=None),
+            replace(cloud, points_mm=levers + platform + by_point[:, :3], uncertainty=known),
         )
 
     def _crossing(self, pair: tuple[int, int]) -> Crossing:

@@ -56,11 +56,34 @@ class PlaneFound(Description):
     distance_mm: float
 
 
+class StepFound(Description):
+    """The step: its face at smaller z of the profiles as `PlaneFound`, and how far along the normal the other lies."""
+
+    kind: Literal["step"] = "step"
+    normal: Vector
+    distance_mm: float
+    height_mm: float
+    height_std_mm: NotNegative | None = None
+
+
 class BoardFound(Description):
     """The target: ``T_base_target`` (4, 4), mm."""
 
     kind: Literal["board"] = "board"
     T_base_target: Rows
+
+
+class SensorShare(Description):
+    """What a mount has in common with the points of the sensor with whose calibration it was found.
+
+    ``calibration`` is that calibration's digest. ``by_parameters`` (6, P) are the derivatives of the mount, ordered as
+    `Mount.covariance`, by the parameters of its joint estimate, for the sensor's frame as the calibration's file places
+    it beside the camera. ``covariance_apart`` (6, 6) is the mount's covariance by all else.
+    """
+
+    calibration: str
+    by_parameters: Rows
+    covariance_apart: Rows
 
 
 class Mount(Description):
@@ -72,13 +95,15 @@ class Mount(Description):
     uncertainty is half of the 95 % interval (Student's t). ``point_std_mm`` is the noise of a point of a profile,
     ``pose_std_mm`` that of the platform's position for each coordinate; both are estimated from the profiles.
     On a rotary table (``table``) the platform's z axis is the table's; shift along it and turn about it are chosen, and
-    have no variance. ``inputs`` holds the SHA-256 of every file that was read.
+    have no variance. ``sensor`` says which part of the covariance the calibration of the sensor makes, where that is
+    known by a joint estimate; else the profiles count as exact but for their noise. ``inputs`` holds the SHA-256 of
+    every file that was read.
     """
 
     T_platform_sensor: Rows
     covariance: Rows
     coverage_factor: Positive
-    artefact: Annotated[SphereFound | PlaneFound | BoardFound, Field(discriminator="kind")]
+    artefact: Annotated[SphereFound | PlaneFound | StepFound | BoardFound, Field(discriminator="kind")]
     robot_scale: Positive | None = None
     robot_scale_std: NotNegative | None = None
     time_offset_s: float | None = None
@@ -88,6 +113,7 @@ class Mount(Description):
     rms_mm: NotNegative
     held_out_rms_mm: NotNegative
     table: bool = False
+    sensor: SensorShare | None = None
     poses: tuple[MountPose, ...]
     weaknesses: tuple[str, ...] = ()
     next_pose: NextPose | None = None
@@ -102,6 +128,10 @@ class Mount(Description):
         covariance = np.array(self.covariance)
         if np.abs(covariance - covariance.T).max() > 1e-9 * np.abs(covariance).max():
             raise ValueError("covariance must be a symmetric 6x6 matrix")
+        if self.sensor is not None:
+            by, apart = self.sensor.by_parameters, self.sensor.covariance_apart
+            if len(by) != 6 or len({*map(len, by)}) != 1 or [*map(len, apart)] != [6] * 6:
+                raise ValueError("sensor must have by_parameters (6, P) and covariance_apart (6, 6)")
         if not np.all(np.delete(np.diag(covariance), (2, 5) if self.table else ()) > 0):
             raise ValueError("covariance must have positive variances")
         return self
@@ -113,3 +143,13 @@ class Mount(Description):
     def std(self) -> np.ndarray:
         """Standard uncertainties (6,): translation, mm, and rotation about the platform's axes, rad."""
         return np.sqrt(np.diag(np.array(self.covariance)))
+
+    def apart_from(self, calibration: str) -> tuple[np.ndarray, np.ndarray | None]:
+        """Covariance (6, 6) that is independent of points by a calibration of the sensor, given by its digest.
+
+        Where the mount was found with that calibration, there are also the mount's derivatives (6, P) by the parameters
+        of its joint estimate.
+        """
+        if self.sensor is None or self.sensor.calibration != calibration:
+            return np.array(self.covariance), None
+        return np.array(self.sensor.covariance_apart), np.array(self.sensor.by_parameters)

@@ -8,14 +8,14 @@ holds it to rounding. One is kept for every profile line.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_part
 
-_NODES = (8, 16, 32)
+_NODES = (12, 24)
 """Numbers of nodes along either direction that are tried, one after another."""
 
 _WORTH = 5000
@@ -24,12 +24,14 @@ _WORTH = 5000
 
 @dataclass(frozen=True, eq=False)
 class LineTable:
-    """A function of line and place on it with K values, as Chebyshev series of the place.
+    """A function of line and place on it with K values, as Chebyshev series of both.
 
-    ``series`` (L, n, K) are those of the lines from ``first_line`` on, for places from ``low_px`` to ``high_px``.
+    ``terms`` (T, n, K) are those of line and place, ``of_lines`` (L, T) the polynomials of each line from
+    ``first_line`` on, for places from ``low_px`` to ``high_px``.
     """
 
-    series: np.ndarray
+    terms: np.ndarray
+    of_lines: np.ndarray
     first_line: int
     low_px: float
     high_px: float
@@ -59,13 +61,11 @@ class LineTable:
             values = exact(at_line.ravel(), at_place.ravel()).reshape(count, count, -1)
             if not np.isfinite(values).all():
                 return None
-            # Axes: term of the place, term of the line, value.
-            series = np.tensordot(into_series, np.tensordot(into_series, values, (1, 1)), (1, 1))
+            # Axes: term of the line, term of the place, value.
+            series = np.tensordot(into_series, np.tensordot(into_series, values, (1, 0)), (1, 1))
             if max(np.abs(series[-2:]).max(), np.abs(series[:, -2:]).max()) <= tolerance:
-                by_line = chebyshev.chebvander((np.arange(lines[0], lines[1] + 1) - line) / half_lines, count - 1)
-                flat = np.moveaxis(series, 1, 0).reshape(count, -1)
-                per_line = (by_line @ flat).reshape(len(by_line), count, -1)
-                return cls(per_line, lines[0], place - half_places, place + half_places)
+                of_lines = chebyshev.chebvander((np.arange(lines[0], lines[1] + 1) - line) / half_lines, count - 1)
+                return cls(series, of_lines, lines[0], place - half_places, place + half_places)
         return None
 
     @classmethod
@@ -83,38 +83,41 @@ class LineTable:
         lines, places_px = (int(line.min()), int(line.max())), (float(place_px.min()), float(place_px.max()))
         return cls.of(exact, lines, places_px, tolerance=tolerance)
 
-    def values(self, line: np.ndarray, place_px: np.ndarray, *, out: np.ndarray | None = None) -> np.ndarray:
-        """Values (N, K), into ``out`` where that is given, for lines (N,) int and places (N,) within the table."""
-        result = np.empty((len(line), self.series.shape[2])) if out is None else out
-        row = np.ascontiguousarray(line, dtype=np.intp) - self.first_line
+    def combined(self, weights: np.ndarray) -> LineTable:
+        """Table of the sums of its values with weights (K, M)."""
+        return replace(self, terms=self.terms @ weights)
+
+    def series(self, line: np.ndarray, place_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Series (L, n, K) of lines and, for lines (N,) int and places (N,), their rows (N,) and arguments (N,)."""
+        row, of_lines = np.ascontiguousarray(line, dtype=np.intp) - self.first_line, self.of_lines
+        if len(row) < len(of_lines):
+            row, of_lines = np.arange(len(row)), of_lines[row]
         scale = 2.0 / (self.high_px - self.low_px)
         at = np.ascontiguousarray((np.asarray(place_px, dtype=float) - self.low_px) * scale - 1.0)
-        _sum_series(self.series, row, at, result)
+        return np.tensordot(of_lines, self.terms, 1), row, at
+
+    def values(self, line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
+        """Values (N, K) for lines (N,) int and places (N,) within the table."""
+        result = np.empty((len(line), self.terms.shape[2]))
+        _sum_series(*self.series(line, place_px), result)
         return result
 
 
 @compiled
 def _sum_series(series: np.ndarray, row: np.ndarray, at: np.ndarray, result: np.ndarray) -> None:
-    """Sums of Chebyshev polynomials, each by recurrence from the two before.
+    """Sums of Chebyshev polynomials at places (N,)."""
+    for n in range(row.size):
+        sum_terms(series[row[n]], at[n], result[n])
 
-    Places are taken line by line, so that a line's series is fetched from memory once.
-    """
-    first = np.zeros(series.shape[0] + 1, np.int64)
-    for n in range(row.size):
-        first[row[n] + 1] += 1
-    for line in range(series.shape[0]):
-        first[line + 1] += first[line]
-    order = np.empty(row.size, np.int64)
-    for n in range(row.size):
-        order[first[row[n]]] = n
-        first[row[n]] += 1
-    for n in order:
-        terms, sums, x = series[row[n]], result[n], at[n]
-        before, polynomial = x, 1.0
+
+@compiled_part
+def sum_terms(terms: np.ndarray, x: float, sums: np.ndarray) -> None:
+    """Sums (K,) of a line's terms (n, K) times Chebyshev polynomials, each by recurrence from the two before."""
+    before, polynomial = x, 1.0
+    for k in range(sums.size):
+        sums[k] = 0.0
+    for term in range(terms.shape[0]):
+        weights = terms[term]
         for k in range(sums.size):
-            sums[k] = 0.0
-        for term in range(terms.shape[0]):
-            weights = terms[term]
-            for k in range(sums.size):
-                sums[k] += polynomial * weights[k]
-            before, polynomial = polynomial, 2.0 * x * polynomial - before
+            sums[k] += polynomial * weights[k]
+        before, polynomial = polynomial, 2.0 * x * polynomial - before

@@ -133,7 +133,7 @@ def describe(path: str | Path) -> str:
         case [] | [*_, ".toml"]:
             lines = sensor_lines(load_sensor(name))
         case _:
-            raise DescriptionError(f"{path}: expected a .h5, .ply, .json or .toml file, or the name of a sensor")
+            raise DescriptionError(f"{path}: expected a capture, cloud, .json or .toml file, or the name of a sensor")
     return "\n".join(lines)
 
 

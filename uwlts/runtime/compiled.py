@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from numba import njit
+from numba.core.dispatcher import Dispatcher
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
@@ -16,20 +17,34 @@ _Result = TypeVar("_Result")
 _FASTMATH = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 """LLVM's fast-math flags for vectorization: sums may be reassociated, and NaN must not occur; infinities may."""
 
+_OPTIONS: dict[str, Any] = {"fastmath": _FASTMATH, "error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
+
 
 def compiled(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
-    """A function compiled by Numba. It may call such functions of its own package, and of no other.
+    """A function compiled by Numba. It may call such functions, of other packages only those that call none of another.
 
     Without a folder that can be written it is compiled anew in every process.
     """
-    options: dict[str, Any] = {"fastmath": _FASTMATH, "error_model": "numpy", "nogil": True}
     try:
-        kept: Any = njit(cache=True, **options)(function)
+        kept: Any = njit(cache=True, **_OPTIONS)(function)
         # Numba takes a function as unchanged where its own file is; here a change of what it calls shows as well.
-        kept._cache._cache_file._source_stamp = _stamp(Path(inspect.getfile(function)).parent)
+        called = (function.__globals__.get(name) for name in function.__code__.co_names)
+        files = {
+            inspect.getfile(each) for each in (function, *(c.py_func for c in called if isinstance(c, Dispatcher)))
+        }
+        kept._cache._cache_file._source_stamp = tuple(map(_stamp, sorted({Path(file).parent for file in files})))
     except (RuntimeError, AttributeError):
-        return njit(**options)(function)
+        return njit(**_OPTIONS)(function)
     return kept
+
+
+def compiled_part(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
+    """A part of `compiled` functions that Python itself does not call.
+
+    Without what converts arguments, and kept only within its callers, a short one takes half the time to compile.
+    """
+    options: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True}
+    return njit(**options)(function)
 
 
 @cache

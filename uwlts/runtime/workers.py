@@ -6,6 +6,7 @@ ends, however that happens: `concurrent.futures` finishes what it has begun and 
 and leaves its processes behind where the command is killed.
 """
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -328,6 +329,9 @@ def _serve(connection: Connection) -> None:
                     send("raised", error)
                 else:
                     send("done", result)
+                    if not gc.get_freeze_count():
+                        # What is imported by now stays, and the collector need not look through it again.
+                        gc.freeze()
     finally:
         # Whatever the interrupt has become on its way through a library, there is nothing to say about it.
         if stopped.is_set():

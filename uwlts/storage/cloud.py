@@ -4,7 +4,7 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from uwlts.model.input_file import opened, parsed_json, require_plain, require_r
 from uwlts.model.sensor import Description, Table
 from uwlts.storage.copc_file import is_copc, read_copc
 from uwlts.storage.files import written_aside
+from uwlts.storage.foreign_clouds import FOREIGN_FORMATS, read_foreign
 from uwlts.storage.hdf5_file import find_dataset, format_of, read_array, read_label, write_label
 
 FORMAT = "uwlts-cloud"
@@ -30,6 +31,10 @@ POINTS_OF_PART = 1_000_000
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """The coordinates whose covariances are kept of the symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz."""
 
+FOOTPRINT, FOOTPRINT_STD = "footprint_mm", "footprint_std"
+"""Metadata of clouds of unmoved sensors: standard deviations of the part of a surface that a point is the mean of,
+across the sheet (X) and along the stripe (Y), mm, and the relative standard uncertainty of their squares."""
+
 NO_INDEX = -1
 """Frame and line of points whose file does not name them."""
 
@@ -38,6 +43,10 @@ _PER_POINT = ("points_mm", "intensity", "frame", "line")
 _KINDS = dict(zip(_PER_POINT, (np.float64, np.float32, np.int32, np.int32), strict=True)) | {"deviation_mm": np.float32}
 _KINDS |= {"time_s": np.float64}
 _COMMENT = "uwlts-metadata"
+_UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
+_SHARED = "shared_errors"
+WATER = "water"
+"""With what the names of errors of a medium's index begin, which may drift between scans."""
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
 _FARTHEST_MM = 1e12
@@ -46,6 +55,10 @@ _LONGEST_PLY_HEADER = 2**24
 _MOST_PROPERTIES = 1000
 _TYPE_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
 _TYPE_BYTES |= {f"{kind}{bits}": bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)}
+CLOUD_ENDINGS = (".ply", ".h5", ".copc.laz", *FOREIGN_FORMATS)
+"""Endings of the clouds that can be read."""
+_CLOUDS_ALONE = (".ply", ".xyz", ".las", ".e57")
+"""Endings of clouds and of nothing else that is measured."""
 _Rows = Callable[[int], slice]
 _PIECE = re.compile(rf"{_COMMENT} (\d+)/(\d+) (.*);")
 
@@ -65,18 +78,23 @@ class PointUncertainty:
     poses_mm : (K, N, 3) float32 or None
         How each point moves for one standard deviation of each independent part of its image's pose, which is
         independent from image to image.
+    shared : dict of str to (M, Q) float64
+        What clouds have in common, by the name of a calibration of the sensor or its mount, or of the water it was
+        used in (`WATER`): each pattern holds so much of Q independent parts of its errors, each of standard deviation
+        one. Clouds that name the same share these.
     """
 
     random_mm2: np.ndarray
     position_mm: np.ndarray
     patterns_mm: np.ndarray
     poses_mm: np.ndarray | None = None
+    shared: dict[str, np.ndarray] = field(default_factory=dict)
 
     def __getitem__(self, selection: Any) -> "PointUncertainty":
         """That of a selection of the points, by a slice, indices or a mask."""
         poses = None if self.poses_mm is None else self.poses_mm[:, selection]
         patterns = self.patterns_mm[:, selection]
-        return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], patterns, poses)
+        return PointUncertainty(self.random_mm2[selection], self.position_mm[selection], patterns, poses, self.shared)
 
     def by_image_mm(self) -> np.ndarray:
         """All that moves the points of an image together and is independent from image to image (1 + K, N, 3)."""
@@ -188,6 +206,7 @@ class PointCloud:
             *(getattr(self, name)[selection] for name in _PER_POINT),
             deviation_mm=None if deviation is None else deviation[selection],
             uncertainty=None if known is None else known[selection],
+            time_s=None if self.time_s is None else self.time_s[selection],
             metadata=self.metadata,
         )
 
@@ -223,7 +242,8 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
     vertices = np.empty(len(cloud), [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
     for name, values in columns.items():
         vertices[name] = values
-    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=_comments(cloud.metadata))
+    comments = _comments(_with_shared(cloud))
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
     with written_aside(path, overwrite=overwrite) as aside:
         ply.write(str(aside))
 
@@ -231,6 +251,7 @@ def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
 def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
     """Read a cloud from HDF5 (``.h5``), COPC (``.copc.laz``) or PLY, also another program's (x, y, z suffice).
 
+    Points of other programs may also come as text (``.xyz``, ``.csv`` and others, mm), LAS or E57 (m).
     Fields that CloudCompare has saved again (`scalar_intensity` and so on) are recognised. Missing intensity is NaN,
     missing frame and line are -1, a deviation that is missing or NaN throughout is None.
 
@@ -249,6 +270,9 @@ def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None)
     """
     if is_copc(path):
         return _read_copc(path, None, at_most)
+    if _is_foreign(path):
+        whole = _read_foreign(Path(path))
+        return whole.selected(_every(len(whole), at_most)), len(whole)
     return _read_rows(Path(path), lambda count: _every(count, at_most))
 
 
@@ -277,7 +301,7 @@ def cloud_parts(path: str | os.PathLike[str], most: int = POINTS_OF_PART) -> Ite
 
     Of HDF5 and binary PLY only one part is held in memory.
     """
-    if is_copc(path):
+    if is_copc(path) or _is_foreign(path):
         whole = read_cloud(path)
         yield from (whole.selected(slice(start, start + most)) for start in range(0, max(len(whole), 1), most))
         return
@@ -303,6 +327,7 @@ def joined(parts: Sequence[PointCloud]) -> PointCloud:
             np.concatenate([each.position_mm for each in known]),
             np.concatenate([each.patterns_mm for each in known], axis=1),
             np.concatenate(poses, axis=1) if len(poses) == len(parts) else None,
+            known[0].shared,
         )
         if len(known) == len(parts)
         else None,
@@ -320,8 +345,32 @@ def _read_copc(
     return PointCloud(found.points_mm, found.intensity, frame, line, found.deviation_mm), found.total
 
 
+def _is_foreign(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() in FOREIGN_FORMATS
+
+
+def _read_foreign(path: Path) -> PointCloud:
+    found = read_foreign(path)
+    none, unknown = np.full(len(found.points_mm), np.nan), np.full(len(found.points_mm), NO_INDEX)
+    try:
+        return PointCloud(
+            found.points_mm,
+            none if found.intensity is None else found.intensity,
+            unknown if found.frame is None else found.frame,
+            unknown if found.line is None else found.line,
+            deviation_mm=found.deviation_mm,
+            time_s=found.time_s,
+        )
+    except CaptureError as error:
+        raise CaptureError(f"{path}: {error}") from error
+
+
 def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     """The rows of a file that are selected by the number of all, and that number."""
+    if path.suffix.lower() not in (".ply", ".h5"):
+        with opened(path, called="cloud") as file:
+            if not file.read(4).startswith(b"ply"):
+                raise CaptureError(f"{path} ends with none of {', '.join(CLOUD_ENDINGS)}, the formats of clouds")
     try:
         return _read_hdf5(path, rows) if _in_hdf5(path) else _read_ply(path, rows)
     except CaptureError as error:
@@ -335,7 +384,9 @@ def _every(count: int, at_most: int | None) -> slice:
 
 def is_cloud(path: str | os.PathLike[str]) -> bool:
     """Whether a file is a cloud: by its ending, where that is not the captures' as well, and else by its label."""
-    return format_of(Path(path)) == FORMAT if _in_hdf5(path) else is_copc(path) or Path(path).suffix.lower() == ".ply"
+    if _in_hdf5(path):
+        return format_of(Path(path)) == FORMAT
+    return is_copc(path) or Path(path).suffix.lower() in _CLOUDS_ALONE
 
 
 def _in_hdf5(path: str | os.PathLike[str]) -> bool:
@@ -363,6 +414,37 @@ def _uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.n
 
 def _pose_names(count: int) -> list[str]:
     return [f"pose{k}_{axis}" for k in range(count) for axis in "xyz"]
+
+
+def _with_shared(cloud: PointCloud) -> Table:
+    """Metadata in a file: with what the patterns share with other clouds."""
+    if cloud.uncertainty is None or not cloud.uncertainty.shared:
+        return cloud.metadata
+    shared: Table = {name: np.round(each, 9).tolist() for name, each in cloud.uncertainty.shared.items()}
+    return {**cloud.metadata, _SHARED: shared}
+
+
+def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Table, PointUncertainty | None]:
+    """Metadata and uncertainty of a cloud from those in a file; CaptureError where they do not fit together."""
+    if _SHARED not in metadata:
+        return metadata, known
+    rest = {name: each for name, each in metadata.items() if name != _SHARED}
+    if known is None:
+        return rest, None
+    stated = metadata[_SHARED]
+    try:
+        if not isinstance(stated, dict):
+            raise TypeError("not an object")
+        shared = {name: np.array(each, dtype=np.float64) for name, each in stated.items()}
+    except (TypeError, ValueError) as error:
+        raise CaptureError(f"its metadata is damaged: {_SHARED} holds no numbers") from error
+    if any(
+        each.ndim != 2 or len(each) != len(known.patterns_mm) or not np.isfinite(each).all() for each in shared.values()
+    ):
+        raise CaptureError(
+            f"its metadata is damaged: {_SHARED} does not belong to its {len(known.patterns_mm)} patterns"
+        )
+    return rest, replace(known, shared=shared)
 
 
 def _as_json(metadata: Table) -> str:
@@ -443,6 +525,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
             poses = np.stack([column(name, np.nan) for name in _pose_names(parts)]).reshape(parts, 3, -1)
             uncertainty = replace(uncertainty, poses_mm=np.ascontiguousarray(np.moveaxis(poses, 1, 2)))
     deviation = column("deviation", np.nan)
+    metadata, uncertainty = _without_shared(_metadata(ply.comments), uncertainty)
     cloud = PointCloud(
         points_mm=np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"]),
         intensity=column("intensity", np.nan),
@@ -451,7 +534,7 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         deviation_mm=None if np.isnan(deviation).all() else deviation,
         uncertainty=uncertainty,
         time_s=column("time", np.nan, np.float64) if "time" in known else None,
-        metadata=_metadata(ply.comments),
+        metadata=metadata,
     )
     return cloud, len(whole)
 
@@ -491,12 +574,12 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
     arrays = {name: getattr(cloud, name) for name in _PER_POINT}
     arrays |= {name: each for name in ("deviation_mm", "time_s") if (each := getattr(cloud, name)) is not None}
     if cloud.uncertainty is not None:
-        arrays |= {name: each for name, each in vars(cloud.uncertainty).items() if each is not None}
+        arrays |= {name: each for name in _UNCERTAINTY if (each := getattr(cloud.uncertainty, name)) is not None}
         arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()
     # In memory first: HDF5 does not survive a full disk.
     content = BytesIO()
     with h5py.File(content, "w", libver="latest") as file:
-        write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=cloud.metadata))
+        write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=_with_shared(cloud)))
         for name, data in arrays.items():
             file.create_dataset(name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True)
     with written_aside(path, overwrite=overwrite) as aside:
@@ -505,7 +588,7 @@ def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: b
 
 def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     require_regular_file(path, called="cloud")
-    names = [part.name for part in fields(PointUncertainty)]
+    names = _UNCERTAINTY
     try:
         with h5py.File(path, "r") as file:
             header = read_label(file, _CloudHeader, path=path, format=FORMAT, version=VERSION)
@@ -534,4 +617,5 @@ def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     if needed[0] in arrays:
         known = PointUncertainty(*(arrays[name] for name in needed), poses_mm=arrays.get("poses_mm"))
     per_point = {name: arrays[name] for name in _KINDS if name in arrays}
-    return PointCloud(**per_point, uncertainty=known, metadata=header.metadata), total
+    metadata, known = _without_shared(header.metadata, known)
+    return PointCloud(**per_point, uncertainty=known, metadata=metadata), total

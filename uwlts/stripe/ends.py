@@ -52,10 +52,13 @@ def _half_lit(good: np.ndarray, centre: np.ndarray, *, lines: int, jump_px: floa
     found = np.flatnonzero(good)
     if len(found) == 0:
         return found
+    count, place = len(found), centre[found]
     # breaks[k] stands before found[k], the last one after all of them.
-    breaks = np.empty(len(found) + 1, bool)
-    breaks[1:-1] = (np.diff(found) > _SHORT_GAP + 1) | (np.abs(np.diff(centre[found])) > jump_px)
+    breaks = np.empty(count + 1, bool)
+    breaks[1:-1] = (found[1:] - found[:-1] > _SHORT_GAP + 1) | (np.abs(place[1:] - place[:-1]) > jump_px)
     breaks[0], breaks[-1] = found[0] > _SHORT_GAP, len(good) - 1 - found[-1] > _SHORT_GAP
-    before = np.concatenate([[0], np.cumsum(breaks)])
-    place = np.arange(len(found))
-    return found[before[np.minimum(place + lines + 1, len(breaks))] > before[np.maximum(place - lines + 1, 0)]]
+    # Breaks before each place, from so many lines before the first one to so many after the last one.
+    before = np.zeros(count + 2 * lines + 2, np.int32)
+    np.cumsum(breaks, out=before[lines + 1 : lines + count + 2])
+    before[lines + count + 2 :] = before[lines + count + 1]
+    return found[before[2 * lines + 1 :][:count] > before[1 : count + 1]]

@@ -11,7 +11,7 @@ import numpy as np
 from uwlts.model.errors import ImageError
 from uwlts.model.stripe import Stripe, StripeStatus
 from uwlts.stripe.candidates import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
-from uwlts.stripe.direct import SeenStripes
+from uwlts.stripe.direct import SeenStripes, direct_stripes
 from uwlts.stripe.ends import copied, leave_ends_out
 from uwlts.stripe.learned import find_learned
 from uwlts.stripe.methods import amplitudes, place_centre
@@ -23,6 +23,9 @@ _LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np
 
 _MANY = 0.25
 """Lines with a stripe that is too wide, over those with one that is measured, from which a wider window is tried."""
+
+_WARM_LINES = 200
+"""Lines of the image that warms up: enough for stripes to go on."""
 
 _LEAST_NOISE = 0.3
 """Grey levels: standard deviation of rounding to whole ones."""
@@ -176,15 +179,22 @@ def stripe_in(
 
 
 def warm_up(dtype: np.dtype | type = np.uint8, options: StripeOptions = StripeOptions()) -> None:
-    """Load what extraction from images of a type needs, or compile it where that was never done on this machine.
+    """Load all that finding stripes in images of a type needs, or compile it where that was never done on this machine.
 
-    Otherwise the first image of a stream waits for it: some tenths of a second, and some seconds once.
+    Otherwise the first images of a stream wait for it: some tenths of a second, and some seconds once. The rule of
+    direct light and `extract_candidates` are among it, and what only saturated stripes need.
     """
     half = options.half_window_px
-    profile = 100.0 * np.exp(-0.5 * np.square((np.arange(4 * half) - 2 * half) / 2.0))
-    lines = np.tile(profile, (16, 1)).astype(dtype)
+    place, lines = np.arange(8 * half), np.arange(_WARM_LINES)[:, None]
+    # A stripe, and beside it a dimmer one that comes and goes.
+    beside = 0.3 * (lines % 20 < 10)
+    seen = [share * np.exp(-0.5 * np.square((place - at * half) / 2.0)) for share, at in ((1.0, 2), (beside, 5))]
+    image = np.broadcast_to(100.0 * sum(seen), (_WARM_LINES, 8 * half)).astype(dtype)
     for method in (options.method, "quadratic"):
-        extract_stripe(lines, stripe_along="height", options=replace(options, method=method))
+        extract_stripe(image, stripe_along="height", options=replace(options, method=method))
+    rivals = replace(options, peak=PeakRule.DIRECT)
+    images = (see_stripes(image, stripe_along="height", options=rivals, saturation=_LARGEST[image.dtype]) for _ in "ab")
+    list(direct_stripes(images, farther=1))
 
 
 def _found_by_model(profiles: np.ndarray, options: StripeOptions, clip: float) -> _Lines:

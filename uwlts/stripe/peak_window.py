@@ -9,7 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_part
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Full width at half maximum of a Gaussian over its standard deviation."""
@@ -108,7 +108,7 @@ class PeakWindow(NamedTuple):
         return np.maximum(self.sigma, np.float32(LEAST_KERNEL))
 
 
-@compiled
+@compiled_part
 def cut(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> None:
     """Pixels of one of the profiles (N, L) from `start` on, the border pixel repeated beyond the border."""
     count, size = profiles.shape[0], out.size
@@ -121,7 +121,7 @@ def cut(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> None:
             out[k] = profiles[min(max(start + k, 0), count - 1), line]
 
 
-@compiled
+@compiled_part
 def filtered(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
     """Low-pass of a window with a symmetric kernel of 2 R + 1 weights.
 
@@ -139,7 +139,7 @@ def filtered(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
             out[k] += kernel[j] * (before[k] + after[k])
 
 
-@compiled
+@compiled_part
 def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> Peak:
     """What stands in the window `smooth`, which begins at pixel `start` of `count` and may run over the image border.
 
@@ -191,7 +191,7 @@ def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> 
     return Peak(top, middle, sigma, reach, base, slope, highest - (base if closed else ground), closed, crowded)
 
 
-@compiled
+@compiled_part
 def greatest(values: np.ndarray) -> np.float32:
     """The greatest of some numbers; less than any where there are none."""
     result = np.float32(-np.inf)
@@ -200,7 +200,7 @@ def greatest(values: np.ndarray) -> np.float32:
     return result
 
 
-@compiled
+@compiled_part
 def _least(values: np.ndarray) -> np.float32:
     result = np.float32(np.inf)
     for k in range(values.size):
@@ -208,13 +208,13 @@ def _least(values: np.ndarray) -> np.float32:
     return result
 
 
-@compiled
+@compiled_part
 def _part(low: np.floating, high: np.floating, level: np.floating) -> np.float32:
     """Share of the way from one pixel to the next at which the straight line between them meets a level."""
     return np.float32(min(max((level - low) / max(high - low, np.float32(1e-6)), np.float32(0.0)), np.float32(1.0)))
 
 
-@compiled
+@compiled_part
 def _flank(smooth: np.ndarray, first: int) -> np.float32:
     """Background in a flank: the lower of two low-passed values three pixels apart, which no hot pixel raises."""
     first = min(max(first, 0), smooth.size - FLANK)
@@ -260,7 +260,7 @@ def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, mo
         moments[m, 0], moments[m, 1], moments[m, 2] = total, first, second
 
 
-@compiled
+@compiled_part
 def part_inside(u: float, half: float) -> float | np.floating:
     """Share of a pixel, u from the centre, that lies within `half` of it."""
     return min(max(half + np.float32(0.5) - abs(u), np.float32(0.0)), np.float32(1.0))

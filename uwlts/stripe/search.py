@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from uwlts.model.stripe import StripeStatus
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_part
 from uwlts.stripe.peak_window import (
     FIRST,
     FLANK,
@@ -94,7 +92,7 @@ def search_all(
     Arguments as of `search`. Two stripes of which one reaches into the other's pixels cannot be measured: neither is
     there.
     """
-    rules = _rules(replace(options, peak=PeakRule.FIRST), coarse=coarse, fine=fine, clip=clip)
+    rules = _rules(options, coarse=coarse, fine=fine, clip=clip)._replace(order=FIRST)
     peaks = PeakWindow.empty(_MOST * len(lines), 2 * rules.half + rules.block, options.smoothing_px)
     kernel = low_pass(options.smoothing_px)
     smooth = np.empty(peaks.window.shape[1], np.float32)
@@ -201,14 +199,7 @@ def _search_lines(
             if there < _CLEAR * rules.fine and _is_spike(near, there, rules.fine):
                 blocks[chosen] = 0
                 continue
-            filtered(pixels, kernel, smooth)
-            peak = measured(smooth, start, profiles.shape[0], rules)
-            offset = _offset(peak, size, rules)
-            if offset != 0:
-                start += offset
-                cut(profiles, line, start, window)
-                filtered(pixels, kernel, smooth)
-                peak = measured(smooth, start, profiles.shape[0], rules)
+            start, peak = _followed(profiles, line, start, kernel, pixels, smooth, rules)
             verdict = _judged(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE:
                 if (not peak.closed or peak.sigma > rules.widest) and peak.height >= rules.bright:
@@ -283,14 +274,7 @@ def _search_all(
             near = window[rules.half - 1 : rules.half + rules.block + 1]
             if there < _CLEAR * rules.fine and _is_spike(near, np.float32(there), rules.fine):
                 continue
-            filtered(pixels, kernel, smooth)
-            peak = measured(smooth, start, profiles.shape[0], rules)
-            offset = _offset(peak, size, rules)
-            if offset != 0:
-                start += offset
-                cut(profiles, line, start, window)
-                filtered(pixels, kernel, smooth)
-                peak = measured(smooth, start, profiles.shape[0], rules)
+            start, peak = _followed(profiles, line, start, kernel, pixels, smooth, rules)
             if _judged(peak, start, profiles.shape[0], rules) != _OK:
                 continue
             place, known = start + peak.middle, False
@@ -305,7 +289,29 @@ def _search_all(
     return count
 
 
-@compiled
+@compiled_part
+def _followed(
+    profiles: np.ndarray,
+    line: int,
+    start: int,
+    kernel: np.ndarray,
+    pixels: np.ndarray,
+    smooth: np.ndarray,
+    rules: SearchRules,
+) -> tuple[int, Peak]:
+    """What stands in a window that has been cut out of a line, moved with its pixels to the peak, and its beginning."""
+    filtered(pixels, kernel, smooth)
+    peak = measured(smooth, start, profiles.shape[0], rules)
+    offset = _offset(peak, smooth.size, rules)
+    if offset != 0:
+        start += offset
+        cut(profiles, line, start, pixels[kernel.size // 2 :][: smooth.size])
+        filtered(pixels, kernel, smooth)
+        peak = measured(smooth, start, profiles.shape[0], rules)
+    return start, peak
+
+
+@compiled_part
 def _offset(peak: Peak, size: int, rules: SearchRules) -> int:
     """How far a window is to follow a peak of which a half-height crossing or a flank lies outside it."""
     to_end = np.float32(0.5 * (size - 1))
@@ -316,7 +322,7 @@ def _offset(peak: Peak, size: int, rules: SearchRules) -> int:
     return 0
 
 
-@compiled
+@compiled_part
 def _keep(peaks: PeakWindow, number: int, peak: Peak, window: np.ndarray) -> None:
     """Keep a peak and its window under a number."""
     peaks.middle[number], peaks.sigma[number], peaks.reach[number] = peak.middle, peak.sigma, peak.reach
@@ -325,7 +331,7 @@ def _keep(peaks: PeakWindow, number: int, peak: Peak, window: np.ndarray) -> Non
         peaks.window[number, k] = window[k]
 
 
-@compiled
+@compiled_part
 def _greatest_block(blocks: np.ndarray) -> np.number:
     """The highest contrast of a line's blocks."""
     highest = blocks[0]
@@ -334,7 +340,7 @@ def _greatest_block(blocks: np.ndarray) -> np.number:
     return highest
 
 
-@compiled
+@compiled_part
 def _next_block(blocks: np.ndarray, highest: np.number, least: np.float32, rules: SearchRules) -> int:
     """The block that the rule names among those that reach `least`; -1 where none does.
 
@@ -358,7 +364,7 @@ def _next_block(blocks: np.ndarray, highest: np.number, least: np.float32, rules
     return chosen
 
 
-@compiled
+@compiled_part
 def _is_spike(near: np.ndarray, there: np.float32, fine: float) -> bool:
     """Whether a block sticks out by noise in single pixels: a cheap look that spares most unlit lines a close one.
 
@@ -372,7 +378,7 @@ def _is_spike(near: np.ndarray, there: np.float32, fine: float) -> bool:
     return there - (single - mean * np.float32(1.0 / 3.0)) < _SPIKE * fine
 
 
-@compiled
+@compiled_part
 def _judged(peak: Peak, start: int, count: int, rules: SearchRules) -> int:
     """`StripeStatus`: NO_STRIPE for what is too low, too narrow or too wide, or rises towards the border."""
     if peak.height < rules.fine:

@@ -5,13 +5,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import uwlts
+from tests.uwlts.joint_views import MEDIUM
+from tests.uwlts.sensor_profiles import half_way, joint_estimate, largest_parts
 from tests.virtual_sensors import scene_of
 from twin import render
-from uwlts.calibration.mount_board import BoardImage, _Problem
+from uwlts.calibration.mount_board import _Problem
+from uwlts.calibration.mount_board_images import BoardImage, posed_board
+from uwlts.model.calibration import KnownMedium
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import BoardFound
 from uwlts.optics.nominal import nominal
 from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.targets import parse_target
 
 MIDDLE = np.array([60.0, 40.0, 0.0])
 
@@ -80,6 +85,40 @@ def test_the_covariance_is_that_of_the_errors():
     assert 0.7 < np.sqrt(np.mean(np.square(ratios))) < 1.35
 
 
+def table_images(rng, angles, *, position_mm=0.01, turn_rad=5e-5):
+    """Images of a target on a table that turns it, and the table's frame in the sensor's (4, 4)."""
+    std = np.array([0.02, 0.02, 0.15, 2e-3, 2e-3, 2e-4])
+    table, target = pose((130.0, 10.0, 0.0), (5.0, 20.0, 90.0)), pose((20.0, -15.0, 40.0), (30.0, -10.0, 25.0))
+    images = []
+    for number, angle in enumerate(angles):
+        step = std * rng.normal(size=6)
+        in_camera = CAMERA @ table @ pose((0, 0, np.degrees(angle)), (0, 0, 0)) @ target
+        turn = Rotation.from_rotvec(step[3:]).as_matrix() @ in_camera[:3, :3]
+        found = np.eye(4)
+        found[:3, :3], found[:3, 3] = turn, in_camera[:3, :3] @ MIDDLE + in_camera[:3, 3] + step[:3] - turn @ MIDDLE
+        platform = pose((0, 0, -np.degrees(angle)), (0, 0, 0))
+        images.append(BoardImage(f"image {number}", found, np.diag(std**2), 50, 0.1, platform))
+    return images, table
+
+
+def test_the_axis_of_a_rotary_table_is_found():
+    """Direction and place have two coordinates each; their chi-square with four degrees is below 36 but once in 3e6."""
+    images, table = table_images(np.random.default_rng(2), np.radians(np.linspace(-40, 40, 12)))
+    used, state, scatter = _Problem(images, CAMERA, MIDDLE, table=True).robust()
+    assert len(used.images) == 12 and used.size == 10
+    # Of the true axis in the table's frame as found, at the height of the sensor: what is free is zero there.
+    there = state[0] @ table
+    at = there[:3, 3] - there[:3, 2] * there[2, 3] / there[2, 2]
+    height = state[0][2, 3]
+    at += (height / there[2, 2]) * there[:3, 2]
+    off = np.array([*at[:2], -there[1, 2], there[0, 2]])
+    covariance = (used.free @ np.linalg.inv(used.information(state, scatter)) @ used.free.T)[:6, :6]
+    assert not covariance[[2, 5]].any()
+    kept = covariance[np.ix_([0, 1, 3, 4], [0, 1, 3, 4])]
+    assert off @ np.linalg.solve(kept, off) < 36
+    assert np.sqrt(np.diag(kept)).max() < 0.5
+
+
 def test_wrong_poses_are_left_out():
     problem = _Problem(simulated(np.random.default_rng(1), wrong=(3, 7)), CAMERA, MIDDLE)
     used, state, _ = problem.robust()
@@ -139,3 +178,32 @@ def test_wrong_evidence_is_refused(thesis, capture_path):
         uwlts.calibrate_mount(capture_path, np.tile(poses[0], (7, 1, 1)), calibration=calibration)
     with pytest.raises(DescriptionError, match="shows a target: give no radius"):
         uwlts.calibrate_mount(capture_path, calibration=calibration, radius_mm=3.0)
+
+
+def test_a_target_s_pose_follows_the_sensor(thesis, capture_path):
+    """The same image by other calibrations; corners that count less in the robust fit leave some per cent."""
+    known = joint_estimate(thesis)
+    with Capture(capture_path) as capture:
+        image, target = next(iter(capture.frames(laser_on=False)))[1], parse_target(capture.header.target)
+
+    def posed(values):
+        changed = known.calibration.model_copy(
+            update={
+                "camera": known.parameters.camera(values),
+                "window": known.parameters.window_model(values),
+                "media": (KnownMedium(medium=MEDIUM, index=known.parameters.medium_index(values, known.view)),),
+            }
+        )
+        return posed_board("", image, target, changed, known, changed.window, changed.index_of(MEDIUM), np.eye(4))
+
+    own = posed(known.values)
+    middle, checked = target.points_mm.mean(axis=0), 0
+    for part in largest_parts(known, own.by_sensor):
+        ends = [posed(known.values + sign * part).camera_from_target for sign in (1, -1)]
+        for end in ends:
+            end[:3, 3] += end[:3, :3] @ middle
+        expected, found = half_way(*ends), own.by_sensor @ part
+        size = np.repeat([np.linalg.norm(expected[:3]), np.linalg.norm(expected[3:])], 3)
+        np.testing.assert_allclose(found / size, expected / size, atol=0.1)
+        checked += 1
+    assert checked == 3

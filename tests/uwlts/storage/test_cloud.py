@@ -5,7 +5,7 @@ import os
 import resource
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import h5py
@@ -41,8 +41,9 @@ def some_cloud(count: int = 40, **changes) -> PointCloud:
 def some_uncertainty(count: int = 40, patterns: int = 3) -> PointUncertainty:
     rng = np.random.default_rng(5)
     shapes = {"random_mm2": (count, 6), "patterns_mm": (patterns, count, 3), "poses_mm": (6, count, 3)}
-    names = [part.name for part in fields(PointUncertainty)]
-    return PointUncertainty(**{n: rng.normal(size=shapes.get(n, (count, 3))).astype(np.float32) for n in names})
+    names = [part.name for part in fields(PointUncertainty) if part.name != "shared"]
+    arrays = {name: rng.normal(size=shapes.get(name, (count, 3))).astype(np.float32) for name in names}
+    return PointUncertainty(**arrays, shared={"sensor": rng.normal(size=(patterns, 5)).round(6)})
 
 
 @KINDS
@@ -62,9 +63,12 @@ def test_a_cloud_comes_back_bit_by_bit(tmp_path, name):
         assert getattr(back, field).dtype == kind
         np.testing.assert_array_equal(getattr(back, field), getattr(cloud, field))
     for part in fields(PointUncertainty):
-        found = getattr(back.uncertainty, part.name)
-        assert found.dtype == np.float32
-        np.testing.assert_array_equal(found, getattr(cloud.uncertainty, part.name))
+        found, written = (getattr(each.uncertainty, part.name) for each in (back, cloud))
+        if part.name == "shared":
+            assert found.keys() == written.keys() and np.array_equal(found["sensor"], written["sensor"])
+        else:
+            assert found.dtype == np.float32
+            np.testing.assert_array_equal(found, written)
     assert back.metadata == cloud.metadata
     assert os.listdir(tmp_path) == [name]
     assert is_cloud(tmp_path / name)
@@ -103,6 +107,17 @@ def test_a_cloud_larger_than_memory_allows_is_read_thinned(tmp_path, name):
     read, total, last, grown_mb = done.stdout.split()
     assert (int(read), int(total), float(last)) == (100_000, count, 3.0 * (count - 40))
     assert int(grown_mb) < 50
+
+
+@KINDS
+@pytest.mark.parametrize("wrong", [5, {"sensor": [[1.0]]}, {"sensor": "words"}])
+def test_damage_to_what_clouds_share_is_refused(tmp_path, name, wrong):
+    write_cloud(
+        tmp_path / name,
+        some_cloud(uncertainty=replace(some_uncertainty(), shared={}), metadata={"shared_errors": wrong}),
+    )
+    with pytest.raises(CaptureError, match="shared_errors"):
+        read_cloud(tmp_path / name)
 
 
 @KINDS

@@ -21,6 +21,8 @@ TARGET, STRIPE, STEP = "target", "stripe on the target", "stripe on the step"
 BENDS = (TargetParameter.BOW, TargetParameter.SADDLE)
 STRETCH = (TargetParameter.STRETCH_X, TargetParameter.STRETCH_Y)
 SHIFT = TargetParameter.STRIPE
+_TOGETHER = 2000
+"""Pixels whose residuals are computed together: fewer take longer each, and those of more leave the cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +197,7 @@ class TargetEvidence(StripeEvidence):
 
     def pose(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, image: int) -> np.ndarray:
         """``T_camera_target`` (4, 4) of one of the images."""
-        pose = _Pose(self, parameters, global_values, local, image)
+        pose = _Poses(self, parameters, global_values, local, np.array([image]))
         result = np.eye(4)
         result[:3, :3] = pose.rotation
         result[:3, 3] = pose.shift - pose.rotation @ (pose.direction * pose.travel)
@@ -209,16 +211,14 @@ class TargetEvidence(StripeEvidence):
 
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
         """Those of the target's points and of the stripe, image by image; None where a ray meets nothing."""
-        found = []
-        for image in np.unique(self.placement.image):
-            pose = _Pose(self, parameters, global_values, local, image)
-            parts = [self._of_points(parameters, global_values, pose)]
-            if self.lit(image).any():
-                parts.append(self._of_stripe(parameters, global_values, pose))
-            if any(part is None for part in parts):
-                return None
-            found += parts
-        return found
+        found: list[Residuals] = []
+        for of_kind, image in ((self._of_points, self.placement.image), (self._of_stripe, self.image)):
+            for here in _batches(image):
+                pose = _Poses(self, parameters, global_values, local, image[here])
+                if (parts := of_kind(parameters, global_values, pose, here)) is None:
+                    return None
+                found += parts
+        return sorted(found, key=lambda part: part.image)
 
     def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
         points = self.placement.pixels.copy()
@@ -227,8 +227,10 @@ class TargetEvidence(StripeEvidence):
                 points[self.placement.image == part.image] -= np.where(kept, part.values, 0.0).reshape(-1, 2)
         return replace(super().linearised(residuals, used), predicted_points=points)
 
-    def _of_points(self, parameters: Parameters, global_values: np.ndarray, pose: "_Pose") -> Residuals | None:
-        here = self.placement.image == pose.image
+    def _of_points(
+        self, parameters: Parameters, global_values: np.ndarray, pose: "_Poses", here: np.ndarray
+    ) -> list[Residuals] | None:
+        """Those of some of the target's points (n,), image after image."""
         found_px = self.placement.pixels[here]
         at_px = found_px if self.predicted_points is None else self.predicted_points[here]
         rays = parameters.rays(global_values, self.view, at_px)
@@ -256,7 +258,7 @@ class TargetEvidence(StripeEvidence):
             """From (2, N, c) to rows (2 N, c)."""
             return (into @ moved.transpose(1, 0, 2)).reshape(2 * len(known), -1)
 
-        by_scale = flat(pose.by_scale()[:, None])
+        by_scale = flat(pose.by_scale())
         by_global = np.empty((2, len(known), len(parameters.keys)))
         for axis in (0, 1):
             by_global[axis] = parameters.by_global(by_rays[:, axis], self.view)
@@ -266,10 +268,12 @@ class TargetEvidence(StripeEvidence):
             parameters.add(by_global[axis], StageParameter.SCALE, by_scale[axis])
         values = (found_px - at_px).ravel() + to_pixels(found[:, :, None]).ravel()
         by_local = to_pixels(flat(pose.by_local(at)).transpose(1, 2, 0))
-        return Residuals(TARGET, values, to_pixels(by_global), by_local, pose.local_columns, pose.image)
+        return pose.by_image(TARGET, values, to_pixels(by_global), by_local)
 
-    def _of_stripe(self, parameters: Parameters, global_values: np.ndarray, pose: "_Pose") -> Residuals | None:
-        here = self.lit(pose.image)
+    def _of_stripe(
+        self, parameters: Parameters, global_values: np.ndarray, pose: "_Poses", here: np.ndarray
+    ) -> list[Residuals] | None:
+        """Those of some of the stripe's pixels (n,), image after image."""
         points = self.on_sheet(parameters, global_values, here, shifted_px=parameters.value(global_values, SHIFT))
         if points is None:
             return None
@@ -280,17 +284,18 @@ class TargetEvidence(StripeEvidence):
         gradient = np.stack([*(steep * (at[:2] - self.middle_mm[:, None])), np.ones(at.shape[1])])
         outward = pose.rotation @ gradient
         by_stripe = -np.sum(outward * points.by_rays[COLUMNS.index("uv"[self.across])], axis=0)
-        by_global = {SHIFT: by_stripe, StageParameter.SCALE: pose.by_scale() @ gradient}
+        by_global = {SHIFT: by_stripe, StageParameter.SCALE: np.sum(pose.by_scale() * gradient, axis=0)}
         off = Distances(
             at[2] - bow * bends[0] - saddle * bends[1],
             outward,
             np.einsum("in,cin->nc", gradient, pose.by_local(points.points)),
             dict(zip(BENDS, -bends, strict=True)) | by_global,
         )
-        columns = pose.local_columns
-        return self.stripe_residuals(
-            parameters, points, off, kind=STRIPE, local_columns=columns, image=pose.image, here=here
+        all_columns = np.empty(0, int)
+        every = self.stripe_residuals(
+            parameters, points, off, kind=STRIPE, local_columns=all_columns, image=-1, here=here
         )
+        return pose.by_image(STRIPE, every.values, every.by_global, every.by_local)
 
     def _bends(self, points: np.ndarray) -> np.ndarray:
         """Heights (2, N) of the target's points (N, 2 or 3) for a bow of one, and for a saddle of one."""
@@ -302,47 +307,71 @@ def _values(parameters: Parameters, global_values: np.ndarray, keys: tuple[Param
     return np.array([parameters.value(global_values, key) for key in keys])
 
 
-class _Pose:
-    """Pose of the target to the camera in one image, and its derivatives by the parameters ``local_columns`` (c,).
+def _batches(image: np.ndarray) -> list[np.ndarray]:
+    """Numbers of pixels, image after image, of as many images at a time as stay in the processor's cache."""
+    order = np.argsort(image, kind="stable")
+    starts = np.flatnonzero(np.diff(image[order], prepend=-1))
+    return np.split(order, starts[1:][np.diff(starts // _TOGETHER) > 0]) if len(order) else []
 
-    The stage has moved by ``travel`` mm along ``direction``, ``nominal`` without its errors; where it has one of its
-    own, that is the last of the parameters.
+
+class _Poses:
+    """Pose of the target to the camera for pixels (n,) of several images, and its derivatives by local parameters.
+
+    ``image`` (n,) is each pixel's, ``travel`` (n,) how far, in mm, the stage has moved along ``direction`` in it.
     """
 
     def __init__(
-        self, evidence: TargetEvidence, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, image: int
+        self,
+        evidence: TargetEvidence,
+        parameters: Parameters,
+        global_values: np.ndarray,
+        local: np.ndarray,
+        image: np.ndarray,
     ):
         placement = evidence.placement
         self.rotation, rotation_by = cv2.Rodrigues(local[:3])
         self._rotation_by = rotation_by.reshape(3, 3, 3)
-        self.shift, self.image = local[3:6], int(image)
+        self.shift, self.image, self._staged = local[3:6], image, evidence.staged
         tilt = local[6:8] if evidence.staged else np.zeros(2)
         self.direction, self._direction_by = leaning(np.array([0.0, 0.0, placement.along_z]), np.eye(3)[:2], tilt)
-        self._nominal = self.travel = 0.0
-        self.local_columns = np.arange(6)
+        self._nominal = self.travel = np.zeros(len(image))
         if evidence.staged:
-            self.local_columns = np.append(np.arange(8), 8 + np.flatnonzero(evidence.images() == image))
-            self._nominal = float(placement.shifts_mm[placement.image == image][0])
+            images, first = np.unique(placement.image, return_index=True)
+            # The first image has no error of its own position.
+            self._place = np.searchsorted(images, image)
+            self._nominal = placement.shifts_mm[first][self._place]
             scale = 1.0 + parameters.value(global_values, StageParameter.SCALE)
-            self.travel = self._nominal * scale + float(local[self.local_columns[8:]].sum())
+            self.travel = self._nominal * scale + np.append(0.0, local[8:])[self._place]
 
     def into_target(self, points: np.ndarray) -> np.ndarray:
-        """Points (3, N) of the camera frame in the target's frame at the first image."""
-        return self.rotation.T @ (points - self.shift[:, None]) + (self.direction * self.travel)[:, None]
+        """Points (3, n) of the camera frame in the target's frame at the first image."""
+        return self.rotation.T @ (points - self.shift[:, None]) + self.direction[:, None] * self.travel
 
     def by_scale(self) -> np.ndarray:
-        """Derivative (3,) of `into_target` by the stage's scale."""
-        return self.direction * self._nominal
+        """Derivatives (3, n) of `into_target` by the stage's scale."""
+        return self.direction[:, None] * self._nominal
 
     def by_local(self, points: np.ndarray) -> np.ndarray:
-        """Derivatives (c, 3, N) of `into_target` by the local parameters."""
-        result = np.empty((len(self.local_columns), 3, points.shape[1]))
+        """Derivatives (c, 3, n) of `into_target` by the local parameters, the last one that of each pixel's image."""
+        result = np.empty((9 if self._staged else 6, 3, points.shape[1]))
         result[:3] = self._rotation_by.transpose(0, 2, 1) @ (points - self.shift[:, None])
         result[3:6] = -self.rotation[:, :, None]
-        if len(self.local_columns) > 6:
+        if self._staged:
             result[6:8] = self._direction_by[:, :, None] * self.travel
-            result[8:] = self.direction[:, None]
+            result[8] = self.direction[:, None]
         return result
+
+    def by_image(self, kind: str, values: np.ndarray, by_global: np.ndarray, by_local: np.ndarray) -> list[Residuals]:
+        """Residuals of each image from those of all pixels, of one coordinate or two each."""
+        images, first = np.unique(self.image, return_index=True)
+        rows, found = len(values) // len(self.image), []
+        for image, start, end in zip(images, first, np.append(first[1:], len(self.image)), strict=True):
+            here = slice(rows * start, rows * end)
+            place = self._place[start] if self._staged else 0
+            columns = np.append(np.arange(8), 7 + place) if place else np.arange(min(8, by_local.shape[1]))
+            own = by_local[here, : len(columns)]
+            found.append(Residuals(kind, values[here], by_global[here], own, columns, int(image)))
+        return found
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

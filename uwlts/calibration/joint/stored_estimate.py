@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import JsonValue
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.intrinsics import DISTORTION, CameraOptions, Intrinsics
 from uwlts.calibration.joint.derivatives import DescribedSheet
@@ -19,6 +20,10 @@ from uwlts.model.errors import CalibrationError
 from uwlts.model.joint_estimate import CoveredRegion, ImageFit, JointEstimate
 from uwlts.model.parameter_keys import LensParameter, MediumIndex, SheetParameter, WindowParameter, parameter_of
 from uwlts.model.sensor import Medium, Sensor, Table, Uncertainty
+from uwlts.model.stripe import pixels_of
+
+_FRAME_STEP = 1e-5
+"""Of the sheet's parameters, rad and mm, for differences: what they leave out is a millionth of a millionth."""
 
 
 def calibration_of(
@@ -137,6 +142,46 @@ class StoredEstimate:
         """Pixels (N, 2) of points (N, 3) in the camera frame; NaN where there is none."""
         return self.parameters.project(self.values, self.view, points)
 
+    def points_by(self, line: np.ndarray, centre_px: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Points (N, 3) of stripe centres, and their derivatives (N, 3, 1 + P) by the pixel and all parameters.
+
+        The pixel is that across the stripe. In the OCS, which stays where the calibration places it beside the camera.
+        None where a centre has no point.
+        """
+        pixels = pixels_of(line, centre_px, stripe_along=self.calibration.stripe_along)
+        points = self.parameters.on_sheet(self.values, self.view, pixels)
+        if points is None:
+            return None
+        result = np.empty((len(line), 3, 1 + len(self.values)))
+        result[:, :, 0] = points.by_rays[self.across()].T
+        for axis in range(3):
+            result[:, axis, 1:] = self.parameters.by_global(
+                points.by_rays[:, axis], self.view, points.by_sheet[:, axis]
+            )
+        frame = self.calibration.object_transform()
+        at = (points.points.T - frame[:3, 3]) @ frame[:3, :3]
+        return at, np.einsum("ji,njr->nir", frame[:3, :3], result)
+
+    def frame_by(self) -> np.ndarray:
+        """Derivatives (6, P) of the OCS by the parameters: shift, mm, and rotation, rad, along its own axes.
+
+        The OCS belongs to the sheet, and moves with it as that becomes known better.
+        """
+        axis, here = self.parameters.sheet.axis, self.calibration.object_transform()
+        result = np.zeros((6, len(self.values)))
+        for column, key in enumerate(self.parameters.keys):
+            if not isinstance(key, SheetParameter):
+                continue
+            moved = []
+            for step in (_FRAME_STEP, -_FRAME_STEP):
+                values = self.values.copy()
+                values[column] += step
+                moved.append(np.linalg.inv(here) @ object_frame(self.parameters.sheet_model(values), laser_axis=axis))
+            result[:3, column] = (moved[0] - moved[1])[:3, 3] / (2 * _FRAME_STEP)
+            turned = moved[0][:3, :3] @ moved[1][:3, :3].T
+            result[3:, column] = Rotation.from_matrix(turned).as_rotvec() / (2 * _FRAME_STEP)
+        return result
+
     def across(self) -> int:
         """The coordinate of the pixel that runs across the stripe."""
         return 1 if self.calibration.stripe_along == "width" else 0
@@ -148,12 +193,14 @@ def with_independent(covariance: np.ndarray, std: Sequence[float]) -> np.ndarray
 
 
 def covariance_root(covariance: np.ndarray) -> np.ndarray:
-    """A matrix (P, R) whose product with its transpose is the covariance (P, P), by the correlations."""
+    """The matrix (P, P) whose product with its transpose is the covariance (P, P), by the correlations' symmetric root.
+
+    It is the same wherever it is calculated, so that its columns, independent parts of the parameters, can be compared.
+    """
     scale = np.sqrt(np.diag(covariance))
     scale = np.where(scale > 0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    kept = values > 0
-    return scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    return scale[:, None] * ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
 def require_joint(calibration: Calibration) -> JointEstimate:

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_part
 from uwlts.stripe.methods import quadratic
 from uwlts.stripe.peak_window import FLANK, FWHM_PER_SIGMA, PeakWindow, greatest
 
@@ -78,9 +78,7 @@ def centres(peak: PeakWindow) -> np.ndarray:
     # Flat rows, of which the compiler knows that their parts do not overlap.
     signal = np.empty((groups, (2 * most + 1) * _LANES), np.float32)
     known, sums = np.empty((groups, _KNOWN * _LANES), np.float32), np.empty(14 * _LANES, np.float32)
-    _set_side_by_side(peak, noise, signal, known)
-    _improve(known, signal, sums, _USUAL_CONTRAST, _FIRST_STEPS)
-    _improve(known, signal, sums, _contrast(known, signal, sampled, noise), _STEPS - _FIRST_STEPS)
+    _fit(peak, noise, sampled, signal, known, sums)
     centre = np.floor(peak.middle + np.float32(0.5)) + known[:, _CENTRE : _CENTRE + _LANES].ravel()[: peak.start.size]
     width = np.float32(FWHM_PER_SIGMA) * peak.sigma
     haloed = np.flatnonzero((noise > _SPECKLED_HALO * peak.height) & (width > _PLATEAU))
@@ -107,6 +105,21 @@ def _flank_noise(peak: PeakWindow, sampled: np.ndarray, result: np.ndarray) -> N
 
 
 @compiled
+def _fit(
+    peak: PeakWindow, noise: float, sampled: np.ndarray, signal: np.ndarray, known: np.ndarray, sums: np.ndarray
+) -> None:
+    """Fit all lines; the fits are in ``known``, while ``signal`` and ``sums`` are room to work in."""
+    _set_side_by_side(peak, noise, signal, known)
+    contrast = _USUAL_CONTRAST
+    for step in range(_STEPS):
+        if step == _FIRST_STEPS:
+            contrast = _contrast(known, signal, sampled, noise)
+        for group in range(known.shape[0]):
+            _sum_moments(known[group], signal[group], np.float32(contrast * contrast), sums)
+            _step(known[group], sums)
+
+
+@compiled_part
 def _set_side_by_side(peak: PeakWindow, noise: float, signal: np.ndarray, known: np.ndarray) -> None:
     """Signal above the background (G, (2 R + 1) lanes) and what is known (G, 8 lanes) of G groups of lines.
 
@@ -134,7 +147,7 @@ def _set_side_by_side(peak: PeakWindow, noise: float, signal: np.ndarray, known:
             known[group, _REACH + k] = peak.reach[m]
 
 
-@compiled
+@compiled_part
 def _contrast(known: np.ndarray, signal: np.ndarray, sampled: np.ndarray, noise: float) -> float:
     """Contrast of the pixels above half height: what the fit leaves of them over the model, less the floor's share.
 
@@ -154,16 +167,7 @@ def _contrast(known: np.ndarray, signal: np.ndarray, sampled: np.ndarray, noise:
     return math.sqrt(max(total, 0.0) / count)
 
 
-@compiled
-def _improve(known: np.ndarray, signal: np.ndarray, sums: np.ndarray, contrast: float, steps: int) -> None:
-    """Some steps of the fit; centre, height and sigma are replaced in `known`."""
-    for group in range(known.shape[0]):
-        for _ in range(steps):
-            _sum_moments(known[group], signal[group], np.float32(contrast * contrast), sums)
-            _step(known[group], sums)
-
-
-@compiled
+@compiled_part
 def _sum_moments(known: np.ndarray, signal: np.ndarray, squared_contrast: np.float32, sums: np.ndarray) -> None:
     """Moments of f^2 / v up to u^4, then of (y - f) f / v up to u^2.
 
@@ -215,7 +219,7 @@ def _sum_moments(known: np.ndarray, signal: np.ndarray, squared_contrast: np.flo
             sums[_RISE_BEFORE + k] *= sums[_FALLING + k]
 
 
-@compiled
+@compiled_part
 def _exp(x: np.float32) -> np.float32:
     """e^x as (e^(x / 16))^16, which vector units can do: to 2e-5 of it above -5, and never above e^-12 beyond that."""
     y = max(x, np.float32(-12.0)) * np.float32(1.0 / 16.0)
@@ -227,7 +231,7 @@ def _exp(x: np.float32) -> np.float32:
     return power * power
 
 
-@compiled
+@compiled_part
 def _step(known: np.ndarray, sums: np.ndarray) -> None:
     """One step of the fit from the normal equations, by Cramer's rule; no change is above the limit.
 

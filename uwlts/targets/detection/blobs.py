@@ -1,16 +1,19 @@
 """Closed bright or dark blobs of an unevenly lit image, as candidates for the images of circles."""
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from uwlts.model.errors import ImageError
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_part
 
 # Sides of the square window over which the two local grey levels are taken. A window serves blobs from about a tenth
 # to three quarters of its side, so factors of four cover 4 px to 380 px with overlap.
 WINDOWS_PX = (32, 128, 512)
+# Local grey levels are means of blocks of so many pixels a side, with linear interpolation between their middles.
+BLOCK_PX = 4
 MIN_AREA_PX = 10.0  # a blob of fewer pixels has no measurable shape (a disc of 4 px diameter covers 12.6)
 # Pure noise, which the median filter has more than halved, shows 0.7 of its standard deviation between both levels.
 CONTRAST_OVER_NOISE = 3.0
@@ -49,21 +52,22 @@ def checked_grey(image):
     return image
 
 
-def noise_level(grey):
-    """Standard deviation of the pixel noise of a float32 image (H, W), in grey levels.
+def noise_level(image):
+    """Standard deviation of the pixel noise of an image (H, W), in grey levels.
 
     The mask of Immerkaer (Fast noise variance estimation, CVIU 64, 1996, eq. 2) cancels linear shading and has norm 6.
     Its lower fifth is used instead of its mean because a fine pattern puts an edge into most neighbourhoods.
     """
     # One row in four is enough for a quantile.
-    upper, middle, lower = grey[0:-2:4], grey[1:-1:4], grey[2::4]
-    rows = upper[: len(lower)] - 2 * middle[: len(lower)] + lower
+    rows = image[: 4 * ((len(image) - 2) // 4) + 3].astype(np.int32)
+    rows = rows[0:-2:4] - 2 * rows[1:-1:4] + rows[2::4]
     response = np.abs(rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:])
+    lower_fifth = np.searchsorted(np.cumsum(np.bincount(response.ravel())), 0.2 * response.size)
     lower_fifth_of_unit_normal = 0.2533
-    return float(np.quantile(response, 0.2) / (6 * lower_fifth_of_unit_normal))
+    return float(lower_fifth) / (6 * lower_fifth_of_unit_normal)
 
 
-def find_blobs(grey, noise):
+def find_blobs(image, noise):
     """Find the most numerous family of ellipse-like blobs, whatever its polarity and size.
 
     Each window of `WINDOWS_PX` gives a threshold half-way between the mean levels of the local bright and dark pixels
@@ -72,21 +76,22 @@ def find_blobs(grey, noise):
     polarity with most blobs of about the same size win, of as many the smaller ones: what is bright around each dark
     circle is a blob too.
 
-    ``grey`` is the image (H, W) in float32, ``noise`` the standard deviation of a pixel; the result may be empty.
+    ``noise`` is the standard deviation of a pixel of the image (H, W); the result may be empty.
     """
-    low, high = np.quantile(grey[::4, ::4], (0.001, 0.999))
+    low, high = np.quantile(image[::4, ::4], (0.001, 0.999))
     floor = max(CONTRAST_OVER_NOISE * noise, CONTRAST_OVER_RANGE * (high - low))
-    smooth = cv2.medianBlur(grey, 3)
-    small = _reduced(smooth)
+    smooth = cv2.medianBlur(image, 3)
+    # All pixels are above -1.
+    _, mean = _above(smooth, np.full(_blocks(smooth), -1, np.float32))
     best, best_score = Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), True), (0, 0.0)
     for window in WINDOWS_PX:
-        if window > WINDOWS_PX[0] and window > max(grey.shape):
+        if window > WINDOWS_PX[0] and window > max(image.shape):
             break
-        threshold, contrast = _local_levels(smooth, small, window)
-        clear = contrast > floor
-        for bright in (True, False):
-            side = smooth > threshold if bright else smooth < threshold
-            blobs = _ellipse_like(np.logical_and(side, clear).view(np.uint8), bright=bright)
+        sides = np.empty((2, *smooth.shape), np.uint8)
+        threshold, contrast = map(_widened, _local_levels(smooth, mean, window))
+        _set_sides(smooth, threshold, contrast, np.float32(floor), sides[0], sides[1])
+        for bright, side in zip((True, False), sides, strict=True):
+            blobs = _ellipse_like(side, bright=bright)
             radii = np.sqrt(np.linalg.det(blobs.shapes))
             score = _largest_family(radii), -float(np.median(radii)) if len(radii) else 0.0
             if score > best_score:
@@ -94,60 +99,102 @@ def find_blobs(grey, noise):
     return best
 
 
-def _local_levels(smooth, small, window):
-    """Threshold (H, W) and contrast (H, W) between the local bright and dark levels, in grey levels.
+def _local_levels(smooth, mean, window):
+    """Threshold and contrast between the local bright and dark levels, in grey levels, of the blocks of an image.
 
-    `small` is `smooth` at a quarter of its resolution, at which all local means are taken.
+    ``mean`` is that of the blocks.
     """
-    mean = _local_mean(small, window)
-    threshold, bright, dark = _enlarged(mean, smooth.shape), mean, mean
-    above, grey_above = np.empty_like(smooth), np.empty_like(smooth)
+    threshold = bright = dark = mean = _local_mean(mean, window)
     for _ in range(2):
-        _split(smooth, threshold, above, grey_above)
-        share = np.clip(_local_mean(_reduced(above), window), 1e-4, 1 - 1e-4)
-        above_sum = _local_mean(_reduced(grey_above), window)
-        bright, dark = above_sum / share, (mean - above_sum) / (1 - share)
-        threshold = _enlarged((bright + dark) / 2, smooth.shape)
-    return threshold, _enlarged(bright - dark, smooth.shape)
+        share, above = (_local_mean(values, window) for values in _above(smooth, threshold))
+        share = np.clip(share, 1e-4, 1 - 1e-4)
+        bright, dark = above / share, (mean - above) / (1 - share)
+        threshold = (bright + dark) / 2
+    return threshold, bright - dark
+
+
+def _local_mean(blocks, window):
+    side = window // BLOCK_PX + 1
+    return cv2.blur(blocks, (side, side), borderType=cv2.BORDER_REFLECT)
+
+
+def _above(smooth, threshold):
+    """Of each block the share of pixels above the threshold, interpolated between blocks, and their sum over all."""
+    share, above = np.empty_like(threshold), np.empty_like(threshold)
+    wide = _widened(threshold)
+    _sum_above(smooth, wide, np.empty((2, wide.shape[1]), np.float32), share, above)
+    return share, above
+
+
+def _blocks(image):
+    """Numbers of blocks along both sides of an image; the last ones may be smaller."""
+    return tuple(-(-size // BLOCK_PX) for size in image.shape)
+
+
+def _widened(blocks):
+    """Values of blocks interpolated along their rows, for each column of pixels."""
+    rows, columns = blocks.shape
+    return cv2.resize(blocks, (BLOCK_PX * columns, rows), interpolation=cv2.INTER_LINEAR)
+
+
+@compiled_part
+def _between(count, v):
+    """Rows of blocks, of so many, on either side of a row of pixels, and the share of the second one."""
+    at = (v + 0.5) / BLOCK_PX - 0.5
+    top = math.floor(at)
+    return max(top, 0), min(top + 1, count - 1), np.float32(at - top)
 
 
 @compiled
-def _split(smooth, threshold, above, grey_above):
-    """1 and the grey level where an image is above its threshold, 0 elsewhere."""
+def _sum_above(smooth, threshold, sums, share, above):
     height, width = smooth.shape
-    for v in range(height):
+    number, total = sums[0], sums[1]
+    for block in range(share.shape[0]):
+        first, last = BLOCK_PX * block, min(BLOCK_PX * (block + 1), height)
         for u in range(width):
-            is_above = np.float32(smooth[v, u] > threshold[v, u])
-            above[v, u], grey_above[v, u] = is_above, is_above * smooth[v, u]
+            number[u], total[u] = np.float32(0.0), np.float32(0.0)
+        for v in range(first, last):
+            top, bottom, part = _between(share.shape[0], v)
+            pixels, upper, lower = smooth[v], threshold[top], threshold[bottom]
+            for u in range(width):
+                grey = np.float32(pixels[u])
+                is_above = np.float32(grey > upper[u] + part * (lower[u] - upper[u]))
+                number[u] += is_above
+                total[u] += is_above * grey
+        for c in range(share.shape[1]):
+            left, right = BLOCK_PX * c, min(BLOCK_PX * (c + 1), width)
+            count, grey, area = np.float32(0.0), np.float32(0.0), np.float32((last - first) * (right - left))
+            for u in range(left, right):
+                count, grey = count + number[u], grey + total[u]
+            share[block, c], above[block, c] = count / area, grey / area
 
 
-def _reduced(values):
-    return cv2.resize(values, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-
-
-def _local_mean(small, window):
-    side = window // 4 + 1
-    return cv2.blur(small, (side, side), borderType=cv2.BORDER_REFLECT)
-
-
-def _enlarged(values, shape):
-    return cv2.resize(values, shape[::-1], interpolation=cv2.INTER_LINEAR)
+@compiled
+def _set_sides(smooth, threshold, contrast, floor, bright, dark):
+    """Masks (H, W) of what is brighter and of what is darker than the threshold, where there is contrast."""
+    for v in range(smooth.shape[0]):
+        top, bottom, part = _between(threshold.shape[0], v)
+        pixels, is_bright, is_dark = smooth[v], bright[v], dark[v]
+        upper, lower, above, below = threshold[top], threshold[bottom], contrast[top], contrast[bottom]
+        for u in range(pixels.size):
+            level = upper[u] + part * (lower[u] - upper[u])
+            clear = above[u] + part * (below[u] - above[u]) > floor
+            is_bright[u] = clear & (np.float32(pixels[u]) > level)
+            is_dark[u] = clear & (np.float32(pixels[u]) < level)
 
 
 def _ellipse_like(mask, *, bright):
     """Blobs of a 0/1 mask whose outline encloses the area of the ellipse with the same moments."""
     height, width = mask.shape
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    is_outline = hierarchy.reshape(-1, 4)[:, 3] < 0 if contours else ()
-    found = []
+    lengths = np.fromiter(map(len, contours), int, len(contours))
     # The outline of the largest circle that fits into the image has less than four times its shorter side.
-    for contour, outline in zip(contours, is_outline, strict=True):
-        if outline and 8 <= (length := len(contour)) <= 4 * min(height, width):
-            u, v, du, dv = cv2.boundingRect(contour)
-            if u > 1 and v > 1 and u + du < width - 1 and v + dv < height - 1:
-                moments = cv2.moments(contour)
-                found.append((length, *(moments[name] for name in ("m00", "m10", "m01", "mu20", "mu11", "mu02"))))
-    found = np.array(found).reshape(-1, 7)
+    chosen = np.flatnonzero((lengths >= 8) & (lengths <= 4 * min(height, width)))
+    chosen = chosen[hierarchy[0, chosen, 3] < 0] if len(contours) else chosen
+    found = np.empty((len(chosen), 7))
+    if len(chosen):
+        ends = np.cumsum(lengths[chosen])
+        _outline_moments(np.concatenate([contours[k] for k in chosen])[:, 0], ends, width, height, found)
     # The outline runs through pixel centres: it leaves out half a pixel all around, and all of a line of pixels.
     found = found[(found[:, 1] > 0) & (found[:, 1] + found[:, 0] / 2 >= MIN_AREA_PX)]
     area, covariances = found[:, 1], found[:, 4:] / found[:, 1:2]
@@ -159,6 +206,43 @@ def _ellipse_like(mask, *, bright):
     values, vectors = np.linalg.eigh(shapes.reshape(-1, 2, 2))
     semi_axes = 2 * np.sqrt(values) + 0.5
     return Blobs(centres, (vectors * semi_axes[:, None, :]) @ vectors.swapaxes(1, 2), bright)
+
+
+@compiled
+def _outline_moments(points, ends, width, height, found):
+    """Number of points, area, first moments and central second moments (K, 7) of polygons, by Green's theorem.
+
+    Those of polygons at the image's border have no area. ``points`` (N, 2) are of one polygon after the other, up to
+    ``ends`` (K,).
+    """
+    first = 0
+    for number in range(ends.size):
+        end, inside = ends[number], True
+        # From the first point on, so that no digits are lost.
+        u0, v0 = points[first, 0], points[first, 1]
+        area, mu, mv, uu, uv, vv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        before_u, before_v = float(points[end - 1, 0] - u0), float(points[end - 1, 1] - v0)
+        for k in range(first, end):
+            inside &= 1 < points[k, 0] < width - 2 and 1 < points[k, 1] < height - 2
+            u, v = float(points[k, 0] - u0), float(points[k, 1] - v0)
+            cross = before_u * v - u * before_v
+            area += cross
+            mu += cross * (before_u + u)
+            mv += cross * (before_v + v)
+            uu += cross * (before_u * (before_u + u) + u * u)
+            vv += cross * (before_v * (before_v + v) + v * v)
+            uv += cross * (before_u * (2.0 * before_v + v) + u * (before_v + 2.0 * v))
+            before_u, before_v = u, v
+        sign = 1.0 if area > 0.0 else -1.0
+        area, mu, mv = sign * area / 2.0, sign * mu / 6.0, sign * mv / 6.0
+        result = found[number]
+        result[0], result[1] = end - first, area if inside else 0.0
+        result[2], result[3] = mu + area * u0, mv + area * v0
+        if area > 0.0:
+            result[4] = sign * uu / 12.0 - mu * mu / area
+            result[5] = sign * uv / 24.0 - mu * mv / area
+            result[6] = sign * vv / 12.0 - mv * mv / area
+        first = end
 
 
 def _largest_family(radii):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import KDTree
 
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_part
 from uwlts.targets.detection.blobs import Blobs, checked_grey, find_blobs, noise_level
 
 PASSES = 2
@@ -71,19 +71,17 @@ def _level_planes(grey, centres, shapes, reaches):
     """
     rim, normals = _rims(shapes)
     planes = np.zeros((len(centres), 2, 3))
+    near = KDTree(centres).query(centres, k=min(NEIGHBOURS + 1, len(centres)))[1] if len(centres) > 1 else None
     for side, reach in enumerate((-reaches[0], reaches[1])):
         offsets = rim + normals * reach[:, None, None]
         planes[:, side, 0] = sample(grey, centres[:, None] + offsets).mean(1)
-        planes[:, side, 1:] = _slopes(centres, planes[:, side, 0])
+        if near is not None:
+            planes[:, side, 1:] = _slopes(centres, planes[:, side, 0], near)
     return planes
 
 
-def _slopes(places, values):
-    """Slopes (N, 2) of planes through values (N,) at each of the places (N, 2) and at those next to it."""
-    count = min(NEIGHBOURS + 1, len(places))
-    if count < 2:
-        return np.zeros_like(places)
-    near = KDTree(places).query(places, k=count)[1]
+def _slopes(places, values, near):
+    """Slopes (N, 2) of planes through values (N,) at each of the places (N, 2) and at those ``near`` it (N, K)."""
     alike = np.abs(values[near] - values[:, None]) <= MAX_LEVEL_DEPARTURE * np.abs(values[:, None])
     weights = alike / alike.sum(1, keepdims=True)
     at, level = places[near], values[near]
@@ -116,19 +114,26 @@ def _sum_shares(grey, centres, inner, outer, planes, result):
             dv = v - centre_v
             first, last = _run(q, centre_u, dv)
             whole_from, whole_to = _run(inner[n], centre_u, dv)
-            for u in range(max(first, 0), min(last + 1, width)):
-                du, share = u - centre_u, 1.0
-                if u < whole_from or u > whole_to:
-                    dark = outside + outside_u * du + outside_v * dv
-                    relative = (inside + inside_u * du + inside_v * dv - dark) / (inside - outside)
-                    # Planes that meet within the band belong to no circle; their share stays finite, and the centre
-                    # shows it.
-                    share = (grey[v, u] - dark) / (max(relative, MIN_RELATIVE_CONTRAST) * (inside - outside))
+            first, last = max(first, 0), min(last, width - 1)
+            whole_from, whole_to = max(whole_from, first), min(whole_to, last)
+            if whole_from > whole_to:
+                whole_from, whole_to = last + 1, last
+            whole = whole_to - whole_from + 1
+            area, sum_v = area + whole, sum_v + whole * dv
+            sum_u += whole * (0.5 * (whole_from + whole_to) - centre_u)
+            for band in range(first, last + 1 - whole):
+                u = band if band < whole_from else band + whole
+                du = u - centre_u
+                dark = outside + outside_u * du + outside_v * dv
+                relative = (inside + inside_u * du + inside_v * dv - dark) / (inside - outside)
+                # Planes that meet within the band belong to no circle; their share stays finite, and the centre shows
+                # it.
+                share = (grey[v, u] - dark) / (max(relative, MIN_RELATIVE_CONTRAST) * (inside - outside))
                 area, sum_u, sum_v = area + share, sum_u + share * du, sum_v + share * dv
         result[n, 0], result[n, 1] = centre_u + sum_u / area, centre_v + sum_v / area
 
 
-@compiled
+@compiled_part
 def _run(q, centre_u, dv):
     """First and last u within an ellipse in a row; the first is after the last where the row misses it."""
     mixed = q[0, 1] * dv
@@ -236,48 +241,83 @@ def _rims(shapes):
 
 def _moved(grey, ellipses, longest, noise):
     """Ellipses moved to the edges around them by least squares, and whether (N,) the edges are whole."""
-    rim, normals = _rims(ellipses.shapes)
-    reach = np.minimum(longest, REACH_OVER_MINOR_AXIS * np.linalg.eigvalsh(ellipses.shapes)[:, 0])
-    profiles = np.empty((len(ellipses), PROFILES, SAMPLES), np.float32)
-    _sample_profiles(grey, ellipses.centres[:, None] + rim, normals, reach, profiles)
-    if not ellipses.bright:
-        profiles = -profiles
-    inner, outer = profiles[:, :, :2].mean(2), profiles[:, :, -2:].mean(2)
-    harmonics = np.stack([np.ones(PROFILES), *DIRECTIONS.T], 1)
-    smoother = harmonics @ np.linalg.pinv(harmonics)
-    inner_level, outer_level = inner @ smoother, outer @ smoother
-    contrast = inner_level - outer_level
-    departure = np.abs(inner - outer - contrast)
+    count, reach = len(ellipses), np.minimum(longest, REACH_OVER_MINOR_AXIS * np.linalg.eigvalsh(ellipses.shapes)[:, 0])
     share = np.where(reach < longest, MAX_CONTRAST_DEPARTURE_IF_SMALL, MAX_CONTRAST_DEPARTURE)
-    whole = (contrast > 0).all(1) & (departure <= np.maximum(share[:, None] * contrast, 6 * noise)).all(1)
-    crossing, crossed = _crossing(profiles - (inner_level + outer_level)[:, :, None] / 2)
-    distance, middle = crossing * reach[:, None], SAMPLES // 2
-    slope = (profiles[:, :, middle - 2] - profiles[:, :, middle + 2]).mean(1) / (8 * reach / (SAMPLES - 1))
-    mean_contrast = contrast.mean(1)
-    sharpness = slope / np.where(whole, mean_contrast, 1.0)
-    # The distances along the normals are linear in small changes of the centre (2) and of the shape (3).
-    (n_u, n_v), (e_u, e_v) = np.moveaxis(normals, 2, 0), DIRECTIONS.T
-    design = np.stack([n_u, n_v, n_u * e_u, n_u * e_v + n_v * e_u, n_v * e_v], 2)
-    normal = design.swapaxes(1, 2) @ design
-    change = np.linalg.solve(normal, design.swapaxes(1, 2) @ distance[:, :, None])
-    residual = distance - (design @ change)[:, :, 0]
-    rms = np.sqrt((residual**2).sum(1) / (PROFILES - 5))
-    centres = ellipses.centres + change[:, :2, 0]
-    shapes = ellipses.shapes + change[:, [2, 3, 3, 4], 0].reshape(-1, 2, 2)
-    moved = Ellipses(centres, shapes, ellipses.bright, rms, mean_contrast, sharpness)
-    return moved, whole & crossed & (np.linalg.eigvalsh(shapes)[:, 0] > 1.0)
+    normal, right, figures = np.empty((count, 5, 5)), np.empty((count, 5)), np.empty((count, 4))
+    sign, room = 1.0 if ellipses.bright else -1.0, np.empty((PROFILES, SAMPLES))
+    blobs = ellipses.centres, ellipses.shapes, np.linalg.inv(ellipses.shapes), reach, share
+    _measure_edges(grey, *blobs, DIRECTIONS, sign, 6 * noise, room, normal, right, figures)
+    squares, contrast, slope, whole = figures[:, 0], figures[:, 1], figures[:, 2], figures[:, 3] > 0
+    change = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+    rms = np.sqrt(np.maximum(squares - (right * change).sum(1), 0.0) / (PROFILES - 5))
+    centres, shapes = ellipses.centres + change[:, :2], ellipses.shapes + change[:, [2, 3, 3, 4]].reshape(-1, 2, 2)
+    sharpness = slope / np.where(whole, contrast, 1.0)
+    moved = Ellipses(centres, shapes, ellipses.bright, rms, contrast, sharpness)
+    return moved, whole & (np.linalg.eigvalsh(shapes)[:, 0] > 1.0)
 
 
-def _crossing(excess):
-    """Places, -1 to 1, where profiles (N, P, S) fall through zero nearest their middle, and whether all N x P do."""
-    falls = (excess[:, :, :-1] > 0) & (excess[:, :, 1:] <= 0)
-    from_middle = np.abs(np.arange(SAMPLES - 1) - (SAMPLES - 2) / 2)
-    first = np.where(falls, from_middle, np.inf).argmin(2)
-    before = np.take_along_axis(excess, first[:, :, None], 2)[:, :, 0]
-    after = np.take_along_axis(excess, first[:, :, None] + 1, 2)[:, :, 0]
-    crossed = falls.any(2)
-    share = np.where(crossed, before / np.where(crossed, before - after, 1.0), 0.5)
-    return 2 * (first + share) / (SAMPLES - 1) - 1, crossed.all(1)
+@compiled
+def _measure_edges(
+    grey, centres, shapes, inverses, reaches, shares, directions, sign, disturbed, room, normal, right, figures
+):
+    """Normal equations (N, 5, 5), (N, 5) of changes of centre (2) and shape (3) that move ellipses to their edges.
+
+    Distances along the normals are linear in small changes. ``figures`` (N, 4) are the squares of all distances, the
+    contrast, the edge's slope, and whether (0 or 1) every profile has the contrast and falls through its middle.
+    """
+    around, samples = room.shape
+    middle, apart = samples // 2, 2.0 / (samples - 1)
+    levels = np.empty((2, around))
+    for n in range(centres.shape[0]):
+        shape, inverse, reach = shapes[n], inverses[n], reaches[n]
+        slope, squares, contrasts, whole = 0.0, 0.0, 0.0, True
+        harmonics = np.zeros((2, 3))
+        for p in range(around):
+            e_u, e_v = directions[p, 0], directions[p, 1]
+            n_u, n_v = inverse[0, 0] * e_u + inverse[0, 1] * e_v, inverse[0, 1] * e_u + inverse[1, 1] * e_v
+            step = reach / math.sqrt(n_u * n_u + n_v * n_v)
+            at_u = centres[n, 0] + shape[0, 0] * e_u + shape[0, 1] * e_v
+            at_v = centres[n, 1] + shape[0, 1] * e_u + shape[1, 1] * e_v
+            for s in range(samples):
+                away = step * (apart * s - 1.0)
+                room[p, s] = sign * _bilinear(grey, at_u + away * n_u, at_v + away * n_v)
+            slope += room[p, middle - 2] - room[p, middle + 2]
+            levels[0, p], levels[1, p] = (
+                (room[p, 0] + room[p, 1]) / 2,
+                (room[p, samples - 2] + room[p, samples - 1]) / 2,
+            )
+            for side in range(2):
+                harmonics[side, 0] += levels[side, p] / around
+                harmonics[side, 1] += 2.0 * levels[side, p] * e_u / around
+                harmonics[side, 2] += 2.0 * levels[side, p] * e_v / around
+        normal[n], right[n] = 0.0, 0.0
+        for p in range(around):
+            e_u, e_v = directions[p, 0], directions[p, 1]
+            inside = harmonics[0, 0] + harmonics[0, 1] * e_u + harmonics[0, 2] * e_v
+            outside = harmonics[1, 0] + harmonics[1, 1] * e_u + harmonics[1, 2] * e_v
+            contrast, level = inside - outside, (inside + outside) / 2
+            departure = abs(levels[0, p] - levels[1, p] - contrast)
+            whole &= contrast > 0 and departure <= max(shares[n] * contrast, disturbed)
+            contrasts += contrast / around
+            # Where the profile falls through its middle level, nearest to its own middle.
+            nearest, crossing = float(samples), 0.0
+            for s in range(samples - 1):
+                before, after = room[p, s] - level, room[p, s + 1] - level
+                away = abs(s - (samples - 2) / 2)
+                if before > 0 and after <= 0 and away < nearest:
+                    nearest, crossing = away, apart * (s + before / (before - after)) - 1.0
+            whole &= nearest < samples
+            n_u, n_v = inverse[0, 0] * e_u + inverse[0, 1] * e_v, inverse[0, 1] * e_u + inverse[1, 1] * e_v
+            length, distance = math.sqrt(n_u * n_u + n_v * n_v), crossing * reach
+            n_u, n_v = n_u / length, n_v / length
+            by = (n_u, n_v, n_u * e_u, n_u * e_v + n_v * e_u, n_v * e_v)
+            squares += distance * distance
+            for i in range(5):
+                right[n, i] += by[i] * distance
+                for j in range(5):
+                    normal[n, i, j] += by[i] * by[j]
+        figures[n, 0], figures[n, 1], figures[n, 3] = squares, contrasts, 1.0 if whole else 0.0
+        figures[n, 2] = slope / around * (samples - 1) / (8.0 * reach)
 
 
 def sample(grey, points):
@@ -288,24 +328,12 @@ def sample(grey, points):
 
 
 @compiled
-def _sample_profiles(grey, middles, normals, reach, profiles):
-    """Grey values (N, P, S) from minus to plus ``reach`` (N,) along normals (N, P, 2) about middles (N, P, 2)."""
-    count, around, samples = profiles.shape
-    for n in range(count):
-        for p in range(around):
-            for s in range(samples):
-                step = reach[n] * (2 * s / (samples - 1) - 1)
-                u, v = middles[n, p, 0] + step * normals[n, p, 0], middles[n, p, 1] + step * normals[n, p, 1]
-                profiles[n, p, s] = _bilinear(grey, u, v)
-
-
-@compiled
 def _interpolate(grey, points, values):
     for n in range(len(points)):
         values[n] = _bilinear(grey, points[n, 0], points[n, 1])
 
 
-@compiled
+@compiled_part
 def _bilinear(grey, u, v):
     height, width = grey.shape
     left, top = min(max(int(u), 0), width - 2), min(max(int(v), 0), height - 2)
@@ -326,8 +354,8 @@ def find_circles(image):
     """
     grey = checked_grey(image).astype(np.float32)
     # Half a grey level covers an image without noise, whose only disturbance is its rounding.
-    noise = max(noise_level(grey), 0.5)
-    ellipses = fit_ellipses(grey, find_blobs(grey, noise), noise)
+    noise = max(noise_level(image), 0.5)
+    ellipses = fit_ellipses(grey, find_blobs(image, noise), noise)
     centres, agree = area_centroids(grey, ellipses)
     return replace(ellipses, centres=centres)[agree]
 

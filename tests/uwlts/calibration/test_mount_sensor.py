@@ -1,0 +1,134 @@
+"""What a sensor's calibration does to a mount and to points along a path, against changed calibrations."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+import uwlts
+from tests.uwlts.calibration.test_mount_board import CAMERA, MIDDLE, simulated
+from tests.uwlts.joint_views import MEDIUM
+from tests.uwlts.mount_views import errors_of
+from tests.uwlts.sensor_profiles import RADIUS_MM, captured_by, half_way, joint_estimate, largest_parts
+from uwlts.calibration.joint.stored_estimate import covariance_root
+from uwlts.calibration.mount_board import _Problem
+from uwlts.measurement.moving import Ride, with_platform
+from uwlts.measurement.point_uncertainty import point_uncertainty
+from uwlts.model.any_calibration import calibration_digest
+from uwlts.storage.capture import CaptureHeader, FrameTable
+
+
+@pytest.fixture(scope="module")
+def known(thesis):
+    return joint_estimate(thesis)
+
+
+@pytest.fixture(scope="module")
+def captured(known):
+    return captured_by(known, known.values, np.random.default_rng(1))
+
+
+@pytest.fixture(scope="module")
+def mount(captured):
+    return uwlts.calibrate_mount(captured, radius_mm=RADIUS_MM)
+
+
+def test_a_mount_follows_the_sensor_as_its_derivatives_say(known, captured, mount):
+    """Against mounts from the same stripes by other calibrations; second order and iteration leave less than 2 %."""
+    by = np.array(mount.sensor.by_parameters)
+    for part in largest_parts(known, by):
+        found = []
+        for sign in (1, -1):
+            other = replace(known, values=known.values + sign * part)
+            profiles = [other.points_by(*stripes.T)[0] for stripes in captured.stripes]
+            found.append(uwlts.calibrate_mount(replace(captured, profiles=profiles), radius_mm=RADIUS_MM).transform())
+        moved, std = half_way(*found), mount.std()
+        assert np.linalg.norm(moved / std) > 0.3, "a part that matters"
+        np.testing.assert_allclose(by @ part[: by.shape[1]] / std, moved / std, atol=0.02 * np.linalg.norm(moved / std))
+
+
+@pytest.mark.slow
+def test_intervals_hold_for_sensors_that_differ_from_their_calibration(known):
+    """Sensors drawn from the covariance: chi-square of six for each, beyond the limits once in 10^6 (both sides).
+
+    Without the sensor's part the errors are hundreds of times larger than stated.
+    """
+    excess, apart = [], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        values = rng.multivariate_normal(known.values, known.covariance, method="svd")
+        found = uwlts.calibrate_mount(captured_by(known, values, rng), radius_mm=RADIUS_MM)
+        off = np.concatenate(errors_of(found.transform()))
+        excess.append(off @ np.linalg.solve(np.array(found.covariance), off))
+        apart.append(off @ np.linalg.solve(np.array(found.sensor.covariance_apart), off))
+    low, high = chi2.isf([1 - 5e-7, 5e-7], 6 * len(excess))
+    assert low < np.sum(excess) < high
+    assert np.median(apart) > 100
+
+
+def test_points_do_not_count_the_sensor_twice(known, thesis, captured, mount):
+    """Points along a path follow another calibration, and the mount that goes with it, as their patterns say."""
+    number, by = 0, np.array(mount.sensor.by_parameters)
+    line, centre = np.tile(np.arange(300, 900), 2), np.repeat([450.0, 620.0], 600)
+    header = CaptureHeader(
+        name="scan",
+        sensor=thesis,
+        medium_name="water",
+        medium=MEDIUM,
+        stage_direction=(1.0, 0.0, 0.0),
+        saturation_dn=255,
+        T_platform_sensor=mount.T_platform_sensor,
+    )
+    pose, frame = captured.poses[number], np.repeat([0, 1], 600)
+    poses = np.array([pose, pose])
+    table = FrameTable(header, Path("scan"), np.zeros(2), np.ones(2), poses, np.zeros(2))
+    noisy = centre + 0.1 * np.random.default_rng(2).standard_normal(len(line))
+    apart, common = mount.apart_from(calibration_digest(known.calibration))
+    assert common is not None and mount.apart_from("another")[1] is None
+
+    def points(values, step):
+        seen, _ = replace(known, values=values).points_by(line, noisy)
+        turn = Rotation.from_rotvec(step[3:]).as_matrix() @ mount.transform()[:3, :3]
+        on_platform = seen @ turn.T + mount.transform()[:3, 3] + step[:3]
+        return on_platform @ pose[:3, :3].T + pose[:3, 3]
+
+    moved = []
+    for part in covariance_root(known.covariance).T:
+        ends = (points(known.values + sign * part, sign * by @ part[: by.shape[1]]) for sign in (1, -1))
+        moved.append(np.subtract(*ends) / 2)
+    expected = np.sqrt(np.sum(np.square(moved), axis=0))
+    shared = point_uncertainty(table, known.calibration, frame, line, noisy, mount_by=common)
+    by_patterns = np.sqrt(np.sum(shared.patterns_mm.astype(float) ** 2, axis=0))
+    # Second order of the errors, and patterns of 0.05 um that are left out.
+    np.testing.assert_allclose(by_patterns, expected, rtol=0.02, atol=2e-4)
+    ride, base = Ride(poses, None, np.zeros(2)), points(known.values, np.zeros(6))
+    together = with_platform(shared, base, frame, ride, mount, mount_covariance=apart).std_mm()
+    alone = point_uncertainty(table, known.calibration, frame, line, noisy)
+    twice = with_platform(alone, base, frame, ride, mount).std_mm()
+    # Where the mount was found it makes good what the calibration does: the sphere stays where it was.
+    assert np.median(together) < 0.5 * np.median(twice)
+
+
+def test_a_mount_by_a_target_follows_its_images():
+    """Each image's pose moves by a random matrix times a number; the solution by the derivative, to second order."""
+    rng = np.random.default_rng(3)
+    by = [np.diag([0.1, 0.1, 0.1, 1e-3, 1e-3, 1e-3]) @ rng.standard_normal((6, 1)) for _ in range(12)]
+    images = [replace(each, by_sensor=own) for each, own in zip(simulated(rng), by, strict=True)]
+    problem, scatter = _Problem(images, CAMERA, MIDDLE), np.array([0.05, 3e-4, 1.0])
+    state = problem.solved(problem.start(), scatter)
+    ends = []
+    for size in (0.1, -0.1):
+        moved = []
+        for image, own in zip(images, by, strict=True):
+            step, seen = size * own[:, 0], image.camera_from_target.copy()
+            place = seen[:3, :3] @ MIDDLE + seen[:3, 3] + step[:3]
+            seen[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ seen[:3, :3]
+            seen[:3, 3] = place - seen[:3, :3] @ MIDDLE
+            moved.append(replace(image, camera_from_target=seen))
+        ends.append(_Problem(moved, CAMERA, MIDDLE).solved(state, scatter)[0])
+    expected, found = half_way(*ends) / 0.1, problem.by_sensor(state, scatter)[:6, 0]
+    size = np.repeat([np.linalg.norm(expected[:3]), np.linalg.norm(expected[3:])], 3)
+    np.testing.assert_allclose(found / size, expected / size, atol=0.02)

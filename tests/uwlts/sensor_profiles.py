@@ -1,0 +1,90 @@
+"""Profiles of a sphere by a sensor whose calibration is wrong by a draw from its own covariance, on a robot.
+
+The true sensor has parameters of its own: stripe centres are where its rays meet its sheet on the sphere. What is
+measured of them is by the calibration.
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tests.uwlts.calibration_views import built_sensor
+from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
+from tests.uwlts.mount_views import MOUNT, SPHERE_MM
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, stored_estimate
+from uwlts.calibration.mount_sensor import CapturedProfiles
+from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.calibration.sheet import object_frame
+from uwlts.model.sensor import Sensor
+from uwlts.model.stripe import pixels_of
+
+RADIUS_MM = 19.05
+LINES = np.arange(120, 1160, 8)
+
+
+def joint_estimate(thesis: Sensor) -> StoredEstimate:
+    """A joint estimate from a target in water, whose sheet is known to some tenths of a millimetre."""
+    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
+    series = target_series(built_sensor(), medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise)
+    options = CalibrationOptions(poses="stage", correct_circles=False)
+    return stored_estimate(solve_jointly(gathered(thesis, [series]), options=options).calibration, thesis, MEDIUM)
+
+
+def largest_parts(known, by, count=3):
+    """Independent parts (count, P) of the parameters' errors that move a mount most."""
+    root = covariance_root(known.covariance)
+    return root[:, np.argsort(-np.linalg.norm(by @ root[: by.shape[1]] * 1e3, axis=0))[:count]].T
+
+
+def half_way(first, second):
+    """Half of the way from one mount to another (6,): shift, mm, and turn, rad."""
+    turn = Rotation.from_matrix(first[:3, :3] @ second[:3, :3].T).as_rotvec()
+    return np.append(first[:3, 3] - second[:3, 3], turn) / 2
+
+
+def captured_by(
+    known: StoredEstimate, values: np.ndarray, rng: np.random.Generator, *, poses: int = 15, noise_px: float = 0.1
+) -> CapturedProfiles:
+    """Profiles by the calibration of what a sensor of other parameters ``values`` (P,) sees, from an ideal robot."""
+    stripes, platforms = [], []
+    for number in range(poses):
+        turned = Rotation.from_euler("x", np.pi) * Rotation.from_rotvec(rng.uniform(-1, 1, 3) * np.radians(25))
+        side = (-1) ** number
+        place = np.array([side * rng.uniform(0.3, 0.6) * RADIUS_MM, rng.uniform(-35, 35), rng.uniform(-30, 30)])
+        base_sensor = np.eye(4)
+        base_sensor[:3, :3] = turned.as_matrix()
+        base_sensor[:3, 3] = SPHERE_MM - base_sensor[:3, :3] @ place
+        found = stripe_of_sphere(known, values, place)
+        stripes.append(found + np.column_stack([np.zeros(len(found)), noise_px * rng.standard_normal(len(found))]))
+        platforms.append(base_sensor @ np.linalg.inv(MOUNT))
+    profiles = [known.points_by(*each.T)[0] for each in stripes]
+    return CapturedProfiles(profiles, stripes, np.arange(poses, dtype=float), np.array(platforms), None, known)
+
+
+def stripe_of_sphere(known: StoredEstimate, values: np.ndarray, centre_mm: np.ndarray) -> np.ndarray:
+    """Lines and stripe centres (n, 2) on a sphere with its centre in the OCS of the sensor with these parameters."""
+    parameters = known.parameters
+    frame = object_frame(parameters.sheet_model(values), laser_axis=parameters.sheet.axis)
+    reach = np.arange(150.0, 900.0, 15.0)
+
+    def points(line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
+        pixels = pixels_of(line, centre_px, stripe_along=known.calibration.stripe_along)
+        seen = parameters.on_sheet(values, known.view, pixels)
+        assert seen is not None
+        return (seen.points.T - frame[:3, 3]) @ frame[:3, :3]
+
+    line, at = (each.ravel() for each in np.meshgrid(LINES, reach, indexing="ij"))
+    seen = points(line, at)
+    off = (np.linalg.norm(seen - centre_mm, axis=1) - RADIUS_MM).reshape(len(LINES), -1)
+    depth = seen[:, 2].reshape(len(LINES), -1)
+    changes = np.signbit(off[:, 1:]) != np.signbit(off[:, :-1])
+    hit = np.flatnonzero(changes.any(axis=1))
+    # Of the two sides of the sphere that nearer to the sensor.
+    first = np.array([min(np.flatnonzero(changes[row]), key=lambda k, row=row: depth[row, k]) for row in hit])
+    low, high = reach[first], reach[first + 1]
+    sign = np.signbit(off[hit, first])
+    for _ in range(30):
+        middle = (low + high) / 2
+        same = np.signbit(np.linalg.norm(points(LINES[hit], middle) - centre_mm, axis=1) - RADIUS_MM) == sign
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return np.column_stack([LINES[hit], (low + high) / 2])

@@ -1,0 +1,111 @@
+"""What a sensor's calibration does to a mount that is found with it: profiles of a capture, with their derivatives."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, stored_estimate
+from uwlts.model.any_calibration import calibration_digest, check_fits
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CalibrationError, DescriptionError
+from uwlts.model.mount import SensorShare
+from uwlts.optics.reconstruction import reconstruct_profile
+from uwlts.storage.capture import Capture
+from uwlts.stripe import find_stripes
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedProfiles:
+    """Profiles of a calibrated sensor on a platform, one for each laser image of a capture.
+
+    ``profiles`` are P arrays (n, 3) in the sensor's frame, mm, ``stripes`` their profile lines and stripe centres
+    (n, 2), ``times_s`` (P,) their times. ``poses`` (M, 4, 4) are ``T_base_platform``, at ``pose_times_s`` (M,) where
+    these are known. ``known`` is the joint estimate of the sensor's calibration, if it has one.
+    """
+
+    profiles: Sequence[np.ndarray]
+    stripes: Sequence[np.ndarray]
+    times_s: np.ndarray
+    poses: np.ndarray
+    pose_times_s: np.ndarray | None
+    known: StoredEstimate | None
+
+    def selected(self, numbers: Sequence[int] | np.ndarray) -> "CapturedProfiles":
+        """Some of the profiles, each with its own pose."""
+        profiles, stripes = ([each[number] for number in numbers] for each in (self.profiles, self.stripes))
+        times = self.times_s[numbers]
+        return replace(self, profiles=profiles, stripes=stripes, times_s=times, poses=self.poses[numbers])
+
+    def moved(self, number: int, rows: np.ndarray) -> np.ndarray:
+        """Derivatives (n, 3, Q) of rows of a profile by the parameters of the joint estimate, sensor's frame."""
+        assert self.known is not None
+        found = self.known.points_by(*self.stripes[number][rows].T)
+        if found is None:
+            raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
+        return found[1][:, :, 1:]
+
+
+def profiles_of(
+    capture: Capture, calibration: Calibration, poses: np.ndarray | None, pose_times_s: np.ndarray | None
+) -> CapturedProfiles:
+    """Profiles of all laser images of a capture. The poses are those given, else the capture's own.
+
+    Raises
+    ------
+    DescriptionError
+        Images have no pose, and none are given.
+    """
+    check_fits(capture.header, calibration, source=capture.path.name)
+    mounted = capture.header.sensor.camera.window.mounted
+    stripes, laser = find_stripes(capture), np.flatnonzero(capture.laser_on)
+    points = reconstruct_profile(
+        calibration if mounted else calibration.model_copy(update={"window": None}),
+        stripes.line,
+        stripes.centre_px,
+        medium_index=calibration.index_of(capture.header.medium),
+        stage_mm=0.0,
+        stage_direction=np.array([1.0, 0.0, 0.0]),
+    ).points_mm
+    times = capture.time_s[laser]
+    if poses is None:
+        own = capture.pose[laser]
+        poses, pose_times_s = own, times
+        if missing := int(np.count_nonzero(~np.isfinite(own).all(axis=(1, 2)))):
+            raise DescriptionError(
+                f"{missing} of {len(laser)} laser images of {capture.path.name} have no pose of the platform: give a "
+                "table of poses, or import them"
+            )
+    known = None
+    if calibration.joint is not None:
+        known = stored_estimate(calibration, capture.header.sensor, capture.header.medium)
+    found = np.column_stack([stripes.line, stripes.centre_px])
+    profiles, where = ([each[stripes.frame == frame] for frame in laser] for each in (points, found))
+    return CapturedProfiles(profiles, where, times, poses, pose_times_s, known)
+
+
+def with_sensor(
+    own: np.ndarray, by_parameters: np.ndarray, rotation: np.ndarray, known: StoredEstimate
+) -> tuple[np.ndarray, SensorShare]:
+    """Covariance (K, K) of a mount and what was estimated with it, with what the sensor's calibration does to them.
+
+    Both start with shift and turn of the mount, as does ``by_parameters`` (K, Q), by the parameters of the joint
+    estimate; ``own`` (K, K) is the covariance without them, ``rotation`` (3, 3) the mount's. The mount leads from the
+    OCS, which belongs to the sensor's true sheet: its own uncertainty is part of the mount's.
+    """
+    joint = known.calibration.joint
+    assert joint is not None
+    count = len(joint.parameters)
+    # Water that has drifted since, or another, is no part of the calibration.
+    besides = known.covariance.copy()
+    besides[:count, :count] -= joint.covariance_matrix()
+    apart = own + by_parameters @ besides @ by_parameters.T
+    in_true_frame, frame = by_parameters.copy(), known.frame_by()
+    in_true_frame[:6] += np.vstack([rotation @ frame[:3], rotation @ frame[3:]])
+    total = own + in_true_frame @ known.covariance @ in_true_frame.T
+    share = SensorShare(
+        calibration=calibration_digest(known.calibration),
+        by_parameters=tuple(tuple(row) for row in by_parameters[:6, :count].tolist()),
+        covariance_apart=tuple(tuple(row) for row in ((apart + apart.T) / 2)[:6, :6].tolist()),
+    )
+    return (total + total.T) / 2, share
