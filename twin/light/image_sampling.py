@@ -16,10 +16,6 @@ NODE_SPACING_PX = 2
 """Pixels from one ray of the coarse grid to the next, and side of its cells."""
 LIT_SIGMAS = 4.5
 """The stripe is rendered up to this many standard deviations of the sheet: 4e-5 of its peak."""
-LARGEST_RATIO = 2.0
-"""Light on longer ways falls off more slowly than to half within two cells, but for the cells next to the stripe."""
-SPREAD_CELLS = (1, 2, 4, 8)
-"""Standard deviations in cells over which outliers are spread, one after the other."""
 _CANDIDATES = 64
 """Number of generators tried for every further axis; more improve the lattice by a few percent."""
 
@@ -89,25 +85,6 @@ def near_sheet(across: np.ndarray, reached: np.ndarray | bool = True) -> np.ndar
         for nodes in (np.abs(across) < LIT_SIGMAS, seen & (across < 0), seen & (across > 0), reached)
     )
     return there & (close | before & behind)
-
-
-def without_outliers(cells: np.ndarray, free: np.ndarray) -> np.ndarray:
-    """Cells (rows, columns) of smooth light whose bright outliers are spread over their neighbourhood, float32.
-
-    What a cell exceeds `LARGEST_RATIO` times the median of the 5 x 5 cells about it by is spread like a Gaussian, over
-    wider and wider neighbourhoods as long as it stands out there. The sum of all cells stays as it is, and so does
-    light that is smooth. Only ``free`` cells (rows, columns) give or take: light next to the stripe is steep.
-    """
-    values, among = cells.astype(np.float32), free.astype(np.float32)
-    for sigma in SPREAD_CELLS:
-        excess = among * np.maximum(values - LARGEST_RATIO * cv2.medianBlur(values, 5), 0)
-        room = np.maximum(_blurred(among, sigma), np.finfo(np.float32).eps)
-        values += among * _blurred(excess / room, sigma) - excess
-    return values
-
-
-def _blurred(cells: np.ndarray, sigma: float) -> np.ndarray:
-    return cv2.GaussianBlur(cells, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
 
 
 def widened(cells: np.ndarray, radius_px: np.ndarray, *, cell_px: int = NODE_SPACING_PX) -> np.ndarray:

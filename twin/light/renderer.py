@@ -2,10 +2,9 @@
 
 A laser frame is made in three passes. Rays through the nodes of a coarse grid find the pixels near the lit stripe and
 the haze of the sheet; the stripe's pixels are rendered with many samples over pixel, pupil and exposure, with fewer
-within a wide stripe; random walks add the light that came on longer ways, which is smooth: cell by cell within the
-stripe's pixels, in large cells elsewhere, whose outliers are spread with their energy kept. The windows stand still
-before the camera, so the nodes' rays behind the window are traced once; the objects stand still in the scene, so
-nothing is rebuilt or recompiled between frames.
+within a wide stripe; random walks add the light that came on longer ways, which is smooth (`twin.light.longer_ways`).
+The windows stand still before the camera, so the nodes' rays behind the window are traced once; the objects stand still
+in the scene, so nothing is rebuilt or recompiled between frames.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import drjit as dr
@@ -23,15 +21,8 @@ import numpy as np
 from twin.backend.arrays import Float, Point3f, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, ray_segments
 from twin.light.illumination import Light, lights
-from twin.light.image_sampling import (
-    NODE_SPACING_PX,
-    lattice,
-    near_sheet,
-    over_corners,
-    pupil_shifts,
-    widened,
-    without_outliers,
-)
+from twin.light.image_sampling import NODE_SPACING_PX, lattice, near_sheet, over_corners, pupil_shifts, widened
+from twin.light.longer_ways import Sources, falling_off, light_on_longer_ways
 from twin.light.particles import Body, spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet
@@ -44,12 +35,8 @@ from twin.scene.objects import build_objects
 from uwlts.model.placement import camera_from_object, check_design
 from uwlts.model.sensor import Medium, Sensor
 
-WALK_CELL_PX = 8
-"""Side of the cells of multiply scattered light away from the stripe."""
 SAMPLES_AT_ONCE = 2**23
 """More samples are rendered one part after the other; this many take some 100 MB."""
-WALKS_AT_ONCE = 2**21
-"""The same for random walks, which take some 200 MB."""
 CHANGE_SHARE = 2e-3
 """Under the lamp, pixels whose corners differ by more than this share of the brightest are rendered finely."""
 BEND_SHARE = 1e-3
@@ -61,11 +48,6 @@ _MIRRORS = 2
 """Largest number of mirrors that the camera looks into one after the other."""
 _WALKS_PER_SAMPLE = 0.15
 """Random walks per cell and sample of a lit pixel in clear water; turbid water takes more."""
-_WALKS_BESIDE_STRIPE = 8
-_CELLS_BESIDE_STRIPE = 2
-"""So many times more walks are taken in so many cells beside the stripe, where light is bright and steep."""
-_WALKS_IN_STRIPE = 4
-"""The same in the small cells of the stripe's pixels."""
 _SPOT_ASIDE = 0.25
 """Slope of an uneven lamp's axis against the camera's over that of the view's corner: the lamp is mounted beside it."""
 _DRIFTING_STREAM = 7
@@ -143,7 +125,8 @@ class Renderer:
         self._mirrors = self.objects.mirrors if effects.secondary_light else ()
         # Through the water to the stand-off and back, light is scattered so many times.
         scatterings = 2 * self.scattering.coefficient * self.design.standoff_mm
-        self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 8 * scatterings)
+        self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 4 * scatterings * (1 + scatterings))
+        self._scatters = self.scattering.coefficient > 0 and (effects.haze or effects.multiple_scattering)
         self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
         # Where the first laser's own stripe is, of the last frame: its truth asks for the same.
         self._own_stripe: tuple[SensorPose, np.ndarray] | None = None
@@ -170,13 +153,17 @@ class Renderer:
         """The light of the laser on the image sensor; see `irradiance`."""
         pose = SensorPose(scene_from_object, travel)
         direct, mirrored = lights(self._sheets, pose, self._mirrors)
-        lit, haze = self._laser_nodes(pose, direct, mirrored)
-        image = haze.copy()
-        walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm)
-        if walker.finds_light:
-            self._add_walks(image, lit, walker, seed=seed, walks=math.ceil(spp * self._walks_per_sample))
+        lit, haze, surfaces = self._laser_nodes(pose, direct, mirrored)
         rows, columns = np.nonzero(self._repeated(lit))
         stripe, polarised, rough = self._stripe(pose, rows, columns, direct + mirrored, spp=spp)
+        walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm)
+        image = np.zeros_like(haze)
+        if walker.finds_light:
+            image[rows, columns] = stripe
+            sources, walks = Sources(image, haze, lit, surfaces), math.ceil(spp * self._walks_per_sample)
+            image = light_on_longer_ways(self.view, walker, sources, seed=seed, walks=walks)
+        haze = haze if self.effects.haze else np.zeros_like(haze)
+        image += haze
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
         particles, polarisation = self._particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
         return LaserFrame(image, haze, particles, rows, columns, stripe, polarisation, rough / bright)
@@ -248,23 +235,25 @@ class Renderer:
 
     def _laser_nodes(
         self, pose: SensorPose, direct: list[Light], mirrored: list[Light]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Cells (rows, columns) close to the lit stripe, and the haze (H, W) in W/mm2."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Cells (rows, columns) close to the lit stripe, the haze (H, W) in W/mm2, and the surfaces of `Sources`."""
         bundle, shape = self.view.grid(NODE_SPACING_PX)
         lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
         own, reach = lit.copy(), np.zeros_like(lit, np.float32)
         image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
+        surfaces: list[Float] = []
         for moment, sources in self._moments(pose, direct + mirrored):
             haze = mi.Float(0.0)
             for index, segment in enumerate(self._segments(moment, bundle, None)):
                 across = [self._sigmas(light, segment) for light in sources]
                 straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
                 depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
-                if index == 0 and moment is pose and self.effects.haze and self.scattering.coefficient > 0:
+                if index == 0 and moment is pose and self._scatters:
+                    surfaces = self._surfaces(pose, segment, sources)
                     for light, sigmas in zip(sources, across, strict=True):
                         haze += bundle.weight * self._haze(light, segment, sigmas)
                 reached = [light.may_reach(segment.end(), light.at(segment.end())) for light in sources]
-                dr.eval(depth, haze, *across, *reached)
+                dr.eval(depth, haze, surfaces, *across, *reached)
                 stripes = [
                     near_sheet(sigmas.numpy().reshape(shape), there.numpy().reshape(shape))
                     for sigmas, there in zip(across, reached, strict=True)
@@ -279,7 +268,8 @@ class Renderer:
             if moment is pose and dr.width(haze) > 1:
                 image = self._repeated(0.25 * over_corners(np.add, haze.numpy().reshape(shape)))
         self._own_stripe = pose, own
-        return widened(lit, reach), image
+        over_cells = [0.25 * over_corners(np.add, each.numpy().reshape(shape)) for each in surfaces]
+        return widened(lit, reach), image, np.array(over_cells).reshape(-1, *lit.shape)
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
         """The pose, and more of them over the exposure if the sensor travels, with the lights there."""
@@ -308,61 +298,20 @@ class Renderer:
         reached = light.reaches(self.objects.scene, place, light.at(place), None, (t > 0) & (scattered > 0))
         return dr.select(reached, scattered * dr.exp(-self.scattering.c * t), 0.0)
 
-    # --- light on longer ways -----------------------------------------------------------------------------------------
-
-    def _add_walks(self, image: np.ndarray, lit: np.ndarray, walker: Walker, *, seed: int, walks: int) -> None:
-        """Add multiply scattered and secondary light to an image (H, W), in large cells but for those in ``lit``."""
-        camera = self.sensor.camera
-        rows, columns = -(-camera.height_px // WALK_CELL_PX), -(-camera.width_px // WALK_CELL_PX)
-        beside = self._beside_stripe(lit, rows, columns)
-        lit_cells = np.flatnonzero(lit)
-        large = np.arange(rows * columns)
-        large = np.concatenate([large, np.repeat(np.flatnonzero(beside), _WALKS_BESIDE_STRIPE - 1)])
-        small = np.repeat(lit_cells, _WALKS_IN_STRIPE)
-        row = np.concatenate([large // columns * WALK_CELL_PX, small // lit.shape[1] * NODE_SPACING_PX])
-        column = np.concatenate([large % columns * WALK_CELL_PX, small % lit.shape[1] * NODE_SPACING_PX])
-        side = np.repeat([WALK_CELL_PX, NODE_SPACING_PX], [len(large), len(small)])
-        each = self._walked(walker, row, column, side, seed=seed, walks=walks)
-        in_large = (np.bincount(large, each[: len(large)]) / np.bincount(large)).reshape(rows, columns)
-        # Light from surface to surface is not smooth where water scatters none, nor has it rare bright samples.
-        in_large = without_outliers(in_large, ~beside if walker.scatters else np.zeros_like(beside))
-        size = columns * WALK_CELL_PX, rows * WALK_CELL_PX
-        smooth = cv2.resize(in_large, size, interpolation=cv2.INTER_LINEAR)[: camera.height_px, : camera.width_px]
-        if len(lit_cells):
-            in_small = np.zeros(lit.shape, np.float32)
-            in_small[lit] = each[len(large) :].reshape(-1, _WALKS_IN_STRIPE).mean(axis=1)
-            smooth = np.where(self._repeated(lit), self._repeated(in_small), smooth)
-        image += smooth
-
-    def _beside_stripe(self, lit: np.ndarray, rows: int, columns: int) -> np.ndarray:
-        """Large cells (rows, columns) on the stripe, whose small cells are ``lit``, and next to it."""
-        on_stripe = np.zeros((rows, columns), np.uint8)
-        row, column = np.nonzero(lit)
-        on_stripe[row * NODE_SPACING_PX // WALK_CELL_PX, column * NODE_SPACING_PX // WALK_CELL_PX] = 1
-        across = 2 * _CELLS_BESIDE_STRIPE + 1
-        return cv2.dilate(on_stripe, np.ones((across, across), np.uint8)) > 0
-
-    def _walked(
-        self, walker: Walker, rows: np.ndarray, columns: np.ndarray, sides: np.ndarray, *, seed: int, walks: int
-    ) -> np.ndarray:
-        """Mean irradiance (C,) of light on longer ways over square cells of pixels, from ``walks`` walks in each.
-
-        ``rows`` and ``columns`` (C,) name each cell's first pixel, ``sides`` (C,) its sides in pixels.
-        """
-        x, y, side = (to_jit(mi.Float, values) for values in (columns - 0.5, rows - 0.5, sides))
-        total = np.zeros(len(rows))
-        most = max(1, WALKS_AT_ONCE // len(rows))
-        for part, first in enumerate(range(0, walks, most)):
-            some = min(most, walks - first)
-            count, place_seed = len(rows) * some, (1009 * part + 2 * seed) % 2**32
-            cell = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, some)
-            place: Any = dr.arange(mi.UInt32, count)
-            keys: list[Any] = [dr.opaque(mi.UInt32, (place_seed + k) % 2**32) for k in (0, 1)]
-            u, v = (mi.sample_tea_float32(place, key) for key in keys)
-            left, above, width = (dr.gather(mi.Float, values, cell) for values in (x, y, side))
-            bundle = self.view.bundle(left + u * width, above + v * width)
-            total += walker.radiance(bundle, cell, len(rows), seed=seed + 1013 * part)
-        return total / walks
+    def _surfaces(self, pose: SensorPose, segment: RaySegment, sources: list[Light]) -> list[Float]:
+        """Irradiance per ray of surfaces lit from where the laser is, as `Sources` has it."""
+        end, bsdf = segment.end(), segment.si.bsdf()
+        seen = segment.weight * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
+        parts = []
+        for light in sources:
+            here = light.at(end)
+            within = light.at(mi.Point3f(end - here.normal * here.distance_mm))
+            active = segment.valid & (within.irradiance > 0)
+            towards = segment.si.to_local(pose.direction(-here.direction))
+            sent = bsdf.eval(mi.BSDFContext(), segment.si, towards, active)[0]
+            sent *= seen * within.irradiance * within.sigma_mm
+            parts.append(falling_off(sent, here.distance_mm, active))
+        return [sum(each, mi.Float(0.0)) for each in zip(*parts, strict=True)]
 
     # --- lamp ---------------------------------------------------------------------------------------------------------
 

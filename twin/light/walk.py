@@ -19,6 +19,7 @@ Left out: light that went by way of a mirror and was scattered or reflected by s
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -26,7 +27,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import PCG32, Bool, BSDFPtr, Float, Point3f, SurfaceInteraction3f, UInt32, Vector3f
+from twin.backend.arrays import PCG32, Bool, BSDFPtr, Float, Point2f, Point3f, SurfaceInteraction3f, UInt32, Vector3f
 from twin.light.illumination import Light, SheetLobe
 from twin.light.pose import Rays, SensorPose
 from twin.light.sheet import SheetLight
@@ -54,7 +55,8 @@ class _Walks:
     """Walks in the sensor's OCS: the ray, the light it stands for, and the pixel or cell it counts for.
 
     ``density`` is that of the ray's direction in 1/sr where a lit surface at its end is to be counted, else 0.
-    ``away`` is True once the walk has left the camera's own ray, ``reflected`` once it has met a surface.
+    ``away`` is True once the walk has left the camera's own ray, ``reflected`` once it has met a surface, ``scattered``
+    once the water has scattered it.
     """
 
     origin: Point3f
@@ -66,6 +68,7 @@ class _Walks:
     density: Float
     away: Bool
     reflected: Bool
+    scattered: Bool
 
     def of(self, kept: UInt32) -> _Walks:
         """The walks with the given indices."""
@@ -95,10 +98,21 @@ class Walker:
 
     def radiance(self, bundle: Rays, cell: UInt32, cells: int, *, seed: int) -> np.ndarray:
         """Sum (cells,) over the rays of each cell of their weight times the light that came on a longer way."""
-        width = dr.width(cell)
         total = np.zeros(cells)
+        for where, *parts in self.found(bundle, cell, seed=seed):
+            for light in parts:
+                total += np.bincount(where, light, cells)
+        return total
+
+    def found(self, bundle: Rays, cell: UInt32, *, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Cells (N,) and two kinds of light (N,) that walks found for them, one part of their ways after the other.
+
+        The first kind was scattered by the water, the second only sent from surface to surface. Each is that of one ray
+        on one or more stretches, times the ray's weight.
+        """
+        width = dr.width(cell)
         if not self.finds_light:
-            return total
+            return
         walks = _Walks(
             bundle.origin,
             bundle.direction,
@@ -109,6 +123,7 @@ class Walker:
             dr.zeros(mi.Float, width),
             dr.full(mi.Bool, False, width),
             dr.full(mi.Bool, False, width),
+            dr.full(mi.Bool, False, width),
         )
         step, stretches = 0, 1
         while True:
@@ -117,11 +132,11 @@ class Walker:
             walks, found, alive = self._steps(walks, number, stretches) if step else self._step(walks, number)
             dr.eval(found, alive, *vars(walks).values())
             # Dr.Jit's threads would add in any order, which rounds differently every time.
-            total += np.bincount(walks.cell.numpy(), found.numpy(), cells)
+            yield walks.cell.numpy(), found.x.numpy(), found.y.numpy()
             step += stretches
             kept = cast(Any, dr.compress(alive))
             if dr.width(kept) == 0 or step >= _STEPS:
-                return total
+                return
             if dr.width(kept) == 1:
                 # Arrays of one entry would take a kernel of their own: two halves do for the whole.
                 kept = mi.UInt32([kept[0], kept[0]])
@@ -129,16 +144,16 @@ class Walker:
             walks = walks.of(kept)
             stretches = 1 if dr.width(kept) > _FEW else _STEPS - step
 
-    def _steps(self, walks: _Walks, seed: UInt32, stretches: int) -> tuple[_Walks, Float, Bool]:
+    def _steps(self, walks: _Walks, seed: UInt32, stretches: int) -> tuple[_Walks, Point2f, Bool]:
         """As `_step`, but so many stretches of the walks in one kernel, which is the same for any number."""
 
-        def following(walks: _Walks, found: Float, alive: Bool, seed: UInt32, left: UInt32):
+        def following(walks: _Walks, found: Point2f, alive: Bool, seed: UInt32, left: UInt32):
             walks, more, alive = self._step(walks, seed)
-            return walks, found + more, alive, seed + 1, left - 1
+            return walks, mi.Point2f(found + more), alive, seed + 1, left - 1
 
         width = dr.width(walks.cell)
         walks, found, alive, _, _ = dr.while_loop(
-            (walks, dr.zeros(mi.Float, width), dr.full(mi.Bool, True, width), seed, dr.opaque(mi.UInt32, stretches)),
+            (walks, dr.zeros(mi.Point2f, width), dr.full(mi.Bool, True, width), seed, dr.opaque(mi.UInt32, stretches)),
             lambda walks, found, alive, seed, left: alive & (left > 0),
             following,
             mode="symbolic",
@@ -146,8 +161,8 @@ class Walker:
         )
         return walks, found, alive
 
-    def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Float, Bool]:
-        """The next stretch of all walks: they as they go on, the light found, and which of them go on."""
+    def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Point2f, Bool]:
+        """The next stretch of all walks: they as they go on, both kinds of light found, and which of them go on."""
         state, sequence = mi.sample_tea_32(seed, walks.number)
         random = cast(Any, mi.PCG32)
         rng: PCG32 = random(size=dr.width(walks.number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
@@ -160,20 +175,21 @@ class Walker:
         bsdf = si.bsdf()
         mirror = dr.select(hit, self.objects.mirror_share(si), 0.0)
 
-        found = mi.Float(0.0)
+        from_sheet, from_surfaces = mi.Float(0.0), mi.Float(0.0)
         for light in self.lights:
             if self.scatters:
-                found += self._scattered_by_sheet(light, o, d, length, walks.away, rng.next_float32())
-            found += dr.exp(-c * length) * self._lit_end(light, walks, si, bsdf, end, hit)
+                from_sheet += self._scattered_by_sheet(light, o, d, length, walks.away, rng.next_float32())
+            from_surfaces += dr.exp(-c * length) * self._lit_end(light, walks, si, bsdf, end, hit)
 
         # The walk is scattered on its way or ends on the surface, and goes on if it still promises enough.
         in_water, distance, passed = self._free_path(o, d, length, hit, rng)
         vertex = mi.Point3f(o + d * distance)
-        reflected = cast(Bool, walks.reflected | ~in_water)
+        reflected, scattered_now = cast(Bool, walks.reflected | ~in_water), cast(Bool, walks.scattered | in_water)
         here = [light.at(vertex) for light in self.lights]
         towards_laser = [-each.direction for each in here]
         sheets = [SheetLobe.at(each, self.scattering.over_sine) for each in here]
-        found *= walks.strength
+        by_water = walks.strength * (from_sheet + dr.select(walks.scattered, from_surfaces, 0.0))
+        between_surfaces = walks.strength * dr.select(walks.scattered, 0.0, from_surfaces)
         strength = walks.strength * passed
         # It may find more light than one in any direction: scattered on, it may run towards the laser.
         promise = mi.Float(1.0)
@@ -202,8 +218,9 @@ class Walker:
         may_connect = alive if self.effects.secondary_light else alive & ~reflected
         for light in self.lights:
             u = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
-            found += strength * self._connected(light, vertex, scattered, u, may_connect)
-        found *= walks.weight
+            connected = strength * self._connected(light, vertex, scattered, u, may_connect)
+            by_water += dr.select(scattered_now, connected, 0.0)
+            between_surfaces += dr.select(scattered_now, 0.0, connected)
 
         # A new direction: the mirror's, one about the laser's direction, or the vertex's own.
         choice, which = rng.next_float32(), rng.next_float32()
@@ -246,8 +263,9 @@ class Walker:
             density=dr.select(specular | ~away, 0.0, density),
             away=away,
             reflected=reflected,
+            scattered=scattered_now,
         )
-        return following, found, alive
+        return following, mi.Point2f(walks.weight * by_water, walks.weight * between_surfaces), alive
 
     def _scattered_by_sheet(
         self, light: Light, o: Point3f, d: Vector3f, length: Float, active: Bool, u: Float

@@ -1,6 +1,5 @@
 """The lattice of samples in a pixel: even along every axis, in pairs about the middle, so that nothing is shifted."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
-from twin.light.image_sampling import lattice, pupil_shifts, without_outliers
+from twin.light.image_sampling import lattice, pupil_shifts
 from twin.light.renderer import Renderer
 from twin.options import NONE
 
@@ -69,22 +68,3 @@ def test_few_samples_leave_a_blurred_stripe_where_it_is(thesis, along: str):
     assert width["many"] > 2 * width["sharp"], "the stripe is blurred"
     for name in ("few", "odd"):
         assert np.abs(centre[name] - centre["many"]).max() < 0.005, name
-
-
-def test_outliers_are_spread_and_smooth_light_is_kept():
-    rng = np.random.default_rng(0)
-    y, x = np.mgrid[:64, :80]
-    # Halves within three cells, as fast as light that is left alone may fall off (two cells to half the median).
-    smooth = (2.0 ** (-np.hypot(x - 30, y - 30) / 3)).astype(np.float32)
-    free = np.ones(smooth.shape, bool)
-    np.testing.assert_array_equal(without_outliers(smooth + 0.02, free), smooth + np.float32(0.02))
-    spotted = 1 + 0.1 * rng.random(smooth.shape).astype(np.float32)
-    places = rng.integers(0, smooth.size, 12)
-    spotted.flat[places] = 100.0
-    free[20:30] = False
-    found = without_outliers(spotted, free)
-    # Energy is kept to the rounding of 32 bits over 5,120 cells. The first pass alone leaves 1 / (2 pi) of a spot
-    # in its middle, twice that at an edge; the others, which go on from there, must come below.
-    assert found.sum(dtype=float) == pytest.approx(spotted.sum(dtype=float), rel=1e-5)
-    assert found[free].max() < 1 + 99 / (2 * math.pi)
-    np.testing.assert_array_equal(found[~free], spotted[~free])

@@ -1,0 +1,176 @@
+"""The image of light on longer ways: where random walks begin, and the smooth light that is made of what they find.
+
+Walks begin in square cells of the image: large ones away from the stripe, more of them beside it, and the small cells
+of the stripe's pixels. Where water scatters, `twin.light.smoothing` takes the noise out with the help of what is known
+without noise: the stripe, the haze, and how brightly surfaces near the sheet would send its light on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from twin.backend.arrays import Bool, Float, to_jit
+from twin.light.camera import CameraView
+from twin.light.image_sampling import NODE_SPACING_PX
+from twin.light.smoothing import Findings, blurred, estimated, interpolated
+from twin.light.walk import Walker
+
+WALK_CELL_PX = 8
+"""Side of the cells of multiply scattered light away from the stripe."""
+WALKS_AT_ONCE = 2**21
+"""More random walks are followed one part after the other; this many take some 200 MB."""
+SPREAD_MM = (0.3, 1.2, 5.0, 20.0, 80.0)
+"""Distances from the sheet over which the light that water scatters upon surfaces falls off to 1 / e."""
+TOLERANCE = 2.5e-4
+"""Noise that is left, as a share of the stripe's peak: a fifth of the rounding to 8 bits of a peak at 200."""
+NOISE_SHARES = (0.05, 0.2)
+"""The same as a share of the light, of that which the water scatters and of the steeper one from surface to surface."""
+_NARROWEST_CELLS = 0.7
+"""Standard deviation of the least blurred images of stripe and haze; each further one is three times as wide."""
+_WALKS_BESIDE_STRIPE = 8
+_CELLS_BESIDE_STRIPE = 2
+"""So many times more walks are taken in so many cells beside the stripe, where light is bright and steep."""
+_WALKS_IN_STRIPE = 4
+"""The same in the small cells of the stripe's pixels, but only once where the cells around tell their light."""
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What sends light on longer ways: images (H, W) in W/mm2 of the stripe and the haze, and the lit surfaces.
+
+    ``lit`` (rows, columns) marks the small cells of the stripe's pixels, ``surfaces`` (S, rows, columns) is what
+    surfaces would send to the camera of light that comes from the laser and falls off with the distance from the sheet
+    over each of `SPREAD_MM`.
+    """
+
+    stripe: np.ndarray
+    haze: np.ndarray
+    lit: np.ndarray
+    surfaces: np.ndarray
+
+
+def falling_off(reflected: Float, distance_mm: Float, active: Bool) -> list[Float]:
+    """Light of the surfaces at so many mm from the sheet that send ``reflected`` on, for `Sources.surfaces`."""
+    return [dr.select(active, reflected * dr.exp(-dr.abs(distance_mm) / spread), 0.0) for spread in SPREAD_MM]
+
+
+def light_on_longer_ways(view: CameraView, walker: Walker, sources: Sources, *, seed: int, walks: int) -> np.ndarray:
+    """Irradiance (H, W) in W/mm2 of multiply scattered and secondary light; ``walks`` begin in most large cells."""
+    height, width = sources.stripe.shape
+    rows, columns = -(-height // WALK_CELL_PX), -(-width // WALK_CELL_PX)
+    times = np.where(_beside_stripe(sources.lit, rows, columns), _WALKS_BESIDE_STRIPE, 1)
+    times_in_stripe = 1 if walker.scatters else _WALKS_IN_STRIPE
+    row_in_stripe, column_in_stripe = np.nonzero(sources.lit)
+    large = np.repeat(np.arange(rows * columns), times.ravel())
+    small = np.repeat(np.arange(len(row_in_stripe)), times_in_stripe)
+    kinds = [(Findings(rows, columns), Findings(1, len(row_in_stripe))) for _ in NOISE_SHARES]
+    for cell, *parts in walked(
+        view,
+        walker,
+        np.concatenate([large // columns * WALK_CELL_PX, row_in_stripe[small] * NODE_SPACING_PX]),
+        np.concatenate([large % columns * WALK_CELL_PX, column_in_stripe[small] * NODE_SPACING_PX]),
+        np.repeat([WALK_CELL_PX, NODE_SPACING_PX], [len(large), len(small)]),
+        seed=seed,
+        walks=walks,
+    ):
+        is_large = cell < len(large)
+        of_large, of_small = large[cell[is_large]], small[cell[~is_large] - len(large)]
+        for (in_large, in_small), light in zip(kinds, parts, strict=True):
+            in_large.add(of_large, light[is_large])
+            in_small.add(of_small, light[~is_large])
+    cells, inside = np.zeros((rows, columns)), np.zeros(len(row_in_stripe))
+    if walker.scatters:
+        features = _features(sources, rows, columns)
+        place_row, place_column = _in_large_cells(row_in_stripe), _in_large_cells(column_in_stripe)
+        fine = _features_in_stripe(sources, features, place_row, place_column)
+        tolerance = TOLERANCE * float(sources.stripe.max(initial=0.0))
+        for (in_large, in_small), noise_share in zip(kinds, NOISE_SHARES, strict=True):
+            estimate = estimated(in_large, walks * times, features, tolerance=tolerance, noise_share=noise_share)
+            cells += estimate.cells
+            inside += estimate.at(place_row, place_column, fine, in_small, walks * times_in_stripe)
+    else:
+        # Without rare bright samples, light from surface to surface is left as steep as it may be.
+        for in_large, in_small in kinds:
+            cells += in_large.total() / (walks * times)
+            inside += in_small.total()[0] / (walks * times_in_stripe)
+    size = columns * WALK_CELL_PX, rows * WALK_CELL_PX
+    image = cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
+    in_cells = np.zeros(sources.lit.shape, np.float32)
+    in_cells[sources.lit] = inside
+    return np.where(_repeated(sources.lit, height, width), _repeated(in_cells, height, width), image)
+
+
+def walked(
+    view: CameraView, walker: Walker, rows: np.ndarray, columns: np.ndarray, sides: np.ndarray, *, seed: int, walks: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Cells (N,) and both kinds of irradiance (N,) in W/mm2 of `Walker.found`; ``walks`` begin in each cell.
+
+    ``rows`` and ``columns`` (C,) name the first pixel of each of the square cells, ``sides`` (C,) its sides in pixels.
+    """
+    x, y, side = (to_jit(mi.Float, values) for values in (columns - 0.5, rows - 0.5, sides))
+    most = max(1, WALKS_AT_ONCE // len(rows))
+    for part, first in enumerate(range(0, walks, most)):
+        some = min(most, walks - first)
+        count, place_seed = len(rows) * some, (1009 * part + 2 * seed) % 2**32
+        cell = dr.arange(mi.UInt32, count) // dr.opaque(mi.UInt32, some)
+        place: Any = dr.arange(mi.UInt32, count)
+        keys: list[Any] = [dr.opaque(mi.UInt32, (place_seed + k) % 2**32) for k in (0, 1)]
+        u, v = (mi.sample_tea_float32(place, key) for key in keys)
+        left, above, width = (dr.gather(mi.Float, values, cell) for values in (x, y, side))
+        bundle = view.bundle(left + u * width, above + v * width)
+        yield from walker.found(bundle, cell, seed=seed + 1013 * part)
+
+
+def _beside_stripe(lit: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Large cells (rows, columns) on the stripe, whose small cells are ``lit``, and next to it."""
+    on_stripe = np.zeros((rows, columns), np.uint8)
+    row, column = np.nonzero(lit)
+    on_stripe[row * NODE_SPACING_PX // WALK_CELL_PX, column * NODE_SPACING_PX // WALK_CELL_PX] = 1
+    across = 2 * _CELLS_BESIDE_STRIPE + 1
+    return cv2.dilate(on_stripe, np.ones((across, across), np.uint8)) > 0
+
+
+def _features(sources: Sources, rows: int, columns: int) -> np.ndarray:
+    """What light on longer ways may look like (J, rows, columns): nothing in particular, the haze, surfaces, blurs."""
+    stripe, haze = (_in_cells(image, rows, columns) for image in (sources.stripe, sources.haze))
+    surfaces = [_in_cells(image, rows, columns) for image in sources.surfaces]
+    widths = [_NARROWEST_CELLS]
+    while widths[-1] < 0.2 * max(rows, columns):
+        widths.append(3 * widths[-1])
+    blurs = [blurred(source, width) for source in (stripe, haze) for width in widths]
+    return np.stack([np.ones_like(haze), haze, *surfaces, *blurs])
+
+
+def _features_in_stripe(
+    sources: Sources, features: np.ndarray, place_rows: np.ndarray, place_columns: np.ndarray
+) -> np.ndarray:
+    """The same (J, P) in the small cells of the stripe, at ``place_rows`` and ``place_columns`` (P,) of the others."""
+    haze = sources.haze[::NODE_SPACING_PX, ::NODE_SPACING_PX][sources.lit]
+    blurs = [interpolated(feature, place_rows, place_columns) for feature in features[2 + len(sources.surfaces) :]]
+    return np.stack([np.ones_like(haze), haze, *(image[sources.lit] for image in sources.surfaces), *blurs])
+
+
+def _in_cells(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Means over large cells (rows, columns) of an image of pixels or small cells."""
+    height, width = (-(-size // cells) * cells for size, cells in zip(image.shape, (rows, columns), strict=True))
+    missing = height - image.shape[0], width - image.shape[1]
+    if any(missing):
+        image = np.pad(image, [(0, each) for each in missing], mode="edge")
+    return cv2.resize(image.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
+
+
+def _in_large_cells(small: np.ndarray) -> np.ndarray:
+    """Rows or columns of the middle of small cells, counted in large cells from the middle of the first one."""
+    return ((small + 0.5) * (NODE_SPACING_PX / WALK_CELL_PX) - 0.5).astype(np.float32)
+
+
+def _repeated(cells: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Values of small cells given to their pixels, (H, W)."""
+    return cells.repeat(NODE_SPACING_PX, axis=0).repeat(NODE_SPACING_PX, axis=1)[:height, :width]

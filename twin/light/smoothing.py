@@ -1,0 +1,230 @@
+"""Smooth light from few random walks: their noise is removed by what its sources predict, and the sum is kept.
+
+Most light of a walk is small; now and then one finds very much. So walks are sorted into classes by how much they
+found, each four times brighter than the one below, and the light of each class is estimated on its own, the more widely
+the fewer walks it rests on:
+
+- The class as a whole is described by a sum of features, images without noise of what sends the light. The weights,
+  none negative, are those of the largest likelihood of counts, found by expectation and maximisation (Shepp and Vardi
+  1982, Eq. 2.13), which keeps the sum of all light.
+- Where more walks are at hand, they correct that locally: by the ratio of what they found to what the features
+  predict, both summed under a Gaussian that is just wide enough for a noise below the tolerance.
+- Where they suffice, each cell keeps what its own walks found.
+
+Light that the features do not predict is therefore blurred only as far as its noise exceeds the tolerance.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+_AT_ONCE = 2**22
+"""So many findings are kept before they are sorted; they take some 50 MB."""
+_CLASS_BITS = 2
+"""The light of a class of walks varies by this power of two."""
+_FAINT_SHARE = 0.05
+"""Walks that change their cell by less than this share of the tolerance need no classes of their own."""
+_CLASSES_ADD = 4
+"""So many classes at most add to the noise in one place, each at its tolerance."""
+_NO_WEIGHT = 1e-25
+"""Light in W/mm2 that is none."""
+_PORTION = 1.0
+"""What one walk adds in one place may be so many times the tolerance."""
+_WIDTHS = (0.7, 1.4, 2.8, 5.6)
+"""Standard deviations in cells of the local corrections."""
+_STEPS = 40
+"""Further steps of the likelihood change the light by less than its noise."""
+
+
+class Findings:
+    """Light that walks found in cells (rows, columns), by its class, and the sum of its squares."""
+
+    def __init__(self, rows: int, columns: int):
+        self.shape = rows, columns
+        self._light: dict[int, np.ndarray] = {}
+        self._squares: dict[int, float] = {}
+        self._new: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def add(self, cell: np.ndarray, light: np.ndarray) -> None:
+        """Add the light (N,) of walks of flat cells (N,)."""
+        self._new.append((cell[light > 0], light[light > 0]))
+        if sum(len(light) for _, light in self._new) > _AT_ONCE:
+            self._sort()
+
+    def _sort(self) -> None:
+        """Bring what was added to its classes."""
+        if not any(len(light) for _, light in self._new):
+            return
+        cell, light = (np.concatenate(each) for each in zip(*self._new, strict=True))
+        self._new = []
+        kind = np.frexp(light)[1] // _CLASS_BITS
+        first, size = int(kind.min()), math.prod(self.shape)
+        count = int(kind.max()) - first + 1
+        sums = np.bincount((kind - first) * size + cell, light, count * size).reshape(count, *self.shape)
+        squares = np.bincount(kind - first, np.square(light, dtype=float), count)
+        for each in np.flatnonzero(squares).tolist():
+            self._light[first + each] = self._light.get(first + each, 0.0) + sums[each]
+            self._squares[first + each] = self._squares.get(first + each, 0.0) + float(squares[each])
+
+    def classes(self, faint: float = 0.0) -> list[range]:
+        """Classes without gaps, from the faintest on; all those of walks that found less than ``faint`` are one."""
+        self._sort()
+        if not self._light:
+            return []
+        first, last = min(self._light), max(self._light)
+        joined = first
+        while joined < last and 2.0 ** (_CLASS_BITS * (joined + 1)) <= faint:
+            joined += 1
+        return [range(first, joined + 1), *(range(kind, kind + 1) for kind in range(joined + 1, last + 1))]
+
+    def light(self, kinds: range) -> np.ndarray:
+        """Light (rows, columns) of the walks of some classes."""
+        self._sort()
+        return sum((self._light[kind] for kind in kinds if kind in self._light), np.zeros(self.shape))
+
+    def squares(self, kinds: range) -> float:
+        """Sum of the squares of what each of these walks found."""
+        self._sort()
+        return sum(self._squares.get(kind, 0.0) for kind in kinds)
+
+    def total(self) -> np.ndarray:
+        """Light (rows, columns) of all walks."""
+        self._sort()
+        return sum(self._light.values(), np.zeros(self.shape))
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Mean light of a walk: in cells (rows, columns), and what its features alone say of it there.
+
+    ``classes`` (K) are those of the walks, ``weights`` (K, J) the features' in each, ``portions`` (K,) the light of a
+    walk, in the mean over light.
+    """
+
+    cells: np.ndarray
+    described: np.ndarray
+    classes: list[range]
+    weights: np.ndarray
+    portions: np.ndarray
+    tolerance: float
+    noise_share: float
+
+    def at(
+        self, rows: np.ndarray, columns: np.ndarray, features: np.ndarray, findings: Findings, walks: int
+    ) -> np.ndarray:
+        """Light (P,) in places at ``rows`` and ``columns`` (P,) of the cells, with features (J, P) of their own.
+
+        ``findings`` are those of ``walks`` in each place; where they are noisy, the features' weights and the cells'
+        deviations from them say what the light is.
+        """
+        ratio = np.divide(self.cells, self.described, out=np.ones_like(self.cells), where=self.described > 0)
+        expected = interpolated(ratio, rows, columns) * (self.weights @ features)
+        allowed = np.maximum(self.tolerance, self.noise_share * expected.sum(axis=0))
+        light = np.zeros_like(allowed)
+        for kinds, each, portion in zip(self.classes, expected, self.portions / walks, strict=True):
+            light += np.where(_quiet(each, portion, allowed), findings.light(kinds).ravel() / walks, each)
+        return light
+
+
+def estimated(
+    findings: Findings, walks: np.ndarray, features: np.ndarray, *, tolerance: float, noise_share: float
+) -> Estimate:
+    """Light in cells that were given ``walks`` (rows, columns) each, described by features (J, rows, columns).
+
+    Noise of up to ``tolerance``, or the share ``noise_share`` of the light where that is more, is left.
+    """
+    mean_walks = float(walks.mean())
+    exposure = (walks / mean_walks).astype(np.float32)
+    total = findings.total()
+    faint = _FAINT_SHARE * max(tolerance * mean_walks, noise_share * float(total.mean()))
+    classes = [kinds for kinds in findings.classes(faint) if findings.squares(kinds) > 0]
+    light = np.array([findings.light(kinds) / mean_walks for kinds in classes], np.float32).reshape(-1, *total.shape)
+    portions = np.array([findings.squares(kinds) / findings.light(kinds).sum() for kinds in classes])
+    weights = _weights(light, features, exposure)
+    each_described = (weights @ features.reshape(len(features), -1)).reshape(light.shape)
+    described = each_described.sum(axis=0)
+    allowed = np.maximum(tolerance, noise_share * described)
+    cells = np.zeros(total.shape, np.float32)
+    for found, expected, portion in zip(light, each_described, portions / mean_walks, strict=True):
+        cells += _corrected(found, expected, exposure, portion, allowed)
+    # Over all walks, nothing is added or lost.
+    cells *= light.sum(dtype=float) / max((exposure * cells).sum(dtype=float), float(np.finfo(np.float32).tiny))
+    return Estimate(cells, described, classes, weights, portions, tolerance, noise_share)
+
+
+def _corrected(
+    found: np.ndarray, expected: np.ndarray, exposure: np.ndarray, portion: float, allowed: np.ndarray
+) -> np.ndarray:
+    """Light (rows, columns) of one class: what was found as far as that is quiet, else what its features predict.
+
+    ``portion`` is what a walk of the class adds to the light at the exposure 1.
+    """
+    accepted = _quiet(expected, portion / exposure, allowed)
+    estimate = np.where(accepted, found / exposure, expected)
+    for width in _WIDTHS:
+        if accepted.all():
+            break
+        nearby = np.maximum(_under_gaussian(exposure * expected, width), np.finfo(np.float32).tiny)
+        share = expected / nearby
+        suffices = ~accepted & _quiet(expected, portion * share / (4 * math.pi * width**2), allowed)
+        if suffices.any():
+            estimate = np.where(suffices, share * _under_gaussian(found, width), estimate)
+            accepted |= suffices
+    return estimate
+
+
+def _quiet(light: np.ndarray, per_walk: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+    """Whether light that comes in portions of ``per_walk`` is as quiet as is allowed, and no portion stands out.
+
+    The number of portions scatters as its root, so that the variance of the light is a portion times it.
+    """
+    return (light * per_walk <= np.square(allowed) / _CLASSES_ADD) & (per_walk <= _PORTION * allowed)
+
+
+def _weights(light: np.ndarray, features: np.ndarray, exposure: np.ndarray) -> np.ndarray:
+    """Weights (K, J) of features (J, rows, columns) that make the light of walks most likely.
+
+    ``light`` (K, rows, columns) is that of all walks, whose number goes as ``exposure`` (rows, columns).
+    """
+    # Blocks of cells tell the weights as well, as all features are blurred.
+    counts, seen = _in_blocks(light), _in_blocks(features * exposure)
+    norm = seen.sum(axis=1)
+    per_norm = np.divide(1, norm, out=np.zeros_like(norm), where=norm > 0)
+    back = (seen * per_norm[:, None]).T.copy()
+    weights = counts.sum(axis=1)[:, None] * per_norm / np.count_nonzero(norm)
+    for _ in range(_STEPS):
+        weights *= (counts / np.maximum(weights @ seen, np.finfo(np.float32).tiny)) @ back
+        weights[weights < _NO_WEIGHT * per_norm] = 0  # numbers that small are slow
+    return weights
+
+
+def _in_blocks(cells: np.ndarray) -> np.ndarray:
+    """Means (K, B) over blocks of about 2 x 2 cells (K, rows, columns)."""
+    rows, columns = cells.shape[1:]
+    size = max(1, columns // 2), max(1, rows // 2)
+    blocks = [cv2.resize(each, size, interpolation=cv2.INTER_AREA).ravel() for each in cells]
+    return np.array(blocks, np.float32).reshape(len(cells), size[0] * size[1])
+
+
+def interpolated(cells: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Cells (rows, columns) linearly between their middles at places (P,)."""
+    return map_coordinates(cells, [rows, columns], order=1, mode="nearest")
+
+
+def blurred(cells: np.ndarray, sigma: float) -> np.ndarray:
+    """Cells (rows, columns) under a Gaussian, wide ones in coarser cells."""
+    rows, columns = cells.shape
+    coarse = cells.astype(np.float32)
+    while sigma > 4 and min(coarse.shape) > 8:
+        size = coarse.shape[1] // 2, coarse.shape[0] // 2
+        coarse, sigma = cv2.resize(coarse, size, interpolation=cv2.INTER_AREA), 0.5 * sigma
+    return cv2.resize(_under_gaussian(coarse, sigma), (columns, rows), interpolation=cv2.INTER_LINEAR)
+
+
+def _under_gaussian(cells: np.ndarray, sigma: float) -> np.ndarray:
+    return cv2.GaussianBlur(cells, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
