@@ -89,7 +89,7 @@ def schur_least_squares(
     local : sequence of (b,); starts of the groups
     soft_limit : residual vectors r count as 2 s^2 (sqrt(1 + |r|^2 / s^2) - 1), the "soft L1" loss with this s;
         quadratic without it
-    smallest_gain : the iteration ends with a step that lowers the cost, or is to lower it, by less than this share of it
+    smallest_gain : the iteration ends with a step that lowers the cost, or is to lower it, by less than this share
     damping : of the first step, as a share of the squared lengths of the derivatives; none is needed near the solution
     enough_rounds : the iteration ends after so many rounds, settled or not
 
