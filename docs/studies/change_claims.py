@@ -25,8 +25,8 @@ def flat(x, y):
     return 0 * x
 
 
-def scanned(rng: np.random.Generator, surface, *, common: bool) -> PointCloud:
-    """A cloud in lines of a stage."""
+def scanned(rng: np.random.Generator, surface, *, common: bool, calibration: np.ndarray | None = None) -> PointCloud:
+    """A cloud in lines of a stage, of its own calibration or of one with given errors (2,), in standard deviations."""
     axis = np.arange(-SIDE_MM / 2, SIDE_MM / 2, STEP_MM)
     x, y = np.meshgrid(axis, axis)
     image = np.repeat(np.arange(len(axis))[None], len(axis), axis=0).ravel()
@@ -37,24 +37,27 @@ def scanned(rng: np.random.Generator, surface, *, common: bool) -> PointCloud:
     position, random = np.zeros((count, 3), np.float32), np.zeros((count, 6), np.float32)
     position[:, 2], random[:, 5] = STAGE_MM, NOISE_MM**2
     z = surface(x, y) + NOISE_MM * rng.normal(size=count) + STAGE_MM * rng.normal(size=len(axis))[image]
-    z += np.tensordot(rng.normal(size=2), patterns[:, :, 2], axes=1)
-    known = PointUncertainty(random, position, patterns)
+    errors = rng.normal(size=2) if calibration is None else calibration
+    z += np.tensordot(errors, patterns[:, :, 2], axes=1)
+    known = PointUncertainty(random, position, patterns, shared={f"sensor {errors}": np.eye(2)})
     return PointCloud(np.column_stack([x, y, z]), np.ones(count), image, np.zeros(count, int), uncertainty=known)
 
 
 def main() -> None:
     rng = np.random.default_rng(11)
-    for name, surface, common, reference, register in (
-        ("two scans, noise and images only", wavy, False, None, False),
-        ("two scans", wavy, True, None, False),
-        ("two scans, registered", wavy, True, None, True),
-        ("plane, fitted", flat, True, "plane", False),
-        ("cylinder of 300 mm, fitted", pipe, True, "cylinder", False),
+    for name, surface, common, one, reference, register in (
+        ("two scans, noise and images only", wavy, False, False, None, False),
+        ("two scans of one calibration", wavy, True, True, None, False),
+        ("two scans of two calibrations", wavy, True, False, None, False),
+        ("these, registered", wavy, True, False, None, True),
+        ("plane, fitted", flat, True, False, "plane", False),
+        ("cylinder of 300 mm, fitted", pipe, True, False, "cylinder", False),
     ):
         shares, ratios, levels = [], [], []
         for _ in range(PAIRS):
-            cloud = scanned(rng, surface, common=common)
-            other = scanned(rng, surface, common=common) if reference is None else reference
+            calibration = rng.normal(size=2) if one else None
+            cloud = scanned(rng, surface, common=common, calibration=calibration)
+            other = scanned(rng, surface, common=common, calibration=calibration) if reference is None else reference
             change = uwlts.compare_clouds(cloud, other, register=register)
             seen = change.compared
             shares.append(np.average(change.significant[seen], weights=change.area_mm2[seen]))

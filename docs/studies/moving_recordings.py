@@ -1,13 +1,17 @@
 """Recordings for the studies of moving sensors: sensors with imperfections, their calibrations, and scans by each.
 
 Of each sensor the images of a joint calibration are rendered and its calibration is made, in FOLDER/sensor-SENSOR, then
-scenes are rendered with it, once for each seed of the platform's errors, to FOLDER/sensor-SENSOR/SCENE-SEED.h5:
+scenes are rendered with it, once for each seed of the platform's errors, to FOLDER/sensor-SENSOR/SCENE-SEED.h5. Of
+straight paths ``--denser N`` takes N images for one:
 
     python docs/studies/moving_recordings.py FOLDER robot-sphere --sensors 1 2 3 4 5 --seeds 0 1
 """
 
 import argparse
+from itertools import pairwise
 from pathlib import Path
+
+import numpy as np
 
 import twin
 import uwlts
@@ -35,6 +39,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--sensors", type=int, nargs="+", required=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--denser", type=int, default=1)
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     plan = given.folder / "calibration.toml"
@@ -56,11 +61,26 @@ def main() -> None:
                 if path.exists():
                     continue
                 scene = load_scene(name)
-                scene = load_scene(name, motion=scene.motion.model_dump() | {"errors_seed": seed})
+                motion = scene.motion.model_dump() | {"errors_seed": seed}
+                if given.denser > 1:
+                    motion["waypoints"] = denser(motion["waypoints"], given.denser)
+                scene = load_scene(name, motion=motion)
                 use_variant(CPU)
                 options = Options(spp=16, seed=1000 * number + seed)
                 record_scene(scene, take.sensor, path, as_built=take.built, options=options, overwrite=True)
                 print(f"wrote {path}", flush=True)
+
+
+def denser(waypoints: list[dict], times: int) -> list[dict]:
+    """Waypoints with others between those that are turned the same way."""
+    result = []
+    for first, second in pairwise(waypoints):
+        result.append(first)
+        if first["rotation_deg"] == second["rotation_deg"]:
+            ends = np.array([first["position_mm"], second["position_mm"]])
+            for share in np.arange(1, times) / times:
+                result.append(first | {"position_mm": tuple(ends[0] + share * (ends[1] - ends[0]))})
+    return [*result, waypoints[-1]]
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import Scene
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame, part_path
+from uwlts.storage.copc_file import write_copc
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page, WebSocketRoute
@@ -406,6 +407,32 @@ def test_keys_alone_are_enough(desk, page):
     says(page, "connected: Grbl")
     page.locator(".cloud-view").focus()
     page.keyboard.press("ArrowLeft")
+
+
+@pytest.mark.slow
+def test_who_looks_closer_sees_all_points_there(desk, page):
+    """Of a COPC file with twice as many points as are shown."""
+    rng = np.random.default_rng(3)
+    points = np.column_stack([*rng.uniform(-100, 100, (2, 600_000)), rng.normal(400, 0.1, 600_000)])
+    none = np.full(len(points), -1)
+    cloud = uwlts.PointCloud(points, np.ones(len(points)), none, none)
+    write_copc(desk.folder / "plate.copc.laz", lambda: [cloud])
+    tab(page, "Files")
+    page.get_by_role("button", name="show", exact=True).click()
+    page.locator(".cloud-view[data-points]").wait_for()
+    view = page.locator(".cloud-view")
+    view.focus()
+    with page.expect_response(lambda answer: "cloud/detail" in answer.url) as got:
+        for _ in range(9):
+            view.press("+")
+    page.locator(".cloud-view[data-detail]").wait_for()
+    low, high = np.array(got.value.url.partition("box=")[2].split(","), float).reshape(2, 3)
+    sent = np.frombuffer(got.value.body(), "<f4").reshape(-1, 6)
+    inside = np.all((points >= low) & (points <= high), axis=1)
+    assert 0 < len(sent) == np.count_nonzero(inside) < len(points) / 4
+    kept(page, "closer")
+    view.press("f")
+    page.locator(".cloud-view:not([data-detail])").wait_for()
 
 
 @pytest.mark.slow

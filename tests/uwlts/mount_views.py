@@ -87,3 +87,44 @@ def errors_of(found: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Error of a mount (4, 4): translation (3,), mm, and rotation about the platform's axes (3,), rad."""
     turn = Rotation.from_matrix(MOUNT[:3, :3] @ found[:3, :3].T).as_rotvec()
     return MOUNT[:3, 3] - found[:3, 3], turn
+
+
+def step_campaign(
+    rng: np.random.Generator, *, height_mm: float, poses: int = 20, noise_mm: float = 0.03, tilt_deg: float = 25.0
+) -> Campaign:
+    """A block with its edge along y of the base, through the place of the sphere, seen by an ideal robot.
+
+    Its top lies ``height_mm`` above the table, and reaches to x = 55 mm before that place; beyond lies the table again.
+    """
+    profiles, reported = [], []
+    for _ in range(poses):
+        turn = rng.uniform(-1, 1, 3) * np.radians([tilt_deg, tilt_deg, 40.0])
+        base_sensor = np.eye(4)
+        base_sensor[:3, :3] = (Rotation.from_euler("x", np.pi) * Rotation.from_rotvec(turn)).as_matrix()
+        place = np.array([rng.uniform(-25, 25), 0.0, STANDOFF_MM + rng.uniform(-30, 30)])
+        base_sensor[:3, 3] = SPHERE_MM - base_sensor[:3, :3] @ place
+        profiles.append(_step_profile(base_sensor, rng, height_mm=height_mm, noise_mm=noise_mm))
+        reported.append(base_sensor @ np.linalg.inv(MOUNT))
+    return Campaign(profiles, np.array(reported))
+
+
+def _step_profile(
+    base_sensor: np.ndarray, rng: np.random.Generator, *, height_mm: float, noise_mm: float
+) -> np.ndarray:
+    angles = np.radians(np.linspace(-18, 18, RAYS))
+    rays = np.column_stack([np.sin(angles), np.zeros(RAYS), np.cos(angles)])
+    directions, origin = rays @ base_sensor[:3, :3].T, base_sensor[:3, 3]
+
+    def on_top(x: np.ndarray) -> np.ndarray:
+        return (x < SPHERE_MM[0]) & (x > SPHERE_MM[0] - 55)
+
+    top, table = ((SPHERE_MM[2] + z - origin[2]) / directions[:, 2] for z in (height_mm, 0.0))
+    at_top, at_table = origin[0] + top * directions[:, 0], origin[0] + table * directions[:, 0]
+    with np.errstate(divide="ignore"):
+        side = (SPHERE_MM[0] - origin[0]) / directions[:, 0]
+    # A ray that leaves the space above the block below its top meets the side that faces it, or misses the block.
+    length = np.where(on_top(at_top), top, np.where(on_top(at_table), side, table))
+    profile = np.column_stack([rays[:, 0] * length, rays[:, 2] * length + noise_mm * rng.standard_normal(RAYS)])
+    profile[rng.random(RAYS) < 0.03] = np.nan
+    profile[(length < 0) | (length > 3 * STANDOFF_MM)] = np.nan
+    return profile

@@ -3,28 +3,29 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import assert_never
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2, t
+from scipy.stats import chi2
 
 from uwlts.calibration.mount_board import mount_by_board
 from uwlts.calibration.mount_model import Motion, MountState, Problem, Scatter
 from uwlts.calibration.mount_next_pose import axis_words, missing_turns, next_pose
-from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLine, find_arc, find_line
+from uwlts.calibration.mount_prediction import coverage_factor, held_out_mm, inverse, left_out_excess
+from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLine, find_arc, find_line, find_step
 from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of, with_sensor
-from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere, start_on_table
+from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere, start_of_step, start_on_table
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError, DescriptionError
-from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound
+from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound, StepFound
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture
-from uwlts.storage.mount_files import SENSOR_AXES, MountEvidence, SensorAxis, read_mount_evidence
+from uwlts.storage.mount_files import SENSOR_AXES, Artefact, MountEvidence, SensorAxis, read_mount_evidence
 from uwlts.storage.pose_files import PoseFormat, Unit, read_poses
 
-_FEWEST_POSES = {"sphere": 5, "plane": 8}
+_FEWEST_POSES = {"sphere": 5, "plane": 8, "step": 8}
 """Poses whose profiles have more numbers (three each, or two) than there are unknowns (nine or ten), with some over."""
 _MOST_POINTS = 100_000
 """Points of all profiles together; more take time and hardly lower the uncertainty, as poses err too."""
@@ -45,8 +46,9 @@ def calibrate_mount(
     profiles: str | Path | Sequence[np.ndarray] | CapturedProfiles,
     poses: str | Path | np.ndarray | None = None,
     *,
-    artefact: Literal["sphere", "plane"] = "sphere",
+    artefact: Artefact = "sphere",
     radius_mm: float | None = None,
+    height_mm: float | None = None,
     calibration: Calibration | str | Path | None = None,
     pose_format: PoseFormat = "matrix",
     profile_unit: Unit = "mm",
@@ -57,7 +59,7 @@ def calibrate_mount(
     profile_times_s: np.ndarray | None = None,
     pose_times_s: np.ndarray | None = None,
 ) -> Mount:
-    """Find ``T_platform_sensor`` of any laser profiler from profiles of a sphere or a plane at an unknown fixed place.
+    """Find ``T_platform_sensor`` of any laser profiler from profiles of an artefact at an unknown fixed place.
 
     The platform's poses ``T_base_platform`` are known, as a robot's flange's. The artefact's place and the mount are
     estimated together by least squares of the distances of all points from the artefact, weighted by the noise of the
@@ -74,8 +76,9 @@ def calibrate_mount(
         off show, else of an artefact that its laser images show.
     poses
         ``T_base_platform`` (P, 4, 4), mm, or a CSV file with one pose a line; not needed for a capture that holds them.
-    artefact, radius_mm
-        What is seen; the radius of the sphere where it is known.
+    artefact, radius_mm, height_mm
+        What is seen: a sphere, a plane, or a step, two parallel faces. The radius of the sphere or the height of the
+        step, where it is known.
     calibration
         Of the sensor that took the capture, held fixed; what a joint estimate leaves open becomes part of the mount's
         covariance. A target's images go to `uwlts.calibration.mount_board`.
@@ -117,8 +120,8 @@ def calibrate_mount(
         assert not isinstance(table, str | Path)
         with Capture(profiles) as capture:
             if capture.header.target is not None and not capture.laser_on.all():
-                if radius_mm is not None or scale or time:
-                    raise DescriptionError("the capture shows a target: give no radius, scale or time")
+                if radius_mm is not None or height_mm is not None or scale or time:
+                    raise DescriptionError("the capture shows a target: give no radius, height, scale or time")
                 return mount_by_board([capture], known, table, axis=axis)
             profiles = profiles_of(capture, known, table, times)
     captured = None
@@ -130,6 +133,7 @@ def calibrate_mount(
         poses,
         artefact=artefact,
         radius_mm=radius_mm,
+        height_mm=height_mm,
         pose_format=pose_format,
         profile_unit=profile_unit,
         pose_unit=pose_unit,
@@ -179,7 +183,7 @@ class _Calibration:
     def __init__(self, evidence: MountEvidence, captured: CapturedProfiles | None = None) -> None:
         self.evidence = evidence
         self.captured = captured
-        self.sphere = evidence.artefact == "sphere"
+        self.sphere, self.step = evidence.artefact == "sphere", evidence.artefact == "step"
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
         self.rows = [_thinned(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
@@ -196,9 +200,7 @@ class _Calibration:
                 self.reasons[number] = f"no {self.evidence.artefact} found in the profile"
         self._require_enough()
         kept = np.array([shape is not None for shape in shapes])
-        members = [
-            np.zeros(len(p), dtype=bool) if s is None else s.members for p, s in zip(self.flat, shapes, strict=True)
-        ]
+        members = [self._members(p, s) for p, s in zip(self.flat, shapes, strict=True)]
         whole = Problem(
             self.profiles,
             _motion(self.evidence),
@@ -208,8 +210,10 @@ class _Calibration:
             self.evidence.scale,
             self.evidence.time,
             self.evidence.axis is not None,
+            second=[np.zeros(len(each), dtype=bool) for each in self.profiles] if self.step else None,
+            height_mm=self.evidence.height_mm,
         )
-        problem = whole.selected(kept, [p[m] for p, m in zip(self.profiles, members, strict=True)])
+        problem = self._of_members(whole, kept, members, self._faces(shapes, members))
         arcs = [shape for shape in shapes if isinstance(shape, ProfileArc)]
         lines = [shape for shape in shapes if isinstance(shape, ProfileLine)]
         if self.evidence.axis is not None:
@@ -217,7 +221,7 @@ class _Calibration:
         elif self.sphere:
             state = start_of_sphere(problem, arcs, self.sheet, self.rng)
         else:
-            state = start_of_plane(problem, lines, self.sheet, self.rng)
+            state = (start_of_step if self.step else start_of_plane)(problem, lines, self.sheet, self.rng)
         misfit = misfits(problem, state)
         noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
         good = misfit < max(_LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
@@ -225,16 +229,16 @@ class _Calibration:
         # What the first search got wrong in single profiles is searched again near the artefact that the others show.
         for _ in range(2):
             state, scatter = _refined(problem.selected(good), state, scatter)
-            members = self._found_again(whole, state, scatter)
+            members, faces = self._found_again(whole, state, scatter)
             kept = np.array([np.count_nonzero(each) >= LEAST_POINTS for each in members])
-            problem = whole.selected(kept, [p[m] for p, m in zip(self.profiles, members, strict=True)])
+            problem = self._of_members(whole, kept, members, faces)
             good = np.ones(len(problem.points), dtype=bool)
             self._require_enough(np.flatnonzero(kept))
         while True:
             used = problem.selected(good)
             state, scatter = _refined(used, state, scatter)
             limit = float(chi2.isf(_FALSE_ALARM / len(kept), used.per_pose))
-            excess = _left_out_excess(used, state, scatter)
+            excess = left_out_excess(used, state, scatter)
             if excess.max() <= limit:
                 break
             good[np.flatnonzero(good)[np.argmax(excess)]] = False
@@ -253,7 +257,32 @@ class _Calibration:
         return self._summary(used, state, scatter, members)
 
     def _shape(self, points: np.ndarray) -> ProfileArc | ProfileLine | None:
-        return find_arc(points, self.evidence.radius_mm, self.rng) if self.sphere else find_line(points, self.rng)
+        match self.evidence.artefact:
+            case "sphere":
+                return find_arc(points, self.evidence.radius_mm, self.rng)
+            case "plane":
+                return find_line(points, self.rng)
+            case "step":
+                return find_step(points, self.evidence.height_mm, self.rng)
+            case _:
+                assert_never(self.evidence.artefact)
+
+    @staticmethod
+    def _members(points: np.ndarray, shape: ProfileArc | ProfileLine | None) -> np.ndarray:
+        return np.zeros(len(points), dtype=bool) if shape is None else shape.members
+
+    @staticmethod
+    def _faces(shapes: Sequence[ProfileArc | ProfileLine | None], members: list[np.ndarray]) -> list[np.ndarray]:
+        """Masks (N,) of the points on the second face of a step; nowhere set without one."""
+        found = [shape.second if isinstance(shape, ProfileLine) else None for shape in shapes]
+        return [np.zeros_like(own) if face is None else face for face, own in zip(found, members, strict=True)]
+
+    def _of_members(
+        self, whole: Problem, kept: np.ndarray, members: list[np.ndarray], faces: list[np.ndarray]
+    ) -> Problem:
+        points = [each[own] for each, own in zip(self.profiles, members, strict=True)]
+        second = [each[own] for each, own in zip(faces, members, strict=True)] if self.step else None
+        return whole.selected(kept, points, second)
 
     def _require_enough(self, numbers: np.ndarray | None = None) -> None:
         poses, needed = len(self.profiles), _FEWEST_POSES[self.evidence.artefact]
@@ -273,29 +302,37 @@ class _Calibration:
                 f"{scatter.pose_mm:.3g} mm (rms)"
             )
 
-    def _found_again(self, whole: Problem, state: MountState, scatter: Scatter) -> list[np.ndarray]:
-        """Masks of the points near the artefact as all poses show it, mm."""
-        off = np.abs(whole.distances(state))
+    def _found_again(
+        self, whole: Problem, state: MountState, scatter: Scatter
+    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Masks of the points near the artefact as all poses show it, and of those on the second face of a step."""
+        signed = whole.distances(state)
+        off = np.abs(signed)
+        if self.step:
+            off = np.minimum(off, np.abs(signed - state.artefact[4]))
         reach = 4 * np.hypot(scatter.point_mm, 2 * scatter.pose_mm)
-        found = []
+        found, faces = [], []
         for points, own in zip(self.flat, np.split(off, np.cumsum(whole.counts)[:-1]), strict=True):
             near = own < reach
-            mask = np.zeros(len(points), dtype=bool)
+            mask, face = np.zeros((2, len(points)), dtype=bool)
             shape = self._shape(points[near])
             if shape is not None:
-                mask[np.flatnonzero(near)[shape.members]] = True
+                mask[near] = shape.members
+                if isinstance(shape, ProfileLine) and shape.second is not None:
+                    face[near] = shape.second
             found.append(mask)
-        return found
+            faces.append(face)
+        return found, faces
 
     def _summary(self, used: Problem, state: MountState, scatter: Scatter, members: list[np.ndarray]) -> Mount:
         information = used.information(state, scatter)
-        own = used.of_all(_inverse(information.sum(axis=0)))
+        own = used.of_all(inverse(information.sum(axis=0)))
         covariance, share = own, None
         if self.captured is not None and self.captured.known is not None:
             by_sensor = self._by_sensor(used, state, scatter, members)
             covariance, share = with_sensor(own, by_sensor, state.rotation, self.captured.known)
         self._require_determined(used, state, scatter, covariance)
-        held = _held_out(used, state, scatter, information)
+        held = held_out_mm(used, state, scatter, information)
         rms, numbers = misfits(used, state), [n for n in range(len(members)) if n not in self.reasons]
         order = {number: place for place, number in enumerate(numbers)}
         poses = []
@@ -311,23 +348,26 @@ class _Calibration:
                     reason=self.reasons.get(number),
                 )
             )
-        std, at = np.sqrt(np.diag(covariance)), 9 + (self.sphere and used.radius_mm is None)
-        found = (
-            SphereFound(
-                centre_mm=tuple(state.artefact[:3].tolist()),
-                radius_mm=float(state.artefact[3]),
-                radius_std_mm=float(std[9]) if used.radius_mm is None else None,
-            )
-            if self.sphere
-            else PlaneFound(normal=tuple(state.artefact[:3].tolist()), distance_mm=float(state.artefact[3]))
-        )
+        std, at = np.sqrt(np.diag(covariance)), 9 + used.size_unknown
+        x, y, z, *sizes = state.artefact.tolist()
+        size_std = float(std[9]) if used.size_unknown else None
+        match self.evidence.artefact:
+            case "sphere":
+                found = SphereFound(centre_mm=(x, y, z), radius_mm=sizes[0], radius_std_mm=size_std)
+            case "plane":
+                found = PlaneFound(normal=(x, y, z), distance_mm=sizes[0])
+            case "step":
+                distance, height = sizes
+                found = StepFound(normal=(x, y, z), distance_mm=distance, height_mm=height, height_std_mm=size_std)
+            case _:
+                assert_never(self.evidence.artefact)
         transform = np.eye(4)
         transform[:3, :3], transform[:3, 3] = Rotation.from_matrix(state.rotation).as_matrix(), state.translation
         weights = used.counts / used.counts.sum()
         return Mount(
             T_platform_sensor=tuple(tuple(row) for row in transform.tolist()),
             covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
-            coverage_factor=_coverage_factor(used, state, scatter, own, covariance),
+            coverage_factor=coverage_factor(used, state, scatter, own, covariance),
             artefact=found,
             robot_scale=state.scale if used.scale else None,
             robot_scale_std=float(std[at]) if used.scale else None,
@@ -359,7 +399,7 @@ class _Calibration:
         whitened = used.whitening(state, scatter)
         derivatives, together = whitened(used.derivatives(state)), np.vstack(moved)
         off = whitened(together if self.sphere else used.on_lines(together))
-        return -used.free @ _inverse(derivatives.T @ derivatives) @ derivatives.T @ off
+        return -used.free @ inverse(derivatives.T @ derivatives) @ derivatives.T @ off
 
     def _require_determined(self, used: Problem, state: MountState, scatter: Scatter, covariance: np.ndarray) -> None:
         shift = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
@@ -429,72 +469,6 @@ def _refined(problem: Problem, state: MountState, scatter: Scatter) -> tuple[Mou
         if abs(scatter.pose_mm - before.pose_mm) <= 0.02 * before.pose_mm + 0.02 * before.point_mm:
             break
     return problem.solved(state, scatter), scatter
-
-
-def _inverse(information: np.ndarray) -> np.ndarray:
-    """Covariance of an information matrix; directions without information get huge variances."""
-    size = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
-    values, vectors = np.linalg.eigh(size[:, None] * information * size)
-    return size[:, None] * (vectors / np.maximum(values, 1e-13)) @ vectors.T * size
-
-
-def _each_left_out(
-    problem: Problem, state: MountState, scatter: Scatter, information: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """For every pose the step of the parameters without it (a Gauss-Newton step), and their covariance then."""
-    whitened = problem.whitening(state, scatter)
-    split = np.cumsum(problem.counts)[:-1]
-    rows = np.split(whitened(problem.derivatives(state)), split)
-    distances = np.split(whitened(problem.distances(state)), split)
-    total, steps = information.sum(axis=0), []
-    gradient = sum(row.T @ own for row, own in zip(rows, distances, strict=True))
-    for row, own, one in zip(rows, distances, information, strict=True):
-        covariance = _inverse(total - one)
-        steps.append((-covariance @ (gradient - row.T @ own), covariance))
-    return steps
-
-
-def _held_out(problem: Problem, state: MountState, scatter: Scatter, information: np.ndarray) -> np.ndarray:
-    """Root mean square distance (P,) of each pose's points from the artefact by the mount of all other poses."""
-    left_out = _each_left_out(problem, state, scatter, information)
-    return np.array([misfits(problem, problem.stepped(state, step))[n] for n, (step, _) in enumerate(left_out)])
-
-
-def _left_out_excess(problem: Problem, state: MountState, scatter: Scatter) -> np.ndarray:
-    """How far each pose lies from what the others predict (P,), chi-square with as many degrees as its profile says."""
-    share = problem.noise_along(state)
-    derivatives, errors = problem.derivatives(state) / share, problem.errors(state) / share
-    split = np.cumsum(problem.counts)[:-1]
-    excess = []
-    left_out = _each_left_out(problem, state, scatter, problem.information(state, scatter))
-    moved = [np.split(problem.distances(state, step) / share[:, 0], split)[n] for n, (step, _) in enumerate(left_out)]
-    sizes = np.full(3, scatter.pose_mm) if problem.sphere else np.array([scatter.pose_mm, scatter.turn_rad])
-    for off, rows, error, (_, covariance) in zip(
-        moved, np.split(derivatives, split), np.split(errors, split), left_out, strict=True
-    ):
-        # All that poses, mount and artefact can do lies in what the errors of the pose span.
-        basis = np.linalg.qr(error)[0]
-        across, by_pose = basis.T @ rows, basis.T @ (error * sizes)
-        spread = across @ covariance @ across.T + by_pose @ by_pose.T + scatter.point_mm**2 * np.eye(basis.shape[1])
-        seen = basis.T @ off
-        excess.append(float(seen @ np.linalg.solve(spread, seen)))
-    return np.array(excess)
-
-
-def _coverage_factor(
-    problem: Problem, state: MountState, scatter: Scatter, own: np.ndarray, covariance: np.ndarray
-) -> float:
-    """Student's factor for 95 %, with degrees of freedom by Welch and Satterthwaite (GUM, G.4).
-
-    The shares of the variances that the points' noise and the sensor's calibration make are known from very many
-    points, the rest from the poses. ``own`` is the covariance without the calibration.
-    """
-    by_points = _inverse(problem.information(state, Scatter(scatter.point_mm, 0.0)).sum(axis=0))
-    total, by_poses = np.diag(covariance)[:6], np.maximum(np.diag(own - problem.of_all(by_points))[:6], 0.0)
-    share = 1 - float(np.mean(by_poses[total > 0] / total[total > 0]))
-    of_poses = max(problem.per_pose * len(problem.points) - problem.size, 1)
-    of_points = max(int(problem.counts.sum()) - problem.per_pose * len(problem.points), 1)
-    return float(t.ppf(0.975, 1 / (share**2 / of_points + (1 - share) ** 2 / of_poses)))
 
 
 def _weaknesses(problem: Problem, state: MountState, covariance: np.ndarray) -> list[str]:

@@ -4,65 +4,43 @@ Or the axis of a rotary table that turns the target.
 """
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, t
 
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, stored_estimate
+from uwlts.calibration.joint.stored_estimate import stored_estimate
+from uwlts.calibration.mount_board_images import (
+    FEWEST_IMAGES,
+    POSE_STEPS,
+    BoardImage,
+    board_images,
+    differences,
+    moved_about,
+    rigid_transform,
+)
 from uwlts.calibration.mount_next_pose import missing_turns
 from uwlts.calibration.mount_sensor import with_sensor
-from uwlts.model.any_calibration import check_fits
-from uwlts.model.calibration import Calibration, WindowModel
-from uwlts.model.errors import CalibrationError, DescriptionError, TargetError
+from uwlts.model.calibration import Calibration
+from uwlts.model.errors import CalibrationError
 from uwlts.model.mount import BoardFound, Mount, MountPose
-from uwlts.optics.camera import directions, project_through_window
-from uwlts.optics.window import trace_window
 from uwlts.storage.capture import Capture
 from uwlts.storage.files import sha256_of
 from uwlts.storage.mount_files import SENSOR_AXES, SensorAxis, require_table
-from uwlts.targets import CircleTarget, Target, parse_target
-from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
-_FEWEST_IMAGES = 4
-"""Three poses with turns about two axes determine the mount; one more shows whether they agree."""
 _FALSE_ALARM = 1e-3
 """Probability that any image of a campaign without wrong ones is left out."""
-_LEAST_PX = 1e-3
-"""No corner or circle is found closer."""
 _NO_FIT = 0.1
 """Share of the target's extent by which platforms do not err; a wrong format of the poses gives more."""
 _OPEN_MM, _OPEN_RAD = 5.0, np.radians(1.0)
 """Standard uncertainties from which a mount counts as not determined."""
 _ROUNDS = 8
-_STEPS = np.array([1e-3] * 3 + [1e-6] * 3)
-"""Of shift (mm) and turn (rad) for differences."""
 _TRIPLES = 100
 """With a third of the images wrong, three right ones are missed by all of them once in 10^15 times."""
-
-
-@dataclass(frozen=True, eq=False)
-class BoardImage:
-    """An image of the target: its pose as the camera sees it, and that of the platform.
-
-    ``camera_from_target`` (4, 4) in mm; ``covariance`` (6, 6) is of a shift of the target's middle (mm) and a turn
-    about it (rad), in the camera's axes; ``points`` found, whose pixels miss by ``rms_px``; ``base_from_platform``
-    (4, 4). ``by_sensor`` (6, Q) are derivatives of shift and turn by the parameters of the sensor's joint estimate,
-    where it has one.
-    """
-
-    name: str
-    camera_from_target: np.ndarray
-    covariance: np.ndarray
-    points: int
-    rms_px: float
-    base_from_platform: np.ndarray
-    by_sensor: np.ndarray | None = None
 
 
 def mount_by_board(
@@ -102,7 +80,7 @@ def mount_by_board(
     """
     header = captures[0].header
     known = None if calibration.joint is None else stored_estimate(calibration, header.sensor, header.medium)
-    target, images, reasons = _seen(captures, calibration, known, poses)
+    target, images, reasons = board_images(captures, calibration, known, poses)
     middle = target.points_mm.mean(axis=0)
     rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in images])
     if axis is not None:
@@ -170,118 +148,6 @@ def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in matrix.tolist())
 
 
-def _seen(
-    captures: Sequence[Capture], calibration: Calibration, known: StoredEstimate | None, poses: np.ndarray | None
-) -> tuple[Target, list[BoardImage], dict[str, str]]:
-    """The target, its pose in every image that shows it, and why others do not."""
-    images: list[BoardImage] = []
-    reasons: dict[str, str] = {}
-    targets, taken = [], 0
-    for capture in captures:
-        check_fits(capture.header, calibration, source=capture.path.name)
-        if capture.header.target is None:
-            raise DescriptionError(f"{capture.path.name} does not describe its target")
-        targets.append(parse_target(capture.header.target))
-        if targets[-1] != targets[0]:
-            raise DescriptionError("the captures show different targets: calibrate with one target, at one place")
-        index = calibration.index_of(capture.header.medium)
-        window = calibration.window if capture.header.sensor.camera.window.mounted else None
-        for frame, image in capture.frames(laser_on=False):
-            name = f"{capture.path.stem}, frame {frame}"
-            pose = capture.pose[frame] if poses is None else poses[taken] if taken < len(poses) else None
-            taken += 1
-            if pose is None:
-                continue
-            if not np.isfinite(pose).all():
-                raise DescriptionError(f"{name} has no pose of the platform: give a table of poses, or import them")
-            try:
-                images.append(_posed(name, image, targets[0], calibration, known, window, index, pose))
-            except (TargetError, CalibrationError) as error:
-                reasons[name] = f"no target: {error}"
-    if poses is not None and taken != len(poses):
-        raise DescriptionError(f"there are {len(poses)} poses for {taken} images with the laser off: expected one each")
-    if len(images) < _FEWEST_IMAGES:
-        why = next(iter(reasons.values()), "there are no images with the laser off")
-        raise CalibrationError(
-            f"{len(images)} of {taken} images show the target; at least {_FEWEST_IMAGES} are needed ({why})"
-        )
-    return targets[0], images, reasons
-
-
-def _posed(
-    name: str,
-    image: np.ndarray,
-    target: Target,
-    calibration: Calibration,
-    known: StoredEstimate | None,
-    window: WindowModel | None,
-    index: float,
-    base_from_platform: np.ndarray,
-) -> BoardImage:
-    """The target's pose in one image by least squares of its points' pixels."""
-    camera, view = calibration.camera, target.detect(image)
-    if len(view.points_mm) < 6:
-        raise CalibrationError(f"{len(view.points_mm)} points found; at least 6 are needed")
-    rays = trace_window(directions(camera, view.pixels), window, medium_index=index)
-    slopes = rays.directions[:, :2] / rays.directions[:, 2:]
-    good, turn, shift = cv2.solvePnP(view.points_mm, slopes, np.eye(3), None)
-    if not good or not np.isfinite(shift).all():
-        raise CalibrationError("its points fit no pose")
-    middle = target.points_mm.mean(axis=0)
-    start = _transform(cv2.Rodrigues(turn)[0], shift.ravel())
-
-    def moved(step: np.ndarray) -> np.ndarray:
-        return _moved_about(start, middle, step)
-
-    def projected(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
-        seen = points @ pose[:3, :3].T + pose[:3, 3]
-        return project_through_window(camera, window, seen, medium_index=index)
-
-    pixels = view.pixels
-    if isinstance(target, CircleTarget):
-        bias = circle_centre_bias(
-            lambda points: projected(start, points),
-            view.points_mm,
-            diameter_mm=target.diameter_mm,
-            axis_u=(1.0, 0.0, 0.0),
-            axis_v=(0.0, 1.0, 0.0),
-        )
-        pixels = pixels - bias
-    if not np.isfinite(projected(start, view.points_mm)).all():
-        raise CalibrationError("it would lie before the window")
-    fit = least_squares(
-        lambda step: (projected(moved(step), view.points_mm) - pixels).ravel(),
-        np.zeros(6),
-        x_scale=[1.0, 1.0, 1.0, 1e-2, 1e-2, 1e-2],
-        loss="soft_l1",
-        f_scale=0.5,
-    )
-    spread = max(float(np.sqrt(np.mean(fit.fun**2) * fit.fun.size / (fit.fun.size - 6))), _LEAST_PX)
-    covariance = spread**2 * np.linalg.inv(fit.jac.T @ fit.jac)
-    by_sensor = None
-    if known is not None:
-        # The pose goes where the pixels stay as they are.
-        found, where = moved(fit.x), np.zeros(6)
-        by_pose = _differences(lambda step: projected(_moved_about(found, middle, step), view.points_mm), where, _STEPS)
-        placed = view.points_mm @ found[:3, :3].T + found[:3, 3]
-        std = np.sqrt(np.diag(known.covariance))
-        by_values = _differences(
-            lambda values: known.parameters.project(values, known.view, placed), known.values, 1e-2 * std
-        )
-        by_sensor = -np.linalg.lstsq(by_pose, by_values, rcond=None)[0]
-    return BoardImage(name, moved(fit.x), covariance, len(pixels), spread, base_from_platform, by_sensor)
-
-
-def _differences(values: Callable[[np.ndarray], np.ndarray], at: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Derivatives (N, K) of values, flattened, by central differences with steps (K,); 0 where a step is 0."""
-    columns = []
-    for number, size in enumerate(steps):
-        step = np.zeros(len(steps))
-        step[number] = size
-        columns.append((values(at + step) - values(at - step)).ravel() / (2 * size or 1.0))
-    return np.stack(columns, axis=1)
-
-
 _State = tuple[np.ndarray, np.ndarray]
 """``T_platform_sensor`` and ``T_base_target``, (4, 4) each."""
 
@@ -343,11 +209,11 @@ class _Problem:
             rotation = Rotation.align_vectors(by_tool, by_board, weights)[0].as_matrix()
         known = boards[:, :3, 3] @ rotation.T - tools[:, :3, 3]
         unknown = (tools[:, :3, :3] - np.eye(3)).reshape(-1, 3)
-        mount = _transform(rotation, np.linalg.lstsq(unknown, known.ravel(), rcond=None)[0])
+        mount = rigid_transform(rotation, np.linalg.lstsq(unknown, known.ravel(), rcond=None)[0])
         places = held @ mount @ seen
         turns = Rotation.from_matrix(places[:, :3, :3]).mean().as_matrix()
         middles = places[:, :3, :3] @ self.middle + places[:, :3, 3]
-        return mount, _transform(turns, np.median(middles, axis=0) - turns @ self.middle)
+        return mount, rigid_transform(turns, np.median(middles, axis=0) - turns @ self.middle)
 
     def residuals(self, state: _State) -> np.ndarray:
         """Per image (K, 6): where its target lies beside the common one, shift of the middle in mm and turn in rad."""
@@ -387,7 +253,7 @@ class _Problem:
 
     def jacobian(self, state: _State) -> np.ndarray:
         """Derivatives (K, 6, size) by the parameters."""
-        moved = _differences(lambda step: self.residuals(self._moved(state, step)), np.zeros(12), np.tile(_STEPS, 2))
+        moved = differences(lambda step: self.residuals(self._moved(state, step)), np.zeros(12), np.tile(POSE_STEPS, 2))
         return moved.reshape(-1, 6, 12) @ self.free
 
     def stepped(self, state: _State, step: np.ndarray) -> _State:
@@ -398,7 +264,7 @@ class _Problem:
         """The state after a shift and a turn of the mount about the platform's axes, and of the target's middle."""
         mount, common = state
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ mount[:3, :3]
-        return _transform(turned, mount[:3, 3] + step[:3]), _moved_about(common, self.middle, step[6:])
+        return rigid_transform(turned, mount[:3, 3] + step[:3]), moved_about(common, self.middle, step[6:])
 
     def information(self, state: _State, scatter: np.ndarray) -> np.ndarray:
         """Information matrix (size, size) of the parameters."""
@@ -476,9 +342,9 @@ class _Problem:
 
     def require_enough(self, images: int) -> None:
         """CalibrationError with too few images."""
-        if len(self.images) < _FEWEST_IMAGES:
+        if len(self.images) < FEWEST_IMAGES:
             raise CalibrationError(
-                f"{len(self.images)} of {images} images of the target agree with the poses; at least {_FEWEST_IMAGES} "
+                f"{len(self.images)} of {images} images of the target agree with the poses; at least {FEWEST_IMAGES} "
                 "are needed. Are the poses T_base_platform, is their format right, do they come in the images' order?"
             )
 
@@ -504,16 +370,3 @@ _BOUNDS = (1e-4, 1e3), (1e-7, 1.0), (1.0, 100.0)
 """Of the scatter: mm, rad, and the factor of the images'."""
 _LEAST = ((0, 1e-3), (3, 1e-6))
 """First component of shift and turn, and the least scatter that counts, mm and rad."""
-
-
-def _transform(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, shift
-    return result
-
-
-def _moved_about(pose: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """A pose (4, 4) after a shift (3,) of the place of a point ``middle`` and a turn (3,) about it."""
-    rotation = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
-    place = pose[:3, :3] @ middle + pose[:3, 3] + step[:3]
-    return _transform(rotation, place - rotation @ middle)

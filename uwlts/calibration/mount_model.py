@@ -1,4 +1,4 @@
-"""Model of a profiler on a platform before a fixed sphere or plane: distances, derivatives, weights and variances."""
+"""Model of a profiler on a platform before a fixed sphere, plane or step: distances, derivatives and weights."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,11 @@ _LEAST_SHARE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class MountState:
-    """Values of all unknowns: mount, artefact (centre and radius, or normal and distance (4,)), scale and offset."""
+    """Values of all unknowns: mount, artefact, scale and offset.
+
+    The artefact is a sphere's centre and radius (4,), a plane's normal and distance (4,), or a step's (5,): those of
+    its face at smaller z of the profiles, and how far along the normal the other one lies.
+    """
 
     rotation: np.ndarray
     translation: np.ndarray
@@ -43,8 +47,8 @@ class Problem:
     """Points (n, 3) of every pose in the sensor's frame, mm, and which unknowns there are.
 
     The parameters are steps from a `MountState`: translation (3), rotation about the platform's axes (3), centre (3)
-    and, if it is unknown, radius of a sphere, or two turns of the normal and the distance of a plane, then scale and
-    offset.
+    and, if it is unknown, radius of a sphere, or two turns of the normal and the distance of a plane or of a step's
+    first face and, if it is unknown, the height of the step, then scale and offset.
     """
 
     points: Sequence[np.ndarray]
@@ -58,6 +62,9 @@ class Problem:
     table: bool = False
     """Whether the platform turns about its own z axis only, as a rotary table: shift along it and turn about it change
     nothing, and are no parameters."""
+    second: Sequence[np.ndarray] | None = None
+    """Of a step, which points (n,) of every pose lie on its second face; None for a plane."""
+    height_mm: float | None = None
 
     @cached_property
     def counts(self) -> np.ndarray:
@@ -80,8 +87,18 @@ class Problem:
     @cached_property
     def free(self) -> np.ndarray:
         """Steps (K, size) of all K values by the parameters."""
-        every = np.eye(9 + (self.sphere and self.radius_mm is None) + self.scale + self.time)
+        every = np.eye(9 + self.size_unknown + self.scale + self.time)
         return np.delete(every, (2, 5), axis=1) if self.table else every
+
+    @property
+    def size_unknown(self) -> bool:
+        """Whether the radius of the sphere, or the height of the step, is a parameter."""
+        return self.radius_mm is None if self.sphere else self.second is not None and self.height_mm is None
+
+    @cached_property
+    def _level(self) -> np.ndarray:
+        """1 for each of the points (N,) on the second face of a step, else 0."""
+        return np.zeros(len(self._all)) if self.second is None else np.concatenate(self.second).astype(np.float64)
 
     def of_all(self, covariance: np.ndarray) -> np.ndarray:
         """Covariance (K, K) of all values from that of the parameters: 0 for what is none."""
@@ -92,19 +109,27 @@ class Problem:
         """Numbers that the profile of one pose determines: a circle's three, or a line's two."""
         return 3 if self.sphere else 2
 
-    def selected(self, kept: np.ndarray, points: Sequence[np.ndarray] | None = None) -> "Problem":
+    def selected(
+        self, kept: np.ndarray, points: Sequence[np.ndarray] | None = None, second: Sequence[np.ndarray] | None = None
+    ) -> "Problem":
         """The problem of some of the poses (a mask), perhaps with other points of all poses."""
         given, motion, numbers = points or self.points, self.motion, np.flatnonzero(kept)
+        levels = second or self.second
         return replace(
             self,
             points=[given[number] for number in numbers.tolist()],
+            second=None if levels is None else [levels[number] for number in numbers.tolist()],
             motion=lambda offset: tuple(each[numbers] for each in motion(offset)),
         )
 
     def thinned(self, most: int) -> "Problem":
         """The problem with at most so many points of each pose, evenly chosen."""
-        chosen = [each[np.unique(np.linspace(0, len(each) - 1, most).astype(int))] for each in self.points]
-        return replace(self, points=chosen)
+        rows = [np.unique(np.linspace(0, len(each) - 1, most).astype(int)) for each in self.points]
+        points, second = (
+            None if given is None else [each[own] for each, own in zip(given, rows, strict=True)]
+            for given in (self.points, self.second)
+        )
+        return replace(self, points=points, second=second)
 
     def stepped(self, state: MountState, step: np.ndarray) -> MountState:
         """The state after a step of the parameters."""
@@ -115,7 +140,9 @@ class Problem:
             artefact, used = np.append(state.artefact[:3] + step[6:9], radius), 9 + (self.radius_mm is None)
         else:
             normal = state.artefact[:3] + step[6:8] @ _across(state.artefact[:3])
-            artefact, used = np.append(normal / np.linalg.norm(normal), state.artefact[3] + step[8]), 9
+            normal /= np.linalg.norm(normal)
+            height = state.artefact[4:] + (step[9] if self.size_unknown else 0.0)
+            artefact, used = np.concatenate([normal, [state.artefact[3] + step[8]], height]), 9 + self.size_unknown
         return MountState(
             turned,
             state.translation + step[:3],
@@ -130,7 +157,8 @@ class Problem:
         base = self._base(state)
         if self.sphere:
             return np.linalg.norm(base - state.artefact[:3], axis=1) - state.artefact[3]
-        return base @ state.artefact[:3] - state.artefact[3]
+        off = base @ state.artefact[:3] - state.artefact[3]
+        return off if self.second is None else off - state.artefact[4] * self._level
 
     def _base(self, state: MountState) -> np.ndarray:
         rotations, positions = self.motion(state.offset_s)
@@ -175,6 +203,7 @@ class Problem:
             columns += [-normals, *([np.full((len(base), 1), -1.0)] if self.radius_mm is None else [])]
         else:
             columns += [base @ _across(state.artefact[:3]).T, np.full((len(base), 1), -1.0)]
+            columns += [-self._level[:, None]] if self.size_unknown else []
         if self.scale:
             columns.append(np.sum(normals * positions[self.poses], axis=1, keepdims=True))
         if self.time:
@@ -189,17 +218,19 @@ class Problem:
 
     @cached_property
     def _along(self) -> np.ndarray:
-        """Positions (N,) along the line of each profile from its middle, mm."""
+        """Positions (N,) along the line, or the two parallel lines, of each profile from its middle, mm."""
         along = []
-        for own in self.points:
-            centred = own - own.mean(axis=0)
-            along.append(centred @ np.linalg.svd(centred, full_matrices=False)[2][0])
+        for own, level in zip(self.points, np.split(self._level, np.cumsum(self.counts)[:-1]), strict=True):
+            lines = [own[level == face] for face in (0, 1) if np.any(level == face)]
+            centred = np.vstack([line - line.mean(axis=0) for line in lines])
+            along.append((own - own.mean(axis=0)) @ np.linalg.svd(centred, full_matrices=False)[2][0])
         return np.concatenate(along)
 
     @cached_property
     def _lines(self) -> list[np.ndarray]:
-        """Orthonormal bases (n, 2) of what a shift and a turn of each profile's line do to its distances."""
-        every = np.column_stack([np.ones(len(self._along)), self._along])
+        """Orthonormal bases (n, K) of what shift and turn of each profile's line, and a step, do to its distances."""
+        faces = [] if self.second is None else [self._level]
+        every = np.column_stack([np.ones(len(self._along)), self._along, *faces])
         return [np.linalg.qr(each)[0] for each in np.split(every, np.cumsum(self.counts)[:-1])]
 
     def on_lines(self, values: np.ndarray) -> np.ndarray:

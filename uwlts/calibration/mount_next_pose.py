@@ -62,7 +62,7 @@ def next_pose(
             if best is None or after < best[0]:
                 words = (
                     f"turn the platform by {np.degrees(side * _TURN_RAD):+.0f} deg about its {'xyz'[axis]} axis from "
-                    f"pose {names[nearest]}, with the {'sphere' if problem.sphere else 'plane'} {where}"
+                    f"pose {names[nearest]}, with the {_kind(problem)} {where}"
                 )
                 pose = np.eye(4)
                 pose[:3, :3], pose[:3, 3] = turned, position
@@ -78,9 +78,14 @@ def next_pose(
     )
 
 
+def _kind(problem: Problem) -> str:
+    return "sphere" if problem.sphere else "plane" if problem.second is None else "step"
+
+
 def _one_pose(problem: Problem, points: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> Problem:
     # Without a trajectory the pose says nothing about the offset of the times.
-    return replace(problem, points=[points], motion=lambda offset: (rotation[None], position[None]))
+    second = None if problem.second is None else [np.zeros(len(points), dtype=bool)]
+    return replace(problem, points=[points], second=second, motion=lambda offset: (rotation[None], position[None]))
 
 
 def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:

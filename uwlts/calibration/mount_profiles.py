@@ -1,6 +1,7 @@
-"""The part of a profile that shows the artefact: an arc of a sphere beside its background, or the line of a plane."""
+"""The part of a profile that shows the artefact: an arc of a sphere, the line of a plane, the two lines of a step."""
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -16,6 +17,12 @@ _REJECTED_BEYOND = 4.0
 _LEAST_ARC = np.radians(30)
 """Smaller arcs are like straight lines, and their centres move by more than the noise along the sagitta."""
 _LARGEST_ROUNDS = 20
+_LINES = 4
+"""Lines sought in a profile of a step: its faces, and what lies beside them."""
+_PARALLEL = 2e-3
+"""By how much faces of a step may seem to be turned against each other besides noise, rad: bow of the profiler."""
+_LEAST_SEEN, _LEAST_SEEN_COSINE = 0.95, 0.5
+"""A step shows its height at least, but for the profiler's scale, and twice that where the sheet leans by 60 deg."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +37,17 @@ class ProfileArc:
 
 @dataclass(frozen=True, eq=False)
 class ProfileLine:
-    """Points of a profile on a line: their mask (N,), their middle (2,), the line's direction (2,) and the scatter."""
+    """Points of a profile on a line: their mask (N,), their middle (2,), the line's direction (2,) and the scatter.
+
+    Of a step these are the points of both faces, middle and direction of the first, and ``second`` (N,) is the mask of
+    the other face's.
+    """
 
     members: np.ndarray
     middle_mm: np.ndarray
     direction: np.ndarray
     std_mm: float
+    second: np.ndarray | None = None
 
 
 def noise_of(points: np.ndarray) -> float:
@@ -145,3 +157,42 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
         if np.array_equal(before, members):
             break
     return ProfileLine(members, middle, direction, std)
+
+
+def find_step(points: np.ndarray, height_mm: float | None, rng: np.random.Generator) -> ProfileLine | None:
+    """The two best supported parallel lines in a profile (N, 2), mm, in the order along it, or None.
+
+    The first is that at smaller z. Of a step of known height they lie as far apart as a sheet shows it that leans by up
+    to 60 deg.
+    """
+    lines: list[tuple[np.ndarray, ProfileLine]] = []
+    left = np.arange(len(points))
+    for _ in range(_LINES):
+        line = find_line(points[left], rng)
+        if line is None:
+            break
+        lines.append((left[line.members], line))
+        left = left[~line.members]
+    best: tuple[int, float, np.ndarray, np.ndarray, ProfileLine] | None = None
+    for (rows, first), (others, second) in combinations(lines, 2):
+        normal = np.array([-first.direction[1], first.direction[0]]) * np.sign(first.direction[0] or 1.0)
+        apart = float((second.middle_mm - first.middle_mm) @ normal)
+        noise = max(first.std_mm, second.std_mm, 1e-4)
+        lean = [
+            line.std_mm / max(np.ptp(points[own] @ line.direction), 1e-9) * np.sqrt(12 / len(own))
+            for own, line in ((rows, first), (others, second))
+        ]
+        turned = abs(float(first.direction[0] * second.direction[1] - first.direction[1] * second.direction[0]))
+        if turned > _REJECTED_BEYOND * float(np.hypot(*lean)) + _PARALLEL or abs(apart) < 2 * _REJECTED_BEYOND * noise:
+            continue
+        if height_mm is not None and not _LEAST_SEEN * height_mm < abs(apart) < height_mm / _LEAST_SEEN_COSINE:
+            continue
+        if best is None or len(rows) + len(others) > best[0]:
+            nearer, farther, line = (rows, others, first) if apart > 0 else (others, rows, second)
+            best = len(rows) + len(others), noise, nearer, farther, line
+    if best is None:
+        return None
+    _, noise, nearer, farther, line = best
+    members, second = np.zeros(len(points), bool), np.zeros(len(points), bool)
+    members[nearer] = members[farther] = second[farther] = True
+    return ProfileLine(members, line.middle_mm, line.direction, noise, second)

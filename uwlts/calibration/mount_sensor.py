@@ -69,8 +69,9 @@ def profiles_of(
     ).points_mm
     times = capture.time_s[laser]
     if poses is None:
-        poses, pose_times_s = capture.pose[laser], times
-        if missing := int(np.count_nonzero(~np.isfinite(poses).all(axis=(1, 2)))):
+        own = capture.pose[laser]
+        poses, pose_times_s = own, times
+        if missing := int(np.count_nonzero(~np.isfinite(own).all(axis=(1, 2)))):
             raise DescriptionError(
                 f"{missing} of {len(laser)} laser images of {capture.path.name} have no pose of the platform: give a "
                 "table of poses, or import them"

@@ -1,4 +1,4 @@
-"""Start values of a mount: in closed form from the circles of a sphere, or by search from the lines of a plane."""
+"""Start values of a mount: in closed form from circles of a sphere, or by search from lines of a plane or step."""
 
 from dataclasses import replace
 
@@ -168,6 +168,19 @@ def start_of_plane(
             solution = np.linalg.lstsq(design, -places @ normal, rcond=1e-10)[0]
             states.append(MountState(turn, solution[:3], np.append(normal, solution[3])))
     return _best(problem.thinned(_THINNED), [_in_sensor_frame(state, sheet) for state in states])
+
+
+def start_of_step(
+    problem: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
+) -> MountState:
+    """State near the solution from the lines of both faces of a step: as of a plane from the first, then the height."""
+    assert problem.second is not None
+    first = [points[np.logical_not(own)] for points, own in zip(problem.points, problem.second, strict=True)]
+    state = start_of_plane(replace(problem, points=first, second=None), lines, sheet, rng)
+    state = replace(state, artefact=np.append(state.artefact, 0.0))
+    found = float(np.median(problem.distances(state)[np.concatenate(problem.second)]))
+    height = found if problem.height_mm is None else float(np.copysign(problem.height_mm, found))
+    return replace(state, artefact=np.append(state.artefact[:4], height))
 
 
 def _in_space(flat: np.ndarray) -> np.ndarray:

@@ -195,8 +195,9 @@ def mount(
     poses: Path | None = None,
     *,
     out: Path,
-    artefact: Literal["sphere", "plane"] = "sphere",
+    artefact: Literal["sphere", "plane", "step"] = "sphere",
     radius_mm: float | None = None,
+    height_mm: float | None = None,
     calibration: Path | None = None,
     pose_format: str = "matrix",
     profile_unit: Literal["mm", "m"] = "mm",
@@ -206,8 +207,8 @@ def mount(
     time: Flag = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Calibrate the mount of any laser profiler on a robot or stage, from its profiles of a sphere or plane; or that of
-    a calibrated sensor, from a capture of one of them or of a target; or the axis of a rotary table.
+    """Calibrate the mount of any laser profiler on a robot or stage, from its profiles of a sphere, plane or step; or
+    that of a calibrated sensor, from a capture of one of them or of a target; or the axis of a rotary table.
 
     The artefact stands still at an unknown place. Prints the transform from the sensor to the platform with its
     uncertainty, the poses that were left out, what the motions determine badly, and the pose to add next.
@@ -223,13 +224,14 @@ def mount(
         out: Mount to write (JSON).
         artefact: What the profiles show.
         radius_mm: Radius of the sphere; estimated unless given.
+        height_mm: Height of the step; estimated unless given.
         calibration: Calibration of the sensor that took the capture.
         pose_format: matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about the moved
             axes), euler-zyx-deg (about the fixed axes) or another order, -rad for radians; angle-deg of a rotary table.
         profile_unit: Unit of the profiles.
         pose_unit: Unit of the positions.
-        axis: The sphere stands on a rotary table whose axis is not known: direction in the sensor's frame nearest to
-            the axis about which angles turn it counter-clockwise.
+        axis: The sphere or target stands on a rotary table whose axis is not known: direction in the sensor's frame
+            nearest to the axis about which angles turn it counter-clockwise.
         scale: Estimate the robot's scale too.
         time: Estimate the offset to add to the profiles' times (columns time_s; the poses are a trajectory).
     """
@@ -241,6 +243,7 @@ def mount(
         poses,
         artefact=artefact,
         radius_mm=radius_mm,
+        height_mm=height_mm,
         calibration=calibration,
         pose_format=pose_format,
         profile_unit=profile_unit,

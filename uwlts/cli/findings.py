@@ -55,6 +55,7 @@ def compare(
     datums: Path | None = None,
     disc_mm: float | None = None,
     deep_mm: float | None = None,
+    same_water: Flag = False,
     unit: Literal["mm", "m"] = "mm",
     overwrite: Overwrite = False,
 ) -> None:
@@ -72,6 +73,7 @@ def compare(
         datums: TOML file with spheres that hold what has not changed; only points in them count for the registration.
         disc_mm: Diameter over which points are averaged; about 30 points unless given.
         deep_mm: Largest distance that is looked for; three diameters unless given.
+        same_water: Both clouds were scanned in water of the same temperature and salinity.
         unit: Unit of the reference.
     """
     from uwlts.report.page_toolkit import refuse_unsuitable_page
@@ -80,7 +82,14 @@ def compare(
     if coloured:
         refuse_unsuitable(coloured, overwrite=overwrite)
     change = uwlts.compare_clouds(
-        cloud, reference, register=register, datums=datums, disc_mm=disc_mm, deep_mm=deep_mm, unit=unit
+        cloud,
+        reference,
+        register=register,
+        datums=datums,
+        disc_mm=disc_mm,
+        deep_mm=deep_mm,
+        same_water=same_water,
+        unit=unit,
     )
     show(change.lines())
     title = f"{cloud.name} against {Path(reference).name}"

@@ -3,6 +3,7 @@
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -98,6 +99,7 @@ class Board:
 
     ``request`` is what the operator is asked to do, and
     ``answers`` what the buttons for it are called. ``coverage`` is a PNG of what a guided calibration has seen.
+    ``detail`` gives, of a cloud of more points than are shown, those in a box from low to high (3,), mm, as `table_of`.
     """
 
     title: str
@@ -111,6 +113,7 @@ class Board:
     coverage: bytes | None = None
     cloud: ThinnedCloud = field(default_factory=ThinnedCloud)
     cloud_name: str = ""
+    detail: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
 
     def __post_init__(self) -> None:
         self._lines: deque[Line] = deque(maxlen=KEPT_LINES)

@@ -1,9 +1,10 @@
 // A point cloud of bounded size: fitted to the view, turned with the mouse or by touch, coloured by a field, with a
 // scale bar, axes and a legend. A click on a point emits its place. Points come from /cloud as float32 (see
-// ThinnedCloud.packed).
+// `packed` in thinned_cloud.py); of larger clouds those in view are fetched from /cloud/detail when the view rests.
 import { OrbitControls, THREE } from "nicegui-scene";
 
 const COLUMNS = 6;
+const REST_MS = 300;
 // Turbo (Mikhailov 2019), polynomials of degree 5 for red, green, blue.
 const TURBO = [
   [0.13572138, 4.6153926, -42.66032258, 132.13108234, -152.94239396, 59.28637943],
@@ -26,7 +27,7 @@ export default {
         <b>{{ legend }}</b></div>
       <div class="empty" v-show="!count">{{ problem }}</div>
     </div>`,
-  props: { field: String, version: Number, marks: Array, fit: Number },
+  props: { field: String, version: Number, marks: Array, fit: Number, closer: Boolean },
   data: () => ({ legend: "", low: "", high: "", count: 0, problem: "no points yet" }),
   mounted() {
     try {
@@ -44,23 +45,22 @@ export default {
     // Orthographic, so that the scale holds at every depth.
     this.camera = new THREE.OrthographicCamera(-100, 100, 100, -100, -1e5, 1e5);
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
-    this.controls.addEventListener("change", () => this.draw());
+    this.controls.addEventListener("change", () => { this.draw(); this.rest(); });
     this.controls.addEventListener("start", () => (this.touched = true));
-    this.geometry = new THREE.BufferGeometry();
-    this.points = new THREE.Points(
-      this.geometry,
-      new THREE.PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true }),
-    );
-    this.points.frustumCulled = false;
-    this.scene.add(this.points);
+    const material = new THREE.PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true });
+    [this.whole, this.near] = [0, 1].map(() => {
+      const geometry = new THREE.BufferGeometry();
+      const points = new THREE.Points(geometry, material);
+      points.frustumCulled = false;
+      this.scene.add(points);
+      return { geometry, table: new Float32Array(0), origin: [0, 0, 0], count: 0 };
+    });
     this.marked = new THREE.Points(
       new THREE.BufferGeometry(),
       new THREE.PointsMaterial({ size: 11, sizeAttenuation: false, color: 0xffffff, depthTest: false }),
     );
     this.marked.frustumCulled = false;
     this.scene.add(this.marked);
-    this.origin = [0, 0, 0];
-    this.table = new Float32Array(0);
     this.fitted = 0;
     this.resized = new ResizeObserver(() => this.resize());
     this.resized.observe(this.$el);
@@ -76,6 +76,7 @@ export default {
     this.load();
   },
   beforeUnmount() {
+    clearTimeout(this.resting);
     this.resized?.disconnect();
     this.controls?.dispose();
     this.renderer?.dispose();
@@ -85,6 +86,7 @@ export default {
     field() { this.colour(); },
     marks() { this.mark(); },
     fit() { this.fitAll(); },
+    closer() { this.rest(); },
   },
   methods: {
     async load() {
@@ -93,18 +95,14 @@ export default {
       if (this.loading) { this.again = true; return; }
       this.loading = true;
       try {
-        const answer = await fetch("cloud");
-        this.origin = answer.headers.get("X-Origin").split(",").map(Number);
-        this.table = new Float32Array(await answer.arrayBuffer());
-        this.count = this.table.length / COLUMNS;
-        const places = new Float32Array(3 * this.count);
-        for (let k = 0; k < this.count; k++)
-          for (let c = 0; c < 3; c++) places[3 * k + c] = this.table[COLUMNS * k + c] + this.origin[c];
-        this.geometry.setAttribute("position", new THREE.BufferAttribute(places, 3));
+        await this.take(this.whole, await fetch("cloud"));
+        this.count = this.whole.count;
+        this.clearNear();
         this.colour();
         // Follows while it grows, until the user turns or zooms.
         if (!this.touched && this.count > 1.2 * this.fitted) this.fitAll();
         this.draw();
+        this.rest();
         this.$el.dataset.points = this.count;
       } finally {
         setTimeout(() => {
@@ -113,25 +111,84 @@ export default {
         }, 1000);
       }
     },
+    async take(layer, answer) {
+      layer.origin = answer.headers.get("X-Origin").split(",").map(Number);
+      layer.table = new Float32Array(await answer.arrayBuffer());
+      layer.count = layer.table.length / COLUMNS;
+      const places = new Float32Array(3 * layer.count);
+      for (let k = 0; k < layer.count; k++)
+        for (let c = 0; c < 3; c++) places[3 * k + c] = layer.table[COLUMNS * k + c] + layer.origin[c];
+      layer.geometry.setAttribute("position", new THREE.BufferAttribute(places, 3));
+    },
+    clearNear() {
+      this.asked = null;
+      Object.assign(this.near, { table: new Float32Array(0), count: 0 });
+      this.near.geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(0), 3));
+      this.near.geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(0), 3));
+      delete this.$el.dataset.detail;
+    },
+    rest() {
+      clearTimeout(this.resting);
+      this.resting = setTimeout(() => this.refine(), REST_MS);
+    },
+    async refine() {
+      const box = this.closer ? this.seenBox() : null;
+      if (box === null) {
+        if (this.near.count) { this.clearNear(); this.draw(); }
+        return;
+      }
+      const asked = (this.asked = box.map((value) => value.toFixed(4)).join());
+      const answer = await fetch(`cloud/detail?box=${asked}`);
+      // The view may have moved on meanwhile.
+      if (answer.status !== 200 || asked !== this.asked) return;
+      await this.take(this.near, answer);
+      this.colour();
+      this.$el.dataset.detail = this.near.count;
+    },
+    seenBox() {
+      // The box about the points in view, a little wider; null where most are, so that no more can be gained.
+      const matrix = new THREE.Matrix4().multiplyMatrices(this.camera.projectionMatrix, this.camera.matrixWorldInverse);
+      const point = new THREE.Vector3();
+      const box = new THREE.Box3();
+      let seen = 0;
+      let ofWhole = 0;
+      for (const layer of [this.whole, this.near]) {
+        const place = layer.geometry.getAttribute("position");
+        for (let k = 0; k < layer.count; k++) {
+          const at = point.fromBufferAttribute(place, k).clone();
+          point.applyMatrix4(matrix);
+          if (Math.abs(point.x) <= 1 && Math.abs(point.y) <= 1) { box.expandByPoint(at); seen++; }
+        }
+        if (layer === this.whole) ofWhole = seen;
+      }
+      if (!seen || ofWhole > this.whole.count / 2) return null;
+      const size = box.getSize(new THREE.Vector3()).length();
+      box.expandByScalar((2 * size) / Math.sqrt(seen) + 1e-3);
+      return [...box.min.toArray(), ...box.max.toArray()];
+    },
     column() { return { depth: 2, intensity: 3, deviation: 4, uncertainty: 5 }[this.field] ?? 2; },
     colour() {
       if (!this.renderer) return;
       const column = this.column();
       const values = [];
-      for (let k = column; k < this.table.length; k += COLUMNS) if (!Number.isNaN(this.table[k])) values.push(this.table[k]);
+      const table = this.whole.table;
+      for (let k = column; k < table.length; k += COLUMNS) if (!Number.isNaN(table[k])) values.push(table[k]);
       values.sort((a, b) => a - b);
-      const offset = column < 3 ? this.origin[column] : 0;
+      const offset = column < 3 ? this.whole.origin[column] : 0;
       let low = values[Math.floor(0.01 * (values.length - 1))] ?? 0;
       let high = values[Math.ceil(0.99 * (values.length - 1))] ?? 1;
       // Deviations are shown about zero.
       if (this.field === "deviation") { high = Math.max(Math.abs(low), Math.abs(high)); low = -high; }
       const span = high - low || 1;
-      const colours = new Float32Array(3 * this.count).fill(0.4);
-      for (let k = 0; k < this.count; k++) {
-        const value = this.table[COLUMNS * k + column];
-        if (!Number.isNaN(value)) colours.set(shade((value - low) / span), 3 * k);
+      for (const layer of [this.whole, this.near]) {
+        const colours = new Float32Array(3 * layer.count).fill(0.4);
+        const moved = column < 3 ? layer.origin[column] - offset : 0;
+        for (let k = 0; k < layer.count; k++) {
+          const value = layer.table[COLUMNS * k + column] + moved;
+          if (!Number.isNaN(value)) colours.set(shade((value - low) / span), 3 * k);
+        }
+        layer.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
       }
-      this.geometry.setAttribute("color", new THREE.BufferAttribute(colours, 3));
       const unit = this.field === "intensity" ? "grey values" : "mm";
       const digits = Math.max(0, 2 - Math.floor(Math.log10(span)));
       const text = (value) => (value + offset).toFixed(Math.min(digits, 6));
@@ -163,8 +220,8 @@ export default {
     fitAll() {
       if (!this.count) return;
       this.fitted = this.count;
-      this.geometry.computeBoundingBox();
-      const box = this.geometry.boundingBox;
+      this.whole.geometry.computeBoundingBox();
+      const box = this.whole.geometry.boundingBox;
       const middle = box.getCenter(new THREE.Vector3());
       const radius = Math.max(box.getSize(new THREE.Vector3()).length() / 2, 1);
       // As the sensor sees it, a little from the side: X up, Z away.
@@ -214,19 +271,22 @@ export default {
     pick(event) {
       const box = this.renderer.domElement.getBoundingClientRect();
       const [u, v] = [event.clientX - box.left, event.clientY - box.top];
-      const place = this.geometry.getAttribute("position");
       const matrix = new THREE.Matrix4().multiplyMatrices(this.camera.projectionMatrix, this.camera.matrixWorldInverse);
       const point = new THREE.Vector3();
       let best = null;
       let nearest = Infinity;
-      for (let k = 0; k < this.count; k++) {
-        point.fromBufferAttribute(place, k).applyMatrix4(matrix);
-        const off = Math.hypot(((point.x + 1) / 2) * box.width - u, ((1 - point.y) / 2) * box.height - v);
-        // Of those under the finger the one in front.
-        if (off < 8 && point.z + off * 1e-3 < nearest) { nearest = point.z + off * 1e-3; best = k; }
+      for (const layer of [this.whole, this.near]) {
+        const place = layer.geometry.getAttribute("position");
+        for (let k = 0; k < layer.count; k++) {
+          point.fromBufferAttribute(place, k).applyMatrix4(matrix);
+          const off = Math.hypot(((point.x + 1) / 2) * box.width - u, ((1 - point.y) / 2) * box.height - v);
+          // Of those under the finger the one in front.
+          if (off < 8 && point.z + off * 1e-3 < nearest) { nearest = point.z + off * 1e-3; best = [layer, k]; }
+        }
       }
       if (best === null) return;
-      const at = [0, 1, 2].map((c) => this.table[COLUMNS * best + c] + this.origin[c]);
+      const [layer, number] = best;
+      const at = [0, 1, 2].map((c) => layer.table[COLUMNS * number + c] + layer.origin[c]);
       this.$emit("pick", { at });
     },
     key(event) {
@@ -251,6 +311,7 @@ export default {
       if (event.key.length > 1 || "+-".includes(event.key)) this.touched = true;
       this.controls.update();
       this.draw();
+      this.rest();
     },
   },
 };

@@ -17,13 +17,17 @@ class CloudView(Element, component="cloud_view.js", esm={"nicegui-scene": str(_T
 
     def __init__(self, picked: Callable[[np.ndarray], None] | None = None):
         super().__init__()
-        self._props |= {"field": "depth", "version": -1, "marks": [], "fit": 0}
+        self._props |= {"field": "depth", "version": -1, "marks": [], "fit": 0, "closer": False}
         if picked is not None:
             self.on("pick", lambda event: picked(_place(event)))
 
     def show_version(self, version: int) -> None:
         """Have the browser fetch the cloud, if it has another one."""
         self._set("version", version)
+
+    def allow_detail(self, allowed: bool) -> None:
+        """Whether there are more points to fetch when someone looks closer."""
+        self._set("closer", allowed)
 
     def colour_by(self, field: str) -> None:
         """Colour by depth or one of the fields of a cloud."""

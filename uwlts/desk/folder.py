@@ -56,7 +56,7 @@ def kind_of(name: str) -> str:
             return "interrupted capture"
         case [_, *_, "truth", "h5"]:
             return "truth"
-        case [_, *_, "ply"]:
+        case [_, *_, "ply"] | [_, *_, "copc", "laz"]:
             return "cloud"
         case [_, *_, "h5"]:
             return "capture"

@@ -21,6 +21,7 @@ from uwlts.desk.guided import answer_buttons
 from uwlts.desk.instrument import Instrument, InstrumentState
 from uwlts.desk.page import BoardView, build_board, laser_off_button, timed
 from uwlts.desk.server import DeskServer
+from uwlts.desk.thinned_cloud import table_of
 from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
 from uwlts.measurement.inspection import Shape, length_between, point_near, shape_near
@@ -29,7 +30,8 @@ from uwlts.model.command_files import own_files
 from uwlts.model.errors import DescriptionError, Error
 from uwlts.model.library import validated
 from uwlts.report.inventory import describe
-from uwlts.storage.cloud import PointCloud, read_thinned_cloud, write_cloud
+from uwlts.storage.cloud import PointCloud, read_region, read_thinned_cloud, write_cloud
+from uwlts.storage.copc_file import is_copc
 from uwlts.storage.files import refuse_unsuitable
 
 _LIST_S = 2.0
@@ -146,17 +148,27 @@ class _Desk:
         """The calibrations to choose from."""
         return [file.name for file in listed(self.folder) if file.kind == "calibration"]
 
-    def show_cloud(self, name: str, cloud: PointCloud, *, of: int | None = None) -> None:
-        """Show a cloud, a part ``of`` so many points, thinned if it is large, and have it measured."""
+    def show_cloud(self, name: str, cloud: PointCloud, *, of: int | None = None, path: Path | None = None) -> None:
+        """Show a cloud, a part ``of`` so many points, thinned if it is large, and have it measured.
+
+        When someone looks closer, more points are shown: all of a COPC file's ``path``, else those of the cloud.
+        """
+
+        def closer(low: np.ndarray, high: np.ndarray) -> np.ndarray:
+            if path is not None:
+                found = read_region(path, low, high, _MOST_SHOWN)
+            else:
+                inside = np.flatnonzero(np.all((cloud.points_mm >= low) & (cloud.points_mm <= high), axis=1))
+                found = cloud.selected(inside[:: -(-len(inside) // _MOST_SHOWN) or 1])
+            return table_of(found.points_mm, **_fields(found))
+
         self.opened = _Opened(cloud)
+        self.board.detail = None
         self.board.cloud.clear()
         self.board.cloud_name = name
-        kept = slice(None, None, -(-len(cloud) // _MOST_SHOWN) or 1)
-        known = cloud.uncertainty
-        std = None if known is None else np.linalg.norm(known[kept].std_mm(), axis=1)
-        deviation = None if cloud.deviation_mm is None else cloud.deviation_mm[kept]
-        total, intensity = of or len(cloud), cloud.intensity[kept]
-        self.board.cloud.add(cloud.points_mm[kept], total, intensity=intensity, deviation=deviation, uncertainty=std)
+        shown, total = cloud.selected(slice(None, None, -(-len(cloud) // _MOST_SHOWN) or 1)), of or len(cloud)
+        self.board.cloud.add(shown.points_mm, total, **_fields(shown))
+        self.board.detail = closer if total > len(shown) else None
 
     def measured(self) -> PointCloud:
         """The cloud to measure: the opened one, else what a scan shows."""
@@ -165,6 +177,13 @@ class _Desk:
         points = self.board.cloud.points()
         none = np.full(len(points), -1)
         return PointCloud(points[:, :3], points[:, 3], none, none, metadata={})
+
+
+def _fields(cloud: PointCloud) -> dict[str, np.ndarray | None]:
+    """Fields (N,) by which a cloud's points are coloured."""
+    known = cloud.uncertainty
+    std = None if known is None else np.linalg.norm(known.std_mm(), axis=1)
+    return {"intensity": cloud.intensity, "deviation": cloud.deviation_mm, "uncertainty": std}
 
 
 class _Number(ui.number):
@@ -449,10 +468,8 @@ class _OperatorPage:
         path = file_in(self._desk.folder, name)
         cloud, total = await asyncio.to_thread(read_thinned_cloud, path, _MOST_OPENED)
         if total > len(cloud):
-            self._board.say(
-                f"{name} has {total:,} points: {len(cloud):,}, evenly chosen, are shown and measured", "warning"
-            )
-        self._desk.show_cloud(name, cloud, of=total)
+            self._board.say(f"{name} has {total:,} points: {len(cloud):,}, evenly chosen, are measured", "warning")
+        self._desk.show_cloud(name, cloud, of=total, path=path if is_copc(path) else None)
         self._view.mark([])
 
     async def _about(self, name: str) -> None:

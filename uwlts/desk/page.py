@@ -135,6 +135,7 @@ class BoardView:
                 self._seen.set_visibility(True)
         if self._cloud is not None:
             self._cloud.show_version(board.cloud.version)
+            self._cloud.allow_detail(board.detail is not None)
             name = f"{board.cloud_name}: " if board.cloud_name else ""
             self._count.set_text(f"{name}{board.cloud.total:,} points")
         for line in board.lines(self._line):

@@ -6,9 +6,11 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from typing import Any, Self
 
+import numpy as np
 import uvicorn
 from fastapi import FastAPI
 from nicegui import Client, ui
@@ -18,7 +20,8 @@ from starlette.responses import Response
 from uwlts.desk.access import GuardedApp, PageAccess, is_local
 from uwlts.desk.board import Board
 from uwlts.desk.page import build_board
-from uwlts.model.errors import SetupError
+from uwlts.desk.thinned_cloud import packed
+from uwlts.model.errors import Error, SetupError
 
 _START_S, _END_S = 30.0, 5.0
 _PORTS = 100
@@ -118,9 +121,16 @@ class DeskServer:
 
         @self._app.get("/cloud")
         def cloud() -> Response:
-            origin, data = board.cloud.packed()
-            headers = _LATEST | {"X-Origin": ",".join(map(str, origin.tolist()))}
-            return Response(data, 200, headers, "application/octet-stream")
+            return _cloud_answer(board.cloud.points())
+
+        @self._app.get("/cloud/detail")
+        def detail(box: str) -> Response:
+            look, table = board.detail, None
+            with suppress(ValueError, Error):
+                low, high = np.array(box.split(","), dtype=float).reshape(2, 3)
+                if look is not None and np.isfinite([low, high]).all() and (low < high).all():
+                    table = look(low, high)
+            return Response(b"", 204, _LATEST) if table is None else _cloud_answer(table)
 
     @property
     def app(self) -> FastAPI:
@@ -149,6 +159,13 @@ class DeskServer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _cloud_answer(table: np.ndarray) -> Response:
+    """Points (N, 6) for the browser."""
+    origin, data = packed(table)
+    headers = _LATEST | {"X-Origin": ",".join(map(str, origin.tolist()))}
+    return Response(data, 200, headers, "application/octet-stream")
 
 
 def _bound(host: str, port: int) -> socket.socket:

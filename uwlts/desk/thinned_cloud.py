@@ -9,6 +9,22 @@ FIELDS = ("intensity", "deviation", "uncertainty")
 _COLUMNS = 3 + len(FIELDS)
 
 
+def table_of(points_mm: np.ndarray, **fields: np.ndarray | None) -> np.ndarray:
+    """Points (N, 6): coordinates (N, 3) in mm, then fields (N,) by the names in `FIELDS`, NaN where unknown."""
+    table = np.full((len(points_mm), _COLUMNS), np.nan)
+    table[:, :3] = points_mm
+    for column, name in enumerate(FIELDS, 3):
+        if (values := fields.get(name)) is not None:
+            table[:, column] = values
+    return table
+
+
+def packed(table: np.ndarray) -> tuple[np.ndarray, bytes]:
+    """Origin (3,) in mm, and points (N, 6) from it with their fields as float32, row by row, for the browser."""
+    origin = np.round(np.median(table[:, :3], axis=0)) if len(table) else np.zeros(3)
+    return origin, (table - np.append(origin, np.zeros(len(FIELDS)))).astype("<f4").tobytes()
+
+
 class ThinnedCloud:
     """Points in mm with their fields, NaN where unknown; at most ``at_most`` of them are kept. Safe between threads.
 
@@ -37,11 +53,8 @@ class ThinnedCloud:
             self._added += len(points_mm)
             self.total += len(points_mm) if of is None else of
             kept = slice(first, None, self._stride)
-            table = np.full((len(points_mm[kept]), _COLUMNS), np.nan)
-            table[:, :3] = points_mm[kept]
-            for column, name in enumerate(FIELDS, 3):
-                if (values := fields.get(name)) is not None:
-                    table[:, column] = values[kept]
+            known = {name: values for name, values in fields.items() if values is not None}
+            table = table_of(points_mm[kept], **{name: values[kept] for name, values in known.items()})
             while len(table):
                 fitting, table = np.split(table, [self._at_most - self._count])
                 self._table[self._count : self._count + len(fitting)] = fitting
@@ -58,10 +71,3 @@ class ThinnedCloud:
         """The points (N, 6) that are kept: coordinates in mm, then the fields."""
         with self._lock:
             return self._table[: self._count].copy()
-
-    def packed(self) -> tuple[np.ndarray, bytes]:
-        """Origin (3,) in mm, and the points from it with their fields as float32, row by row, for the browser."""
-        table = self.points()
-        origin = np.round(np.median(table[:, :3], axis=0)) if len(table) else np.zeros(3)
-        table[:, :3] -= origin
-        return origin, table.astype("<f4").tobytes()

@@ -15,6 +15,7 @@ from uwlts.calibration.joint.evidence import STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, across_of
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, stored_estimate
 from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import StageParameter
@@ -22,7 +23,7 @@ from uwlts.optics.brightness import BLUR_STD, beside_std
 from uwlts.optics.line_table import LineTable, sum_terms
 from uwlts.runtime.compiled import compiled
 from uwlts.storage.capture import Capture, CaptureHeader, FrameTable, sensor_poses
-from uwlts.storage.cloud import PointUncertainty
+from uwlts.storage.cloud import WATER, PointUncertainty
 from uwlts.storage.files import sha256_of
 
 # Patterns that together move the points by no more than this (root mean square) are left out.
@@ -96,7 +97,11 @@ def point_uncertainty(
     pose = of_sensor[:, :3, :3]
     posed = np.all(np.isfinite(of_sensor), axis=(1, 2), keepdims=True)
     pose_of = np.where(posed, pose, np.eye(3))
-    root = covariance_root(known.covariance)
+    found = require_joint(calibration).covariance_matrix()
+    root = np.zeros((len(known.covariance), 1 + len(found)))
+    # What the medium's index adds to the estimate: its drift, or all of it in a medium that was not calibrated in.
+    root[:, 0] = np.sqrt(np.maximum(np.diag(known.covariance) - np.pad(np.diag(found), (0, len(root) - len(found))), 0))
+    root[: len(found), 1:] = covariance_root(found)
     by_stage_alone = ~posed[:, 0, 0]
     middle = np.mean(capture.stage_mm[by_stage_alone]) if by_stage_alone.any() else 0.0
     stage = np.where(by_stage_alone, capture.stage_mm - middle, 0.0)
@@ -105,7 +110,6 @@ def point_uncertainty(
     rigid = (
         np.zeros((6, root.shape[1])) if mount_by is None else _in_sensor(mount_by, header) @ root[: mount_by.shape[1]]
     )
-    source = f"sensor {sha256(root.tobytes() + by_stage.tobytes()).hexdigest()[:16]}"
     exact = partial(_derivatives, known, root, rigid)
     table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE_MM)
     beside = np.zeros((len(line), 3)) if beside_mm is None else beside_std(header.sensor.uncertainty) * beside_mm
@@ -138,8 +142,12 @@ def point_uncertainty(
         raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
     along = np.array(header.stage_direction)
     position = np.where(posed[frame, :, 0], 0.0, header.sensor.uncertainty.stage_position_mm * along)
-    # All but blur and brightness is the sensor's and its stage's, whatever they scan in this medium.
-    return PointUncertainty(random, position.astype(np.float32), patterns, shared={source: weights[2:].T})
+    # All but blur is the sensor's, its stage's and its water's, whatever they scan in this medium.
+    source = f"{calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
+    name = sha256(source.encode()).hexdigest()[:16]
+    of_sensor_parts = np.delete(weights, [0, 2], axis=0)
+    shared = {f"{WATER} {name}": weights[2:3].T, f"sensor {name}": of_sensor_parts.T}
+    return PointUncertainty(random, position.astype(np.float32), patterns, shared=shared)
 
 
 @compiled

@@ -13,13 +13,14 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount
 from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory
-from uwlts.optics.brightness import beside_sheet, sharp_lines, slopes_of_brightness
+from uwlts.optics.brightness import beside_sheet, beside_std, footprint_mm, sharp_lines, slopes_of_brightness
 from uwlts.optics.reconstruction import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, FrameTable, opened_capture, sensor_poses
-from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
 from uwlts.storage.mount_files import read_mount
 from uwlts.stripe import FoundStripes, StripeSettings, find_stripes
 
@@ -193,6 +194,7 @@ def reconstruct_stripes(
             "medium_index": index,
             "artefact": capture.header.artefact,
             "calibration": calibration_digest(calibration),
+            **(_footprint(capture, calibration, kept, index) if isinstance(calibration, Calibration) else {}),
         },
         stripe=sharp[good],
         lines_by_status=lines,
@@ -234,6 +236,15 @@ def _beside(capture: Capture | FrameTable, calibration: Calibration, stripes: Fo
     where = (capture.header.sensor, stripes.line, stripes.centre_px, stripes.width_px, slopes)
     direction = capture.header.stage_direction
     return beside_sheet(calibration, *where, medium_index=index, stage_direction=direction)
+
+
+def _footprint(capture: Capture | FrameTable, calibration: Calibration, kept: FoundStripes, index: float) -> Table:
+    """Metadata of how much of the surface a point is the mean of; none of clouds of moved sensors."""
+    if np.isfinite(capture.pose).any() or not np.isfinite(kept.width_px).any():
+        return {}
+    sensor = capture.header.sensor
+    size = footprint_mm(calibration, sensor, kept.line, kept.centre_px, kept.width_px, medium_index=index)
+    return {FOOTPRINT: list(size), FOOTPRINT_STD: beside_std(sensor.uncertainty)}
 
 
 def _posed(points: np.ndarray, capture: Capture | FrameTable, frame: np.ndarray) -> np.ndarray:

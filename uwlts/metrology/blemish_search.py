@@ -53,11 +53,17 @@ _EDGE_STD = 3.0
 
 @dataclass(frozen=True, eq=False)
 class UnrolledSurface:
-    """An unrolled surface: places (N, 2) in mm, heights (N,) over the undamaged shape, and standard deviations (N,)."""
+    """An unrolled surface: places (N, 2) in mm, heights (N,) over the undamaged shape, and standard deviations (N,).
+
+    ``footprint_mm`` (N, 2) are standard deviations along both axes of the part of the surface that a point is the mean
+    of, zero where not known; ``footprint_std`` is the relative standard uncertainty of their squares.
+    """
 
     places: np.ndarray
     heights: np.ndarray
     std: np.ndarray
+    footprint_mm: np.ndarray
+    footprint_std: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

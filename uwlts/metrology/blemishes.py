@@ -1,8 +1,11 @@
 """Depth, extent and lost metal of a blemish on an unrolled surface, with uncertainty.
 
 The surface is a local quadratic through the points near each place of a grid; the undamaged surface is a plane through
-the points around the blemish. Both are sums over the points, so that the points' errors run through to every value: by
-each pattern that all points share, and by noise drawn anew (GUM Supplement 1, JCGM 101:2008).
+the points around the blemish. What the quadratic and the footprint of each point smooth is put back: what points would
+see of the surface that was found is taken off them, and the rest, smoothed, is added to it (twicing: Tukey, Exploratory
+Data Analysis, 1977, 16C; Van Cittert, Z. Phys. 69, 1931). All are sums over the points, so that the points' errors run
+through to every value: by each pattern that all points share, and by noise drawn anew (GUM Supplement 1, JCGM
+101:2008).
 """
 
 from __future__ import annotations
@@ -31,10 +34,18 @@ _RING = 0.6
 """Width of the surroundings in the blemish's radius."""
 _FEWEST = 12
 _TUKEY = 4.685
+_NODES = [
+    (np.sqrt(3.0) * np.array([a, b]), (2 / 3 if a == 0 else 1 / 6) * (2 / 3 if b == 0 else 1 / 6))
+    for a in (-1, 0, 1)
+    for b in (-1, 0, 1)
+]
+"""Places and weights of a normal distribution in two dimensions (Gauss-Hermite, exact to the fifth power)."""
 _MOST_VARIANCE = 12.0
 """Of a quadratic's value times the number of its points; amid them it is 3 to 5."""
 _CELLS = 26
 """Cells of the grid across the blemish."""
+_FINER = 2
+"""Parts of a cell in which contours are followed, on a cubic spline."""
 _DENT_SHARE = 0.1
 """Of the diameter: a hollow that is longer and wider is called a dent. Shape alone does not tell what made it."""
 
@@ -65,37 +76,37 @@ def measure_blemish(
     except EvaluationError:
         return None
     sign = float(np.sign(indication.height_mm))
-    heights = surface.heights[field.near]
-    depths = sign * field.depths(heights)
-    deepest = int(np.argmax(np.where(field.region, depths, -np.inf)))
-    depth = float(depths[deepest])
+    heights = sign * surface.heights[field.near]
+    depths = field.depths(heights)
+    # Its place by the smoothed surface: the deepest place of a noisy one is too deep.
+    smooth = field.depths(heights, steps=0)
+    deepest = int(np.argmax(np.where(field.region, smooth, -np.inf)))
+    between = field.vertex(smooth, deepest) - float(smooth[deepest])
+    depth = float(depths[deepest]) + between
     # Single points that, were they independent, would scatter local means as these do.
     noise = indication.noise_mm * surface.std[field.near] / float(np.median(surface.std))
-    by_noise = np.sqrt(np.asarray(field.rows.power(2) @ noise**2).ravel())
-    edge = max(_EDGE_SHARE * depth, _EDGE_STD * float(np.median(by_noise)))
-    plain = field.figures(depths, edge, deepest)
     rng, own = np.random.default_rng(_SEED), errors[field.near]
-    drawn = []
-    for _ in range(_DRAWS):
-        moves = rng.standard_normal(len(noise)) * noise
-        moves += own.drawn_of_images(rng)
-        drawn.append(field.figures(depths + sign * field.depths(moves), edge, None) - plain)
+    noisy = [field.depths(rng.standard_normal(len(noise)) * noise + own.drawn_of_images(rng)) for _ in range(_DRAWS)]
+    by_noise = np.std(noisy, axis=0, ddof=1)
+    edge = max(_EDGE_SHARE * depth, _EDGE_STD * float(np.median(by_noise[field.region])))
+    seen = field.figures(depths, edge, deepest)
+    seen[0] += between
+    drawn = [field.figures(depths + each, edge, deepest) - seen for each in noisy]
     # Half of the middle 68 %: some draws let the contour run into its neighbour.
     random = 0.5 * np.diff(np.quantile(drawn, [0.1587, 0.8413], axis=0), axis=0)[0]
-    # A noisy contour reaches farther, by about as much as it does with as much noise again; wider quadratics show what
-    # these blur.
-    bias, blur = np.median(drawn, axis=0), field.figures(sign * field.wide @ heights, edge, None) - plain
-    bias[0] = blur[0] = 0.0
-    seen, plain, random = plain, np.maximum(plain - bias, 0), np.sqrt(random**2 + bias**2 + blur**2)
-    # The depth at its own place: the deepest of a noisy surface is too deep.
-    at = np.array([sign * field.depths_at(deepest, moves) for moves in _draws(rng, noise, own)])
-    random[0] = float(np.std(at, ddof=1))
-    # A quadratic over a radius cuts the bottom by its fourth power: Richardson's estimate from a narrower one.
-    cut = field.richardson * (float(sign * field.narrow @ heights) - depth)
-    random[0] = float(np.hypot(random[0], cut))
+    # A noisy contour reaches farther, by about as much as it does with as much noise again.
+    bias = np.median(drawn, axis=0)
+    bias[0], random[0] = 0.0, by_noise[deepest]
+    plain = np.maximum(seen - bias, 0)
+    # What smoothing may still hide: as much as once more would put back, and what hangs on the footprint's size.
+    resolution = [field.depths(heights, steps=2), field.depths(heights, share=1 - field.footprint_std)]
+    resolved = np.array([field.figures(each, edge, deepest) - seen for each in resolution])
+    resolved[:, 0] += between
+    random = np.sqrt(random**2 + bias**2 + np.sum(resolved**2, axis=0))
     common = None
     if own.patterns_mm is not None:
-        moved = [field.figures(depths + sign * field.depths(p), edge, deepest) - seen for p in own.patterns_mm]
+        moved = np.array([field.figures(depths + field.depths(p), edge, deepest) - seen for p in own.patterns_mm])
+        moved[:, 0] += between
         common = np.sqrt(np.sum(np.square(moved), axis=0))
     length, width = plain[1], plain[2]
     kind = FeatureKind.PROTRUSION
@@ -114,28 +125,26 @@ def measure_blemish(
     return Blemish(kind, tuple(values), field.grid[deepest], extent, indication.points)
 
 
-def _draws(rng: np.random.Generator, noise: np.ndarray, own: NormalErrors) -> list[np.ndarray]:
-    return [rng.standard_normal(len(noise)) * noise + own.drawn_of_images(rng) for _ in range(_DRAWS)]
-
-
 @dataclass(frozen=True, eq=False)
 class _Field:
-    """Depths on a grid (G, 2) of shape ``shape`` as sums over the points ``near`` (n,), by ``rows`` (G, n).
+    """Depths on a grid (G, 2) of shape ``shape`` as sums over the points ``near`` (n,).
 
-    ``region`` (G,) are the cells of the blemish, ``narrow`` (n,) the row of the deepest place by a narrower quadratic,
-    ``richardson`` the factor of the difference that leads to none at all, ``stride`` half a bandwidth in cells,
-    ``wide`` (G, n) the rows of wider quadratics.
+    ``smooth`` (G, n) are local quadratics, ``design`` (n, 3) and ``plane`` (3, n) the undamaged plane's terms and their
+    sums over the points, ``seen`` (n, G) is what points of their footprint see of depths on the grid, ``sharp`` (n, G)
+    what points without one would. ``region`` (G,) are the cells of the blemish, ``stride`` half a bandwidth in cells.
     """
 
     near: np.ndarray
     grid: np.ndarray
     shape: tuple[int, int]
     cell: float
-    rows: sparse.csr_array
-    narrow: np.ndarray
-    richardson: float
+    smooth: sparse.csr_array
+    design: np.ndarray
+    plane: np.ndarray
+    seen: sparse.csr_array
+    sharp: sparse.csr_array
+    footprint_std: float
     stride: int
-    wide: sparse.csr_array
     region: np.ndarray
 
     @classmethod
@@ -164,27 +173,32 @@ class _Field:
         grid = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
         tree = KDTree(places)
         smooth = _quadratic_rows(grid, places, tree, bandwidth)
-        base = sparse.csr_array(np.column_stack([np.ones(len(grid)), grid]) @ plane)
-        rows = sparse.csr_array(smooth - base)
-        wide = sparse.csr_array(_quadratic_rows(grid, places, tree, np.sqrt(2) * bandwidth) - base)
         region = KDTree(places[~ring]).query(grid)[0] < bandwidth
-        depths = np.sign(indication.height_mm) * (rows @ heights)
-        deepest = int(np.argmax(np.where(region, depths, -np.inf)))
-        at = grid[deepest : deepest + 1]
-        narrower = max(bandwidth / np.sqrt(2), 0.8 * search.smallest_mm)
-        narrow = _quadratic_rows(at, places, tree, narrower)
-        row = np.asarray((narrow - sparse.csr_array(np.column_stack([[1.0], at]) @ plane)).todense()).ravel()
         stride = max(1, round(0.5 * bandwidth / cell))
-        share = 1 / (1 - (narrower / bandwidth) ** 4)
-        return cls(near, grid + middle, shape, cell, rows, row, share, stride, wide, region)
+        size = surface.footprint_mm[near]
+        sharp = seen = _interpolation((places - grid[0]) / cell, shape)
+        if np.any(size > 0):
+            parts = [weight * _interpolation((places + node * size - grid[0]) / cell, shape) for node, weight in _NODES]
+            seen = sparse.csr_array(sum(parts[1:], parts[0]))
+        design = np.column_stack([np.ones(len(places)), places])
+        return cls(
+            near, grid + middle, shape, cell, smooth, design, plane, seen, sharp, surface.footprint_std, stride, region
+        )
 
-    def depths(self, heights: np.ndarray) -> np.ndarray:
-        """Heights (G,) over the undamaged surface for heights (n,) of the points."""
-        return self.rows @ heights
+    def depths(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
+        """Heights (G,) over the undamaged surface for heights (n,) of the points.
 
-    def depths_at(self, cell: int, heights: np.ndarray) -> float:
-        """The same in one cell."""
-        return float((self.rows[[cell]] @ heights)[0])
+        What smoothing hides is put back in so many ``steps``, with a ``share`` of what the footprint makes of that.
+        """
+        left = heights - self.design @ (self.plane @ heights)
+        first = self.smooth @ left
+        depths = first
+        for _ in range(steps):
+            there = self.seen @ depths
+            if share != 1.0:
+                there = share * there + (1 - share) * (self.sharp @ depths)
+            depths = depths + self.smooth @ (left - there)
+        return depths
 
     def vertex(self, depths: np.ndarray, top: int) -> float:
         """Largest depth between the cells: of the parabolas through the deepest cell and its neighbours."""
@@ -198,26 +212,23 @@ class _Field:
                     depth -= (after - before) ** 2 / (8 * bend)
         return depth
 
-    def figures(self, depths: np.ndarray, edge: float, deepest: int | None) -> np.ndarray:
-        """Depth, length, width, area and lost area of depths (G,) within the contour of an edge's depth.
-
-        The depth is that of a given cell, or the largest.
-        """
-        inside = (np.where(self.region, depths, -np.inf) > edge).reshape(self.shape)
-        top = int(np.argmax(np.where(self.region, depths, -np.inf))) if deepest is None else deepest
-        labelled: Any = ndimage.label(inside, structure=np.ones((3, 3)))
-        labels = labelled[0]
-        label, depth = labels[np.unravel_index(top, self.shape)], self.vertex(depths, top)
-        if label == 0:
+    def figures(self, depths: np.ndarray, edge: float, deepest: int) -> np.ndarray:
+        """Depth in the ``deepest`` cell; length, width, area and lost area within the contour of an edge's depth."""
+        size = [_FINER * (n - 1) + 1 for n in self.shape]
+        cell, top = self.cell / _FINER, tuple(_FINER * k for k in np.unravel_index(deepest, self.shape))
+        fine = np.asarray(ndimage.zoom(depths.reshape(self.shape), np.divide(size, self.shape), order=3))
+        region = ndimage.zoom(self.region.reshape(self.shape), np.divide(size, self.shape), order=0)
+        labelled: Any = ndimage.label(region & (fine > edge), structure=np.ones((3, 3)))
+        labels, depth = labelled[0], float(depths[deepest])
+        if (label := labels[top]) == 0:
             return np.array([depth, 0.0, 0.0, 0.0, 0.0])
         grown = ndimage.binary_dilation(labels == label, structure=np.ones((3, 3)))
-        field = np.where(grown, depths.reshape(self.shape), -np.inf)
-        length, lost = _crossing(field.max(axis=1), edge, self.cell)
-        width, _ = _crossing(field.max(axis=0), edge, self.cell)
-        slopes = np.gradient(depths.reshape(self.shape), self.cell)
-        steep = np.maximum(np.hypot(*slopes) * self.cell, 1e-9)
-        share = np.clip((np.where(grown, depths.reshape(self.shape), -1e9) - edge) / steep + 0.5, 0, 1)
-        return np.array([depth, length, width, float(share.sum()) * self.cell**2, lost])
+        field = np.where(grown, fine, -np.inf)
+        length, lost = _crossing(field.max(axis=1), edge, cell)
+        width, _ = _crossing(field.max(axis=0), edge, cell)
+        steep = np.maximum(np.hypot(*np.gradient(fine, cell)) * cell, 1e-9)
+        share = np.clip((np.where(grown, fine, -1e9) - edge) / steep + 0.5, 0, 1)
+        return np.array([depth, length, width, float(share.sum()) * cell**2, lost])
 
 
 def _crossing(profile: np.ndarray, edge: float, cell: float) -> tuple[float, float]:
@@ -251,6 +262,24 @@ def _plane(places: np.ndarray, heights: np.ndarray, ring: np.ndarray) -> np.ndar
         spread = max(MAD_TO_STD * float(np.median(np.abs(left[ring]))), 1e-12)
         weight = ring * np.square(np.clip(1 - np.square(left / (_TUKEY * spread)), 0, None))
     return rows
+
+
+def _interpolation(places: np.ndarray, shape: tuple[int, int]) -> sparse.csr_array:
+    """Rows (n, G) of values on a grid at places (n, 2) in cells, exact for quadratics; nothing beyond its border.
+
+    Cubic convolution (Keys, IEEE Transactions on Acoustics, Speech and Signal Processing 29, 1981, Eq. 15).
+    """
+    first = np.floor(places).astype(int)
+    steps = np.arange(-1, 3)
+    away = np.abs((places - first)[:, :, None] - steps)
+    weight = np.where(away <= 1, (1.5 * away - 2.5) * away**2 + 1, ((-0.5 * away + 2.5) * away - 4) * away + 2)
+    at = first[:, :, None] + steps
+    weight = np.where((at >= 0) & (at < np.array(shape)[:, None]), weight, 0.0)
+    at = np.clip(at, 0, np.array(shape)[:, None] - 1)
+    columns = (at[:, 0, :, None] * shape[1] + at[:, 1, None, :]).reshape(len(places), -1)
+    values = (weight[:, 0, :, None] * weight[:, 1, None, :]).reshape(len(places), -1)
+    rows = np.repeat(np.arange(len(places)), columns.shape[1])
+    return sparse.csr_array((values.ravel(), (rows, columns.ravel())), shape=(len(places), shape[0] * shape[1]))
 
 
 def _quadratic_rows(grid: np.ndarray, places: np.ndarray, tree: KDTree, bandwidth: float) -> sparse.csr_array:

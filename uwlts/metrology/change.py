@@ -26,7 +26,7 @@ from uwlts.metrology.point_spacing import disc_of
 from uwlts.metrology.registration import Registration, SampledSurface, register_to_surface
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
-from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty, read_cloud
+from uwlts.storage.cloud import PAIRS, WATER, PointCloud, PointUncertainty, read_cloud
 from uwlts.storage.pose_files import Unit
 
 _MOST_PLACES = 20_000
@@ -195,6 +195,7 @@ def compare_clouds(
     datums: np.ndarray | str | os.PathLike[str] | None = None,
     disc_mm: float | None = None,
     deep_mm: float | None = None,
+    same_water: bool = False,
     unit: Unit = "mm",
 ) -> SurfaceChange:
     """Find where a surface differs from an earlier cloud, a mesh or an ideal shape by more than the uncertainty.
@@ -203,9 +204,10 @@ def compare_clouds(
     Leroux, ISPRS J. 82, 2013). The variance of the distance is that of M3C2-EP (Winiwarter, Anders and Höfle, ISPRS J.
     178, 2021) with the parts that this sensor's points have: noise of single points, or their roughness where that is
     larger, over their number; the stage's position of each image; and what all points share by calibration, which no
-    averaging lowers. The two clouds count as calibrated independently, so that of one calibration the level is too
-    large rather than too small. A registration, or the fit of an ideal shape, adds its own, and takes up what of the
-    shared errors looks like a movement.
+    averaging lowers. Of two clouds of one calibration, medium and direction of the stage, what both share of
+    calibration, stage and sheet cancels in the difference. The water's index, which may have drifted between them,
+    does not, unless ``same_water`` says so. A registration, or the fit of an ideal shape, adds its own, and takes up
+    what of the shared errors looks like a movement.
 
     Parameters
     ----------
@@ -224,6 +226,9 @@ def compare_clouds(
         Diameter of the disc; about 30 points of the sparser side unless given.
     deep_mm
         Largest distance that is looked for; three diameters unless given.
+    same_water
+        Both clouds were scanned in water of the same temperature and salinity, so that of one calibration its index is
+        off by the same.
     unit
         Unit of the reference, mm or m.
 
@@ -255,7 +260,8 @@ def compare_clouds(
             disc = max(disc, disc_of(surface.points_mm, surface.frame))
         if fixed is not None and not register:
             raise EvaluationError("datums hold a registration: ask for that, too (--register)")
-        sides = _against_points(new, surface, fixed, register=register, disc=disc, deep=deep_mm or _DEEP * disc)
+        deep = deep_mm or _DEEP * disc
+        sides = _against_points(new, surface, fixed, register=register, disc=disc, deep=deep, same_water=same_water)
     else:
         sides = _against_shape(new, surface, fixed, register=register, disc=disc, deep=deep_mm or _DEEP * disc)
     deep = deep_mm or _DEEP * disc
@@ -287,7 +293,14 @@ class _Sides:
 
 
 def _against_points(
-    new: PointCloud, surface: ReferencePoints, datums: np.ndarray | None, *, register: bool, disc: float, deep: float
+    new: PointCloud,
+    surface: ReferencePoints,
+    datums: np.ndarray | None,
+    *,
+    register: bool,
+    disc: float,
+    deep: float,
+    same_water: bool,
 ) -> _Sides:
     points, known, other, found = new.points_mm, new.uncertainty, surface.uncertainty, None
     if register:
@@ -308,6 +321,9 @@ def _against_points(
     )
     # A mesh is what it is: between its samples nothing scatters.
     variance = here.variance_mm2 + (0.0 if surface.meshed else there.variance_mm2)
+    variance += np.sum(here.patterns_mm**2, axis=1) + np.sum(there.patterns_mm**2, axis=1)
+    if known is not None and other is not None:
+        variance -= 2 * _common(here.patterns_mm, known, there.patterns_mm, other, same_water=same_water)
     words = "mesh" if surface.meshed else "cloud"
     return _Sides(places, normals, here.mean_mm - there.mean_mm, variance, found, found, words)
 
@@ -346,7 +362,19 @@ def _against_shape(
         disc_mm=disc,
         deep_mm=deep,
     )
-    return _Sides(places, normals, here.mean_mm, here.variance_mm2, found, moved, placed.words())
+    variance = here.variance_mm2 + np.sum(here.patterns_mm**2, axis=1)
+    return _Sides(places, normals, here.mean_mm, variance, found, moved, placed.words())
+
+
+def _common(
+    here: np.ndarray, known: PointUncertainty, there: np.ndarray, other: PointUncertainty, *, same_water: bool
+) -> np.ndarray:
+    """Covariance (P,) of the means of two clouds by what both share, from the moves (P, M) by the patterns of each."""
+    result = np.zeros(len(here))
+    for name in known.shared.keys() & other.shared.keys():
+        if same_water or not name.startswith(WATER):
+            result += np.sum((here @ known.shared[name]) * (there @ other.shared[name]), axis=1)
+    return result
 
 
 def _areas(places: np.ndarray) -> np.ndarray:
@@ -387,4 +415,5 @@ def _moved(
     followed = [found.moves_mm(step, points) for step in found.by_cloud]
     patterns = patterns + np.array(followed, np.float32).reshape(patterns.shape)
     poses = None if known.poses_mm is None else known.poses_mm @ rotation.T
-    return points, PointUncertainty(pairs, known.position_mm @ rotation.T, patterns.astype(np.float32), poses)
+    position = known.position_mm @ rotation.T
+    return points, PointUncertainty(pairs, position, patterns.astype(np.float32), poses, known.shared)

@@ -243,7 +243,7 @@ class JointRegistration:
             std = found.std_mm * spread
             u = np.clip(found.distance_mm / std / _TUKEY, -1, 1)
             # Both directions count by half, and K scans of one place have K (K - 1) / 2 pairs and K - 1 differences.
-            each = 1 / (others[source][found.source] * self.patches[source].shared)
+            each = 1 / (others[source][found.source] * self.patches[source].alike(len(found.source)))
             weight = (1 - u * u) ** 2 / std**2 * each
             block = np.zeros((len(weight), unknown))
             for number, rows, sign in ((source, found.source, 1.0), (target, found.target, -1.0)):

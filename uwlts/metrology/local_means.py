@@ -23,10 +23,14 @@ _PAIRS_AT_A_TIME = 2_000_000
 
 
 class LocalMeans(NamedTuple):
-    """Mean (P,) of the points at P places along the normal, NaN where there are too few, and its variance (P,)."""
+    """Mean (P,) of the points at P places along the normal, NaN where there are too few, and its variance (P,).
+
+    The variance is without that by the patterns that all points share, which move the mean by ``patterns_mm`` (P, M).
+    """
 
     mean_mm: np.ndarray
     variance_mm2: np.ndarray
+    patterns_mm: np.ndarray
 
 
 def local_means(
@@ -43,13 +47,14 @@ def local_means(
     """Average points (N, 3) within discs across normals (P, 3) at places (P, 3).
 
     What is averaged are the points' distances from the place along its normal, or ``distance_mm`` (N,) from a reference
-    that is known everywhere. The variance is by the points' noise, or by their scatter where that is larger, over their
-    number, and more where the points of an image err together; by the position of each image; and by what all share.
+    that is known everywhere. The variance is by the points' noise and the position of each image, or by the points'
+    scatter, more where those of an image err together, where that is larger.
     A scatter from n points counts as much more as Student's t of n - 1 degrees of freedom is wider than the normal
     distribution.
     """
     count, mean, rough, stated, other = (np.zeros(len(places)) for _ in range(5))
     together, alone = np.zeros(len(places)), np.zeros(len(places))
+    patterns = np.zeros((len(places), 0 if uncertainty is None else len(uncertainty.patterns_mm)))
     radius = float(np.hypot(disc_mm / 2, deep_mm))
     for place, point in _neighbours(KDTree(points), places, radius):
         away = points[point] - places[place]
@@ -71,11 +76,12 @@ def local_means(
             sums, expected = _of_images(place, frame[point], off, scatter, number)
             together[here], alone[here] = sums[here], expected[here]
         if uncertainty is not None:
-            single, shared = _stated(place, point, normals, uncertainty, frame, number)
-            stated[here], other[here] = single[here], shared[here]
-    variance = _neighbours_share(together, alone, count) * np.maximum(rough, stated) + other
+            single, images, shared = _stated(place, point, normals, uncertainty, frame, number)
+            stated[here], other[here], patterns[here] = single[here], images[here], shared[here]
+    # The scatter of whole images is part of what is seen.
+    variance = np.maximum(_neighbours_share(together, alone, count) * rough, stated + other)
     mean[count < FEWEST] = np.nan
-    return LocalMeans(mean, variance)
+    return LocalMeans(mean, variance, patterns)
 
 
 def _wider(number: np.ndarray) -> np.ndarray:
@@ -104,8 +110,8 @@ def _stated(
     known: PointUncertainty,
     frame: np.ndarray | None,
     number: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Variances (P,) of the mean of each place's points along the normal: of single points; of images and patterns."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Variances (P,) of each place's mean by single points and by images, and its moves (P, M) by patterns."""
     size, normal, many = len(number), normals[place], np.maximum(number, 1)
     single = np.bincount(place, variance_along(known.random_mm2[point], normal), minlength=size) / many**2
     image = np.arange(len(point)) if frame is None else frame[point].astype(np.int64)
@@ -116,10 +122,11 @@ def _stated(
         moved = np.einsum("ni,ni->n", part[point], normal)
         together = np.bincount(owner.ravel(), moved / many[place])
         result += np.bincount(group[:, 0], together**2, minlength=size)
-    for pattern in known.patterns_mm:
+    moves = np.zeros((size, len(known.patterns_mm)))
+    for number_of, pattern in enumerate(known.patterns_mm):
         along = np.einsum("ni,ni->n", pattern[point], normal)
-        result += (np.bincount(place, along, minlength=size) / many) ** 2
-    return single, result
+        moves[:, number_of] = np.bincount(place, along, minlength=size) / many
+    return single, result, moves
 
 
 def _of_images(

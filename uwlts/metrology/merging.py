@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from uwlts.metrology.joint_registration import JointRegistration
-from uwlts.storage.cloud import NO_INDEX, PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, NO_INDEX, PAIRS, PointCloud, PointUncertainty
 
 _BLOCK = 50_000
 _LEFT_OUT = 1e-4
@@ -117,7 +117,7 @@ def _metadata(scans: Sequence[PointCloud], names: Sequence[str], joint: JointReg
     shared = {
         key: value
         for key, value in scans[0].metadata.items()
-        if all(scan.metadata.get(key) == value for scan in scans[1:])
+        if key not in (FOOTPRINT, FOOTPRINT_STD) and all(scan.metadata.get(key) == value for scan in scans[1:])
     }
     listed = [
         {"name": name, "first_frame": first, "pose": pose.tolist()}

@@ -60,6 +60,10 @@ class Patches:
         Number of patches that each point is part of: neighbouring patches are not independent.
     one_sided : bool
         All normals look to -Z, where the sensor was; else their signs have no meaning.
+    by_images : float
+        Share of the usual patch's variance that the errors of images make, which patches along an image have in common.
+    strips : float
+        Into how many strips of that kind, as wide as a patch, the cloud's images fall.
     """
 
     places_mm: np.ndarray
@@ -71,6 +75,13 @@ class Patches:
     radius_mm: float
     shared: float
     one_sided: bool
+    by_images: float = 0.0
+    strips: float = 1.0
+
+    def alike(self, count: int) -> float:
+        """Of how many patches as one, so many of them tell, all over the images."""
+        along = max(count / self.strips, self.shared)
+        return (1 - self.by_images) * self.shared + self.by_images * along
 
     def __len__(self) -> int:
         return len(self.places_mm)
@@ -96,15 +107,23 @@ class Patches:
             self.radius_mm,
             self.shared,
             self.one_sided,
+            self.by_images,
+            self.strips,
         )
 
 
 def surface_patches(
-    points_mm: np.ndarray, uncertainty: PointUncertainty | None = None, *, radius_mm: float | None = None
+    points_mm: np.ndarray,
+    uncertainty: PointUncertainty | None = None,
+    *,
+    frame: np.ndarray | None = None,
+    radius_mm: float | None = None,
 ) -> Patches:
-    """Patches of the surface that points (N, 3) lie on.
+    """Patches of the surface that points (N, 3) lie on, of images (N,) where these are known.
 
-    The radius of the discs is the smallest that holds enough points on both sides of every profile, unless given.
+    The radius of the discs is the smallest that holds enough points on both sides of every profile, unless given. What
+    moves all points of an image together (`PointUncertainty.poses_mm`) is averaged over the images of a disc alone, and
+    is common to all patches along an image.
 
     Raises
     ------
@@ -143,6 +162,14 @@ def surface_patches(
         variance = np.maximum(variance, _along(uncertainty, points_mm, owner, middle, axes[:, 2]) / radius**2)
     variance = np.maximum(variance, typical)
     covariance = variance[:, None, None] * inverse
+    shared, share, strips = max(float(weight.sum() / counts.sum()), 1.0), 0.0, 1.0
+    if uncertainty is not None and uncertainty.poses_mm is not None and frame is not None:
+        first = _first_points(owner)
+        by_image, images = _by_images(uncertainty.poses_mm, frame, first[middle], first[near], held, axes[:, 2])
+        own, moved = covariance[:, 0, 0], by_image / radius**2 / images
+        share = float(np.median(moved) / (np.median(moved) + np.median(own)))
+        strips = max(len(np.unique(frame)) / float(np.median(images)), 1.0)
+        covariance[:, 0, 0] = own + moved
     units = radius ** np.array([1.0, 0, 0, -1, -1, -1])
     places, axes, shape = _levelled(means[middle], axes, shape * units)
     flipped = axes[:, 2, 2] > 0
@@ -154,11 +181,8 @@ def surface_patches(
     shape = shape * signs
     covariance = covariance * np.outer(units, units) * signs[:, :, None] * signs[:, None]
     patterns = _patch_patterns(uncertainty, owner, middle, len(counts))
-    first = np.zeros(len(means), np.int64)
-    first[owner[::-1]] = np.arange(len(points_mm))[::-1]
-    shared = float(weight.sum() / counts.sum())
-    parts = (places, axes, shape, covariance, patterns, first[middle])
-    patches = Patches(*parts, radius, max(shared, 1.0), one_sided)
+    parts = (places, axes, shape, covariance, patterns, _first_points(owner)[middle])
+    patches = Patches(*parts, radius, shared, one_sided, share, strips)
     chosen = np.flatnonzero(kept)
     return patches[chosen[:: max(1, -(-len(chosen) // _MOST))]]
 
@@ -315,14 +339,28 @@ def _along(
     known: PointUncertainty, points: np.ndarray, owner: np.ndarray, middle: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
     """Stated variance (P,) of one point along the normals of patches: single points, and images."""
-    first = np.zeros(int(owner.max()) + 1, np.int64)
-    first[owner] = np.arange(len(points))
-    at = first[middle]
+    at = _first_points(owner)[middle]
     pairs = known.random_mm2[at]
     variance = np.einsum("pi,pi->p", known.position_mm[at], normals) ** 2
     for column, (i, j) in enumerate(PAIRS):
         variance += (1 if i == j else 2) * pairs[:, column] * normals[:, i] * normals[:, j]
     return variance
+
+
+def _first_points(owner: np.ndarray) -> np.ndarray:
+    """Number of the first point in each cube, by the cubes (N,) of the points."""
+    first = np.zeros(int(owner.max()) + 1, np.int64)
+    first[owner[::-1]] = np.arange(len(owner))[::-1]
+    return first
+
+
+def _by_images(
+    poses_mm: np.ndarray, frame: np.ndarray, at: np.ndarray, near: np.ndarray, held: np.ndarray, normals: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Variance (P,) along normals by the pose of an image, and the number of images (P,) in each patch."""
+    variance = np.sum(np.einsum("kpi,pi->kp", poses_mm[:, at], normals) ** 2, axis=0)
+    images = np.sort(np.where(held, frame[near], frame[at][:, None]), axis=1)
+    return variance, 1 + np.count_nonzero(np.diff(images, axis=1), axis=1)
 
 
 def _patch_patterns(known: PointUncertainty | None, owner: np.ndarray, middle: np.ndarray, cells: int) -> np.ndarray:

@@ -25,6 +25,9 @@ _SECTORS = 72
 """Sectors of 5 deg, as of a pipe standard (`uwlts.metrology.artefacts`)."""
 _LEAST_ARC = np.pi
 """Arc from which the ovality is known: of less a shift of the axis passes for it."""
+_MOST_OVALITY = 0.02
+"""Of the diameter: the largest out of roundness that a pipe may have where it cannot be seen (ISO 3183, Table 10). Up
+to that all are as likely, and all directions (JCGM 100:2008, 4.3.7)."""
 _WHOLE_ARC = np.radians(300.0)
 """Arc from which the third and fourth harmonics are fitted too, so that they do not pass for others."""
 _FEWEST_OF_SECTION = 60
@@ -179,9 +182,11 @@ def pipe_features(cloud: PointCloud, form: PipeForm, *, section_mm: float | None
         middle = form.point_mm + 0.5 * (start + end) * form.axes[2]
         if "sin" in terms:
             middle = middle + coefficients[1] * form.axes[0] + coefficients[2] * form.axes[1]
-        part = errors[inside]
-        left = raw[own] - design @ coefficients
-        values = _section_values(form, part, weights, coefficients, terms, left)
+        if "sin" in terms:
+            left = raw[own] - design @ coefficients
+            values = _section_values(form, errors[inside], weights, coefficients, terms, left)
+        else:
+            values = (_diameter_of_arc(form, errors, inside, weights[0], float(coefficients[0])),)
         size = np.array([extent[0], extent[1], end - start])
         features.append(Feature(FeatureKind.SECTION, f"section {number}", values, middle, form.axes, size, own))
     return features
@@ -190,6 +195,9 @@ def pipe_features(cloud: PointCloud, form: PipeForm, *, section_mm: float | None
 def _values(form: PipeForm, errors: NormalErrors) -> tuple[FeatureValue, ...]:
     kind, used, coefficients, diameter = FeatureKind.PIPE, form.used, form.coefficients, 2 * form.radius_mm
     random, common = errors.covariances(form.weights, form.distance_mm[used], _groups(form, used))
+    if not form.is_seen_round:
+        by_ovality = form.weights @ _unseen_ovality(form, used)
+        common = by_ovality @ by_ovality.T + (0.0 if common is None else common)
     place = {term: k for k, term in enumerate(form.terms)}
 
     def covariances(*terms: str, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray | None]:
@@ -258,6 +266,33 @@ def _section_values(
         angle = 0.5 * float(np.degrees(np.arctan2(vector[1], vector[0])))
         values.append(plain_value(kind, "ovality angle", angle, stds[0] or 0.0, stds[1]))
     return tuple(values)
+
+
+def _diameter_of_arc(
+    form: PipeForm, errors: NormalErrors, inside: np.ndarray, weights: np.ndarray, off: float
+) -> FeatureValue:
+    """Diameter of a section of which an arc was seen, whose middle is where the whole pipe's axis puts it.
+
+    Of the points used (U,) those ``inside`` (U,) bool are the section's, with ``weights`` (K,) in its distance ``off``
+    from the pipe.
+    """
+    moved = [form.terms.index(term) for term in ("cos", "sin", "along cos", "along sin")]
+    own = form.used[inside]
+    by_axis = weights @ _design(form.along_mm[own], form.angle[own], form.scale_mm, form.terms)[:, moved]
+    whole = -by_axis @ form.weights[moved]
+    whole[inside] += weights
+    random, common = errors.covariances(whole[None], form.distance_mm[form.used], _groups(form, form.used))
+    by_ovality = whole @ _unseen_ovality(form, form.used)
+    variance = float(by_ovality @ by_ovality) + (0.0 if common is None else float(common[0, 0]))
+    std = 2 * float(np.sqrt(random[0, 0])), 2 * float(np.sqrt(variance))
+    return plain_value(FeatureKind.SECTION, "diameter", 2 * (form.radius_mm + off), *std)
+
+
+def _unseen_ovality(form: PipeForm, points: np.ndarray) -> np.ndarray:
+    """How the radii of points (N, 2) move by one standard deviation of each part of an ovality that was not seen."""
+    # A fourth of the ovality is the amplitude; its square has a third of the largest one's, in each part half of it.
+    std = 2 * form.radius_mm * _MOST_OVALITY / 4 / np.sqrt(6.0)
+    return std * np.column_stack([np.cos(2 * form.angle[points]), np.sin(2 * form.angle[points])])
 
 
 def _groups(form: PipeForm, used: np.ndarray) -> np.ndarray:

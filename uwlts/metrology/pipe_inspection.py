@@ -11,6 +11,7 @@ from uwlts.metrology.blemishes import Blemish, measure_blemish
 from uwlts.metrology.features import Feature, FeatureKind, Inspection
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.metrology.pipe_form import MOST_OFF_SHARE, PipeForm, fit_pipe, pipe_features
+from uwlts.metrology.point_spacing import footprint_on
 from uwlts.metrology.propagation import normal_errors
 from uwlts.model.errors import EvaluationError
 from uwlts.storage.cloud import PointCloud
@@ -118,7 +119,10 @@ def _unrolled(cloud: PointCloud, form: PipeForm, seam: _Seam) -> UnrolledSurface
     heights = form.distance_mm[seam.points]
     spread = max(MAD_TO_STD * float(np.median(np.abs(heights - np.median(heights)))), 1e-9)
     std = errors.single_mm if np.all(errors.single_mm > 0) else np.full(len(heights), spread)
-    return UnrolledSurface(np.column_stack([form.along_mm[seam.points], form.radius_mm * angle]), heights, std)
+    axis = np.broadcast_to(form.axes[2], (len(seam.points), 3))
+    tangents = np.stack([axis, np.cross(axis, form.outwards[seam.points])], axis=1)
+    places = np.column_stack([form.along_mm[seam.points], form.radius_mm * angle])
+    return UnrolledSurface(places, heights, std, *footprint_on(cloud, seam.points, tangents))
 
 
 def _blemish_features(
@@ -157,8 +161,8 @@ def _notes(cloud: PointCloud, form: PipeForm, search: BlemishSearch, false_alarm
     if not form.is_seen_round:
         seen = np.degrees(form.arc)
         notes.append(
-            f"{seen:.0f} deg of the circumference were seen: the ovality is not determined, and the diameter is that "
-            "of this arc"
+            f"{seen:.0f} deg of the circumference were seen: the ovality is not determined, and what it may do to the "
+            "diameter is in its interval"
         )
     level = float(np.nanmedian(search.level_mm)) if np.isfinite(search.level_mm).any() else np.nan
     notes.append(

@@ -1,14 +1,18 @@
-"""Spacing of a cloud's points, which lie dense along a stripe and sparse from image to image."""
+"""Spacing of a cloud's points, which lie dense along a stripe and sparse from image to image, and their footprint."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.spatial import KDTree
 
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
+
 POINTS_PER_DISC = 30
 """Points of a disc over which they are averaged: their mean's noise is a fifth of theirs."""
 _IMAGES_PER_DISC = 3.0
 _SAMPLED, _ASKED = 2000, 64
+_STEEPEST = 0.3
+"""Least cosine of a surface towards the laser: on steeper ones a footprint counts as no longer."""
 
 
 def disc_of(points_mm: np.ndarray, frame: np.ndarray | None = None) -> float:
@@ -30,3 +34,21 @@ def _between_images(points_mm: np.ndarray, frame: np.ndarray) -> float:
     sample = sample[:: max(1, len(sample) // _ASKED)]
     least = [np.linalg.norm(points_mm[frame != frame[k]] - points_mm[k], axis=1).min() for k in sample]
     return float(np.median(least))
+
+
+def footprint_on(cloud: PointCloud, chosen: np.ndarray, tangents: np.ndarray) -> tuple[np.ndarray, float]:
+    """Standard deviations (K, 2) of the footprints of chosen (K,) points along tangents (K, 2, 3) of the surface, mm.
+
+    And the relative standard uncertainty of their squares. Zeros where the cloud does not state a footprint, as it is
+    for clouds of moved sensors and of other programs.
+    """
+    known = cloud.metadata.get(FOOTPRINT)
+    if not (isinstance(known, list) and len(known) == 2 and all(isinstance(each, float) for each in known)):
+        return np.zeros((len(chosen), 2)), 0.0
+    size, std = np.array(known, float), cloud.metadata.get(FOOTPRINT_STD)
+    # The laser's light comes along Z: what it covers across it, X and Y, is longer on a surface that leans.
+    flat = tangents[:, :, :2]
+    leaning = np.abs(flat[:, 0, 0] * flat[:, 1, 1] - flat[:, 0, 1] * flat[:, 1, 0])
+    inverse = np.stack([flat[:, 1, ::-1] * [1, -1], flat[:, 0, ::-1] * [-1, 1]], axis=1)
+    spread = np.linalg.norm(inverse * size, axis=2) / np.maximum(leaning, _STEEPEST)[:, None]
+    return spread, float(std) if isinstance(std, float) else 0.0

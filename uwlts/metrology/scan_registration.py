@@ -211,7 +211,7 @@ def register(
     patches = []
     for number, (name, scan) in enumerate(zip(names, scans, strict=True)):
         try:
-            patches.append(surface_patches(scan.points_mm, scan.uncertainty))
+            patches.append(surface_patches(scan.points_mm, scan.uncertainty, frame=scan.frame))
         except EvaluationError as error:
             raise EvaluationError(f"{name}: {error}") from error
         progress(number + 1, steps)

@@ -426,7 +426,7 @@ class _Alignment:
         a, b = pair
         found = distances_between(self.moved(b), np.eye(4), self.moved(a), np.eye(4), reach_mm=self._reach())
         fits = np.abs(found.distance_mm) < 5 * found.std_mm
-        return np.count_nonzero(fits) >= _FEWEST and bool(np.mean(fits) > _SHARE)
+        return bool(np.count_nonzero(fits) >= _FEWEST and np.mean(fits) > _SHARE)
 
     def settle(self) -> None:
         """Estimate the path and the shares of its drift by turns; pairs that do not agree then are given up."""

@@ -1,13 +1,14 @@
 """Inspection of a weld bead between two plates, by the quantities of ISO 5817.
 
-Heights are over the line between both plates. In each section across the weld they are local quadratics over the width,
-sums over the points, so that the points' errors run through to every value: by each pattern that all points share, and
-by noise drawn anew (GUM Supplement 1, JCGM 101:2008).
+Heights are over the line between both plates. In each section across the weld they are local quadratics over the width;
+what these and the footprint of each point smooth is put back (twicing, as of blemishes). All are sums over the points,
+so that the points' errors run through to every value: by each pattern that all points share, and by noise drawn anew
+(GUM Supplement 1, JCGM 101:2008).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from uwlts.metrology.evaluation import TOWARDS_SENSOR
 from uwlts.metrology.features import Feature, FeatureKind, FeatureValue, Inspection
 from uwlts.metrology.fits import fit_plane
 from uwlts.metrology.least_squares import MAD_TO_STD, evenly_thinned, fit_robustly, principal_axes
+from uwlts.metrology.point_spacing import footprint_on
 from uwlts.metrology.propagation import NormalErrors, normal_errors, plain_value
 from uwlts.model.errors import EvaluationError
 from uwlts.storage.cloud import PointCloud
@@ -51,6 +53,7 @@ _WHOLE_SHARE = 0.7
 _SIGNIFICANT = 4.0
 """Standard deviations of the plates' points that a bead must stand out."""
 _TUKEY = 4.685
+_NOTHING = 1e-9
 
 
 def inspect_weld(cloud: PointCloud, *, section_mm: float | None = None) -> Inspection:
@@ -82,18 +85,32 @@ class _Profiles:
     """Heights over the plates on a grid across each section, as sums over the points.
 
     ``smooth`` (S G, n) are local quadratics of the points, ``plates`` two pairs: what a plate's level, slope along and
-    slope across (3,) add to the reference in each cell (S G, 3), and their own sums over the points (3, n).
+    slope across (3,) add to the reference at each point (n, 3), and their own sums over the points (3, n). ``seen``
+    (n, S G) is what points of their footprint see of profiles, ``sharp`` (n, S G) what points without one would.
     """
 
     across_mm: np.ndarray
     sections: int
     smooth: sparse.csr_array
     plates: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+    seen: sparse.csr_array
+    sharp: sparse.csr_array
 
-    def of(self, heights: np.ndarray) -> np.ndarray:
-        """Profiles (S, G) for heights (n,) of the points."""
-        reference = sum(base @ (rows @ heights) for base, rows in self.plates)
-        return (self.smooth @ heights - reference).reshape(self.sections, len(self.across_mm))
+    def of(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
+        """Profiles (S, G) for heights (n,) of the points.
+
+        What smoothing hides is put back in so many ``steps``, with a ``share`` of what the footprint makes of that.
+        """
+        left = heights - sum(base @ (rows @ heights) for base, rows in self.plates)
+        profiles = self.smooth @ left
+        known = np.isfinite(profiles)
+        # Beside lost lines nothing can be put back.
+        whole = abs(self.seen) @ ~known < _NOTHING
+        for _ in range(steps):
+            filled = np.where(known, profiles, 0.0)
+            there = share * (self.seen @ filled) + (1 - share) * (self.sharp @ filled)
+            profiles = profiles + self.smooth @ np.where(whole, left - there, 0.0)
+        return profiles.reshape(self.sections, len(self.across_mm))
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,8 +119,8 @@ class _Bead:
 
     ``axes`` (3, 3) are along, across and outwards, ``chosen`` (n,) the points on and beside the bead, ``raw_mm`` (n,)
     their heights over the middle, ``heights_mm`` (n,) those over the plates, ``half_mm`` about half of its width and
-    ``noise_mm`` the standard deviation of a point that gives local means their scatter; ``wider`` are profiles by wider
-    local quadratics.
+    ``noise_mm`` the standard deviation of a point that gives local means their scatter; ``footprint_std`` is the
+    relative standard uncertainty of the points' squared footprint.
     """
 
     axes: np.ndarray
@@ -116,7 +133,7 @@ class _Bead:
     length_mm: float
     noise_mm: float
     profiles: _Profiles
-    wider: _Profiles
+    footprint_std: float
 
 
 def _bead_of(cloud: PointCloud, section_mm: float | None) -> _Bead:
@@ -145,17 +162,21 @@ def _bead_of(cloud: PointCloud, section_mm: float | None) -> _Bead:
     edge = half * (1 + 2 * _BEYOND_SHARE) + bandwidth
     grid = np.linspace(-edge, edge, int(np.ceil(6 * edge / bandwidth)) + 1)
     smooth = _profile_rows(across, section, count, grid, bandwidth)
-    centres = along.min() + (np.arange(count) + 0.5) * length / count
-    cells = np.column_stack([np.ones(count * len(grid)), np.repeat(centres, len(grid)), np.tile(grid, count)])
-    part = np.clip((cells[:, 2:] + half) / (2 * half), 0, 1)
-    profiles = _Profiles(grid, count, smooth, ((cells * (1 - part), rows[0]), (cells * part, rows[1])))
-    wider = replace(profiles, smooth=_profile_rows(across, section, count, grid, np.sqrt(2) * bandwidth))
-    beside = np.abs(cells[:, 2]) > half * (1 + _BEYOND_SHARE)
-    means = profiles.of(raw).ravel()[beside]
+    part = share[:, None]
+    plates = (design * (1 - part), rows[0]), (design * part, rows[1])
+    size, footprint_std = footprint_on(cloud, chosen, np.broadcast_to(axes[:2], (len(chosen), 2, 3)))
+    sharp = _interpolation(across, section, count, grid)
+    parts = [
+        weight * _interpolation(across + node * size[:, 1], section, count, grid)
+        for node, weight in ((-np.sqrt(3.0), 1 / 6), (0.0, 2 / 3), (np.sqrt(3.0), 1 / 6))
+    ]
+    profiles = _Profiles(grid, count, smooth, plates, sparse.csr_array(sum(parts[1:], parts[0])), sharp)
+    beside = np.abs(np.tile(grid, count)) > half * (1 + _BEYOND_SHARE)
+    means = profiles.of(raw, steps=0).ravel()[beside]
     expected = np.sqrt(np.asarray(smooth.power(2).sum(axis=1)).ravel()[beside])
     seen = MAD_TO_STD * float(np.nanmedian(np.abs(means) / expected))
     on_bead = np.abs(across) < half
-    return _Bead(axes, middle, chosen, raw, heights, on_bead, half, length, seen, profiles, wider)
+    return _Bead(axes, middle, chosen, raw, heights, on_bead, half, length, seen, profiles, footprint_std)
 
 
 def _found(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
@@ -223,6 +244,18 @@ def _profile_rows(
     return sparse.csr_array(parts, shape=(count * len(grid), len(across)))
 
 
+def _interpolation(across: np.ndarray, section: np.ndarray, count: int, grid: np.ndarray) -> sparse.csr_array:
+    """Rows (n, S G) of values on the grid at places (n,) in sections, exact for quadratics (Keys 1981, Eq. 15)."""
+    cell = (across - grid[0]) / (grid[1] - grid[0])
+    at = np.floor(cell).astype(int)[:, None] + np.arange(-1, 3)
+    away = np.abs(cell[:, None] - at)
+    weight = np.where(away <= 1, (1.5 * away - 2.5) * away**2 + 1, ((-0.5 * away + 2.5) * away - 4) * away + 2)
+    weight = np.where((at >= 0) & (at < len(grid)), weight, 0.0)
+    columns = section[:, None] * len(grid) + np.clip(at, 0, len(grid) - 1)
+    rows = np.repeat(np.arange(len(across)), 4)
+    return sparse.csr_array((weight.ravel(), (rows, columns.ravel())), shape=(len(across), count * len(grid)))
+
+
 def _quadratic_row(u: np.ndarray) -> np.ndarray | None:
     if len(u) < 5 or u.min() > -0.2 or u.max() < 0.2:
         return None
@@ -258,9 +291,10 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
     # The extreme of a noisy profile is too far out, by about as much as with as much noise again.
     extremes = ["undercut" in name or "height" in name for name in _NAMES]
     bias[extremes] = np.maximum(np.nanmean(drawn, axis=0)[extremes], 0)
-    # Wider local quadratics show what these blur.
-    blur = _figures(replace(bead, profiles=bead.wider), bead.raw_mm, whole, toes) - seen
-    random = np.sqrt(random**2 + bias**2 + np.nan_to_num(blur) ** 2)
+    # What smoothing may still hide: as much as once more would put back, and what hangs on the footprint's size.
+    resolution = [bead.profiles.of(bead.raw_mm, steps=2), bead.profiles.of(bead.raw_mm, share=1 - bead.footprint_std)]
+    resolved = np.nan_to_num([_figures_of(bead, each, bead.raw_mm, whole, toes) - seen for each in resolution])
+    random = np.sqrt(random**2 + bias**2 + np.sum(resolved**2, axis=0))
     plain = np.where(extremes, np.maximum(seen - bias, 0), seen)
     common = None
     if errors.patterns_mm is not None:
@@ -289,11 +323,16 @@ def _toes_and_slopes(bead: _Bead, profiles: np.ndarray, whole: np.ndarray) -> np
 
 
 def _figures(bead: _Bead, raw: np.ndarray, whole: np.ndarray, toes: np.ndarray) -> np.ndarray:
-    """Values in the order of `_NAMES` for heights (n,) of the points.
+    """Values in the order of `_NAMES` for heights (n,) of the points."""
+    return _figures_of(bead, bead.profiles.of(raw), raw, whole, toes)
+
+
+def _figures_of(bead: _Bead, profiles: np.ndarray, raw: np.ndarray, whole: np.ndarray, toes: np.ndarray) -> np.ndarray:
+    """Values in the order of `_NAMES` for profiles (S, G) and heights (n,) of the points.
 
     Of the sections ``whole`` (W,); undercuts are looked for beyond the ``toes`` (W, 2).
     """
-    profiles, grid = bead.profiles.of(raw), bead.profiles.across_mm
+    grid = bead.profiles.across_mm
     tops, flanks = _tops(bead, profiles), _toes_and_slopes(bead, profiles, whole)
     width = float(np.nanmedian(flanks[:, 1] - flanks[:, 0]))
     angles = 180 - np.degrees(np.arctan(np.nanmedian(flanks[:, 2:], axis=0)))

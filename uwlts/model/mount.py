@@ -56,6 +56,16 @@ class PlaneFound(Description):
     distance_mm: float
 
 
+class StepFound(Description):
+    """The step: its face at smaller z of the profiles as `PlaneFound`, and how far along the normal the other lies."""
+
+    kind: Literal["step"] = "step"
+    normal: Vector
+    distance_mm: float
+    height_mm: float
+    height_std_mm: NotNegative | None = None
+
+
 class BoardFound(Description):
     """The target: ``T_base_target`` (4, 4), mm."""
 
@@ -93,7 +103,7 @@ class Mount(Description):
     T_platform_sensor: Rows
     covariance: Rows
     coverage_factor: Positive
-    artefact: Annotated[SphereFound | PlaneFound | BoardFound, Field(discriminator="kind")]
+    artefact: Annotated[SphereFound | PlaneFound | StepFound | BoardFound, Field(discriminator="kind")]
     robot_scale: Positive | None = None
     robot_scale_std: NotNegative | None = None
     time_offset_s: float | None = None

@@ -10,6 +10,7 @@ blur moves light from one line to the next and with it the centre that is seen t
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -45,6 +46,10 @@ _LEAST_ACROSS = 0.3
 _TABLE_TOLERANCE = 1e-6
 """Error of the tabulated shift per slope, mm^2, and of the largest thickness over the described one, per px."""
 
+_MOST_FOR_FOOTPRINT = 1000
+_PIXEL_VARIANCE = 1.0 / 12.0
+"""Of a pixel's own width, px2: an image is blurred at least by that."""
+
 _MOVED_MM, _MOVED_PX = 0.05, 0.5
 """Steps of sheet and pixel for the derivatives of the points: some sigma of the sheet, within one pixel."""
 
@@ -71,24 +76,12 @@ def beside_sheet(
     across = float(np.array(calibration.sheet.normal) @ frame[:3, :3] @ direction)
     if abs(across) < _LEAST_ACROSS or not slopes.any():
         return np.zeros((len(slopes), 3))
-    sheet = calibration.sheet
-    window = calibration.window if sensor.camera.window.mounted else None
-
-    def points(line: np.ndarray, place_px: np.ndarray, further_mm: float = 0.0) -> np.ndarray:
-        shifted = sheet.model_copy(update={"offset_mm": sheet.offset_mm + further_mm})
-        moved = calibration.model_copy(update={"sheet": shifted, "window": window})
-        pixels = pixels_of(line, place_px, stripe_along=calibration.stripe_along)
-        return reconstruct_pixels(
-            moved, pixels, medium_index=medium_index, stage_mm=0.0, stage_direction=direction
-        ).points_mm
+    on_sheet = _on_sheet(calibration, sensor, medium_index=medium_index)
 
     def exact(line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
-        here = points(line, place_px)
-        per_mm = (points(line, place_px, _MOVED_MM) - here) / _MOVED_MM
-        per_px = (points(line, place_px + _MOVED_PX) - here) / _MOVED_PX
-        in_camera = here @ frame[:3, :3].T + frame[:3, 3]
-        away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
-        sigma = sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
+        values = on_sheet(line, place_px)
+        sigma = _sigma_at(values[:, :3], calibration, sensor, medium_index=medium_index)
+        per_mm, per_px = values[:, 3:6], values[:, 6:]
         return np.column_stack([per_mm * (sigma**2)[:, None], per_px[:, 2] / (per_mm[:, 2] * sigma)])
 
     table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE)
@@ -97,6 +90,64 @@ def beside_sheet(
     # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
     thickest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA * values[:, 3]
     return values[:, :3] * (slopes / across * np.minimum(1.0, thickest**2))[:, None]
+
+
+def footprint_mm(
+    calibration: Calibration,
+    sensor: Sensor,
+    line: np.ndarray,
+    centre_px: np.ndarray,
+    width_px: np.ndarray,
+    *,
+    medium_index: float,
+) -> tuple[float, float]:
+    """Standard deviations of the part of a surface square to the laser that a point is the mean of, mm.
+
+    Across the sheet (X) that of its thickness, and along the stripe (Y) that of the image's blur, which is what the
+    sheet leaves of the stripe's width; medians over the stripe centres (N,).
+    """
+    chosen = np.flatnonzero(np.isfinite(width_px))
+    chosen = chosen[:: max(1, len(chosen) // _MOST_FOR_FOOTPRINT)]
+    exact = _on_sheet(calibration, sensor, medium_index=medium_index)
+    values, beside = exact(line[chosen], centre_px[chosen]), exact(line[chosen] + 1.0, centre_px[chosen])
+    # Where the surface is square to the laser's axis, Z stays.
+    per_mm, per_px = np.abs(values[:, 5]), np.abs(values[:, 8])
+    width = width_px[chosen] / FWHM_PER_SIGMA
+    sigma = np.minimum(
+        _sigma_at(values[:, :3], calibration, sensor, medium_index=medium_index), width * per_px / per_mm
+    )
+    blur = np.sqrt(np.maximum(width**2 - (sigma * per_mm / per_px) ** 2, _PIXEL_VARIANCE))
+    return float(np.median(sigma)), float(np.median(blur * np.abs(beside[:, 1] - values[:, 1])))
+
+
+def _on_sheet(
+    calibration: Calibration, sensor: Sensor, *, medium_index: float
+) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """Points on the sheet, OCS, and their derivatives by a shift of the sheet, mm, and by the pixel across: (N, 9)."""
+    sheet = calibration.sheet
+    window = calibration.window if sensor.camera.window.mounted else None
+
+    def points(line: np.ndarray, place_px: np.ndarray, further_mm: float = 0.0) -> np.ndarray:
+        shifted = sheet.model_copy(update={"offset_mm": sheet.offset_mm + further_mm})
+        moved = calibration.model_copy(update={"sheet": shifted, "window": window})
+        pixels = pixels_of(line, place_px, stripe_along=calibration.stripe_along)
+        at_start = {"stage_mm": 0.0, "stage_direction": np.array([1.0, 0.0, 0.0])}
+        return reconstruct_pixels(moved, pixels, medium_index=medium_index, **at_start).points_mm
+
+    def exact(line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
+        here = points(line, place_px)
+        per_mm = (points(line, place_px, _MOVED_MM) - here) / _MOVED_MM
+        return np.hstack([here, per_mm, (points(line, place_px + _MOVED_PX) - here) / _MOVED_PX])
+
+    return exact
+
+
+def _sigma_at(on_sheet: np.ndarray, calibration: Calibration, sensor: Sensor, *, medium_index: float) -> np.ndarray:
+    """Standard deviation (N,) of the sheet's profile at points (N, 3) on it, OCS, mm."""
+    frame = calibration.object_transform()
+    in_camera = on_sheet @ frame[:3, :3].T + frame[:3, 3]
+    away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
+    return sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
 
 
 def slopes_of_brightness(
@@ -187,8 +238,7 @@ def _slopes(
     step = np.median(position[rows:] - position[:-rows]) / rows if rows else 0.0
     least = max(0.15 * step**2, _LEAST_APART_MM**2)
     by_position, by_column = np.zeros(shape), np.zeros(shape)
-    room = np.empty((shape[0], 5, shape[1])), np.zeros((9, shape[1]))
-    _fit_planes(there, z, np.ascontiguousarray(s, dtype=float), rows, columns, least, *room, by_position, by_column)
+    _fit_planes(there, z, np.ascontiguousarray(s, dtype=float), rows, columns, least, by_position, by_column)
     return by_position[row, column - first], by_column[row, column - first]
 
 
@@ -200,22 +250,19 @@ def _fit_planes(
     rows: int,
     columns: int,
     least: float,
-    along: np.ndarray,
-    total: np.ndarray,
     by_position: np.ndarray,
     by_column: np.ndarray,
 ) -> None:
     """Slopes (F, L) of planes through the values z (F, L) that are there, at positions s (F,), 0 where unknown.
 
-    The sums over the window are running ones, first along a row, ``along`` (F, 5, L), and then from row to row,
-    ``total`` (9, L), zero at first.
+    The sums over the window are running ones, first along a row and then from row to row.
     """
     count, width = there.shape
+    along = np.zeros((count, 5, width))
     for row in range(count):
         n, x1, x2, z1, xz = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(width + columns):
-            for side in range(2):
-                at, sign = k - side * (2 * columns + 1), 1.0 - 2.0 * side
+            for at, sign in ((k, 1.0), (k - 2 * columns - 1, -1.0)):
                 if 0 <= at < width and there[row, at]:
                     x, value = at - 0.5 * width, z[row, at]
                     n, x1, x2 = n + sign, x1 + sign * x, x2 + sign * x * x
@@ -224,9 +271,9 @@ def _fit_planes(
                 to = along[row, :, k - columns]
                 to[0], to[1], to[2], to[3], to[4] = n, x1, x2, z1, xz
     size = (2 * rows + 1) * (2 * columns + 1)
+    total = np.zeros((9, width))
     for k in range(count + rows):
-        for side in range(2):
-            row, sign = k - side * (2 * rows + 1), 1.0 - 2.0 * side
+        for row, sign in ((k, 1.0), (k - 2 * rows - 1, -1.0)):
             if 0 <= row < count:
                 for at in range(width):
                     n, x1, z1 = sign * along[row, 0, at], sign * along[row, 1, at], sign * along[row, 3, at]

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.model.mount import BoardFound, Mount, SphereFound
+from uwlts.model.mount import BoardFound, Mount, SphereFound, StepFound
 
 
 def mount_lines(mount: Mount) -> list[str]:
@@ -27,6 +27,10 @@ def mount_lines(mount: Mount) -> list[str]:
     elif isinstance(found, SphereFound):
         known = "given" if found.radius_std_mm is None else f"+-{mount.coverage_factor * found.radius_std_mm:.3f}"
         lines.append(f"sphere, mm                at {_vector(found.centre_mm)}, radius {found.radius_mm:.3f} ({known})")
+    elif isinstance(found, StepFound):
+        known = "given" if found.height_std_mm is None else f"+-{mount.coverage_factor * found.height_std_mm:.3f}"
+        place = f"normal {_vector(found.normal)}, distance {found.distance_mm:.3f} mm"
+        lines.append(f"step                      {place}, height {abs(found.height_mm):.3f} mm ({known})")
     else:
         lines.append(f"plane                     normal {_vector(found.normal)}, distance {found.distance_mm:.3f} mm")
     if mount.robot_scale is not None and mount.robot_scale_std is not None:

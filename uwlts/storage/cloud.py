@@ -31,6 +31,10 @@ POINTS_OF_PART = 1_000_000
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """The coordinates whose covariances are kept of the symmetric 3x3 matrix: xx, xy, xz, yy, yz, zz."""
 
+FOOTPRINT, FOOTPRINT_STD = "footprint_mm", "footprint_std"
+"""Metadata of clouds of unmoved sensors: standard deviations of the part of a surface that a point is the mean of,
+across the sheet (X) and along the stripe (Y), mm, and the relative standard uncertainty of their squares."""
+
 NO_INDEX = -1
 """Frame and line of points whose file does not name them."""
 
@@ -41,6 +45,8 @@ _KINDS |= {"time_s": np.float64}
 _COMMENT = "uwlts-metadata"
 _UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
 _SHARED = "shared_errors"
+WATER = "water"
+"""With what the names of errors of a medium's index begin, which may drift between scans."""
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
 _FARTHEST_MM = 1e12
@@ -73,8 +79,9 @@ class PointUncertainty:
         How each point moves for one standard deviation of each independent part of its image's pose, which is
         independent from image to image.
     shared : dict of str to (M, Q) float64
-        What clouds have in common, by the name of a calibration of the sensor or its mount: each pattern holds so much
-        of Q independent parts of its errors, each of standard deviation one. Clouds that name the same share these.
+        What clouds have in common, by the name of a calibration of the sensor or its mount, or of the water it was
+        used in (`WATER`): each pattern holds so much of Q independent parts of its errors, each of standard deviation
+        one. Clouds that name the same share these.
     """
 
     random_mm2: np.ndarray
@@ -413,9 +420,8 @@ def _with_shared(cloud: PointCloud) -> Table:
     """Metadata in a file: with what the patterns share with other clouds."""
     if cloud.uncertainty is None or not cloud.uncertainty.shared:
         return cloud.metadata
-    return cloud.metadata | {
-        _SHARED: {name: np.round(each, 9).tolist() for name, each in cloud.uncertainty.shared.items()}
-    }
+    shared: Table = {name: np.round(each, 9).tolist() for name, each in cloud.uncertainty.shared.items()}
+    return {**cloud.metadata, _SHARED: shared}
 
 
 def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Table, PointUncertainty | None]:
@@ -425,8 +431,11 @@ def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Ta
     rest = {name: each for name, each in metadata.items() if name != _SHARED}
     if known is None:
         return rest, None
+    stated = metadata[_SHARED]
     try:
-        shared = {str(name): np.array(each, dtype=np.float64) for name, each in dict(metadata[_SHARED]).items()}
+        if not isinstance(stated, dict):
+            raise TypeError("not an object")
+        shared = {name: np.array(each, dtype=np.float64) for name, each in stated.items()}
     except (TypeError, ValueError) as error:
         raise CaptureError(f"its metadata is damaged: {_SHARED} holds no numbers") from error
     if any(

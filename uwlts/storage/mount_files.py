@@ -40,6 +40,7 @@ _OFTEN_MEANT = (
 _OFTEN_MEANT += ("euler-ZYZ-deg", "rotvec-deg", "rotvec-rad", "euler-ZYX-rad", "euler-xyz-rad", "euler-XYZ-rad")
 
 
+Artefact = Literal["sphere", "plane", "step"]
 SensorAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 SENSOR_AXES: dict[SensorAxis, np.ndarray] = {
     sign + name: (-1.0 if sign else 1.0) * direction  # pyright: ignore[reportAssignmentType]
@@ -55,8 +56,9 @@ class MountDescription(Description):
 
     profiles: str
     poses: str
-    artefact: Literal["sphere", "plane"] = "sphere"
+    artefact: Artefact = "sphere"
     radius_mm: Positive | None = None
+    height_mm: Positive | None = None
     pose_format: str = "matrix"
     profile_unit: Unit = "mm"
     pose_unit: Unit = "mm"
@@ -71,8 +73,9 @@ class MountEvidence:
 
     profiles: list[np.ndarray]
     poses: np.ndarray
-    artefact: Literal["sphere", "plane"]
+    artefact: Artefact
     radius_mm: float | None = None
+    height_mm: float | None = None
     names: list[str]
     axis: SensorAxis | None = None
     scale: bool = False
@@ -101,8 +104,9 @@ def read_mount_evidence(
     profiles: str | Path | Sequence[np.ndarray],
     poses: str | Path | np.ndarray | None,
     *,
-    artefact: Literal["sphere", "plane"],
+    artefact: Artefact,
     radius_mm: float | None,
+    height_mm: float | None,
     pose_format: str,
     profile_unit: Unit,
     pose_unit: Unit,
@@ -122,13 +126,18 @@ def read_mount_evidence(
             raise DescriptionError(f"{path} names the poses already: leave the other ones out")
         given = validated(MountDescription, read_table(path), path)
         profiles, poses = path.parent / given.profiles, path.parent / given.poses
-        artefact, radius_mm, pose_format = given.artefact, given.radius_mm, given.pose_format
+        artefact, radius_mm, height_mm = given.artefact, given.radius_mm, given.height_mm
+        pose_format = given.pose_format
         profile_unit, pose_unit, scale, time = given.profile_unit, given.pose_unit, given.scale, given.time
         axis = given.axis
-    if artefact not in ("sphere", "plane"):
-        raise DescriptionError(f"the artefact is {artefact!r}; expected sphere or plane")
-    if radius_mm is not None and not (np.isfinite(radius_mm) and radius_mm > 0 and artefact == "sphere"):
-        raise DescriptionError(f"radius_mm is {radius_mm:g} of a {artefact}; expected the positive radius of a sphere")
+    if artefact not in ("sphere", "plane", "step"):
+        raise DescriptionError(f"the artefact is {artefact!r}; expected sphere, plane or step")
+    for name, size, of, wanted in (
+        ("radius_mm", radius_mm, "sphere", "radius"),
+        ("height_mm", height_mm, "step", "height"),
+    ):
+        if size is not None and not (np.isfinite(size) and size > 0 and artefact == of):
+            raise DescriptionError(f"{name} is {size:g} of a {artefact}; expected the positive {wanted} of a {of}")
     if poses is None:
         raise DescriptionError("the poses are missing: give T_base_platform of every profile")
     if isinstance(profiles, str | Path):
@@ -163,6 +172,7 @@ def read_mount_evidence(
         poses=matrices,
         artefact=artefact,
         radius_mm=radius_mm,
+        height_mm=height_mm,
         names=names or [str(number + 1) for number in range(len(checked))],
         axis=axis,
         scale=scale,

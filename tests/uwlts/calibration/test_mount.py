@@ -17,10 +17,11 @@ from tests.uwlts.mount_views import (
     errors_of,
     profile_of,
     sphere_campaign,
+    step_campaign,
 )
 from uwlts.cli import main
 from uwlts.model.errors import CalibrationError, DescriptionError
-from uwlts.model.mount import Mount, PlaneFound, SphereFound
+from uwlts.model.mount import Mount, PlaneFound, SphereFound, StepFound
 from uwlts.storage.mount_files import read_mount, read_profiles
 from uwlts.storage.pose_files import read_poses
 
@@ -81,6 +82,27 @@ def test_a_plane_gives_the_mount(rng):
     within(mount)
     assert isinstance(mount.artefact, PlaneFound)
     assert abs(mount.artefact.distance_mm) == pytest.approx(SPHERE_MM[2] - 1.1 * RADIUS_MM, abs=0.2)
+
+
+@pytest.mark.parametrize("height", [12.0, None])
+def test_a_step_gives_the_mount(rng, height):
+    """Two faces 12 mm apart; errors as of `within`, and the height as well known as it says."""
+    mount = mount_of(step_campaign(rng, height_mm=12.0), artefact="step", height_mm=height)
+    within(mount)
+    assert (mount.std()[:3] < 0.3).all() and (np.degrees(mount.std()[3:]) < 0.05).all()
+    assert isinstance(mount.artefact, StepFound) and sum(pose.reason is None for pose in mount.poses) >= 18
+    if height is None:
+        assert abs(abs(mount.artefact.height_mm) - 12.0) < 5 * mount.artefact.height_std_mm < 0.1
+    else:
+        assert abs(mount.artefact.height_mm) == height and mount.artefact.height_std_mm is None
+    assert np.abs(mount.artefact.normal) == pytest.approx([0, 0, 1], abs=1e-3)
+
+
+def test_a_step_of_another_height_is_not_found(rng):
+    with pytest.raises(CalibrationError, match="0 of 20 profiles show the step"):
+        mount_of(step_campaign(rng, height_mm=12.0), artefact="step", height_mm=40.0)
+    with pytest.raises(DescriptionError, match="positive height of a step"):
+        mount_of(step_campaign(rng, height_mm=12.0, poses=8), artefact="plane", height_mm=12.0)
 
 
 def test_the_scale_of_a_robot_is_found(rng):
@@ -298,10 +320,12 @@ def test_the_axis_of_a_rotary_table_is_found(tmp_path, rng):
     assert std[2] == std[5] == 0, "shift along the axis and turn about it are chosen"
     uwlts.write_mount(tmp_path / "mount.json", mount)
     assert read_mount(tmp_path / "mount.json") == mount
-    # The same profiles fit the mirrored table about an axis the other way round.
+    # The same profiles fit the table that is mirrored in the sheet, y -> -y: its axis, an axial vector, is
+    # (-x, y, -z), which lies 2 arccos |y| from the true one. Two errors of at most 5 standard deviations are apart.
     mirrored = uwlts.calibrate_mount(profiles, poses, radius_mm=RADIUS_MM, axis="z")
-    assert mirrored.rms_mm < 1.5 * mount.rms_mm
-    assert axis_errors(mirrored, table)[0] > 0.5
+    assert mirrored.rms_mm == pytest.approx(mount.rms_mm, rel=0.01)
+    apart = 2 * np.arccos(abs(table[1, 2]))
+    assert axis_errors(mirrored, table)[0] == pytest.approx(apart, abs=2 * 5 * np.linalg.norm(std[3:5]))
 
 
 def test_poses_that_are_no_turns_of_a_table_are_refused(rng):

@@ -9,7 +9,8 @@ from tests.uwlts.joint_views import MEDIUM
 from tests.uwlts.sensor_profiles import half_way, joint_estimate, largest_parts
 from tests.virtual_sensors import scene_of
 from twin import render
-from uwlts.calibration.mount_board import BoardImage, _posed, _Problem
+from uwlts.calibration.mount_board import _Problem
+from uwlts.calibration.mount_board_images import BoardImage, posed_board
 from uwlts.model.calibration import KnownMedium
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import BoardFound
@@ -193,7 +194,7 @@ def test_a_target_s_pose_follows_the_sensor(thesis, capture_path):
                 "media": (KnownMedium(medium=MEDIUM, index=known.parameters.medium_index(values, known.view)),),
             }
         )
-        return _posed("", image, target, changed, known, changed.window, changed.index_of(MEDIUM), np.eye(4))
+        return posed_board("", image, target, changed, known, changed.window, changed.index_of(MEDIUM), np.eye(4))
 
     own = posed(known.values)
     middle, checked = target.points_mm.mean(axis=0), 0

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwlts.desk.thinned_cloud import FIELDS, ThinnedCloud
+from uwlts.desk.thinned_cloud import FIELDS, ThinnedCloud, packed
 
 PIECES = st.lists(st.integers(0, 60), max_size=30)
 
@@ -77,7 +77,7 @@ def test_what_is_packed_can_be_unpacked(at_most: int, sizes: list[int], far: flo
         piece = points(total, size) + [far, 0, -far]
         cloud.add(piece, uncertainty=np.full(size, 0.125))
         total += size
-    origin, data = cloud.packed()
+    origin, data = packed(cloud.points())
     kept, table = cloud.points(), np.frombuffer(data, "<f4").reshape(-1, 6)
     assert origin.shape == (3,) and (origin == np.round(origin)).all()
     assert len(table) == len(kept)
@@ -99,7 +99,7 @@ def test_points_that_stand_for_more_are_counted_as_what_they_stand_for(at_most: 
 
 
 def test_an_empty_cloud_is_packed_too():
-    origin, data = ThinnedCloud().packed()
+    origin, data = packed(ThinnedCloud().points())
     assert origin.tolist() == [0, 0, 0] and data == b""
 
 

@@ -359,7 +359,9 @@ def test_water_does_not_drift_before_its_own_scan(calibration, stripes, thesis, 
     water = thesis.media["water"]
     known = calibration.model_copy(update={"media": (calibration.media[0].model_copy(update={"medium": water}),)})
     with capture_of(tmp_path, drifting, water) as capture:
-        own = known.model_copy(update={"provenance": known.provenance | {"scan_captures": [source_of(capture)]}})
+        own = known.model_copy(
+            update={"provenance": known.provenance | {"scan_captures": [source_of(capture).model_dump(mode="json")]}}
+        )
         free, tied = (
             point_uncertainty(capture, each, frame, line, centre).systematic_mm2()[:, 5] for each in (known, own)
         )
@@ -380,12 +382,12 @@ def test_clouds_of_one_calibration_say_what_they_share(calibration, stripes, the
             capture, calibration.model_copy(update={"joint": changed_joint(calibration)}), *stripes
         )
     assert first.shared.keys() == second.shared.keys() != other.shared.keys()
-    (name,) = first.shared
+    ours, theirs = (np.hstack([known.shared[name] for name in first.shared]) for known in (first, second))
     pick = np.arange(0, len(line), 300)
     between = np.einsum(
         "mni,mk,knj->nij",
         first.patterns_mm[:, pick].astype(float),
-        first.shared[name] @ second.shared[name].T,
+        ours @ theirs.T,
         second.patterns_mm[:, pick].astype(float),
     )
     stored = stored_estimate(calibration, thesis, MEDIUM)

@@ -1,6 +1,7 @@
 """Change between clouds: what is claimed where nothing changed, what is found, and what a registration leaves open."""
 
 import json
+from dataclasses import replace
 
 import laspy
 import numpy as np
@@ -13,7 +14,7 @@ import uwlts
 from uwlts.cli import app
 from uwlts.metrology.registration import SampledSurface, register_to_surface
 from uwlts.model.errors import CaptureError, DescriptionError, EvaluationError, OutputError
-from uwlts.storage.cloud import PointCloud, PointUncertainty
+from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty
 
 NOISE_MM, SHIFT_MM, TILT, STAGE_MM = 0.03, 0.04, 1e-3, 0.02
 SIDE_MM, STEP_MM = 60.0, 0.5
@@ -28,8 +29,11 @@ def dent(x, y):
     return 0.5 * (np.hypot(x - 10, y - 5) < 5)
 
 
-def scanned(rng, *, change=None, common=True, surface=height):
-    """A cloud taken in lines by a stage, whose errors are those that it states."""
+def scanned(rng, *, change=None, common=True, surface=height, calibration=None):
+    """A cloud taken in lines by a stage, whose errors are those that it states.
+
+    ``calibration`` are the errors (3,) of water, shift and tilt by one calibration, in standard deviations.
+    """
     x, y = np.meshgrid(np.arange(-SIDE_MM / 2, SIDE_MM / 2, STEP_MM), np.arange(-SIDE_MM / 2, SIDE_MM / 2, STEP_MM))
     image = np.repeat(np.arange(x.shape[1])[None], x.shape[0], axis=0).ravel()
     x, y = (each.ravel() + rng.uniform(-0.2, 0.2, x.size) for each in (x, y))
@@ -45,9 +49,14 @@ def scanned(rng, *, change=None, common=True, surface=height):
     random[:, 5] = NOISE_MM**2
     seen = points.copy()
     seen[:, 2] += NOISE_MM * rng.normal(size=count) + STAGE_MM * rng.normal(size=image.max() + 1)[image]
-    seen[:, 2] += np.tensordot(rng.normal(size=2), patterns[:, :, 2], axes=1)
-    line = np.zeros(count, int)
-    return PointCloud(seen, np.ones(count), image, line, uncertainty=PointUncertainty(random, position, patterns))
+    errors, shared = rng.normal(size=2), {}
+    if calibration is not None:
+        # The patterns are any independent ones: here shift and tilt, each partly by the water.
+        shares = np.array([[0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+        errors, shared = shares @ calibration, {f"{WATER} 1": shares[:, :1], "sensor 1": shares[:, 1:]}
+    seen[:, 2] += np.tensordot(errors, patterns[:, :, 2], axes=1)
+    known = PointUncertainty(random, position, patterns, shared=shared)
+    return PointCloud(seen, np.ones(count), image, np.zeros(count, int), uncertainty=known)
 
 
 def test_nothing_is_claimed_where_nothing_changed():
@@ -72,6 +81,36 @@ def test_the_level_is_that_of_the_distances():
         change = uwlts.compare_clouds(scanned(rng), scanned(rng), disc_mm=6.0)
         ratios.append(1.96 * change.distance_mm[change.compared] / change.level_mm[change.compared])
     assert 0.6 < np.sqrt(np.mean(np.square(np.concatenate(ratios)))) < 1.5
+
+
+def test_what_one_calibration_shares_cancels():
+    """The levels are those by hand, within what the scatter in discs of 30 points leaves of their median."""
+    rng = np.random.default_rng(4)
+    calibration = rng.normal(size=3)
+    cloud, other = (scanned(rng, calibration=calibration) for _ in range(2))
+    renamed = {name.replace("1", "2"): parts for name, parts in other.uncertainty.shared.items()}
+    foreign = replace(other, uncertainty=replace(other.uncertainty, shared=renamed))
+    quiet = uwlts.compare_clouds(*(scanned(rng, common=False) for _ in range(2)))
+    found = [
+        uwlts.compare_clouds(cloud, *pair, same_water=same)
+        for pair, same in (((other,), True), ((other,), False), ((foreign,), True))
+    ]
+    random = np.median(quiet.level_mm[quiet.compared]) / 1.96
+    tilted = 2 * (TILT * found[2].points_mm[:, 1]) ** 2
+    expected = [0.0, 2 * (0.6 * SHIFT_MM) ** 2, 2 * SHIFT_MM**2 + tilted]
+    for change, common in zip(found, expected, strict=True):
+        ratio = change.level_mm / 1.96 / np.sqrt(random**2 + common)
+        assert np.median(ratio[change.compared]) == pytest.approx(1.0, abs=0.05)
+    # A twentieth of the places and as much again for chance: a disc holds 30 points, so that places are a thousand.
+    assert share(found[0]) < 0.1
+    one = uwlts.compare_clouds(scanned(rng, calibration=calibration, change=shallow), other, same_water=True)
+    x, y = one.points_mm.T[:2]
+    assert one.significant[np.hypot(x - 10, y - 5) < 4].mean() > 0.8
+    assert found[2].significant.mean() < 0.02
+
+
+def shallow(x, y):
+    return 0.05 * (np.hypot(x - 10, y - 5) < 6)
 
 
 def share(change):

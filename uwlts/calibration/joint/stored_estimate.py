@@ -193,12 +193,14 @@ def with_independent(covariance: np.ndarray, std: Sequence[float]) -> np.ndarray
 
 
 def covariance_root(covariance: np.ndarray) -> np.ndarray:
-    """A matrix (P, R) whose product with its transpose is the covariance (P, P), by the correlations."""
+    """The matrix (P, P) whose product with its transpose is the covariance (P, P), by the correlations' symmetric root.
+
+    It is the same wherever it is calculated, so that its columns, independent parts of the parameters, can be compared.
+    """
     scale = np.sqrt(np.diag(covariance))
     scale = np.where(scale > 0, scale, 1.0)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
-    kept = values > 0
-    return scale[:, None] * vectors[:, kept] * np.sqrt(values[kept])
+    return scale[:, None] * ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
 def require_joint(calibration: Calibration) -> JointEstimate:
