@@ -1,9 +1,10 @@
 """Wrong and lost points on scenes with mirrors and inside corners: the brightest peak, and the direct stripe.
 
 ``python docs/studies/stripe_reflections.py`` prints the table of docs/explanation/stripe-methods.md and draws its
-picture. A point is wrong that lies more than 3 px from every place of the image where the laser lights a surface; a lit
-profile line without a right point is lost. The scenes of the first half were looked at while the rules were made, those
-of the second were not.
+picture. A point is wrong that lies more than 3 px from every place where the laser lights a surface: where the sheet's
+middle meets one, and where the light that comes straight from surfaces has a stripe, which lies elsewhere if an edge
+cuts the sheet. A profile line on which the sheet's middle lights a surface is lost without a right point. The named
+scenes were looked at while the rules were made; those drawn at random were not.
 """
 
 from collections.abc import Iterator
@@ -15,13 +16,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from twin.options import Options, use_variant
+from twin.options import ALL, Options, use_variant
 from twin.scene.description import Scene, load_scene
 from uwlts.model.library import load_sensor
 from uwlts.stripe import StripeOptions, extract_candidates, find_stripes
 
 NEAR_PX, FRAMES, STEP_MM = 3.0, 5, 5.0
 BRIGHTEST = StripeOptions(peak="strongest", ambiguous_ratio=1.0)
+FAINTEST = StripeOptions(threshold_floor=0.5)
+LONGER_WAYS = ("haze", "multiple-scattering", "secondary-light")
 PICTURE = Path("docs/pictures/stripe-reflections.png")
 PICTURED = "inside corner, 12°"
 Thing = dict[str, Any]
@@ -59,7 +62,7 @@ def scene(*things: Thing, turned: Any = (0, 0, 0), at: Any = (0, 0, 0), water: A
 
 
 SHINING = {"mirror": 0.4, "reflectance": 0.5}
-SEEN = {
+NAMED = {
     "sphere on a mirror": scene(sphere(), mirror(25.0)),
     "sphere on a mirror, 20°": scene(sphere(), mirror(25.0), turned=(20, 0, 0)),
     "sphere above a mirror, 10° and 8°, coastal": scene(
@@ -85,8 +88,6 @@ SEEN = {
     "clean corner along the stripe": scene(
         *corner("x", finish="diffuse", mirror=0.85, reflectance=0.1), turned=(5, 0, 3)
     ),
-}
-HELD_OUT = {
     "sphere on a mirror, -18° and 4°, coastal": scene(
         sphere(40.0), mirror(20.0, 0.03), turned=(-18, 4, 0), at=(0, 0, 30), water="coastal"
     ),
@@ -114,13 +115,55 @@ HELD_OUT = {
     "sphere on paint": scene(sphere(), block((160, 200, 10), (0, 0, 30), finish="painted"), turned=(5, 5, 0)),
 }
 
+LOOKED_AT, HELD_OUT = (*range(9), *range(1000, 1012)), tuple(range(9, 20))
+"""Seeds of scenes drawn at random whose images the rules were changed by, and of those whose were not."""
+
+
+def drawn(seed: int) -> tuple[str, Scene]:
+    """A random scene and its name: things on a mirror, or an inside corner of shining faces, in some water."""
+    rng = np.random.default_rng(seed)
+
+    def between(low: float, high: float) -> float:
+        return round(float(rng.uniform(low, high)), 2)
+
+    kind = ("mirror", "corner beside the stripe", "corner along the stripe")[rng.choice(3, p=(0.5, 0.35, 0.15))]
+    water = (None, "coastal", 1.0)[rng.choice(3, p=(0.5, 0.3, 0.2))]
+    tilt = between(-30.0, 30.0)
+    if kind == "mirror":
+        things = [mirror(between(15.0, 30.0), between(0.02, 0.06), between(0.5, 0.9))]
+        for _ in range(rng.integers(1, 4)):
+            at, finish = (between(-10, 10), between(-50, 50), between(-10, 5)), ("painted", "pvc")[rng.integers(2)]
+            if rng.random() < 0.5:
+                things.append(sphere(between(15, 50), at, finish))
+            else:
+                size = between(20, 80), between(15, 50), between(10, 40)
+                things.append(block(size, at, finish=finish))
+    else:
+        share = between(0.3, 0.8)
+        shine = {"mirror": share, "reflectance": min(between(0.1, 0.5), round(0.95 - share, 2))}
+        if rng.random() < 0.5:
+            shine["finish"] = "diffuse"
+        side = "x" if "along" in kind else ("y", "-y")[rng.integers(2)]
+        # The corner is turned so that the camera looks into it.
+        tilt = abs(tilt) if side == "y" else -abs(tilt) if side == "-y" else tilt / 5
+        things = corner(side, high=between(25, 80), **shine)
+    turned = tilt, between(-8, 8), between(-20, 20)
+    at = 0.0, between(-10, 10), between(-40, 60)
+    name = f"{seed}: {kind}, turned by {turned[0]:g}°, {turned[1]:g}°, {turned[2]:g}°, {water or 'clear'}"
+    return name, scene(*things, turned=turned, at=at, water=water)
+
 
 @dataclass(frozen=True)
 class Rendered:
-    """Images (F, H, W) of a scene, as `find_stripes` takes them, and (N, 3) image, line and place of what is lit."""
+    """Images (F, H, W) of a scene, as `find_stripes` takes them.
+
+    ``lit`` (N, 3) are image, line and place of where the sheet's middle lights a surface, ``direct`` (M, 3) those of
+    the stripes of light straight from surfaces.
+    """
 
     images: np.ndarray
     lit: np.ndarray
+    direct: np.ndarray
 
     @property
     def capture(self) -> Any:
@@ -156,16 +199,29 @@ def rendered(of: Scene) -> Rendered:
         found = crossings(studio.renderer, studio.pose(shot))
         shone = found.brightness > 0
         lit.append(np.column_stack([np.full(shone.sum(), number), found.line[shone], found.centre_px[shone]]))
-    return Rendered(np.stack(images), np.concatenate(lit))
+    return Rendered(np.stack(images), np.concatenate(lit), direct_light(of))
+
+
+def direct_light(of: Scene) -> np.ndarray:
+    """Image, line and place (M, 3) of the stripes of the light that comes straight from surfaces, without mirrors."""
+    from twin.recording.studio import Studio
+
+    studio = Studio(load_sensor("thesis"), of, Options(effects=ALL.without(*LONGER_WAYS)))
+    full_scale, result = 255 / studio.sensor.detector.full_well_e, []
+    for number, shot in enumerate(of.motion.shots()):
+        light = full_scale * studio.exposed(shot, number).direct
+        own = extract_candidates(light, stripe_along="width", options=FAINTEST)
+        result.append(np.column_stack([np.full(len(own.line), number), own.line, own.centre_px]))
+    return np.concatenate(result)
 
 
 def wrong_and_lost(of: Rendered, options: StripeOptions) -> tuple[float, float, int]:
     """Percent of the points that are wrong, percent of the lit lines without a right one, and the number of points."""
     stripes, wrong, right = find_stripes(of.capture, options=options), 0, 0
-    lines = np.unique(of.lit[:, :2], axis=0)
+    lines, places = np.unique(of.lit[:, :2], axis=0), np.concatenate([of.lit, of.direct])
     for number in range(len(of.images)):
         here = stripes[stripes.frame == number]
-        tree = cKDTree(of.lit[of.lit[:, 0] == number, 1:])
+        tree = cKDTree(places[places[:, 0] == number, 1:])
         away = tree.query(np.column_stack([here.line, here.centre_px]))[0]
         wrong += int(np.count_nonzero(away > NEAR_PX))
         right += len(np.intersect1d(here.line[away <= NEAR_PX], lines[lines[:, 0] == number, 1]))
@@ -174,16 +230,20 @@ def wrong_and_lost(of: Rendered, options: StripeOptions) -> tuple[float, float, 
 
 
 def rows() -> Iterator[str]:
-    yield "| scene | brightest peak: wrong % | lost % | direct stripe: wrong % | lost % |"
-    yield "| --- | --- | --- | --- | --- |"
-    for group in (SEEN, HELD_OUT):
+    looked_at, held_out = (dict(map(drawn, seeds)) for seeds in (LOOKED_AT, HELD_OUT))
+    for title, group in (("named", NAMED), ("drawn, looked at", looked_at), ("drawn, held out", held_out)):
+        yield f"| {title} | brightest peak: wrong % | lost % | direct stripe: wrong % | lost % |"
+        yield "| --- | --- | --- | --- | --- |"
+        sums = np.zeros((2, 2))
         for name, of in group.items():
             shown = rendered(of)
-            (wrong, lost, _), (ours, missing, _) = (wrong_and_lost(shown, o) for o in (BRIGHTEST, StripeOptions()))
-            yield f"| {name} | {wrong:.2f} | {lost:.1f} | {ours:.2f} | {missing:.1f} |"
+            found = [wrong_and_lost(shown, options) for options in (BRIGHTEST, StripeOptions())]
+            yield f"| {name} | " + " | ".join(f"{wrong:.2f} | {lost:.1f}" for wrong, lost, _ in found) + " |"
+            sums += [(0.01 * wrong * count, count) for wrong, _, count in found]
             if name == PICTURED:
                 draw(shown)
-        yield "| | | | | |" if group is SEEN else ""
+        yield "| all points | " + " | ".join(f"{100 * wrong / count:.3f} |" for wrong, count in sums) + " |"
+        yield ""
 
 
 def draw(of: Rendered) -> None:

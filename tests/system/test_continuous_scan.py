@@ -10,9 +10,11 @@ import uwlts
 from tests.system.drawn_hardware import HEIGHT_PX, WIDTH_PX, write_plan
 from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
+from twin.sensor.peak_finder import PeakFinder
 from uwlts.hardware import continuous
 from uwlts.measurement.latency import measure_latency
 from uwlts.model.errors import DescriptionError, EvaluationError, HardwareError, RangeError
+from uwlts.model.library import load_sensor
 from uwlts.storage.capture import Capture
 
 TRAVEL_MM, STEPS_PER_MM = 300.0, 100
@@ -30,8 +32,9 @@ def surface(position_mm: float) -> np.ndarray:
 class Hill:
     """A free-running camera before a hill; ``states`` are the true ones in the middle of the exposures."""
 
-    def __init__(self, controller: GrblController):
+    def __init__(self, controller: GrblController, *, scan3d: bool = False):
         self.controller, self.states, self.lit = controller, [], True
+        small = load_sensor("thesis").camera.model_copy(update={"width_px": WIDTH_PX, "height_px": HEIGHT_PX})
         self._rng = np.random.default_rng(2)
         self.camera = GigeCamera(
             lambda exposure_ms: self._drawn(controller.state()),
@@ -39,6 +42,7 @@ class Hill:
             height_px=HEIGHT_PX,
             encoder=controller.steps,
             expose=self._expose,
+            scan3d=PeakFinder(small, 255, 16) if scan3d else None,
         )
 
     def _expose(self) -> ExposedFrame:
@@ -55,9 +59,9 @@ class Hill:
 
 
 @pytest.fixture
-def hill() -> Iterator[Hill]:
+def hill(request) -> Iterator[Hill]:
     with GrblController(settings=STAGE) as controller:
-        drawn = Hill(controller)
+        drawn = Hill(controller, **getattr(request, "param", {}))
         with drawn.camera:
             yield drawn
 
@@ -109,8 +113,11 @@ def test_frames_are_where_the_stage_was_whatever_the_clocks_differ_by(hill, tmp_
 
 
 @pytest.mark.slow
-def test_an_encoder_places_the_frames_without_any_clock(hill, tmp_path):
-    moving = f"speed_mm_per_s = {SPEED}, both_ways = false, mm_per_count = {ENCODER_MM}"
+@pytest.mark.parametrize(
+    ("hill", "more"), [({}, ""), ({"scan3d": True}, ", profiles_per_frame = 10")], indirect=["hill"]
+)
+def test_an_encoder_places_the_frames_without_any_clock(hill, more, tmp_path):
+    moving = f"speed_mm_per_s = {SPEED}, both_ways = false, mm_per_count = {ENCODER_MM}{more}"
     warned = []
     uwlts.scan(plan(tmp_path, hill, moving), tmp_path / "a.h5", home=True, warn=warned.append)
     with Capture(tmp_path / "a.h5") as capture:

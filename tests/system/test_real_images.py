@@ -26,7 +26,7 @@ from uwlts.model.parameter_keys import LensParameter
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_ import import_images
 from uwlts.storage.pose_files import read_poses
-from uwlts.stripe import PeakRule, StripeOptions, extract_stripe
+from uwlts.stripe import PeakRule, StripeOptions, extract_stripe, find_stripes
 from uwlts.targets import ChessboardTarget
 from uwlts.targets.detection import detect_lattice
 
@@ -208,6 +208,21 @@ def etna(tmp_path: Path) -> Iterator[Capture]:
     import_images(DATA / "etna", tmp_path / "etna.h5", description=tmp_path / "import.toml")
     with Capture(tmp_path / "etna.h5") as capture:
         yield capture
+
+
+def test_no_reflection_on_the_machine_beside_the_board_is_taken(etna: Capture):
+    """They stand 200 px and more beside the line, which itself is too wide to be measured on some lines."""
+    stripes, count = find_stripes(etna), 0
+    for frame in np.unique(stripes.frame):
+        here = stripes[stripes.frame == frame]
+        curve = np.polynomial.Chebyshev.fit(here.line, here.centre_px, 3)
+        kept = np.abs(here.centre_px - curve(here.line)) < 30
+        curve = np.polynomial.Chebyshev.fit(here.line[kept], here.centre_px[kept], 3)
+        # The line jumps by 20 px where it leaves the board.
+        assert np.abs(here.centre_px - curve(here.line)).max() < 40
+        count += len(here.line)
+    # By eye the line crosses all 1024 rows of each image.
+    assert count > 0.9 * 1024 * len(np.unique(stripes.frame))
 
 
 @pytest.mark.slow

@@ -9,12 +9,14 @@ import pytest
 
 import uwlts
 from tests.system.small_board import small_sensor, turned_board
-from twin.devices.gige_camera import GigeCamera
+from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.serve import ServedTwin, serve
 from twin.options import Flaws, Options
 from twin.recording.studio import record_scene
 from twin.scene.description import Scene
 from twin.sensor.peak_finder import INVALID, PeakFinder
+from uwlts.hardware import aravis
+from uwlts.hardware.camera import Region
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.model.errors import DescriptionError, HardwareError
@@ -60,6 +62,85 @@ def test_calibrated_coordinates_are_refused():
         pytest.raises(HardwareError, match="gives CalibratedC, which is not in pixels"),
     ):
         open_camera(served.address).open()
+
+
+ROWS, STAMP_NS = 8, 3_000_000
+"""Profiles in a frame, and time between them."""
+
+
+class Counting:
+    """Exposures of a drawn 3D camera: each shows its number in the encoder's count, its time and its profile."""
+
+    def __init__(self) -> None:
+        self.number, self.began_s = -1, 1000.0
+
+    def __call__(self) -> ExposedFrame:
+        self.number += 1
+        number = self.number
+        return ExposedFrame(self.began_s + 1e-9 * STAMP_NS * number, 5 - 3 * number, lambda _: self.image(number))
+
+    def image(self, number: int) -> np.ndarray:
+        image = np.zeros((64, 96), np.uint8)
+        # Two rows as bright: half-way between them.
+        image[10 + number % 40 : 12 + number % 40] = 200
+        return image
+
+
+@pytest.fixture
+def counting() -> Iterator[Counting]:
+    exposures = Counting()
+    small = load_sensor("thesis").camera.model_copy(update={"width_px": 96, "height_px": 64})
+    served = GigeCamera(
+        lambda exposure_ms: exposures.image(0),
+        width_px=96,
+        height_px=64,
+        scan3d=PeakFinder(small, 255, 16),
+        encoder=lambda: 0,
+        expose=exposures,
+    )
+    with served:
+        exposures.served = served
+        yield exposures
+
+
+def test_each_profile_of_a_frame_has_its_own_count_and_time(counting):
+    with open_camera("gige:127.0.0.1") as camera:
+        settings = camera.configure(exposure_ms=0.1, frame_rate_hz=200.0, profiles=ROWS)
+        assert settings.region == Region(0, 0, 96, ROWS) and settings.frame_rate_hz == pytest.approx(200.0)
+        camera.start(faults="skip")
+        grabbed = [camera.grab(5.0) for _ in range(3 * ROWS)]
+        counting.served.inject("drop")
+        while camera.counts.dropped == 0:
+            grabbed.append(camera.grab(5.0))
+        grabbed += [camera.grab(5.0) for _ in range(ROWS)]
+        camera.stop()
+    numbers = np.array([(5 - frame.encoder) // 3 for frame in grabbed])
+    steps = np.diff(numbers)
+    # Of the frame that was lost all profiles are.
+    assert set(steps) == {1, 1 + ROWS} and np.flatnonzero(steps > 1) % ROWS == ROWS - 1
+    for number, frame in zip(numbers, grabbed, strict=True):
+        assert (frame.seen.centre_px == 10.5 + number % 40).all()
+        # Aravis's time stamps are whole ns.
+        assert abs(frame.time_s - grabbed[0].time_s - 1e-9 * STAMP_NS * (number - numbers[0])) < 2e-9
+    assert camera.counts.dropped == 1
+
+
+def test_profiles_without_time_stamps_follow_the_line_rate_and_single_ones_their_trigger(counting, monkeypatch):
+    with open_camera("gige:127.0.0.1") as camera:
+        monkeypatch.setattr(aravis, "CHUNKS", ("EncoderValue",))
+        camera.configure(exposure_ms=0.1, frame_rate_hz=100.0, profiles=ROWS)
+        camera.start()
+        times = np.array([camera.grab(5.0).time_s for _ in range(ROWS)])
+        assert np.allclose(np.diff(times), 0.01, atol=1e-9)
+        camera.stop()
+        camera.configure(trigger="software")
+        camera.start()
+        camera.trigger()
+        frame = camera.grab(5.0)
+        assert frame.encoder == 0 and (frame.seen.centre_px == 10.5).all()
+        camera.stop()
+        with pytest.raises(HardwareError, match="profiles is 8: a free-running 3D camera"):
+            camera.configure(trigger="software", profiles=ROWS)
 
 
 def test_a_scan_holds_the_centre_lines_that_the_twin_simulates(served, folder, board, sensor, tmp_path):

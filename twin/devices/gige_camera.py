@@ -7,12 +7,12 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from ctypes import c_char_p, c_double, c_int, c_size_t, c_uint32, c_uint64, c_void_p
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Literal, Protocol, Self
 from xml.etree import ElementTree
 
@@ -27,9 +27,10 @@ _BYTES_PER_S, _TOGETHER = 125e6, 8
 _OVERHEAD_BYTES = 36
 _LEADER, _TRAILER, _PAYLOAD, _IMAGE, _MONO8 = 1, 2, 3, 1, 0x01080001
 # Of profiles: the pixel format (GenICam Pixel Format Naming Convention), and chunks by numbers of the camera's own.
-_COORD3D_C16, _WITH_CHUNKS, _IMAGE_CHUNK, _ENCODER_CHUNK = 0x011000B8, 0x4000, 0x45430000, 0x45430001
-_CHUNK_BYTES = 8 + 16
-"""Room of the chunks behind an image."""
+_COORD3D_C16, _WITH_CHUNKS = 0x011000B8, 0x4000
+_IMAGE_CHUNK, ENCODER_CHUNK, TIME_CHUNK = 0x45430000, 0x45430001, 0x45430002
+_CHUNK_BYTES, _ROW_BYTES = 3 * 8, 2 * 8
+"""Room of the chunks behind an image: what names them, and what they hold of each row."""
 
 
 def image_packets(
@@ -39,13 +40,13 @@ def image_packets(
     number: int,
     region: tuple[int, int, int, int],
     packet_bytes: int,
-    encoder: int | None = None,
+    chunks: Mapping[int, Sequence[int]] = MappingProxyType({}),
 ) -> list[bytes]:
     """Leader, parts of the region, and trailer of an image (H, W) of uint8, or of profiles (H, W) of uint16.
 
     ``time_ns`` is its time stamp, ``number`` its number of 16 bits, ``region`` left, top, width and height in px, of
-    which what lies beyond the image is dark, and ``packet_bytes`` the size of a packet with all its headers. An
-    ``encoder`` count follows the image as chunk data (GigE Vision 2.0, extended chunk mode).
+    which what lies beyond the image is dark, and ``packet_bytes`` the size of a packet with all its headers. Numbers of
+    rows follow the image as ``chunks`` by their identifiers (GigE Vision 2.0, extended chunk mode).
     """
     x, y, width, height = region
     seen = np.zeros((height, width), image.dtype)
@@ -53,11 +54,11 @@ def image_packets(
     seen[: part.shape[0], : part.shape[1]] = part
     pixels, room = seen.astype(seen.dtype.newbyteorder("<")).tobytes(), packet_bytes - _OVERHEAD_BYTES
     kind, pixel_format = _IMAGE, _MONO8 if image.dtype == np.uint8 else _COORD3D_C16
-    if encoder is not None:
+    if chunks:
         kind |= _WITH_CHUNKS
-        count = struct.pack(">q", encoder)
-        for chunk, data in ((_IMAGE_CHUNK, b""), (_ENCODER_CHUNK, count)):
-            pixels += data + struct.pack(">II", chunk, len(data) if data else len(pixels))
+        pixels += struct.pack(">II", _IMAGE_CHUNK, len(pixels))
+        for chunk, numbers in chunks.items():
+            pixels += struct.pack(f">{len(numbers)}qII", *numbers, chunk, 8 * len(numbers))
     leader = struct.pack(">HHQIIIIIHH", 0, kind, time_ns, pixel_format, width, height, x, y, 0, 0)
     parts = [pixels[start : start + room] for start in range(0, len(pixels), room)]
     bodies = [(_LEADER, leader), *((_PAYLOAD, each) for each in parts), (_TRAILER, struct.pack(">II", kind, height))]
@@ -104,7 +105,8 @@ class _Register:
     WIDTH, HEIGHT, SENSOR_HEIGHT, SENSOR_WIDTH = 0x100, 0x104, 0x118, 0x11C
     ACQUISITION, OFFSET_X, OFFSET_Y = 0x124, 0x130, 0x134
     TRIGGER_SOFTWARE, DEVICE_ID, PIXEL_FORMAT = 0x30C, 0xD8, 0x128
-    SCAN3D_SCALE, SCAN3D_OFFSET, SCAN3D_INVALID, CHUNKS, ENCODER_CHUNK = 0x1000, 0x1008, 0x1010, 0x1020, 0x1024
+    SCAN3D_SCALE, SCAN3D_OFFSET, SCAN3D_INVALID = 0x1000, 0x1008, 0x1010
+    CHUNKS, ENCODER_CHUNK, TIME_CHUNK = 0x1020, 0x1024, 0x1028
 
 
 _REGION = (_Register.OFFSET_X, _Register.OFFSET_Y, _Register.WIDTH, _Register.HEIGHT)
@@ -128,8 +130,18 @@ _FUNCTIONS = {
 }
 
 
-_Shot = tuple[np.ndarray, int, int | None]
-"""An image or profile, the time in ns at which its exposure began, and the encoder's count in its middle."""
+@dataclass(frozen=True)
+class _Shot:
+    """An image, or profiles (N, L); the times in ns at which the exposure of each began, and the encoder's counts."""
+
+    seen: np.ndarray
+    times_ns: tuple[int, ...]
+    counts: tuple[int, ...]
+
+    def __add__(self, later: "_Shot") -> "_Shot":
+        """Profiles together with later ones."""
+        seen = np.concatenate([self.seen, later.seen])
+        return _Shot(seen, self.times_ns + later.times_ns, self.counts + later.counts)
 
 
 @dataclass(frozen=True)
@@ -165,8 +177,9 @@ class GigeCamera:
     this machine, SetupError where Aravis is not installed.
 
     With ``scan3d`` it is a 3D camera: its pixel format is Coord3D_C16 until a program asks for Mono8, and each frame
-    holds the profile that is found in the image, with 0 for no stripe. ``encoder()`` is the count of an encoder that is
-    wired to the camera, sent as chunk data where a program asks for it.
+    holds the profile that is found in the image, with 0 for no stripe; a free-running one sends as many profiles
+    together as its Height says. ``encoder()`` is the count of an encoder that is wired to the camera. It is sent as
+    chunk data where a program asks for it, of every profile, and so is the time.
 
     With ``expose`` a free-running camera exposes at its frame rate with true time stamps, however long its images take:
     it is called in the middle of each exposure, and frames wait in the camera's memory, as in one that is faster than
@@ -204,6 +217,7 @@ class GigeCamera:
         self._making: Future[_Shot] | None = None
         self._answer: _Shot | None = None
         self._last: _Shot | None = None
+        self._gathered: tuple[int, _Shot | None] = 0, None
         self._maker_thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="gige-camera")
         self._stopping = threading.Event()
 
@@ -312,9 +326,10 @@ class GigeCamera:
         for name, number in scan3d.items():
             entry = ElementTree.Element(f"{{{_GENAPI}}}EnumEntry", Name=name)
             ElementTree.SubElement(entry, f"{{{_GENAPI}}}Value").text = str(number)
-            formats.insert(0, entry)
+            # Before the first of the others, as the standard's schema wants it.
+            formats.insert([each.tag for each in formats].index(entry.tag), entry)
         if self._encoder is not None:
-            payload.text += f" + {_CHUNK_BYTES}"
+            payload.text += f" + {_CHUNK_BYTES} + HEIGHT * {_ROW_BYTES}"
         ElementTree.register_namespace("", _GENAPI)
         return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
@@ -338,7 +353,17 @@ class GigeCamera:
         except BaseException as error:
             self.failure = error
             raise
-        self._send((seen, round(1e9 * exposed.middle_s - 0.5e6 * exposure_ms), exposed.encoder))
+        counts = () if exposed.encoder is None else (exposed.encoder,)
+        shot = _Shot(seen, (round(1e9 * exposed.middle_s - 0.5e6 * exposure_ms),), counts)
+        if self._of_profiles():
+            # Profiles are sent together, as many as a frame has rows; another port shows another acquisition.
+            port, (gathered_for, gathered) = self._read(_Register.STREAM_PORT), self._gathered
+            shot = shot if gathered is None or gathered_for != port else gathered + shot
+            short = len(shot.seen) < self._read(_Register.HEIGHT)
+            self._gathered = port, shot if short else None
+            if short:
+                return
+        self._send(shot)
 
     def _send(self, shot: _Shot) -> None:
         with self._lock:
@@ -353,12 +378,16 @@ class GigeCamera:
             host, port, packet_bytes = map(self._read, names)
             x, y, width, height = map(self._read, _REGION)
             region = x, y, width, height
-            image, time_ns, count = shot
-            asked = self._read(_Register.CHUNKS) and self._read(_Register.ENCODER_CHUNK)
+            chunks: dict[int, tuple[int, ...]] = {}
+            if shot.counts and self._read(_Register.CHUNKS):
+                if self._read(_Register.ENCODER_CHUNK):
+                    chunks[ENCODER_CHUNK] = shot.counts
+                if self._read(_Register.TIME_CHUNK):
+                    chunks[TIME_CHUNK] = shot.times_ns
         if not dropped:
             size = packet_bytes & 0xFFFF
             packets = image_packets(
-                image, time_ns, number=self._number, region=region, packet_bytes=size, encoder=count if asked else None
+                shot.seen, shot.times_ns[0], number=self._number, region=region, packet_bytes=size, chunks=chunks
             )
             if shortened:
                 lost = range(_CUT_EVERY - 1, len(packets), _CUT_EVERY) or (len(packets) - 2,)
@@ -409,14 +438,15 @@ class GigeCamera:
         image = self._frame(exposure_ms)
         if image.shape != self._size or image.dtype != np.uint8:
             raise ImageError(f"the camera shows {self._size} uint8, the image is {image.shape} {image.dtype}")
-        count = None if self._encoder is None else self._encoder()
-        return self._seen(image), began_ns, count
+        counts = () if self._encoder is None else (self._encoder(),)
+        return _Shot(self._seen(image), (began_ns,), counts)
 
     def _seen(self, image: np.ndarray) -> np.ndarray:
         """The image, or the profile (1, L) that a 3D camera finds in it."""
-        if self._scan3d is not None and self._read(_Register.PIXEL_FORMAT) == _COORD3D_C16:
-            return self._scan3d.numbers(image)[None]
-        return image
+        return self._scan3d.numbers(image)[None] if self._scan3d is not None and self._of_profiles() else image
+
+    def _of_profiles(self) -> bool:
+        return self._scan3d is not None and self._read(_Register.PIXEL_FORMAT) == _COORD3D_C16
 
     def _read(self, register: int) -> int:
         number = c_uint32()

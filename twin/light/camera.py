@@ -269,9 +269,7 @@ def ray_segments(
     """The first segment of camera rays, then one for each of up to ``mirrors`` mirrors that they meet in turn."""
     o, d, weight, length_before = bundle.origin, bundle.direction, bundle.weight, mi.Float(0.0)
     for met in range(mirrors + 1):
-        si = objects.scene.ray_intersect(
-            pose.ray(o, d, after_s), mi.RayFlags.All, mi.Bool(objects.coherent), weight > 0
-        )
+        si = objects.scene.ray_intersect(pose.ray(o, d, after_s), mi.RayFlags.All, objects.coherent, weight > 0)
         valid = si.is_valid() & (weight > 0)
         yield RaySegment(o, d, weight, length_before, si, valid)
         if met < mirrors:

@@ -41,6 +41,8 @@ PROBE_SPP = 4
 """Samples per lit pixel of the images from which the exposure follows, which a percent is exact enough for."""
 BRIGHT_SHARE = 0.98
 """Automatic exposure looks at the brightest pixel of every profile line and lets 2 % of the lines be brighter."""
+STRAY_LINES, LIT_SHARE = 4, 0.05
+"""A line is lit from this share of the brightest one's light, which is not one of the few of single bright pixels."""
 
 
 _FALSE_POSITIONS = 5
@@ -378,11 +380,17 @@ class Studio:
             even, laser = self._light(shot, spp=PROBE_SPP, seed=0, travel=None)
             # Where one shot is enough, its grain need not be known either, which takes as long as all else.
             peaks = self._electrons_per_ms(even, laser, shot, speckle=probe == "scan").max(axis=axis)
-            if (peaks > 0).any():
-                brightest = max(brightest, float(np.quantile(peaks[peaks > 0.05 * peaks.max()], BRIGHT_SHARE)))
+            brightest = max(brightest, lit_level(peaks))
         longest = self.sensor.exposure.longest_ms
         level = self.sensor.exposure.auto_level * self.sensor.detector.full_well_e
         return min(longest, level / brightest) if brightest > 0 else longest
+
+
+def lit_level(peaks: np.ndarray) -> float:
+    """Light that few of the lit lines exceed, of the brightest pixel of every line (L,); 0 where nothing is lit."""
+    reference = np.sort(peaks)[-1 - min(STRAY_LINES, len(peaks) - 1)]
+    lit = peaks[peaks > LIT_SHARE * reference]
+    return float(np.quantile(lit, BRIGHT_SHARE)) if len(lit) else 0.0
 
 
 @dataclass(frozen=True)

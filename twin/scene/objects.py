@@ -53,7 +53,7 @@ class Objects:
 
     scene: mi.Scene
     mirrors: tuple[MirrorFace, ...]
-    coherent: bool
+    coherent: Bool
     _facts: dict[str, Float]
 
     def mirror_share(self, si: SurfaceInteraction3f) -> Float:
@@ -130,7 +130,7 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
     whole = mi.load_dict(whole | {f"object_{i}": shape for i, shape in enumerate(shapes)}, optimize=False)
     return Objects(
         scene=whole,
-        coherent=any(shape.is_mesh() for shape in shapes),
+        coherent=mi.Bool(any(shape.is_mesh() for shape in shapes)),
         mirrors=tuple(face for thing, pose in placed if gloss for face in _mirror_faces(thing, pose)),
         _facts={key: _by_registry(shapes, np.array(values, float)) for key, values in facts.items()},
     )

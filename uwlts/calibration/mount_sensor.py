@@ -68,10 +68,10 @@ def profiles_of(
         stage_direction=np.array([1.0, 0.0, 0.0]),
     ).points_mm
     times = capture.time_s[laser]
+    at = capture.pose[laser] if poses is None else poses
     if poses is None:
-        own = capture.pose[laser]
-        poses, pose_times_s = own, times
-        if missing := int(np.count_nonzero(~np.isfinite(own).all(axis=(1, 2)))):
+        pose_times_s = times
+        if missing := int(np.count_nonzero(~np.isfinite(at).all(axis=(1, 2)))):
             raise DescriptionError(
                 f"{missing} of {len(laser)} laser images of {capture.path.name} have no pose of the platform: give a "
                 "table of poses, or import them"
@@ -81,7 +81,7 @@ def profiles_of(
         known = stored_estimate(calibration, capture.header.sensor, capture.header.medium)
     found = np.column_stack([stripes.line, stripes.centre_px])
     profiles, where = ([each[stripes.frame == frame] for frame in laser] for each in (points, found))
-    return CapturedProfiles(profiles, where, times, poses, pose_times_s, known)
+    return CapturedProfiles(profiles, where, times, at, pose_times_s, known)
 
 
 def with_sensor(

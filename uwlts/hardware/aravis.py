@@ -9,6 +9,7 @@ import time
 from contextlib import suppress
 from ctypes import POINTER, byref, c_char_p, c_double, c_int, c_int64, c_size_t, c_uint, c_uint16, c_uint64, c_void_p
 from dataclasses import dataclass, replace
+from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +20,10 @@ import numpy as np
 from uwlts.hardware.camera import (
     BUFFERS,
     CENTRE_LINES,
+    CHUNKS,
     COORDINATE_BITS,
+    LINE_RATE,
+    LINE_SELECTOR,
     MONO_BITS,
     CameraDevice,
     CameraInfo,
@@ -58,7 +62,9 @@ _OF_CAMERA: tuple[tuple[Any, str, list[Any]], ...] = (
     (None, "set_exposure_time set_gain set_frame_rate", [c_double]),
     (c_void_p, "create_stream", [c_void_p] * 2),
     (c_uint, "get_payload", []),
-    (c_void_p, "create_chunk_parser", []),
+    (c_int64, "get_integer", [c_char_p]),
+    (None, "set_integer", [c_char_p, c_int64]),
+    (None, "set_float", [c_char_p, c_double]),
     (None, "set_chunk_mode", [c_int]),
     (None, "set_chunk_state", [c_char_p, c_int]),
     (c_double, "get_float", [c_char_p]),
@@ -82,7 +88,8 @@ _OTHERS: tuple[tuple[Any, str, list[Any]], ...] = (
     (c_void_p, "arv_buffer_get_data", [c_void_p, POINTER(c_size_t)]),
     (c_uint64, "arv_buffer_get_frame_id arv_buffer_get_timestamp", [c_void_p]),
     (c_int, "arv_buffer_get_image_width arv_buffer_get_image_height", [c_void_p]),
-    (c_int64, "arv_chunk_parser_get_integer_value", [c_void_p, c_void_p, c_char_p, POINTER(POINTER(_GError))]),
+    (c_void_p, "arv_device_get_genicam", [c_void_p]),
+    (None, "arv_gc_set_buffer", [c_void_p, c_void_p]),
     (c_int, "arv_buffer_has_chunks", [c_void_p]),
     (None, "g_object_unref g_free g_error_free", [c_void_p]),
 )
@@ -173,7 +180,8 @@ class AravisCamera(CameraDevice):
         self._functions: SimpleNamespace
         self._camera: int | None = None
         self._stream: int | None = None
-        self._chunks: int | None = None
+        self._chunks: tuple[str, ...] = ()
+        self._by_line = False
         self._gone = False
 
     def _open(self) -> CameraInfo:
@@ -242,8 +250,9 @@ class AravisCamera(CameraDevice):
         return (fitting[0].address if fitting[0].protocol == "GigEVision" else fitting[0].identifier).encode()
 
     def _close(self) -> None:
-        things = [thing for thing in (self._chunks, self._stream, self._camera) if thing is not None]
-        self._chunks = self._stream = self._camera = None
+        things = [thing for thing in (self._stream, self._camera) if thing is not None]
+        self._stream = self._camera = None
+        self._chunks = ()
         if self._gone:
             # Aravis asks it again and again to let go, for 10 s, in which a laser may have to be switched off.
             threading.Thread(target=self._let_go, args=(things,), name="aravis-let-go").start()
@@ -264,21 +273,24 @@ class AravisCamera(CameraDevice):
             offered = [names[index].decode() for index in range(count.value)]
             self._functions.g_free(names)
             self._call("set_pixel_format_from_string", self._grey_format(wanted.bits, offered).encode())
-        else:
-            # One profile a frame.
-            region = replace(region, y_px=0, height_px=1)
         self._set_chunks()
         self._call("set_region", region.x_px, region.y_px, region.width_px, region.height_px)
         exposure_us = None if wanted.exposure_ms is None else 1e3 * wanted.exposure_ms
         self._set_number("exposure_time", exposure_us, automatic="exposure")
         self._set_number("gain", wanted.gain_db, automatic="gain")
-        self._set_number("frame_rate", wanted.frame_rate_hz)
+        by_lines = self.info.coordinates is not None and self._offers(LINE_RATE)
+        if by_lines and wanted.frame_rate_hz is not None:
+            self._call("set_float", LINE_RATE.encode(), wanted.frame_rate_hz)
+        elif not by_lines:
+            self._set_number("frame_rate", wanted.frame_rate_hz)
         if wanted.trigger != "free":
             self._call("set_trigger", b"Software" if wanted.trigger == "software" else b"Line0")
         exposure_us, gain, rate = (
             self._call(f"get_{feature}") if self._has(feature) else None
             for feature in ("exposure_time", "gain", "frame_rate")
         )
+        if by_lines:
+            rate = self._call("get_float", LINE_RATE.encode())
         return CameraSettings(
             exposure_ms=None if exposure_us is None else 1e-3 * exposure_us,
             gain_db=gain,
@@ -289,11 +301,14 @@ class AravisCamera(CameraDevice):
         )
 
     def _set_chunks(self) -> None:
-        """Have the encoder's count sent with every frame, by a camera that has it."""
-        if self._chunks is None and self._offers("ChunkModeActive") and self._offers("ChunkEncoderValue"):
+        """Have what the camera knows of each frame, or of each of its profiles, sent with it."""
+        if self._offers("ChunkModeActive"):
+            self._chunks = tuple(each for each in CHUNKS if self._offers(f"Chunk{each}"))
+        if self._chunks:
             self._call("set_chunk_mode", 1)
-            self._call("set_chunk_state", b"EncoderValue", 1)
-            self._chunks = self._call("create_chunk_parser")
+        for each in self._chunks:
+            self._call("set_chunk_state", each.encode(), 1)
+        self._by_line = self._offers(LINE_SELECTOR)
 
     def _set_number(self, feature: str, value: float | None, *, automatic: str | None = None) -> None:
         if value is None:
@@ -363,20 +378,23 @@ class AravisCamera(CameraDevice):
             return incomplete
         pixels = (ctypes.c_ubyte * needed).from_address(start)
         image = np.frombuffer(pixels, kind).reshape(height, width).astype(kind.newbyteorder("="))
-        seen = image if self.info.coordinates is None else self._profile(image)
-        return Delivered(seen, number, time_s, encoder=self._encoder(buffer))
+        frame, chunk = Delivered(image, number, time_s), partial(self._chunk, buffer)
+        if self.info.coordinates is None:
+            return replace(frame, encoder=chunk("ChunkEncoderValue", 0))
+        return self._profiles(image, frame, chunk)
 
-    def _encoder(self, buffer: int) -> int | None:
-        if self._chunks is None or not self._functions.arv_buffer_has_chunks(buffer):
+    def _chunk(self, buffer: int, feature: str, row: int) -> int | None:
+        """The number of a feature that came with a frame, or with one of its profiles; None if it did not."""
+        functions = self._functions
+        if feature.removeprefix("Chunk") not in self._chunks or not functions.arv_buffer_has_chunks(buffer):
             return None
-        error = POINTER(_GError)()
-        count = self._functions.arv_chunk_parser_get_integer_value(
-            self._chunks, buffer, b"ChunkEncoderValue", byref(error)
-        )
-        if error:
-            self._functions.g_error_free(error)
-            return None
-        return count
+        device = functions.arv_camera_get_device(self._camera)
+        functions.arv_gc_set_buffer(functions.arv_device_get_genicam(device), buffer)
+        with suppress(HardwareError):
+            if self._by_line:
+                self._call("set_integer", LINE_SELECTOR.encode(), row)
+            return self._call("get_integer", feature.encode())
+        return None
 
     def _answers(self) -> None:
         self._numbers("get_region", 4)

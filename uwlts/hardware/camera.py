@@ -10,7 +10,7 @@ twice, come late, or leave out frames that were lost in transfer.
 
 import time
 from abc import ABC, abstractmethod
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -26,6 +26,12 @@ Trigger = Literal["free", "software", "line"]
 
 CENTRE_LINES = "Coord3D_C16"
 """Pixel format of a 3D camera that finds the stripe itself (GenICam Pixel Format Naming Convention 2.4)."""
+
+LINE_RATE, LINE_SELECTOR = "AcquisitionLineRate", "ChunkScanLineSelector"
+"""Features of 3D cameras: profiles per second; and of which profile of a frame the chunk data are read."""
+
+CHUNKS = ("EncoderValue", "Timestamp")
+"""Chunk data that are asked for: Chunk... is the feature's name."""
 
 BUFFERS = 32
 """Frames that may wait in a driver to be fetched; at 60 frames/s half a second. Later ones are lost."""
@@ -181,13 +187,17 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class Delivered:
-    """A frame from a driver: image (H, W) or centre line, None if incomplete, with what the camera reports about it."""
+    """A frame from a driver: image (H, W) or centre line, None if incomplete, with what the camera reports about it.
+
+    ``later`` are the other centre lines of a frame that holds several, in their order.
+    """
 
     seen: np.ndarray | Stripe | None
     frame_id: int
     time_s: float | None = None
     exposure_ms: float | None = None
     encoder: int | None = None
+    later: tuple["Delivered", ...] = ()
 
 
 @dataclass(frozen=True)
@@ -231,6 +241,7 @@ class CameraDevice(ABC):
         self._started = False
         self._check = FrameCheck()
         self._skip = False
+        self._later: deque[GrabbedFrame] = deque()
 
     @property
     def info(self) -> CameraInfo:
@@ -281,14 +292,18 @@ class CameraDevice(ABC):
         bits: int | None = None,
         trigger: Trigger = "free",
         frame_rate_hz: float | None = None,
+        profiles: int = 1,
     ) -> CameraSettings:
         """Set up the camera, and return what it really set, which may be rounded or limited.
 
         Exposure, gain, bits of a grey value, and frames per second of a free-running camera: None leaves what is set.
-        ``region`` is the part of the image sensor to read out; None for all of it. A 3D camera gives one profile a
-        frame, and ``bits`` are its own. ``trigger`` is "free": one frame
+        ``region`` is the part of the image sensor to read out; None for all of it. ``trigger`` is "free": one frame
         after the other; "software": one for each call of ``trigger``; or "line": one for each pulse at the camera's
         trigger input.
+
+        A 3D camera sends so many ``profiles`` in a frame, each with a time stamp and an encoder's count of its own
+        (``ChunkScanLineSelector``); ``grab`` returns them one by one. ``frame_rate_hz`` is that of profiles, and
+        ``bits`` are its own. A triggered one sends one profile.
         """
         info = self.info
         if self._started:
@@ -303,6 +318,12 @@ class CameraDevice(ABC):
         inside = min(region.x_px, region.y_px) >= 0 and min(region.width_px, region.height_px) > 0
         if not inside or right > info.width_px or below > info.height_px:
             raise HardwareError(f"{region} is not within the image sensor of {info.width_px} x {info.height_px} px")
+        if profiles < 1 or (profiles > 1 and (info.coordinates is None or trigger != "free")):
+            raise HardwareError(
+                f"profiles is {profiles}: a free-running 3D camera sends 1 or more in a frame, any other camera 1"
+            )
+        if info.coordinates is not None:
+            region = replace(region, y_px=0, height_px=profiles)
         if bits is None:
             bits = info.bits if self._settings is None else self._settings.bits
         settings = self._configure(CameraSettings(exposure_ms, gain_db, region, bits, trigger, frame_rate_hz))
@@ -318,7 +339,9 @@ class CameraDevice(ABC):
         settings = self.settings
         if self._started:
             raise HardwareError(f"the camera {self.address} is running already")
-        self._check = FrameCheck(period_s=1 / settings.frame_rate_hz if settings.frame_rate_hz else None)
+        together = 1 if self.info.coordinates is None else settings.region.height_px
+        self._check = FrameCheck(period_s=together / settings.frame_rate_hz if settings.frame_rate_hz else None)
+        self._later.clear()
         self._skip = faults == "skip"
         self._start()
         self._started = True
@@ -336,6 +359,7 @@ class CameraDevice(ABC):
             raise HardwareError(
                 f"the camera {self.address} is configured for trigger '{self.settings.trigger}', not 'software'"
             )
+        self._later.clear()
         while self._next(0.0) is not None:
             self._check.begin_anew("late")
         self._trigger()
@@ -348,6 +372,8 @@ class CameraDevice(ABC):
         answer to a later one.
         """
         self._require_running()
+        if self._later:
+            return self._later.popleft()
         deadline = time.monotonic() + timeout_s
         while True:
             left_s = max(deadline - time.monotonic(), 0.0)
@@ -360,12 +386,14 @@ class CameraDevice(ABC):
             status = self._check.judge(frame_id=frame.frame_id, time_s=frame.time_s, complete=frame.seen is not None)
             usable = status is FrameStatus.OK or (self._skip and status is not FrameStatus.DUPLICATED)
             if frame.seen is not None and usable:
-                return self._grabbed(frame.seen, frame, status)
+                self._later.extend(self._grabbed(each, FrameStatus.OK) for each in frame.later)
+                return self._grabbed(frame, status)
             if not self._skip:
                 raise HardwareError(f"frame {frame.frame_id} of the camera {self.address} is {_MEANING[status]}")
 
-    def _grabbed(self, seen: np.ndarray | Stripe, frame: Delivered, status: FrameStatus) -> GrabbedFrame:
-        settings = self.settings
+    def _grabbed(self, frame: Delivered, status: FrameStatus) -> GrabbedFrame:
+        settings, seen = self.settings, frame.seen
+        assert seen is not None
         shape = settings.region.height_px, settings.region.width_px
         if isinstance(seen, np.ndarray) and seen.shape != shape:
             raise HardwareError(
@@ -410,13 +438,38 @@ class CameraDevice(ABC):
             raise HardwareError(f"the camera {self.address} does not give {wanted}, only {', '.join(offered)}")
         return wanted
 
-    def _profile(self, numbers: np.ndarray) -> Stripe:
-        """The centre line of a 3D camera's numbers (1, W); HardwareError where they lie beyond the profile lines."""
-        meant = self.info.coordinates or Coordinates()
+    def _profiles(self, numbers: np.ndarray, frame: Delivered, chunk: Callable[[str, int], int | None]) -> Delivered:
+        """The frame of a 3D camera with the centre lines of the rows of its numbers (N, W).
+
+        ``chunk(feature, row)`` is the number that came with a row, None where none did. HardwareError where places lie
+        beyond the profile lines, or the time of a row is not known.
+        """
+        meant, rows = self.info.coordinates or Coordinates(), range(len(numbers))
         try:
-            return meant.stripe(numbers.ravel(), stripe_along="width", length_px=self.info.height_px)
+            lines = [meant.stripe(each, stripe_along="width", length_px=self.info.height_px) for each in numbers]
         except ImageError as error:
             raise HardwareError(f"the 3D camera {self.address}: {error}") from error
+        times_s: list[float | None] = [frame.time_s]
+        if len(lines) > 1:
+            times_s = [None if frame.time_s is None else frame.time_s + each for each in self._since_first(rows, chunk)]
+        delivered = [
+            replace(frame, seen=line, time_s=time_s, encoder=chunk("ChunkEncoderValue", row))
+            for row, line, time_s in zip(rows, lines, times_s, strict=True)
+        ]
+        return replace(delivered[0], later=tuple(delivered[1:]))
+
+    def _since_first(self, rows: range, chunk: Callable[[str, int], int | None]) -> list[float]:
+        """Times of a frame's profiles since the first one in s, by their own time stamps or the rate of profiles."""
+        stamps = [each for row in rows if (each := chunk("ChunkTimestamp", row)) is not None]
+        # Some cameras have one time stamp a frame alone.
+        if len(stamps) == len(rows) and stamps[-1] > stamps[0]:
+            return [1e-9 * (each - stamps[0]) for each in stamps]
+        if (rate_hz := self.settings.frame_rate_hz) is None:
+            raise HardwareError(
+                f"the 3D camera {self.address} gives neither a ChunkTimestamp for each profile nor its "
+                "AcquisitionLineRate: when its profiles were taken is not known; have it send 1 profile in a frame"
+            )
+        return [row / rate_hz for row in rows]
 
     def _require_running(self) -> None:
         if not self._started:

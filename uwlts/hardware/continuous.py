@@ -122,12 +122,14 @@ def record_continuously(
     clock = _compared(camera, exposure_ms)
     at_rest_mm = stage.position_mm()
     camera.stop()
-    rate_set = camera.configure(**settings, frame_rate_hz=rate_hz).frame_rate_hz
+    together = continuous.profiles_per_frame
+    rate_set = camera.configure(**settings, frame_rate_hz=rate_hz, profiles=together).frame_rate_hz
     if rate_set is None or abs(rate_set / rate_hz - 1) > 0.01:
         warn(f"the camera takes {rate_set} frames/s where the plan needs {rate_hz:.4g}: steps differ from the plan's")
     kinds = {"centre_lines": lines, "moving": True}
     with CaptureWriter(out, header, dtype=dtype, **kinds, plan=plan.recorded(), overwrite=overwrite) as writer:
         reading = _Reading(camera, writer, clock, positions, exposure_ms, sensor, header.saturation_dn)
+        reading.patience_s += together / rate_hz
         reading.hears = lambda frame, stripe, number: (
             counted(stripe),
             progress(min(number + 1, expected), expected),
@@ -204,6 +206,7 @@ class _Reading:
         self._began_s = time.monotonic()
         self.end_s: float | None = None
         self.ending = threading.Event()
+        self.patience_s = _PATIENCE_S + 1e-3 * exposure_ms
         self.error: Exception | None = None
 
     def begin_pass(self) -> None:
@@ -220,7 +223,7 @@ class _Reading:
         """Read frames until one was taken after the end of the last pass."""
         try:
             while not self.ending.is_set():
-                frame = self._camera.grab(_PATIENCE_S + 1e-3 * self._exposure_ms)
+                frame = self._camera.grab(self.patience_s)
                 middle_s = frame.time_s + self._clock.offset_s + 0.5e-3 * self._exposure_ms
                 self._pending.append((frame, middle_s))
                 self._store_what_is_known()

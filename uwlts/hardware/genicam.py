@@ -6,7 +6,7 @@ XIMEA's producer for the thesis's camera is among them, and so are those of Basl
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,10 @@ import numpy as np
 from uwlts.hardware.camera import (
     BUFFERS,
     CENTRE_LINES,
+    CHUNKS,
     COORDINATE_BITS,
+    LINE_RATE,
+    LINE_SELECTOR,
     MONO_BITS,
     CameraDevice,
     CameraInfo,
@@ -120,22 +123,18 @@ class GenicamCamera(CameraDevice):
         with self._reporting("configuring it"):
             self._set_if_there("AcquisitionMode", "Continuous")
             self._set_if_there("TriggerMode", "Off")
-            region = wanted.region
             if self.info.coordinates is None:
                 offered = self._node("PixelFormat").symbolics
                 self._set_if_there("PixelFormat", self._grey_format(wanted.bits, offered))
-            else:
-                # One profile a frame.
-                region = replace(region, y_px=0, height_px=1)
-            for name, value in (("ModeActive", True), ("Selector", "EncoderValue"), ("Enable", True)):
-                if self._has("ChunkEncoderValue"):
-                    self._set_if_there(f"Chunk{name}", value)
-            self._set_region(region)
+            if self._has("ChunkModeActive"):
+                self._set_chunks()
+            self._set_region(wanted.region)
             self._set_number(_EXPOSURE_US, wanted.exposure_ms, "exposure", factor=1e3, automatic="ExposureAuto")
             self._set_number(_GAIN, wanted.gain_db, "gain", automatic="GainAuto")
+            of_rate = _FRAME_RATE if self.info.coordinates is None else (LINE_RATE, *_FRAME_RATE)
             if wanted.frame_rate_hz is not None:
                 self._set_if_there("AcquisitionFrameRateEnable", True)
-            self._set_number(_FRAME_RATE, wanted.frame_rate_hz, "frame rate")
+            self._set_number(of_rate, wanted.frame_rate_hz, "frame rate")
             if wanted.trigger != "free":
                 source = "Software" if wanted.trigger == "software" else "Line0"
                 for name, value in (("Selector", "FrameStart"), ("Mode", "On"), ("Source", source)):
@@ -144,7 +143,7 @@ class GenicamCamera(CameraDevice):
                     raise HardwareError(
                         f"the camera {self.address} cannot be triggered by {source}: use trigger 'free'"
                     )
-            exposure_us, gain, rate = (self._number(names) for names in (_EXPOSURE_US, _GAIN, _FRAME_RATE))
+            exposure_us, gain, rate = (self._number(names) for names in (_EXPOSURE_US, _GAIN, of_rate))
             x, y = (int(self._number((name,)) or 0) for name in ("OffsetX", "OffsetY"))
             width, height = (int(self._node(name).value) for name in ("Width", "Height"))
             return CameraSettings(
@@ -155,6 +154,14 @@ class GenicamCamera(CameraDevice):
                 trigger=wanted.trigger,
                 frame_rate_hz=rate,
             )
+
+    def _set_chunks(self) -> None:
+        """Have what the camera knows of each frame, or of each of its profiles, sent with it."""
+        self._node("ChunkModeActive").value = True
+        offered = self._node("ChunkSelector").symbolics if self._has("ChunkSelector") else ()
+        for each in set(CHUNKS).intersection(offered):
+            self._node("ChunkSelector").value = each
+            self._set_if_there("ChunkEnable", True)
 
     def _set_region(self, wanted: Region) -> None:
         # Moved to the corner first: a width is refused that would not fit beside the offset.
@@ -232,15 +239,24 @@ class GenicamCamera(CameraDevice):
             time_s = 1e-9 * raw.timestamp_ns
         except self._faults:
             time_s = None
-        image = encoder = None
-        if raw.is_complete() and buffer.payload.components:
-            part = buffer.payload.components[0]
-            kind = np.uint8 if self.settings.bits == 8 else np.uint16
-            image = part.data.reshape(part.height, part.width).astype(kind)
-            if self._has("ChunkEncoderValue"):
-                encoder = int(self._node("ChunkEncoderValue").value)
-        seen = image if image is None or self.info.coordinates is None else self._profile(image)
-        return Delivered(seen, raw.frame_id, time_s, encoder=encoder)
+        frame = Delivered(None, raw.frame_id, time_s)
+        if not raw.is_complete() or not buffer.payload.components:
+            return frame
+        part = buffer.payload.components[0]
+        kind = np.uint8 if self.settings.bits == 8 else np.uint16
+        image = part.data.reshape(part.height, part.width).astype(kind)
+        if self.info.coordinates is None:
+            return replace(frame, seen=image, encoder=self._chunk("ChunkEncoderValue", 0))
+        return self._profiles(image, frame, self._chunk)
+
+    def _chunk(self, feature: str, row: int) -> int | None:
+        """The number of a feature that came with the latest frame, or with one of its profiles; None if it did not."""
+        with suppress(*self._faults):
+            if self._has(feature):
+                if self._has(LINE_SELECTOR):
+                    self._node(LINE_SELECTOR).value = row
+                return int(self._node(feature).value)
+        return None
 
     def _answers(self) -> None:
         with self._reporting("asking it"):

@@ -117,13 +117,15 @@ class Continuous(Description):
 
     With ``both_ways`` it travels back as well, which shows the latency between camera and stage; ``latency_ms`` gives
     that instead: by how much the stage's positions are older than the frames. ``mm_per_count`` places the frames by an
-    encoder that is wired to the camera and sent with them (GenICam's ChunkEncoderValue).
+    encoder that is wired to the camera and sent with them (GenICam's ChunkEncoderValue). ``profiles_per_frame`` is how
+    many profiles a 3D camera sends together: more of them cost the network and this computer less.
     """
 
     speed_mm_per_s: Positive
     both_ways: bool = True
     latency_ms: float | None = None
     mm_per_count: float | None = None
+    profiles_per_frame: Annotated[int, Field(ge=1, le=10000)] = 1
 
 
 class ScanPlan(RigPlan):

@@ -217,7 +217,7 @@ class _Field:
         size = [_FINER * (n - 1) + 1 for n in self.shape]
         cell, top = self.cell / _FINER, tuple(_FINER * k for k in np.unravel_index(deepest, self.shape))
         fine = np.asarray(ndimage.zoom(depths.reshape(self.shape), np.divide(size, self.shape), order=3))
-        region = ndimage.zoom(self.region.reshape(self.shape), np.divide(size, self.shape), order=0)
+        region = np.asarray(ndimage.zoom(self.region.reshape(self.shape), np.divide(size, self.shape), order=0))
         labelled: Any = ndimage.label(region & (fine > edge), structure=np.ones((3, 3)))
         labels, depth = labelled[0], float(depths[deepest])
         if (label := labels[top]) == 0:

@@ -18,12 +18,12 @@ import numpy as np
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import Stripe, StripeStatus
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_part
 from uwlts.stripe.ends import leave_ends_out
 from uwlts.stripe.result import StripeCandidates
 
-_GAP = 12
-"""Lines that a dim stripe may be lost for and go on."""
+_GAP, _LONG_GAP = 12, 24
+"""Lines that a dim stripe may be lost for and go on; and those after which it still does where it goes on straight."""
 
 _SLACK_PX = 2.0
 """How much farther a stripe may have moved for each line that it was lost for."""
@@ -35,17 +35,22 @@ _SMOOTH_PX, _ROUGH, _ROUGHEST = 1.5, 0.03, 0.15
 """Departure from the straight way that noise explains, cost in jumps of each px beyond it, and the highest: stripes are
 smooth, and chains of speckles are not."""
 
-_SKIPPED, _LOST = 0.1, 0.005
+_SKIPPED, _LOST = 0.03, 0.005
 """Cost, in jumps, of a line whose candidates the path passes by: of a clear stripe, and of a faint one, which noise may
 hide."""
 
-_FAINT = 4.0
-"""Height, in least heights of a stripe, below which one is faint."""
+_FAINT, _CLEAR = 4.0, 12.0
+"""Mean heights, in least heights of a stripe, up to which one is faint and from which it is clear."""
 
-_BEHIND, _DIMMER, _OCTAVES = 0.002, 0.002, 3.0
-"""Cost, in jumps, of each candidate nearer to the sensor on the same line, and of each halving of the brightness below
-the line's brightest, up to so many: they decide between paths with equally many jumps. A surface hides what lies behind
-it, so that what is seen behind is a reflection; reflections are dimmer than what they show."""
+_BEHIND, _DIMMER, _OCTAVES, _SOME_LINES = 0.35, 0.15, 3.0, 20.0
+"""Cost, in jumps, of a stripe with another one nearer to the sensor on its lines, and of each halving of the brightness
+below the brightest, up to so many; less on fewer lines than so many. They decide between paths with equally many jumps.
+A surface hides what lies behind it, so that what is seen behind is a reflection; reflections are dimmer than what they
+show, but brighter than the own stripe of a mirror."""
+
+_BEHIND_CORNER = 1.5
+"""The same for a stripe behind one that it meets: both begin in a corner, and the nearer one is the surface in which
+the other one is seen."""
 
 _MARGIN = 0.3
 """Jumps by which a path has to be the better one."""
@@ -60,6 +65,9 @@ _REFUSED_BESIDE = 3
 _CROSSING_LINES, _FEWEST_LINES, _OPENING = 12, 6, 0.2
 """Lines, at most and at least, from which two stripes' distance shows where they cross, and its least growth per
 line."""
+
+_CORNER_LINES = 30
+"""The same lines, at most, for a corner: some show another stripe."""
 
 _BESIDE, _AS_BRIGHT, _LONGEST_CROSSING = 4.0, 0.5, 24
 """Distance, in jumps' lengths, within which stripes may run into each other; share of the brightness from which the
@@ -78,6 +86,9 @@ _OK, _AMBIGUOUS = np.uint8(StripeStatus.OK), np.uint8(StripeStatus.AMBIGUOUS)
 @dataclass(frozen=True, eq=False)
 class SeenStripes:
     """The stripe of an image, before ends are left out, and the candidates where there are several, None for no line.
+
+    Candidates without a width cannot be measured: two stripes that run into each other, or one too wide. The path goes
+    on through them, but their lines have no point.
 
     ``least`` is the least height of a stripe in grey levels, ``jump_px`` how far apart neighbouring lines' centres are
     on two stripes, ``end_lines`` as of `StripeOptions`.
@@ -126,12 +137,17 @@ def _chosen(image: SeenStripes, path: _Paths | None, *, beside: Sequence[_Paths 
 
 @dataclass(eq=False)
 class _Paths:
-    """Candidates (M,) of an image on all of its lines, which of them are alone on theirs, and the state of each."""
+    """Candidates (M,) of an image on all of its lines.
+
+    ``number`` is that of the stripe of each (`_number_stripes`), ``alone`` which are alone on their lines, ``state``
+    what is decided.
+    """
 
     line: np.ndarray
     centre_px: np.ndarray
     amplitude: np.ndarray
     width_px: np.ndarray
+    number: np.ndarray
     alone: np.ndarray
     state: np.ndarray
     least: float
@@ -153,8 +169,9 @@ class _Paths:
         _keep_stripes(line, centre, amplitude, kept)
         line, centre, amplitude, width = (values[kept] for values in (line, centre, amplitude, width))
         single = np.bincount(line)[line] == 1
-        state = np.full(len(line), _OPEN, np.int8)
-        return cls(line, centre, amplitude, width, single, state, least, jump_px)
+        number, state = np.empty(len(line), np.intp), np.full(len(line), _OPEN, np.int8)
+        _number_stripes(line, centre, jump_px, number)
+        return cls(line, centre, amplitude, width, number, single, state, least, jump_px)
 
     def decide(self, farther: int, vote: np.ndarray) -> None:
         """Take the candidates that the best path goes through, if it is clearly the best."""
@@ -162,14 +179,14 @@ class _Paths:
             self.line,
             self.centre_px,
             self.amplitude,
+            self.number,
             farther=farther,
             jump_px=self.jump_px,
             least=self.least,
             vote=vote,
         )
         _take(self.line, margin, self.alone, self.state)
-        _refuse_between(self.line, self.centre_px, self.alone, self.state, self.jump_px)
-        _refuse_tails(self.line, self.centre_px, self.alone, self.state, self.jump_px)
+        _refuse_alone(self.line, self.number, self.alone, self.state)
         _refuse_crossings(self.line, self.centre_px, self.amplitude, self.state, self.jump_px)
 
     def vote(self, other: _Paths) -> np.ndarray:
@@ -182,7 +199,7 @@ class _Paths:
         """The stripe of the taken candidates; lines without any that had one are AMBIGUOUS."""
         centre, amplitude = np.full(len(before.status), np.nan), np.full(len(before.status), np.nan, np.float32)
         width, status = amplitude.copy(), before.status.copy()
-        taken = self.state == _TAKEN
+        taken = (self.state == _TAKEN) & np.isfinite(self.width_px)
         status[self.line], lines = _AMBIGUOUS, self.line[taken]
         status[lines] = _OK
         centre[lines], amplitude[lines] = self.centre_px[taken], self.amplitude[taken]
@@ -203,6 +220,7 @@ def path_margins(
     line: np.ndarray,
     centre_px: np.ndarray,
     amplitude: np.ndarray,
+    stripe: np.ndarray,
     *,
     farther: int,
     jump_px: float,
@@ -211,41 +229,104 @@ def path_margins(
 ) -> np.ndarray:
     """Cost (M,), in jumps beyond the best path, of the best path through each candidate (M,) of an image.
 
-    ``line`` (M,) grows; ``farther`` is as of `farther`, 0 where unknown. Neighbours more than ``jump_px`` apart are
-    a jump. ``vote`` (M,) is added to the cost of each candidate.
+    ``line`` (M,) grows; ``stripe`` (M,) numbers the stripes that they belong to; ``farther`` is as of `farther`, 0
+    where unknown. Neighbours more than ``jump_px`` apart are a jump. ``vote`` (M,) is added to the cost of each
+    candidate.
     """
-    skipped = np.where(amplitude < _FAINT * least, _LOST, _SKIPPED)
-    cost = vote + _own_cost(line, centre_px, amplitude, farther)
-    through = np.empty(len(line))
-    _least_cost(line, centre_px, cost, skipped, jump_px, through)
-    backwards = np.empty(len(line))
-    _least_cost(
-        line.max() - line[::-1], centre_px[::-1].copy(), cost[::-1].copy(), skipped[::-1].copy(), jump_px, backwards
-    )
+    mean = np.empty(len(line))
+    _average(line, amplitude, stripe, mean)
+    height = np.minimum(amplitude, mean) / least
+    clear = np.clip((height - _FAINT) / (_CLEAR - _FAINT), 0.0, 1.0)
+    skipped = _LOST + (_SKIPPED - _LOST) * clear
+    cost = vote + _own_cost(line, centre_px, amplitude, stripe, farther)
+    before, after = np.empty((2, len(line)))
+    _slopes(line, centre_px, stripe, before, after)
+    through, backwards = np.empty((2, len(line)))
+    _least_cost(line, centre_px, before, after, cost, skipped, jump_px, through)
+    turned = [values[::-1].copy() for values in (line.max() - line, centre_px, -after, -before, cost, skipped)]
+    _least_cost(*turned, jump_px=jump_px, result=backwards)
     through += backwards[::-1] - cost
     return through - through.min()
 
 
-def _own_cost(line: np.ndarray, centre_px: np.ndarray, amplitude: np.ndarray, farther: int) -> np.ndarray:
-    """Cost (M,) of candidates by the others on their lines."""
+def _own_cost(
+    line: np.ndarray, centre_px: np.ndarray, amplitude: np.ndarray, stripe: np.ndarray, farther: int
+) -> np.ndarray:
+    """Cost (M,) of candidates by the others on their lines; that of a stripe does not grow with its length."""
     _, group, count = np.unique(line, return_inverse=True, return_counts=True)
     brightest = np.zeros(len(count))
     np.maximum.at(brightest, group, amplitude)
     dimmer = np.clip(np.log2(brightest[group] / np.maximum(amplitude, 1e-6)), 0.0, _OCTAVES)
-    order = np.lexsort((farther * centre_px, line))
-    rank = np.empty(len(line))
-    rank[order] = np.arange(len(line)) - (np.cumsum(count) - count)[group[order]]
-    return _DIMMER * dimmer + _BEHIND * (rank if farther else 0.0)
+    behind, rivals = np.zeros(len(line)), np.bincount(stripe, count[group] > 1, minlength=len(line))
+    if farther:
+        order = np.lexsort((farther * centre_px, line))
+        apart = np.full(len(line), np.nan)
+        apart[order[1:]] = np.where(np.diff(line[order]) == 0, np.abs(np.diff(centre_px[order])), np.nan)
+        hidden = np.isfinite(apart)
+        for number in np.flatnonzero(np.bincount(stripe, hidden) > 0):
+            own = np.flatnonzero(hidden & (stripe == number))
+            behind[own] = _BEHIND_CORNER if _meets(line[own], apart[own]) else _BEHIND
+    return (_DIMMER * dimmer + behind) / np.maximum(rivals[stripe], _SOME_LINES)
+
+
+def _meets(line: np.ndarray, apart_px: np.ndarray) -> bool:
+    """Whether distances (K,) of a stripe from the one before it shrink to nothing beyond one of its ends.
+
+    By the median slope (Theil and Sen), as the one before it may be lost on lines where still another one is seen.
+    """
+    if len(line) < _CROSSING_LINES:
+        return False
+    for end, inwards in ((slice(None, _CORNER_LINES), 1), (slice(-_CORNER_LINES, None), -1)):
+        lines, apart = line[end], apart_px[end]
+        away = inwards * (lines - lines[0 if inwards > 0 else -1])
+        one, other = np.triu_indices(len(lines), 1)
+        growth = float(np.median((apart[other] - apart[one]) / (away[other] - away[one])))
+        if growth > _OPENING and np.median(apart - growth * away) <= _LONGEST_CROSSING * growth:
+            return True
+    return False
+
+
+@compiled
+def _number_stripes(line: np.ndarray, centre: np.ndarray, jump_px: float, stripe: np.ndarray) -> None:
+    """Number (M,) of the stripe of each candidate: that of the one before it that it goes on from most straight.
+
+    Only one goes on from each.
+    """
+    first, goes_on, slope = 0, np.zeros(line.size, np.bool_), np.zeros(line.size)
+    for k in range(line.size):
+        while line[k] - line[first] > _GAP:
+            first += 1
+        before, nearest, j = -1, np.inf, k - 1
+        while j >= first and (before < 0 or line[j] == line[before]):
+            away = abs(centre[k] - centre[j] - slope[j] * (line[k] - line[j]))
+            if line[j] < line[k] and not goes_on[j] and away < nearest and _linked(line, centre, k, j, jump_px):
+                before, nearest = j, away
+            j -= 1
+        stripe[k] = k if before < 0 else stripe[before]
+        if before >= 0:
+            goes_on[before] = True
+            step = (centre[k] - centre[before]) / (line[k] - line[before])
+            slope[k] = slope[before] + _TURN * (step - slope[before])
 
 
 @compiled
 def _least_cost(
-    line: np.ndarray, centre: np.ndarray, cost: np.ndarray, skipped: np.ndarray, jump_px: float, result: np.ndarray
+    line: np.ndarray,
+    centre: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
+    cost: np.ndarray,
+    skipped: np.ndarray,
+    jump_px: float,
+    result: np.ndarray,
 ) -> None:
-    """Cost (M,) of the best path that ends in each candidate, its own included."""
+    """Cost (M,) of the best path that ends in each candidate, its own included.
+
+    ``before`` and ``after`` are the slopes of its stripe on either side of each.
+    """
     count = line.size
     # What it costs to pass by, from the first line on: the number of lines with candidates before each one.
-    lines_before, slope = np.zeros(count), np.zeros(count)
+    lines_before = np.zeros(count)
     for k in range(1, count):
         lines_before[k] = lines_before[k - 1] + (1.0 if line[k] != line[k - 1] else 0.0)
     elsewhere, best_of_line, first = 0.0, np.inf, 0
@@ -253,7 +334,7 @@ def _least_cost(
         if k > 0 and line[k] != line[k - 1]:
             elsewhere = min(elsewhere + _SKIPPED, best_of_line + 1.0)
             best_of_line = np.inf
-        while line[k] - line[first] > _GAP:
+        while line[k] - line[first] > _LONG_GAP:
             first += 1
         best = elsewhere
         for j in range(first, k):
@@ -261,14 +342,42 @@ def _least_cost(
             if apart == 0:
                 break
             moved, allowed = centre[k] - centre[j], jump_px + _SLACK_PX * (apart - 1)
-            off = min(abs(moved), abs(moved - slope[j] * apart))
-            if off <= allowed:
+            straight = min(abs(moved - before[j] * apart), abs(moved - after[k] * apart))
+            off = min(abs(moved), straight)
+            if off <= allowed if apart <= _GAP else straight <= jump_px:
                 way = result[j] + min(skipped[j], skipped[k]) * (lines_before[k] - lines_before[j] - 1.0)
                 way += min(max(off - _SMOOTH_PX, 0.0) * _ROUGH, _ROUGHEST)
-                if way < best:
-                    best, slope[k] = way, slope[j] + _TURN * (moved / apart - slope[j])
+                best = min(best, way)
         result[k] = best + cost[k]
         best_of_line = min(best_of_line, result[k])
+
+
+@compiled
+def _slopes(line: np.ndarray, centre: np.ndarray, stripe: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
+    """Slopes (M,) of the stripe of each candidate on the lines before and after it, by least squares; 0 at its ends."""
+    for side, result in ((-1, before), (1, after)):
+        for k in range(line.size):
+            products, squares, j = 0.0, 0.0, k + side
+            while 0 <= j < line.size and abs(line[j] - line[k]) <= _GAP:
+                if stripe[j] == stripe[k]:
+                    away = float(line[j] - line[k])
+                    products, squares = products + away * (centre[j] - centre[k]), squares + away * away
+                j += side
+            result[k] = products / squares if squares > 0.0 else 0.0
+
+
+@compiled
+def _average(line: np.ndarray, amplitude: np.ndarray, stripe: np.ndarray, mean: np.ndarray) -> None:
+    """Mean height (M,) of each candidate and those of its stripe on the lines beside it."""
+    for k in range(line.size):
+        total, count = amplitude[k] * 1.0, 1
+        for side in (-1, 1):
+            j = k + side
+            while 0 <= j < line.size and abs(line[j] - line[k]) <= _GAP:
+                if stripe[j] == stripe[k]:
+                    total, count = total + amplitude[j], count + 1
+                j += side
+        mean[k] = total / count
 
 
 @compiled
@@ -332,61 +441,42 @@ def _take(line: np.ndarray, margin: np.ndarray, alone: np.ndarray, state: np.nda
 
 
 @compiled
-def _refuse_between(line: np.ndarray, centre: np.ndarray, alone: np.ndarray, state: np.ndarray, jump_px: float) -> None:
-    """Refuse candidates that are alone between refused ones of the same stripe: where noise hides the true one."""
-    for k in range(line.size):
-        if alone[k]:
-            refused = True
-            for side in (-1, 1):
-                j, beside = k + side, False
-                while 0 <= j < line.size and abs(line[j] - line[k]) <= _GAP:
-                    if not alone[j] and _linked(line, centre, k, j, jump_px):
-                        beside = state[j] != _TAKEN
-                        break
-                    j += side
-                refused &= beside
-            state[k] = _REFUSED if refused else _TAKEN
+def _refuse_alone(line: np.ndarray, stripe: np.ndarray, alone: np.ndarray, state: np.ndarray) -> None:
+    """Refuse candidates that are alone, as noise hides the true one, between refused ones of the same stripe.
 
-
-@compiled
-def _refuse_tails(line: np.ndarray, centre: np.ndarray, alone: np.ndarray, state: np.ndarray, jump_px: float) -> None:
-    """Refuse candidates that are alone and go on from a longer refused stripe only, where the true one is dark."""
-    first, count = 0, line.size
-    while first < count:
-        if not alone[first] or state[first] != _TAKEN:
-            first += 1
+    So are those at the end of a stripe that is refused on more lines than they are.
+    """
+    count = line.size
+    # Of each candidate the next ones of its stripe, -1 for none.
+    before, after, last = np.full(count, -1), np.full(count, -1), np.full(count, -1)
+    for k in range(count):
+        before[k] = last[stripe[k]]
+        if before[k] >= 0:
+            after[before[k]] = k
+        last[stripe[k]] = k
+    for k in range(count):
+        if not alone[k] or (before[k] >= 0 and alone[before[k]]):
             continue
-        last = first
-        while last + 1 < count and alone[last + 1] and _linked(line, centre, last, last + 1, jump_px):
-            last += 1
-        longest, safe = 0, False
-        for end, side in ((first, -1), (last, 1)):
-            j = end + side
-            while 0 <= j < count and abs(line[j] - line[end]) <= _GAP:
-                if _linked(line, centre, end, j, jump_px):
-                    safe |= state[j] == _TAKEN
-                    if state[j] != _TAKEN:
-                        longest = max(longest, _refused_run(line, centre, state, j, side, jump_px))
-                j += side
-        if not safe and longest > last - first:
-            state[first : last + 1] = _REFUSED
-        first = last + 1
+        end = k
+        while after[end] >= 0 and alone[after[end]]:
+            end = after[end]
+        refused, known = 0, 0
+        for first, onwards in ((before[k], before), (after[end], after)):
+            j = first
+            while j >= 0 and (alone[j] or state[j] != _TAKEN):
+                refused, j = refused + (0 if alone[j] else 1), onwards[j]
+            known += 1 if first >= 0 else 0
+            if first >= 0 and state[first] == _TAKEN:
+                refused = -count
+        lines = line[end] - line[k] + 1
+        state_of_run = _REFUSED if refused > lines or (known == 2 and refused > 0 and lines <= 2 * _GAP) else _TAKEN
+        j = k
+        while j >= 0 and alone[j]:
+            state[j] = state_of_run
+            j = after[j]
 
 
-@compiled
-def _refused_run(
-    line: np.ndarray, centre: np.ndarray, state: np.ndarray, number: int, side: int, jump_px: float
-) -> int:
-    """Lines over which a refused stripe goes on to a side."""
-    at, j = number, number + side
-    while 0 <= j < line.size and abs(line[j] - line[at]) <= _GAP:
-        if state[j] != _TAKEN and line[j] != line[at] and _linked(line, centre, at, j, jump_px):
-            at = j
-        j += side
-    return abs(line[at] - line[number])
-
-
-@compiled
+@compiled_part
 def _linked(line: np.ndarray, centre: np.ndarray, one: int, other: int, jump_px: float) -> bool:
     """Whether two candidates may be of the same stripe."""
     return abs(centre[one] - centre[other]) <= jump_px + _SLACK_PX * max(abs(line[one] - line[other]) - 1, 0)
@@ -430,7 +520,7 @@ def _refuse_crossings(
             state[k] = _OPEN
 
 
-@compiled
+@compiled_part
 def _nearest_beside(line: np.ndarray, centre: np.ndarray, number: int) -> int:
     """Number of the candidate on the same line that is nearest; -1 where none is."""
     first, best = number, -1
@@ -443,7 +533,7 @@ def _nearest_beside(line: np.ndarray, centre: np.ndarray, number: int) -> int:
     return best
 
 
-@compiled
+@compiled_part
 def _pair_beside(
     line: np.ndarray,
     centre: np.ndarray,

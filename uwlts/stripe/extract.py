@@ -99,13 +99,13 @@ def see_stripes(
     seen, jump_px = found.detection, found.options.half_window_px / 2
     if seen is None or options.peak is not PeakRule.DIRECT:
         return SeenStripes(found.stripe, None, options.threshold_floor, jump_px, options.end_lines)
-    lines = np.flatnonzero(found.several)
-    clear = found.stripe.status[lines] == _OK
+    lines = np.flatnonzero(found.several | found.glare)
+    clear = (found.stripe.status[lines] == _OK) & ~found.glare[lines]
     if clear.any():
         heights = {"coarse": seen.coarse, "fine": seen.fine}
         of_rivals = with_rivals(found.profiles, seen.left, lines[clear], **heights, options=found.options)
         lines = np.sort(np.concatenate([of_rivals, lines[~clear]]))
-    rivals = found.candidates(lines, least=2) if len(lines) else None
+    rivals = found.candidates(lines, rivals=True) if len(lines) else None
     if rivals is not None and len(rivals.line) == 0:
         rivals = None
     return SeenStripes(found.stripe, rivals, seen.fine, jump_px, options.end_lines)
@@ -146,14 +146,14 @@ def _extracted(
         kernel = (1, count) if stripe_along == "height" else (count, 1)
         signal = cv2.blur(signal.astype(np.float32), kernel, borderType=cv2.BORDER_REPLICATE)
     profiles = _as_profiles(signal, stripe_along=stripe_along)
-    found, several, detection = _found(profiles, options, clip)
+    found, several, glare, detection = _found(profiles, options, clip)
     # A wider window is taken only if it measures what was too wide.
     wider, widest = options, min(options.widest_window_px, length // 4)
     while found.too_wide() and 2 * wider.half_window_px <= widest:
         wider = wider.doubled()
-        measured, seen_several, seen = _found(profiles, wider, clip)
-        if not measured.too_wide():
-            found, options, several, detection = measured, wider, seen_several, seen
+        found_wider = _found(profiles, wider, clip)
+        if not found_wider[0].too_wide():
+            options, (found, several, glare, detection) = wider, found_wider
 
     none = found.status == _NO_STRIPE
     if none.any():
@@ -163,7 +163,7 @@ def _extracted(
             white = low.max(axis=0) >= clip
         found.status[none & white] = _SATURATED
     stripe = Stripe(found.centre, found.amplitude, found.width, found.status, stripe_along)
-    return _Extracted(stripe, several, profiles, options, detection)
+    return _Extracted(stripe, several, glare, profiles, options, detection)
 
 
 def stripe_in(
@@ -211,11 +211,17 @@ def _found_by_model(profiles: np.ndarray, options: StripeOptions, clip: float) -
     return found
 
 
-def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> tuple[_Lines, np.ndarray, _Detection | None]:
-    """The stripe on each of the profiles (N, L), with one size of window, and which lines (L,) may hold several."""
+def _found(
+    profiles: np.ndarray, options: StripeOptions, clip: float
+) -> tuple[_Lines, np.ndarray, np.ndarray, _Detection | None]:
+    """The stripe on each of the profiles (N, L), with one size of window.
+
+    And which lines (L,) may hold several, and which something bright that is too wide to be measured.
+    """
     if options.method == LEARNED:
         found = _found_by_model(profiles, options, clip if math.isfinite(clip) else max(float(profiles.max()), 1.0))
-        return found, np.zeros(len(found.status), bool), None
+        nothing = np.zeros(len(found.status), bool)
+        return found, nothing, nothing, None
     block = options.half_window_px // 2
     high, low = block_extremes(profiles, block)
     # Blocks more at either end of the lines, so that what one window covers can be crossed out without a check.
@@ -228,6 +234,7 @@ def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> tuple[_
     left = cv2.transpose(board)
     detection = _Detection(board, left, noise, coarse, fine, clip)
     status, wide, several, peak = search(profiles, left, coarse=coarse, fine=fine, options=options, clip=clip)
+    glare = wide.copy()
     # A plateau wider than the window does not even stick out.
     white = low.max(axis=0) >= clip
     wide |= white
@@ -238,7 +245,7 @@ def _found(profiles: np.ndarray, options: StripeOptions, clip: float) -> tuple[_
         centre, found.amplitude[good] = place_centre(options.method, peak)
         found.centre[good] = peak.start + centre.astype(np.float64)
         found.width[good] = peak.sigma * FWHM_PER_SIGMA
-    return found, several, detection
+    return found, several, glare, detection
 
 
 @dataclass(frozen=True)
@@ -256,10 +263,15 @@ class _Detection:
 
 @dataclass(frozen=True)
 class _Extracted:
-    """The stripe of an image, which lines (L,) may hold several, and how it was sought on the profiles (N, L)."""
+    """The stripe of an image, and how it was sought on the profiles (N, L).
+
+    ``several`` (L,) marks the lines that may hold more than one, ``glare`` (L,) those with something bright that is too
+    wide to be measured.
+    """
 
     stripe: Stripe
     several: np.ndarray
+    glare: np.ndarray
     profiles: np.ndarray
     options: StripeOptions
     detection: _Detection | None
@@ -268,31 +280,37 @@ class _Extracted:
         """The stripe without its ends."""
         return leave_ends_out(self.stripe, lines=self.options.end_lines, jump_px=self.options.half_window_px / 2)
 
-    def candidates(self, lines: np.ndarray, *, least: int = 1) -> StripeCandidates:
-        """All stripes on those of some lines (M,) that have at least so many."""
+    def candidates(self, lines: np.ndarray, *, rivals: bool = False) -> StripeCandidates:
+        """All stripes on some lines (M,).
+
+        With ``rivals`` those of lines with two or more alone, with what cannot be measured among them: its place is
+        rough, its width NaN.
+        """
         stripe, seen, options = self.stripe, self.detection, self.options
         count, along = len(stripe.status), stripe.stripe_along
         if seen is None:
             lines = np.intersect1d(lines, stripe.lines)
             centre, amplitude, width = (each[lines] for each in (stripe.centre_px, stripe.amplitude, stripe.width_px))
             return StripeCandidates(lines, centre, amplitude, width, np.zeros(len(lines)), count, along)
-        line, peak = np.empty(0, np.intp), None
+        line, clear, peak = np.empty(0, np.intp), np.empty(0, np.bool_), None
         if len(lines):
             board, heights = cv2.transpose(seen.board), {"coarse": seen.coarse, "fine": seen.fine}
-            line, peak = search_all(self.profiles, board, lines, **heights, options=options, clip=seen.clip)
-            if least > 1 and len(line):
-                enough = np.bincount(line)[line] >= least
-                line, peak = line[enough], peak.keep(enough)
-        if peak is None or len(line) == 0:
-            amplitude, width = np.empty((2, 0), np.float32)
-            return StripeCandidates(line, np.empty(0), amplitude, width, np.empty(0), count, along)
-        centre, amplitude = place_centre(options.method, peak)
-        place = peak.start + centre.astype(np.float64)
-        # A matched filter: the squared height over the noise, summed over the profile of a Gaussian.
-        certainty = 0.5 * math.sqrt(math.pi) * peak.kernel_sigma() * (amplitude / max(seen.noise, _LEAST_NOISE)) ** 2
-        width, order = peak.sigma * np.float32(FWHM_PER_SIGMA), np.lexsort((place, line))
-        place, amplitude, width, certainty = (values[order] for values in (place, amplitude, width, certainty))
-        return StripeCandidates(line[order], place, amplitude, width, certainty.astype(np.float64), count, along)
+            line, clear, peak = search_all(self.profiles, board, lines, **heights, options=options, clip=seen.clip)
+            kept = np.bincount(line, minlength=count)[line] >= 2 if rivals else clear
+            line, clear, peak = line[kept], clear[kept], peak.keep(kept)
+        place, amplitude = np.empty(len(line)), np.empty(len(line), np.float32)
+        width, certainty = np.full(len(line), np.nan, np.float32), np.zeros(len(line))
+        if peak is not None and len(line):
+            place[:], amplitude[:] = peak.start + peak.middle, peak.height
+            measured = peak.keep(clear)
+            centre, amplitude[clear] = place_centre(options.method, measured)
+            place[clear], width[clear] = measured.start + centre.astype(float), measured.sigma * FWHM_PER_SIGMA
+            # A matched filter: the squared height over the noise, summed over the profile of a Gaussian.
+            sharp = amplitude[clear] / max(seen.noise, _LEAST_NOISE)
+            certainty[clear] = 0.5 * math.sqrt(math.pi) * measured.kernel_sigma() * sharp**2
+        order = np.lexsort((place, line))
+        line, place, certainty = line[order], place[order], certainty[order]
+        return StripeCandidates(line, place, amplitude[order], width[order], certainty, count, along)
 
 
 @dataclass(frozen=True)

@@ -53,8 +53,8 @@ class Peak(NamedTuple):
     half-height width over 2.355 with the low-pass taken out (variances add); ``reach`` the whole number of pixels from
     ``middle`` to the first background pixel; ``base`` the background at ``middle`` and ``slope`` its rise per px, from
     the flanks beyond ``reach``; ``height`` that of the top above ``base``, or above the lowest surroundings where not
-    ``closed``: both half-height crossings lie in the window; ``crowded`` where something outside the crossings reaches
-    the given share of the peak again.
+    ``closed``: both half-height crossings lie in the window; ``crowded`` where something outside the crossings rises
+    again to the given share of the peak: above its half height, or out of a valley of half its own height.
     """
 
     top: int
@@ -188,6 +188,11 @@ def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> 
         greatest(smooth[max(near - extent, 0) : left + 1]), greatest(smooth[right : min(near + extent + 1, size)])
     )
     crowded = beside >= ground + np.float32(rules.share) * rise
+    if crowded and beside < level:
+        # A tail that falls steadily is no second stripe.
+        share = np.float32(rules.share) * rise
+        crowded = _rises_again(smooth[max(near - extent, 0) : left + 1][::-1], ground, share, np.float32(rules.fine))
+        crowded |= _rises_again(smooth[right : min(near + extent + 1, size)], ground, share, np.float32(rules.fine))
     return Peak(top, middle, sigma, reach, base, slope, highest - (base if closed else ground), closed, crowded)
 
 
@@ -198,6 +203,20 @@ def greatest(values: np.ndarray) -> np.float32:
     for k in range(values.size):
         result = max(result, values[k])
     return result
+
+
+@compiled_part
+def _rises_again(values: np.ndarray, ground: np.floating, share: np.floating, fine: np.float32) -> np.bool_:
+    """Whether values, from a peak outwards, reach a share above the ground after a valley of half their own height.
+
+    What rises by less than ``fine`` out of the valley may be noise.
+    """
+    lowest, found = values[0], values[0] > values[0]
+    for k in range(values.size):
+        lowest = min(lowest, values[k])
+        above = values[k] - ground
+        found |= above >= share and values[k] - lowest >= max(np.float32(0.5) * above, fine)
+    return found
 
 
 @compiled_part

@@ -66,8 +66,8 @@ class StripeOptions:
         Share of the strongest peak from which another one on the line counts as a stripe too. Under the rules
         ``strongest``, and ``direct`` in a single image, two such stripes make the line ambiguous; ``first`` and
         ``last`` choose among them, and the line is ambiguous only if another reaches into the pixels used. Within one
-        window peaks are separate only if the profile falls below half height between them, and shares below one half
-        count as one half.
+        window a second peak that is higher than half the first one is separate if the profile falls below that half
+        between them, and a lower one if it falls below half the second one's own height.
     end_lines : int
         Lines left out on either side of a place where the stripe ends, or jumps by more than half of `half_window_px`
         from one line to the next: at an edge or a limb the sheet's width meets the surface only in part. 0 keeps them.

@@ -44,6 +44,9 @@ _SPIKE = 0.85
 _BRIGHT = 0.25
 """Height over saturation from which something wide is a stripe rather than haze."""
 
+_MINOR = 0.5
+"""Share of another stripe's height up to which one that cannot be measured is left out."""
+
 MARGIN = 2
 """Blocks on either side of a block's own that one window covers."""
 
@@ -86,20 +89,21 @@ def search_all(
     fine: float,
     options: StripeOptions,
     clip: float,
-) -> tuple[np.ndarray, PeakWindow]:
-    """All stripes on some lines (M,): the line of each, in their order, and its window.
+) -> tuple[np.ndarray, np.ndarray, PeakWindow]:
+    """All stripes on some lines (M,): the line of each, in their order, whether it can be measured, and its window.
 
-    Arguments as of `search`. Two stripes of which one reaches into the other's pixels cannot be measured: neither is
-    there.
+    Arguments as of `search`. Two stripes of which one reaches into the other's pixels cannot be measured, nor one that
+    is bright and too wide, or cut off by the border.
     """
     rules = _rules(options, coarse=coarse, fine=fine, clip=clip)._replace(order=FIRST)
     peaks = PeakWindow.empty(_MOST * len(lines), 2 * rules.half + rules.block, options.smoothing_px)
     kernel = low_pass(options.smoothing_px)
     smooth = np.empty(peaks.window.shape[1], np.float32)
     pixels = np.empty(smooth.size + kernel.size - 1, np.float32)
-    found = np.empty(_MOST * len(lines), np.intp)
-    count = _search_all(profiles, board, lines, kernel, pixels, smooth, rules, found, peaks)
-    return found[:count], peaks.keep(np.arange(count))
+    found, clear = np.empty(_MOST * len(lines), np.intp), np.empty(_MOST * len(lines), np.bool_)
+    count = _search_all(profiles, board, lines, kernel, pixels, smooth, rules, found, clear, peaks)
+    kept = np.flatnonzero(found[:count] >= 0)
+    return found[kept], clear[kept], peaks.keep(kept)
 
 
 def with_rivals(
@@ -202,8 +206,7 @@ def _search_lines(
             start, peak = _followed(profiles, line, start, kernel, pixels, smooth, rules)
             verdict = _judged(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE:
-                if (not peak.closed or peak.sigma > rules.widest) and peak.height >= rules.bright:
-                    wide[line] = True
+                wide[line] |= _is_too_wide(peak, rules)
                 blocks[chosen] = 0
                 continue
             # The window has been searched for rivals already.
@@ -255,9 +258,10 @@ def _search_all(
     smooth: np.ndarray,
     rules: SearchRules,
     found: np.ndarray,
+    clear: np.ndarray,
     peaks: PeakWindow,
 ) -> int:
-    """Fill `found` and the windows of all stripes on some lines; returns how many there are."""
+    """Fill `found`, `clear` and the windows of all stripes on some lines; returns how many there are."""
     size, border, count = smooth.size, kernel.size // 2, 0
     for line in lines:
         blocks, first = board[line], count
@@ -275,7 +279,8 @@ def _search_all(
             if there < _CLEAR * rules.fine and _is_spike(near, np.float32(there), rules.fine):
                 continue
             start, peak = _followed(profiles, line, start, kernel, pixels, smooth, rules)
-            if _judged(peak, start, profiles.shape[0], rules) != _OK:
+            verdict = _judged(peak, start, profiles.shape[0], rules)
+            if verdict == _NO_STRIPE and not _is_too_wide(peak, rules):
                 continue
             place, known = start + peak.middle, False
             for k in range(first, count):
@@ -283,10 +288,27 @@ def _search_all(
                 known |= apart <= np.float32(FWHM_PER_SIGMA) * max(peaks.sigma[k], peak.sigma)
             if known:
                 continue
-            found[count], peaks.start[count] = line, start
+            found[count], clear[count], peaks.start[count] = line, verdict == _OK, start
             _keep(peaks, count, peak, window)
             count += 1
+        _leave_minor_out(first, count, rules, found, clear, peaks)
     return count
+
+
+@compiled_part
+def _leave_minor_out(
+    first: int, count: int, rules: SearchRules, found: np.ndarray, clear: np.ndarray, peaks: PeakWindow
+) -> None:
+    """Set `found` to -1 for those of a line that cannot be measured beside a much higher one that can, or in its light.
+
+    Of what cannot be measured only stripes that might be the line's own matter.
+    """
+    for k in range(first, count):
+        for j in range(first, count):
+            apart = abs(peaks.start[j] + peaks.middle[j] - peaks.start[k] - peaks.middle[k])
+            share = 1.0 if apart <= rules.half + rules.block else _MINOR
+            if clear[j] and not clear[k] and peaks.height[k] <= share * peaks.height[j]:
+                found[k] = -1
 
 
 @compiled_part
@@ -320,6 +342,12 @@ def _offset(peak: Peak, size: int, rules: SearchRules) -> int:
     if (outside or not peak.closed) and peak.height >= rules.fine:
         return int(np.rint(offset))
     return 0
+
+
+@compiled_part
+def _is_too_wide(peak: Peak, rules: SearchRules) -> bool:
+    """Whether what is no stripe is a bright one all the same that is too wide to be measured."""
+    return bool((not peak.closed or peak.sigma > rules.widest) and peak.height >= rules.bright)
 
 
 @compiled_part

@@ -71,6 +71,26 @@ def test_a_reflection_below_a_mirrors_faint_stripe_is_left_out():
     assert len(stripes.line) > 0.9 * LINES
 
 
+def test_a_reflection_beside_a_stripe_that_is_too_wide_is_not_taken():
+    """On some lines the stripe is too wide to be measured; something dim and sharp stands elsewhere."""
+    glare, spot = on(150, 210, 150 + 0 * X), on(155, 205, 260 + 0 * X)
+    floor = np.where(np.isnan(glare), 150.0, np.nan)
+    rows = np.arange(LENGTH)[:, None]
+    wide = np.nan_to_num(200 * np.exp(-0.5 * ((rows - glare) / 10.0) ** 2))
+    image = np.clip(drawn((floor, 60), (spot, 20)) + wide, 0, 255).astype(np.uint8)
+    stripes, brightest = found(image), found(image, options=BRIGHTEST)
+    assert np.abs(stripes.centre_px - 150).max() < 3 and len(stripes.line) > LINES - 70
+    assert np.count_nonzero(np.abs(brightest.centre_px - 150) > 3) > 40
+
+
+def test_the_rest_of_a_reflection_is_not_taken_where_the_wall_is_too_dark_to_be_seen():
+    """The wall is lost over its last fifth, where the reflected floor goes on alone."""
+    wall = on(200, 264, 220 - 1.5 * (X - 200))
+    stripes = found(drawn((FLOOR, 120), (wall, 15), (TOP, 100), (on(200, 280, 240 - 0.1 * X), 110)))
+    true = np.fmax(np.fmax(FLOOR, wall), TOP)[stripes.line]
+    assert (np.abs(stripes.centre_px - true) < 3).all() and len(stripes.line) > 330
+
+
 def test_a_dimmer_stripe_before_the_floor_that_nothing_joins_is_a_reflection():
     """A wall that faces the camera shows the floor nearer than it is, and dimmer."""
     floor, ghost = on(0, LINES, 200 + 0.05 * X), on(30, 350, 120 + 0.05 * X)

@@ -296,6 +296,16 @@ def test_weak_second_stripe_is_ignored(apart):
     assert np.abs(rows(image).centre_px - near).max() < 0.1
     strict = rows(image, options=StripeOptions(ambiguous_ratio=0.3))
     assert (strict.status == StripeStatus.AMBIGUOUS).all()
+    # It has 0.4 of the height.
+    lenient = rows(image, options=StripeOptions(ambiguous_ratio=0.48))
+    assert (lenient.status == StripeStatus.OK).all()
+
+
+@pytest.mark.parametrize("ratio", [0.05, 0.2, 0.45])
+def test_the_tails_of_a_stripe_alone_are_no_second_stripe(ratio):
+    centre = np.linspace(38.0, 41.0, 64)
+    image = grey(gaussian(centre, sigma=2.5, amplitude=150) + gaussian(centre, sigma=7, amplitude=30) + 10)
+    assert (rows(image, options=StripeOptions(ambiguous_ratio=ratio)).status == StripeStatus.OK).all()
 
 
 @pytest.mark.parametrize("apart", [22, 31, 47, 60])
