@@ -223,11 +223,13 @@ def unchanged_in(folder: Path, water: str) -> None:
     """Print where change is claimed beside the pits, which is where nothing changed."""
     before = cloud_of(folder, water, "pipe-before")
     for name, pits in (("pipe-after", small_pits()), ("pipe-corroded", large_pits())):
-        change = uwlts.compare_clouds(cloud_of(folder, water, name), before)
+        change = uwlts.compare_clouds(cloud_of(folder, water, name), before, same_water=True)
         reach = pits.diameter / 2 + change.disc_mm / 2
         clear = change.compared & np.all(distances(pits, change.points_mm) > reach, axis=1)
         share = 100 * float(change.significant[clear].mean())
+        scatter, level = np.sqrt(np.mean(change.distance_mm[clear] ** 2)), np.median(change.level_mm[clear])
         print(f"{water}, {name}: change is claimed on {share:.2f} % of {clear.sum()} places where nothing changed")
+        print(f"  rms distance there {scatter:.4f} mm, level {level:.4f} mm")
 
 
 def flanges_in(folder: Path, water: str) -> list[list[str]]:

@@ -58,7 +58,7 @@ def main() -> None:
         print(
             f"seed {seed}: path {before:.1f} -> {after:.1f} mm (rms), {before / after:.1f} times better; "
             f"{np.sqrt(known.mean()):.1f} mm stated; {len(lengths)} overlaps, lengths between both passes wrong by "
-            f"{np.sqrt(np.mean(np.square(lengths))):.3f} mm (rms)",
+            f"{_rms(lengths):.3f} mm (rms)",
             flush=True,
         )
 
@@ -79,6 +79,10 @@ def best(rate: float, wandering: float, walk: float) -> float:
     gain = before @ seen.T
     after = before - gain @ np.linalg.solve(seen @ gain + 1e-10 * np.eye(len(seen)), gain.T)
     return float(np.sqrt(np.trace(before) / np.trace(after)))
+
+
+def _rms(values: list[np.ndarray]) -> float:
+    return float(np.sqrt(np.mean(np.square(values)))) if values else np.nan
 
 
 def _apart(found: uwlts.Trajectory, true: uwlts.Trajectory, times: tuple[float, float]) -> np.ndarray:

@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 
 _WINDOW_PX = 96
 """Pixels to either side of a centre in which its stripe is looked for; wider ones are cut off there."""
+_LEAST_E = 1e-6
+"""Electrons below which a pixel counts as dark: the smallest numbers are zero on some processors and threads."""
 _LARGEST_HALF = 65504.0
 """Largest number of float16; brighter pixels are clipped to it, far above any full well of use."""
 NO_OBJECT = 255
@@ -150,8 +152,9 @@ def stripe_quality(
     columns = np.arange(len(lines))
     row = np.rint(centre[lines]).astype(int) + np.arange(-_WINDOW_PX, _WINDOW_PX + 1)[:, None]
     inside, row = (row >= 0) & (row < across), np.clip(row, 0, across - 1)
-    signal = np.where(inside, direct[row, lines], 0.0).astype(float)
-    lit = signal > 0
+    signal = direct[row, lines].astype(float)
+    lit = inside & (signal > _LEAST_E)
+    signal[~lit] = 0.0
     behind = np.logical_and.accumulate(lit[_WINDOW_PX:], axis=0)
     before = np.logical_and.accumulate(lit[_WINDOW_PX::-1], axis=0)[::-1]
     signal[:_WINDOW_PX][~before[:-1]] = 0.0

@@ -1,11 +1,11 @@
 """Renders what reaches the image sensor: laser and lamp images as irradiance, only where there is light.
 
 A laser frame is made in three passes. Rays through the nodes of a coarse grid find the pixels near the lit stripe and
-the haze of the sheet; the stripe's pixels are rendered with many samples over pixel, pupil and exposure; random walks
-add the light that came on longer ways, which is smooth: cell by cell within the stripe's pixels, in large cells
-elsewhere, whose outliers are spread with their energy kept. The windows stand still before the camera, so the nodes'
-rays behind the window are traced once; the objects stand still in the scene, so nothing is rebuilt or recompiled
-between frames.
+the haze of the sheet; the stripe's pixels are rendered with many samples over pixel, pupil and exposure, with fewer
+within a wide stripe; random walks add the light that came on longer ways, which is smooth: cell by cell within the
+stripe's pixels, in large cells elsewhere, whose outliers are spread with their energy kept. The windows stand still
+before the camera, so the nodes' rays behind the window are traced once; the objects stand still in the scene, so
+nothing is rebuilt or recompiled between frames.
 """
 
 from __future__ import annotations
@@ -52,6 +52,11 @@ WALKS_AT_ONCE = 2**21
 """The same for random walks, which take some 200 MB."""
 CHANGE_SHARE = 2e-3
 """Under the lamp, pixels whose corners differ by more than this share of the brightest are rendered finely."""
+BEND_SHARE = 1e-3
+"""Of a wide stripe, pixels are rendered finely where second differences exceed this share of the brightest light."""
+_FEWER_SAMPLES, _LEAST_SPP, _WIDE_PX = 4, 4, 64
+"""Elsewhere so many times fewer samples are taken, but no fewer than these: one for each quarter of the pupil. In
+stripes narrower than so many pixels on average, most pixels would be rendered twice."""
 _MIRRORS = 2
 """Largest number of mirrors that the camera looks into one after the other."""
 _WALKS_PER_SAMPLE = 0.15
@@ -171,11 +176,7 @@ class Renderer:
         if walker.finds_light:
             self._add_walks(image, lit, walker, seed=seed, walks=math.ceil(spp * self._walks_per_sample))
         rows, columns = np.nonzero(self._repeated(lit))
-        facts = [
-            self._fine(self._stripe_sums, pose, r, c, direct + mirrored, spp=spp)
-            for r, c in _parts(rows, columns, spp=spp)
-        ]
-        stripe, polarised, rough = np.concatenate([np.zeros((3, 0), np.float32), *facts], axis=1)
+        stripe, polarised, rough = self._stripe(pose, rows, columns, direct + mirrored, spp=spp)
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
         particles, polarisation = self._particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
         return LaserFrame(image, haze, particles, rows, columns, stripe, polarisation, rough / bright)
@@ -441,6 +442,30 @@ class Renderer:
         return dr.exp(math.log(1 - self._uneven_lamp) * squared)
 
     # --- pixels -------------------------------------------------------------------------------------------------------
+
+    def _stripe(
+        self, pose: SensorPose, rows: np.ndarray, columns: np.ndarray, sources: list[Light], *, spp: int
+    ) -> np.ndarray:
+        """Means (3, P) of `_stripe_sums` over pixels, of few samples where the light of a wide stripe is smooth."""
+
+        def means(where: np.ndarray, spp: int) -> np.ndarray:
+            parts = _parts(rows[where], columns[where], spp=spp)
+            found = [self._fine(self._stripe_sums, pose, *part, sources, spp=spp) for part in parts]
+            return np.concatenate([np.zeros((3, 0), np.float32), *found], axis=1)
+
+        everywhere, lines = np.arange(len(rows)), self.sensor.camera.lines()
+        if len(rows) < _WIDE_PX * lines or spp < _LEAST_SPP * _FEWER_SAMPLES:
+            return means(everywhere, spp)
+        sums = means(everywhere, spp // _FEWER_SAMPLES)
+        image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
+        image[rows, columns] = sums[0]
+        bends = np.zeros(image.shape, np.uint8)
+        for along_x, along_y in ((2, 0), (0, 2)):
+            second = cv2.Sobel(image, cv2.CV_32F, along_x, along_y, ksize=1)
+            bends |= (np.abs(second) > BEND_SHARE * sums[0].max(initial=0.0)).view(np.uint8)
+        again = np.flatnonzero(cv2.dilate(bends, np.ones((3, 3), np.uint8))[rows, columns])
+        sums[:, again] = means(again, spp)
+        return sums
 
     def _stripe_sums(
         self, pose: SensorPose, bundle: Rays, after_s: Float | None, sources: list[Light]

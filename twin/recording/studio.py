@@ -38,7 +38,7 @@ from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, truth_path, wri
 
 Progress = Callable[[int, int], None]
 PROBE_SPP = 4
-"""Samples per lit pixel of the images from which the exposure follows, which a percent is exact enough for."""
+"""Samples per lit pixel of the images from which the exposure follows, which need not be known to a percent."""
 BRIGHT_SHARE = 0.98
 """Automatic exposure looks at the brightest pixel of every profile line and lets 2 % of the lines be brighter."""
 STRAY_LINES, LIT_SHARE = 4, 0.05

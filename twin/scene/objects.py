@@ -47,8 +47,8 @@ class Objects:
     """All objects in scene coordinates, with properties of the places hit that Mitsuba's shapes do not provide.
 
     ``scene`` holds what scatters light; ``mirrors`` are the faces that reflect beside that. Tables give a fact of each
-    shape at its number in Dr.Jit's registry, which counts through all scenes of the process. With ``coherent`` rays
-    that lie side by side are best followed together: through facets, not through spheres and cylinders.
+    shape at its number in Dr.Jit's registry, which counts through all scenes of the process. With ``coherent``, rays
+    that lie side by side are faster followed together: among facets, not among spheres and cylinders.
     """
 
     scene: mi.Scene

@@ -181,6 +181,7 @@ def findings_report(
     captures: Files = (),
     calibration: Path | None = None,
     certificate: Path | None = None,
+    verification: Files = (),
     section_mm: float | None = None,
     wall_mm: float | None = None,
     false_alarm: float = 0.05,
@@ -200,6 +201,7 @@ def findings_report(
         captures: Captures that the cloud was reconstructed from, for the traceability.
         calibration: Calibration of the sensor, the one that the cloud names.
         certificate: Its certificate (JSON), whose seal is checked.
+        verification: Evaluations (JSON of uwlts evaluate) of artefacts measured by the same calibration.
         section_mm: Length of a section along a pipe (up to twelve unless given) or a weld.
         wall_mm: Thickness of a pipe's undamaged wall, for the wall that remains.
         false_alarm: Probability that anything is found on the whole of a pipe's surface where nothing is.
@@ -214,6 +216,7 @@ def findings_report(
         captures=captures,
         calibration=calibration,
         certificate=certificate,
+        verification=verification,
         section_mm=section_mm,
         wall_mm=wall_mm,
         false_alarm=false_alarm,

@@ -1,7 +1,7 @@
 """Inspection of flat things: a step between two faces, a flange's face with its holes, a gap between two plates.
 
-Faces are least-squares planes. Edges are found along the profiles: between the last point on a face and the next line
-without one, so that each is known to half a point's spacing on either side.
+Faces are least-squares planes. Edges are found along the profiles, from how much of the stripe's brightness the blur
+has left to the last point on a face, and are known to half a point's spacing.
 """
 
 from __future__ import annotations
@@ -13,11 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.stats import norm
 
 from uwlts.metrology.evaluation import TOWARDS_SENSOR
 from uwlts.metrology.features import Feature, FeatureKind, FeatureValue, Inspection
 from uwlts.metrology.fits import fit_plane
 from uwlts.metrology.least_squares import MAD_TO_STD, evenly_thinned, fit_robustly
+from uwlts.metrology.point_spacing import footprint_on
 from uwlts.metrology.propagation import NormalErrors, normal_errors, plain_value
 from uwlts.metrology.step_faces import StepFace, label_step_faces
 from uwlts.model.errors import EvaluationError
@@ -37,6 +39,8 @@ _EDGE_STD = 1 / np.sqrt(12.0)
 _EDGE_BLUR = 0.5
 """Standard uncertainty, in the spacing of points, of where all edges are seen together: the camera's blur lets the
 stripe end up to about a line beyond the edge."""
+_WHOLE_LINES = range(5, 12)
+"""Lines from an edge whose brightness is that of the face."""
 _FEWEST_EDGES = 8
 _ROUND_SHARE = 0.08
 """Of a hole's radius: scatter of its edge from which it is none."""
@@ -47,6 +51,8 @@ _SAME_SHARE = 0.2
 _REFINED = 4
 _FLAT_CELLS = 24
 """Across the face; the means of cells are its smoothed form."""
+_EDGE_LINES = 4
+"""Lines next to an edge that do not count for the flatness: the camera's blur mixes in what lies beyond."""
 _DRAWS, _SEED = 48, 635
 
 _facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
@@ -302,16 +308,17 @@ def _inspection(
 
 def _flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> FeatureValue:
     """Range of the means of small cells of the face, less what noise alone adds to it (by drawing it again)."""
+    inner = _away_from_edges(cloud, used)
     local = (cloud.points_mm[used] - face.point_mm) @ face.axes[:2].T
     cell = float(np.ptp(local, axis=0).max()) / _FLAT_CELLS
     index = np.unique(np.floor(local / cell).astype(int), axis=0, return_inverse=True)[1].ravel()
-    count = np.bincount(index)
+    count = np.bincount(index[inner], minlength=int(index.max()) + 1)
     full = count >= max(8, 0.2 * np.median(count))
     design = np.column_stack([np.ones(len(local)), local])
 
     def means(distances: np.ndarray) -> np.ndarray:
         left = distances - design @ (face.rows @ distances)
-        return np.bincount(index, left)[full] / count[full]
+        return np.bincount(index[inner], left[inner], len(count))[full] / count[full]
 
     found = means(face.residuals_mm)
     errors = normal_errors(cloud, used, np.broadcast_to(face.axes[2], (len(used), 3)))
@@ -329,6 +336,20 @@ def _flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> FeatureValue:
     return plain_value(FeatureKind.FLANGE, "flatness", max(value - bias, 0.0), random, common, least=0.0)
 
 
+def _away_from_edges(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
+    """Which of the points (N,) have enough lines beside them that were seen, on both sides; all without lines."""
+    if np.any(cloud.frame[used] < 0) or np.any(cloud.line[used] < 0):
+        return np.ones(len(used), bool)
+    order = np.lexsort((cloud.line[used], cloud.frame[used]))
+    frame, line = cloud.frame[used][order], cloud.line[used][order]
+    # Single lost lines are no edge.
+    run = np.cumsum(np.append(0, (np.diff(frame) != 0) | (np.diff(line) >= _LEAST_GAP)))
+    first, last = np.searchsorted(run, run), np.searchsorted(run, run, side="right") - 1
+    inner = np.empty(len(used), bool)
+    inner[order] = (line - line[first] >= _EDGE_LINES) & (line[last] - line >= _EDGE_LINES)
+    return inner
+
+
 def _gaps(cloud: PointCloud, face: _Face, used: np.ndarray) -> list[_Edges]:
     """Edges of the holes that profiles cross, each hole by itself: gaps that overlap in neighbouring images."""
     if np.any(cloud.frame[used] < 0) or np.any(cloud.line[used] < 0):
@@ -343,6 +364,7 @@ def _gaps(cloud: PointCloud, face: _Face, used: np.ndarray) -> list[_Edges]:
     at = np.flatnonzero(same & (np.diff(line) >= _LEAST_GAP) & (step > _LEAST_GAP * spacing))
     if not len(at):
         return []
+    beyond = _beyond_last(cloud, own, np.append(0, np.cumsum(~same)), face, spacing)
     number = np.unique(cloud.frame, return_inverse=True)[1]
     image = number[own[at]]
     lower, upper = line[at], line[at + 1]
@@ -361,10 +383,35 @@ def _gaps(cloud: PointCloud, face: _Face, used: np.ndarray) -> list[_Edges]:
         first = np.repeat([True, False], len(gap))
         direction = local[gap + 1] - local[gap]
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        places = local[inner] + 0.5 * spacing * np.concatenate([direction, -direction])
+        outwards = np.concatenate([direction, -direction])
+        places = local[inner] + beyond[inner, first.astype(int)][:, None] * outwards
         points = own[inner]
         patterns = None if known is None else known.patterns_mm[:, points] @ face.axes[:2].T
         result.append(_Edges(places, frame[inner], first, patterns, points, spacing))
+    return result
+
+
+def _beyond_last(cloud: PointCloud, own: np.ndarray, row: np.ndarray, face: _Face, spacing: float) -> np.ndarray:
+    """How far beyond a point (N,) an edge lies if it is the last one before it: (N, 2), after and before it in its row.
+
+    Blur of standard deviation s leaves the share Phi(d / s) of a stripe's brightness at a distance d within an edge.
+    Where brightness or blur is not known, or the share tells nothing, the edge is half a spacing away.
+    """
+    result = np.full((len(own), 2), 0.5 * spacing)
+    bright = cloud.intensity[own].astype(float)
+    size = footprint_on(cloud, own, np.broadcast_to(face.axes[:2], (len(own), 2, 3)))[0]
+    along = np.diff(cloud.points_mm[own] @ face.axes[:2].T, axis=0)[np.diff(row) == 0]
+    axis = int(np.argmax(np.median(np.abs(along), axis=0)))
+    blur = size[:, axis]
+    if not (np.isfinite(bright).all() and (blur > 0).all()):
+        return result
+    for side, sign in ((0, -1), (1, 1)):
+        inner = np.stack([np.clip(np.arange(len(own)) + sign * k, 0, len(own) - 1) for k in _WHOLE_LINES])
+        known = (row[inner] == row).all(axis=0)
+        share = bright / np.maximum(np.median(bright[inner], axis=0), 1e-9)
+        within = blur * norm.ppf(np.clip(share, 0.02, 0.98))
+        usable = known & (within < spacing)
+        result[usable, side] = within[usable]
     return result
 
 

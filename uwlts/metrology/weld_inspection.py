@@ -292,8 +292,11 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
     extremes = ["undercut" in name or "height" in name for name in _NAMES]
     bias[extremes] = np.maximum(np.nanmean(drawn, axis=0)[extremes], 0)
     # What smoothing may still hide: as much as once more would put back, and what hangs on the footprint's size.
-    resolution = [bead.profiles.of(bead.raw_mm, steps=2), bead.profiles.of(bead.raw_mm, share=1 - bead.footprint_std)]
-    resolved = np.nan_to_num([_figures_of(bead, each, bead.raw_mm, whole, toes) - seen for each in resolution])
+    resolution = [
+        _figures(bead, bead.raw_mm, whole, toes, steps=2),
+        _figures(bead, bead.raw_mm, whole, toes, share=1 - bead.footprint_std),
+    ]
+    resolved = np.nan_to_num(np.array(resolution) - seen)
     random = np.sqrt(random**2 + bias**2 + np.sum(resolved**2, axis=0))
     plain = np.where(extremes, np.maximum(seen - bias, 0), seen)
     common = None
@@ -322,45 +325,51 @@ def _toes_and_slopes(bead: _Bead, profiles: np.ndarray, whole: np.ndarray) -> np
     return np.array([_flanks(bead.profiles.across_mm, profiles[k], float(tops[k])) for k in whole])
 
 
-def _figures(bead: _Bead, raw: np.ndarray, whole: np.ndarray, toes: np.ndarray) -> np.ndarray:
-    """Values in the order of `_NAMES` for heights (n,) of the points."""
-    return _figures_of(bead, bead.profiles.of(raw), raw, whole, toes)
+def _figures(
+    bead: _Bead, raw: np.ndarray, whole: np.ndarray, toes: np.ndarray, *, steps: int = 1, share: float = 1.0
+) -> np.ndarray:
+    """Values in the order of `_NAMES` for heights (n,) of the points.
 
-
-def _figures_of(bead: _Bead, profiles: np.ndarray, raw: np.ndarray, whole: np.ndarray, toes: np.ndarray) -> np.ndarray:
-    """Values in the order of `_NAMES` for profiles (S, G) and heights (n,) of the points.
-
-    Of the sections ``whole`` (W,); undercuts are looked for beyond the ``toes`` (W, 2).
+    Of the sections ``whole`` (W,); undercuts are looked for beyond the ``toes`` (W, 2). The largest of many are taken
+    of the smooth profiles, whose noise is less, with what putting back smoothing changes on average.
     """
-    grid = bead.profiles.across_mm
-    tops, flanks = _tops(bead, profiles), _toes_and_slopes(bead, profiles, whole)
+    profiles, smooth = bead.profiles.of(raw, steps=steps, share=share), bead.profiles.of(raw, steps=0)
+    tops, flanks = _tops(bead, profiles)[whole], _toes_and_slopes(bead, profiles, whole)
     width = float(np.nanmedian(flanks[:, 1] - flanks[:, 0]))
     angles = 180 - np.degrees(np.arctan(np.nanmedian(flanks[:, 2:], axis=0)))
-    depths = np.full((2, len(whole)), np.nan)
-    for side, sign in ((0, -1.0), (1, 1.0)):
-        beyond = sign * (grid - toes[:, side, None]) / (2 * bead.half_mm)
-        groove = np.where((beyond > -_INSIDE_SHARE) & (beyond < _BEYOND_SHARE), profiles[whole], np.nan)
-        lowest = np.argmin(np.where(np.isfinite(groove), groove, np.inf), axis=1)
-        # Where the lines beside the deepest one were lost, that is not the groove's bottom.
-        beside = [profiles[whole, np.clip(lowest + step, 0, len(grid) - 1)] for step in (-1, 1)]
-        known = np.isfinite(groove).any(axis=1) & np.isfinite(beside).all(axis=0)
-        depths[side, known] = -np.nanmin(groove[known], axis=1)
-    # The deepest of neighbouring sections together: of single ones it would be the noise's.
-    seen = [row[np.isfinite(row)] for row in depths]
-    left, right = (np.mean(row) if len(row) else np.nan for row in seen)
-    deepest = max((_largest_mean(row, _TOGETHER) for row in seen if len(row)), default=np.nan)
+    means, deepest = [], []
+    for side in (0, 1):
+        depths, flat = (_undercuts(bead, each[whole], toes[:, side], side) for each in (profiles, smooth))
+        known = np.isfinite(depths) & np.isfinite(flat)
+        means.append(float(np.mean(depths[known])) if known.any() else np.nan)
+        if known.any():
+            # Of neighbouring sections together: the deepest of single ones would be the noise's.
+            deepest.append(_largest_mean(flat[known], _TOGETHER) + float(np.mean((depths - flat)[known])))
+    smooth_tops = _tops(bead, smooth)[whole]
     middle = [float((rows @ raw)[0]) for _, rows in bead.profiles.plates]
     values = [
-        float(np.mean(tops[whole])),
-        _largest_mean(tops[whole], 3),
+        float(np.mean(tops)),
+        _largest_mean(smooth_tops, 3) + float(np.mean(tops - smooth_tops)),
         width,
-        float(left),
-        float(right),
-        float(deepest),
+        *means,
+        max(deepest, default=np.nan),
         *(float(angle) for angle in angles),
         abs(middle[1] - middle[0]),
     ]
     return np.array(values)
+
+
+def _undercuts(bead: _Bead, profiles: np.ndarray, toes: np.ndarray, side: int) -> np.ndarray:
+    """Depths (W,) of the grooves of profiles (W, G) beyond the toes (W,) of a side; NaN where no bottom was seen."""
+    grid = bead.profiles.across_mm
+    beyond = (-1.0, 1.0)[side] * (grid - toes[:, None]) / (2 * bead.half_mm)
+    groove = np.where((beyond > -_INSIDE_SHARE) & (beyond < _BEYOND_SHARE), profiles, np.nan)
+    lowest = np.argmin(np.where(np.isfinite(groove), groove, np.inf), axis=1)
+    # Where the lines beside the deepest one were lost, that is not the groove's bottom.
+    rows = np.arange(len(profiles))
+    beside = [profiles[rows, np.clip(lowest + step, 0, len(grid) - 1)] for step in (-1, 1)]
+    known = np.isfinite(groove).any(axis=1) & np.isfinite(beside).all(axis=0)
+    return np.where(known, -groove[rows, lowest], np.nan)
 
 
 def _largest_mean(values: np.ndarray, count: int) -> float:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 import uwlts
+from uwlts.measurement.evaluation import read_evaluation
 from uwlts.metrology.features import (
     COVERAGE,
     COVERAGE_FACTOR,
@@ -51,6 +52,8 @@ _FIRST = ("depth", "height", "remaining wall")
 """Values that stand first in the table of findings."""
 _SMALLEST = 1e-6
 """An uncertainty below it is written as 0."""
+_SMALLEST_MM = 0.002
+"""Figures without uncertainty are written to a tenth of it."""
 _MOST_PICTURES = 40
 _MOST_DRAWN = 60_000
 _AROUND = 1.2
@@ -67,6 +70,24 @@ class Source:
     note: str
 
 
+@dataclass(frozen=True)
+class _CheckedFigure:
+    """A figure of an artefact, mm, with its expanded uncertainty (k = 2), and the calibrated size whose error it is."""
+
+    name: str
+    calibrated_mm: float | None
+    value_mm: float
+    expanded_mm: float | None
+
+
+@dataclass(frozen=True)
+class _ArtefactCheck:
+    """An artefact in words, and its figures."""
+
+    artefact: str
+    figures: tuple[_CheckedFigure, ...]
+
+
 @keeps_inputs
 def write_findings(
     cloud: str | os.PathLike[str],
@@ -78,6 +99,7 @@ def write_findings(
     captures: Sequence[str | Path] = (),
     calibration: str | Path | None = None,
     certificate: str | Path | None = None,
+    verification: Sequence[str | Path] = (),
     section_mm: float | None = None,
     wall_mm: float | None = None,
     false_alarm: float = 0.05,
@@ -102,6 +124,9 @@ def write_findings(
         Calibration of the sensor; it has to be the one that the cloud names.
     certificate
         Its certificate (JSON), whose seal is checked.
+    verification
+        Evaluations (JSON of `uwlts.write_evaluation`) of artefacts that were measured by the same calibration; their
+        figures stand in the report.
     overwrite
         Replace existing files.
 
@@ -112,7 +137,7 @@ def write_findings(
     CaptureError, CalibrationError
         A file cannot be read.
     EvaluationError
-        The cloud does not show such an object, or the calibration or certificate belongs to another one.
+        The cloud does not show such an object, or the calibration, certificate or verification belongs to another one.
     SetupError
         A PDF is asked for and there is no browser.
     """
@@ -123,14 +148,21 @@ def write_findings(
         refuse_unsuitable(page.with_suffix(".pdf"), overwrite=overwrite)
     measured = read_cloud(path)
     sources = _sources(path, measured, captures, calibration, certificate)
+    checks = [_artefact_check(each, measured) for each in verification]
+    sources += [
+        Source("verification", Path(each).name, sha256_of(each), "by the same calibration") for each in verification
+    ]
     found = inspect(measured, kind, section_mm=section_mm, wall_mm=wall_mm, false_alarm=false_alarm, datum=datum)
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    text = _page(found, measured, sources, title=title or f"Inspection of {path.name}", made=made)
+    text = _page(found, measured, sources, checks, title=title or f"Inspection of {path.name}", made=made)
     record: Table = {
         "title": title or f"Inspection of {path.name}",
         "made": made,
         "software": f"uwlts {uwlts.__version__}",
         "sources": [vars(source) for source in sources],
+        "verification": [
+            {"artefact": check.artefact, "figures": [vars(figure) for figure in check.figures]} for check in checks
+        ],
         "inspection": found.record(),
     }
     if pdf:
@@ -170,7 +202,38 @@ def _sources(
     return sources
 
 
-def _page(found: Inspection, cloud: PointCloud, sources: list[Source], *, title: str, made: str) -> str:
+def _artefact_check(path: str | Path, cloud: PointCloud) -> _ArtefactCheck:
+    """Figures of an artefact that was measured by the calibration that the cloud names."""
+    record, named = read_evaluation(path), cloud.metadata.get("calibration")
+    if record.artefact is None or record.evaluation is None:
+        raise EvaluationError(f"{path} is the evaluation of no artefact: give those of spheres, a step or a plane")
+    if named is None or record.calibration != named:
+        raise EvaluationError(
+            f"{path} is of a cloud by another calibration than this one: it names {str(record.calibration)[:12]}, the "
+            f"cloud {str(named)[:12]}; measure the artefact by the calibration in use"
+        )
+    figures, keys = record.evaluation.figures_mm, record.figure_keys()
+    rows = []
+    for name, measured in figures.items():
+        known, key = record.uncertainty.get(name), keys.get(name)
+        calibrated = None if key is None or key.calibrated is None else key.calibrated.value_mm
+        rows.append(_CheckedFigure(name, calibrated, measured, None if known is None else known.expanded_mm))
+    return _ArtefactCheck(f"{record.evaluation.kind}, {record.cloud}", tuple(rows))
+
+
+def _check_rows(check: _ArtefactCheck) -> list[tuple[str, ...]]:
+    rows = []
+    for each in check.figures:
+        fine = each.expanded_mm or _SMALLEST_MM
+        calibrated = MISSING if each.calibrated_mm is None else f"{each.calibrated_mm:g}"
+        stated = MISSING if each.expanded_mm is None else as_fine_as(each.expanded_mm, fine, digits=2)
+        rows.append((each.name.replace("_", " "), calibrated, as_fine_as(each.value_mm, fine, digits=2), stated))
+    return rows
+
+
+def _page(
+    found: Inspection, cloud: PointCloud, sources: list[Source], checks: list[_ArtefactCheck], *, title: str, made: str
+) -> str:
     parts = [each for each in found.features if each.kind in _BLEMISHES]
     whole = [each for each in found.features if each.kind not in (*_BLEMISHES, FeatureKind.SECTION, FeatureKind.HOLE)]
     repeated = [each for each in found.features if each.kind in (FeatureKind.SECTION, FeatureKind.HOLE)]
@@ -191,6 +254,7 @@ def _page(found: Inspection, cloud: PointCloud, sources: list[Source], *, title:
         left_out=len(parts) - len(drawn),
         notes=found.notes,
         sources=[(each.role, each.name, each.note, each.sha256) for each in sources],
+        checks=[(check.artefact, _check_rows(check)) for check in checks],
         stated=cloud.uncertainty is not None,
         searched=found.kind == "pipe",
         coverage=f"{100 * COVERAGE:.0f} %",

@@ -1,11 +1,13 @@
 """Samples per pixel: evenly placed, they integrate the stripe as well as a thousand random ones would."""
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, sensor_at
+from tests.virtual_sensors import altered, block, clear, cropped, plate, scene_of, sensor_at
 from twin.light.image_sampling import golden_step
 from twin.light.renderer import Renderer
 from twin.options import NONE
@@ -78,3 +80,29 @@ def test_lattice_is_even_along_either_side(count):
         k = np.arange(1, count)
         across, along = np.minimum(k, count - k) / count, np.minimum(k * step % count, -k * step % count) / count
         assert np.hypot(across, along).min() > 0.33 / math.sqrt(count)
+
+
+def test_wide_stripes_take_fewer_samples_where_they_are_smooth(thesis, monkeypatch):
+    # 23 px of standard deviation, broken by the edges and the shadow of a block.
+    sensor = altered(cropped(thesis, 160, 160), {"laser": {"waist_radius_mm": 8.0}})
+    scene = scene_of(plate(), block((40.0, 6.0, 12.0), (0.0, 0.0, -6.0), reflectance=0.5))
+    renderer = Renderer(sensor, clear(0.3), scene, effects=replace(NONE, defocus=True))
+    rendered = 0
+    whole = Renderer._fine
+
+    def counted(self: Renderer, *arguments: Any, spp: int, **kwargs: Any) -> np.ndarray:
+        nonlocal rendered
+        rendered += len(arguments[2]) * spp
+        return whole(self, *arguments, spp=spp, **kwargs)
+
+    monkeypatch.setattr(Renderer, "_fine", counted)
+    image = renderer.irradiance("laser", sensor_at(), spp=16)
+    few, rendered = rendered, 0
+    monkeypatch.setattr("twin.light.renderer._WIDE_PX", math.inf)
+    everywhere = renderer.irradiance("laser", sensor_at(), spp=16)
+    assert 0.2 * rendered < few < 0.7 * rendered
+    change = np.abs(image - everywhere) / everywhere.max()
+    # Means over a pixel by four samples are off by a part of the second difference, which is 1e-3 at most.
+    assert (change == 0).sum() > 500, "edges are rendered as finely as before"
+    assert np.quantile(change, 0.999) < 1e-3
+    assert image.sum() == pytest.approx(everywhere.sum(), rel=3e-4)

@@ -5,11 +5,13 @@ their probability of a false alarm.
 """
 
 import json
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import uwlts
 from uwlts.cli import app
@@ -17,7 +19,7 @@ from uwlts.metrology.blemish_search import UnrolledSurface, search_blemishes
 from uwlts.metrology.features import DEFINITIONS, FeatureKind
 from uwlts.metrology.pipe_form import fit_pipe, pipe_features
 from uwlts.model.errors import EvaluationError
-from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty
 
 NOISE_MM, IMAGE_MM = 0.02, 0.004
 RADIUS_MM = 150.0
@@ -224,6 +226,31 @@ def test_depths_are_within_their_intervals():
     assert all(pit["depth"].systematic < 0.2 * pit["depth"].random for pit in pits)
 
 
+def test_what_the_footprint_of_points_smooths_is_put_back():
+    """25 pits of 2.5 mm diameter and 0.5 mm depth; as if points had no footprint they are a tenth too shallow."""
+    sizes, places = (0.22, 0.2), list(product(np.arange(-12, 13, 6.0), np.arange(-12, 13, 6.0)))
+    nodes, weights = np.polynomial.hermite_e.hermegauss(7)
+
+    def radius(x, angle):
+        result = np.full(np.shape(x), RADIUS_MM)
+        for (a, wa), (b, wb) in product(zip(nodes, weights, strict=True), repeat=2):
+            seen = x + a * sizes[0], RADIUS_MM * angle + b * sizes[1]
+            result = result + wa * wb / (2 * np.pi) * sum(bell(*seen, at, 2.5, 0.5) for at in places)
+        return result
+
+    cloud = pipe_scan(np.random.default_rng(15), half_arc=0.12, along=(-16, 16, 0.4), around_mm=0.15, radius=radius)
+    known = replace(cloud, metadata={FOOTPRINT: list(sizes), FOOTPRINT_STD: 0.2})
+    means = []
+    for each in (cloud, known):
+        pits = uwlts.inspect(each).of(FeatureKind.PIT)
+        assert len(pits) == len(places)
+        means.append(np.mean([pit["depth"].value for pit in pits]))
+    inside = [pit["depth"].low <= 0.5 <= pit["depth"].high for pit in pits]
+    # Fewer than 18 of 25 intervals of 95 % hold the truth once in 10,000 times.
+    assert np.count_nonzero(inside) >= 18
+    assert means[0] < 0.475 < 0.485 < means[1] < 0.515
+
+
 def flat_scan(rng, height, kept, *, along=(-30, 30, 0.5), across=(-60, 60, 900), **options):
     """A flat thing that faces -z, scanned along x in profiles across it; ``kept`` says where there is something."""
     x, y = np.arange(*along), np.linspace(*across)
@@ -292,6 +319,23 @@ def test_a_gap_is_measured():
     assert gap["width"].random < 0.03 and gap["width"].uncertainty < 0.2
 
 
+def test_blur_beyond_an_edge_shows_in_the_brightness():
+    """A gap of 3 mm whose edges are blurred, and seen down to a fourth of the brightness: 0.13 mm beyond each."""
+    blur = 0.2
+
+    def brightness(y):
+        return norm.cdf((np.abs(y) - 1.5) / blur)
+
+    cloud = flat_scan(
+        np.random.default_rng(16), lambda x, y: 0 * y, lambda x, y: brightness(y) > 0.25, across=(-15, 15, 250)
+    )
+    stripes = replace(cloud, intensity=100 * brightness(cloud.points_mm[:, 1]))
+    known = replace(stripes, metadata={FOOTPRINT: [0.15, blur], FOOTPRINT_STD: 0.2})
+    narrow, right = (uwlts.inspect(each, "gap").features[0]["width"].value for each in (stripes, known))
+    # Half of a line's spacing of 0.12 mm on either side is all that is known without.
+    assert narrow < 2.93 and right == pytest.approx(3.0, abs=0.03)
+
+
 def weld_height(x, y, *, undercut, offset):
     """A bead (1 - t^2)^2 of 2 mm and 12 mm on plates that are offset, with grooves of 2.4 mm at its toes."""
     t = np.abs(y) / 6
@@ -309,10 +353,7 @@ def test_a_weld_is_measured(undercut, offset):
     weld = uwlts.inspect(cloud, "weld").features[0]
     within(weld, {"height": 2.0, "misalignment": offset})
     if undercut:
-        # The bottom of a groove is cut by the local quadratic, by less than a twentieth.
-        for name in ("undercut left", "undercut right", "largest undercut"):
-            gate = GATE * weld[name].uncertainty + 0.05 * undercut
-            assert weld[name].value == pytest.approx(undercut, abs=gate), name
+        within(weld, dict.fromkeys(("undercut left", "undercut right", "largest undercut"), undercut))
     else:
         assert max(weld["undercut left"].value, weld["undercut right"].value) < 2 * NOISE_MM
         # From 10 to 50 % of the height the flank's slope is 0.8 mm over (0.827 - 0.541) of 6 mm.

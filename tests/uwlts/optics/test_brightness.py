@@ -8,7 +8,7 @@ from tests.uwlts.joint_views import MEDIUM, seen
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.model.joint_estimate import JointEstimate
 from uwlts.model.placement import camera_from_object, laser_pose
-from uwlts.optics.brightness import beside_sheet, moved_by_blur_px, sheet_sigma_mm, slopes_of_brightness
+from uwlts.optics.brightness import beside_sheet, footprint_mm, moved_by_blur_px, sheet_sigma_mm, slopes_of_brightness
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
 from uwlts.stripe import FoundStripes, extract_stripe
@@ -38,6 +38,25 @@ def thick_stripe(sensor, stage):
         sigma = sheet_sigma_mm(sensor.laser, np.linalg.norm(at_stage[12] - origin), medium_index=WATER)
         weights.append(np.exp(-0.5 * (t / sigma) ** 2 + FADING * (stage + t)))
     return np.average(rows, axis=0, weights=weights)
+
+
+def test_the_footprint_is_that_of_sheet_and_blur(thesis):
+    """A stripe as wide as the described sheet makes it with a blur of 1.2 px, on a plane at the stand-off.
+
+    The plane is square to the laser; its stripe's shift and the lines' spacing are of points seen through the window.
+    """
+    blur_px = 1.2
+    frame = camera_from_object(thesis)
+    points = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    pixels = seen(thesis, points @ frame[:3, :3].T + frame[:3, 3], index=WATER, window=True)
+    origin = frame[:3, :3].T @ (laser_pose(thesis).origin_mm - frame[:3, 3])
+    sigma = float(sheet_sigma_mm(thesis.laser, np.linalg.norm(points[0] - origin), medium_index=WATER))
+    per_mm, per_line = abs(pixels[1, 1] - pixels[0, 1]) / 0.1, 1.0 / abs(pixels[2, 0] - pixels[0, 0])
+    width = 2.3548 * np.hypot(blur_px, sigma * per_mm)
+    calibration = nominal_calibration(thesis, medium=MEDIUM)
+    line, centre = np.full(50, pixels[0, 0]), np.full(50, pixels[0, 1])
+    found = footprint_mm(calibration, thesis, line, centre, np.full(50, width), medium_index=WATER)
+    assert found == pytest.approx((sigma, blur_px * per_line), rel=0.01)
 
 
 def test_points_lie_where_the_light_comes_from(thesis, tmp_path):

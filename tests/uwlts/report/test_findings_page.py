@@ -9,6 +9,7 @@ import pytest
 import uwlts
 from tests.uwlts.metrology.test_surface_mesh import NOISE_MM
 from uwlts.cli import app
+from uwlts.model.artefacts import SphereStandard
 from uwlts.model.errors import EvaluationError, OutputError, SetupError
 from uwlts.report import pdf
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
@@ -35,12 +36,25 @@ def folder(tmp_path_factory):
     cloud = PointCloud(points, np.ones(len(x)), frame, np.zeros(len(x), int), uncertainty=known, metadata=metadata)
     folder = tmp_path_factory.mktemp("pipe")
     uwlts.write_cloud(folder / "pipe.ply", cloud)
+    evaluation = uwlts.evaluate(_ball(rng, calibration="0" * 64), SphereStandard(diameters_mm=(50.0,)))
+    uwlts.write_evaluation(folder / "ball.evaluation.json", evaluation)
     return folder
+
+
+def _ball(rng, *, calibration):
+    """The half of a sphere of 50 mm that faces the sensor."""
+    way = rng.normal(size=(4000, 3))
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    points = (25.0 + NOISE_MM * rng.normal(size=(len(way), 1))) * way * np.where(way[:, 2:] > 0, -1, 1) + [0, 0, 400]
+    none = np.full(len(points), -1)
+    metadata = {"capture": "ball.h5", "calibration": calibration}
+    return PointCloud(points, np.ones(len(points)), none, none, metadata=metadata)
 
 
 def test_page_json_and_pdf_say_the_same(folder, chromium, monkeypatch):
     monkeypatch.chdir(folder)
     words = ["findings-report", "pipe.ply", "--wall-mm", "8", "--captures", "pipe.ply", "--out", "report.html", "--pdf"]
+    words += ["--verification", "ball.evaluation.json"]
     app(words, result_action="return_value")
     record = json.loads((folder / "report.json").read_text())
     pits = [each for each in record["inspection"]["features"] if each["kind"] == "pit"]
@@ -49,11 +63,17 @@ def test_page_json_and_pdf_say_the_same(folder, chromium, monkeypatch):
     # The noise of one point is 0.02 mm.
     assert wall["value"] == pytest.approx(8 - DEPTH_MM, abs=5 * NOISE_MM)
     assert record["sources"][0]["sha256"] == sha256_of(folder / "pipe.ply")
+    assert record["sources"][-1]["sha256"] == sha256_of(folder / "ball.evaluation.json")
+    (check,) = record["verification"]
+    (diameter,) = (each for each in check["figures"] if each["calibrated_mm"] == 50.0)
+    # Of 4000 points with 0.02 mm of noise; all figures are below a tenth of a mm.
+    assert abs(diameter["value_mm"]) < 0.005
     page = chromium.new_page()
     page.goto((folder / "report.html").as_uri())
     text = page.inner_text("main")
     page.close()
     assert "least remaining wall" in text.lower() and f"{wall['value']:.3f}" in text
+    assert diameter["name"].replace("_", " ") in text
     for part in ("GUM", "VDI/VDE 2634", "ASME B31G", "Traceability", record["sources"][0]["sha256"]):
         assert part in text
     assert (folder / "report.pdf").read_bytes().startswith(b"%PDF")
@@ -65,10 +85,16 @@ def test_foreign_calibrations_and_missing_browsers_are_refused(folder, tmp_path,
         uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", calibration=tmp_path / "other.json")
     with pytest.raises(EvaluationError, match="give that, too"):
         uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", certificate=tmp_path / "other.json")
+    foreign = uwlts.evaluate(
+        _ball(np.random.default_rng(1), calibration="1" * 64), SphereStandard(diameters_mm=(50.0,))
+    )
+    uwlts.write_evaluation(tmp_path / "foreign.json", foreign)
+    with pytest.raises(EvaluationError, match="by another calibration"):
+        uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", verification=[tmp_path / "foreign.json"])
     with pytest.raises(OutputError, match="which is HTML"):
         uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.json")
     monkeypatch.delenv("CHROMIUM", raising=False)
     monkeypatch.setattr(pdf, "shutil", SimpleNamespace(which=lambda name: None))
     with pytest.raises(SetupError, match="needs Chromium"):
         uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", pdf=True)
-    assert [path.name for path in tmp_path.iterdir()] == ["other.json"]
+    assert {path.name for path in tmp_path.iterdir()} == {"other.json", "foreign.json"}
