@@ -135,14 +135,15 @@ def points(folder: Path) -> Iterator[Growth]:
 
 
 def evidence() -> Growth:
-    """Joint calibration by images of a target with 81 points and a stripe, in water."""
-    sensor, sizes, seconds = built_sensor(), [4, 12, 40, 120, 400], []
+    """Joint calibration by images of a target with 81 points and a stripe, half of them in air and half in water."""
+    sensor, sizes, seconds = built_sensor(), [8, 24, 80, 240, 800], []
     options = CalibrationOptions(poses="stage", correct_circles=False)
     for count in sizes:
         noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
-        places = np.linspace(-120, 60, count)
-        series = target_series(sensor, medium=0, positions=places, noise=noise, columns=9)
-        made = gathered(load_sensor("thesis"), [series])
+        places = np.linspace(-120, 60, count // 2)
+        views = {"positions": places, "noise": noise, "columns": 9}
+        series = [target_series(sensor, medium=medium, **views) for medium in (None, 0)]
+        made = gathered(load_sensor("thesis"), series)
         seconds.append(cost(lambda made=made: solve_jointly(made, options=options)))
     return Growth("joint calibration", "evidence images", sizes, seconds)
 

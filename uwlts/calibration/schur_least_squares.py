@@ -9,6 +9,9 @@ from uwlts.model.errors import CalibrationError
 
 _ROUNDS = 60  # several times what usual problems take
 _SMALLEST_STEP = 1e-11  # in the residuals' unit: rounding of sums over all of them
+# Damping beside columns of length one up to which a step is the full one, and the largest share of the cost that is
+# gained so near the solution that residuals are linear.
+_HARDLY_DAMPED, _SAFE = 1e-8, 1e-7
 # Columns are scaled to length one: a smaller eigenvalue of the global parameters' normal matrix is rounding.
 _SINGULAR = 1e-13
 
@@ -109,7 +112,8 @@ def schur_least_squares(
         size = max(float(np.max(np.abs(step * scale), initial=0.0)) for step, scale in steps)
         # Scaled steps are in the unit of the residuals, summed over all of them.
         small = size <= _SMALLEST_STEP * np.sqrt(normal.count())
-        if not small and _expected_gain(normal, global_step, local_steps) <= smallest_gain * normal.cost:
+        settling = damping <= _HARDLY_DAMPED and not small
+        if settling and _expected_gain(normal, global_step, local_steps) <= min(smallest_gain, _SAFE) * normal.cost:
             # So near the solution the linear model tells what another look at all residuals would.
             return _solution(tried_global, tried_local, normal, rounds, "cost settled")
         tried = _assembled(model, tried_global, tried_local, soft_limit)

@@ -135,6 +135,21 @@ def test_covariances_are_those_of_monte_carlo(calibration, stripes, thesis, tmp_
     assert (np.abs(systematic - cov) / size).max() < 0.3
 
 
+def test_many_points_by_a_table_have_the_covariance_of_few_by_themselves(calibration, thesis, tmp_path):
+    line, frame = np.tile(np.arange(100, 1180), 6), np.repeat(np.arange(6), 1080)
+    rng = np.random.default_rng(8)
+    centre = 300.0 + 80.0 * frame + 20 * np.sin(line / 200) + rng.normal(0, 0.1, len(line))
+    whole = np.flatnonzero(frame == 2)
+    with capture_of(tmp_path, thesis, MEDIUM, frames=6) as capture:
+        many = point_uncertainty(capture, calibration, frame, line, centre)
+        few = point_uncertainty(capture, calibration, frame[whole], line[whole], centre[whole])
+    assert len(line) >= 5000 > len(whole)
+    # Left out of either is what moves points by 5e-5 mm (root mean square), at most three times that at one of them.
+    found, expected = many.systematic_mm2()[whole], few.systematic_mm2()
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2 * (1.5e-4) ** 2)
+    np.testing.assert_allclose(many.random_mm2[whole], few.random_mm2, rtol=1e-5)
+
+
 def test_random_covariance_is_the_stripes_noise_on_the_object(calibration, stripes, thesis, tmp_path):
     frame, line, centre = stripes
     with capture_of(tmp_path, thesis, MEDIUM) as capture:

@@ -25,6 +25,18 @@ def test_values_are_those_of_the_function(lines, places):
     np.testing.assert_allclose(table.values(line, place), waves(line, place), rtol=0, atol=1e-9)
 
 
+@pytest.mark.parametrize("count", [50, 5000])
+def test_combined_values_are_sums_whether_lines_or_places_are_more(count):
+    table = LineTable.of(waves, (0, 1279), (0.0, 1023.0), tolerance=1e-10)
+    weights = np.array([[1.0, 0.0, 2.0], [0.0, 1.0, -3.0]])
+    assert table is not None
+    rng = np.random.default_rng(5)
+    line, place = rng.integers(0, 1280, count), rng.uniform(0, 1023, count)
+    sums = waves(line, place) @ weights
+    # The largest of the weights times the table's error.
+    np.testing.assert_allclose(table.combined(weights).values(line, place), sums, rtol=0, atol=5e-9)
+
+
 def test_there_is_none_of_what_is_not_smooth_or_not_everywhere():
     def kinked(line, place):
         return np.abs(place - 400.3)[:, None]

@@ -4,9 +4,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 CALLER = """\
 from uwlts.runtime.compiled import compiled
-from inner.called import factor
+from {}.called import factor
 
 @compiled
 def scaled(x):
@@ -15,9 +17,9 @@ def scaled(x):
 print(scaled(2.0), sum(scaled.stats.cache_hits.values()))
 """
 CALLED = """\
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled_part
 
-@compiled
+@compiled_part
 def factor():
     return {}
 """
@@ -29,13 +31,16 @@ def run(folder: Path) -> list[str]:
     return done.stdout.split()
 
 
-def test_a_change_in_another_file_of_the_package_is_noticed(tmp_path: Path):
-    package = tmp_path / "uwlts" / "inner"
-    package.mkdir(parents=True)
-    (package / "__init__.py").touch()
-    (package / "caller.py").write_text(CALLER)
-    (package / "called.py").write_text(CALLED.format("3.0"))
-    assert run(package.parent) == ["6.0", "0"]
-    assert run(package.parent) == ["6.0", "1"]
-    (package / "called.py").write_text(CALLED.format("50.0"))
-    assert run(package.parent) == ["100.0", "0"]
+@pytest.mark.parametrize("other", ["inner", "beside"])
+def test_a_change_in_another_file_that_is_called_is_noticed(tmp_path: Path, other):
+    packages = tmp_path / "uwlts"
+    for name in ("inner", "beside"):
+        (packages / name).mkdir(parents=True)
+        (packages / name / "__init__.py").touch()
+    (packages / "inner" / "caller.py").write_text(CALLER.format(other))
+    called = packages / other / "called.py"
+    called.write_text(CALLED.format("3.0"))
+    assert run(packages) == ["6.0", "0"]
+    assert run(packages) == ["6.0", "1"]
+    called.write_text(CALLED.format("50.0"))
+    assert run(packages) == ["100.0", "0"]

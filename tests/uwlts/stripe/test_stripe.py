@@ -1,6 +1,8 @@
 """Stripe extraction against profiles whose centre is known in closed form."""
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -567,3 +569,37 @@ def test_whatever_an_image_shows_a_stripe_that_is_found_has_a_place(seed):
         assert np.isfinite(stripe.centre_px).tolist() == good.tolist()
         found += np.count_nonzero(good)
     assert found > 10
+
+
+_NOTHING_NEW = """
+import gc
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from uwlts.stripe import StripeOptions, extract_candidates, extract_stripe, warm_up
+from uwlts.stripe.direct import direct_stripes
+from uwlts.stripe.extract import see_stripes
+
+def compiled():
+    loops = [each for each in gc.get_objects() if isinstance(each, Dispatcher)]
+    return {f"{each.py_func.__module__}.{each.py_func.__name__}": len(each.overloads) for each in loops}
+
+warm_up()
+before = compiled()
+place = np.arange(300)[:, None]
+lines = np.arange(400)
+image = 3 + 150 * np.exp(-0.5 * ((place - 100 - 0.1 * lines) / 2) ** 2) * (lines % 90 > 5)
+image = image + 90 * np.exp(-0.5 * ((place - 220 + 0.1 * lines) / 2) ** 2) * (lines > 200)
+image = np.random.default_rng(1).normal(image, 2).clip(0, 255).astype(np.uint8)
+extract_stripe(image, stripe_along="width")
+assert len(extract_candidates(image, stripe_along="width").line) > 500
+seen = [see_stripes(image, stripe_along="width", options=StripeOptions(), saturation=255.0) for _ in range(2)]
+assert seen[0].rivals is not None
+list(direct_stripes(seen, farther=1))
+print({name for name, count in compiled().items() if count != before.get(name)})
+"""
+
+
+def test_nothing_is_compiled_after_the_warm_up():
+    """In a process of its own, where nothing else has called compiled code before."""
+    done = subprocess.run([sys.executable, "-c", _NOTHING_NEW], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
