@@ -42,7 +42,8 @@ _VOXEL = 0.4
 _INTERVALS = 100
 """Of the spline: between two knots a random walk goes a tenth of the drift of the whole path."""
 _SMOOTH, _ROUGH = (0.3, 0.01), (0.2, 0.4)
-"""Shares of wandering rate and random walk with which crossings are searched, the second where there are none else."""
+"""Shares of wandering rate and random walk with which crossings are searched, one after the other: a path that hardly
+bends is told apart from false crossings best, and one that bends much is found with the other shares only."""
 _SHARES = [
     (wander, walk)
     for wander in (0.003, 0.01, 0.03, 0.1, 0.3, 0.6)
@@ -173,16 +174,15 @@ def align_trajectory(
     times = cloud.time_s + clock_offset_s
     path = _Path.of(trajectory, _drift(trajectory, drift_mm, drift_deg), times)
     pieces = _pieces(cloud, times, path)
-    for shares in (_SMOOTH, _ROUGH):
-        joint = _Alignment(pieces, path, shares)
+    searched = [_Alignment(pieces, path, shares) for shares in (_SMOOTH, _ROUGH)]
+    for turn, joint in enumerate(searched):
         for number in range(len(pieces)):
             joint.close_with_earlier(number)
-            progress(number + 1, len(pieces))
+            progress(turn * len(pieces) + number + 1, len(searched) * len(pieces))
         if joint.pairs:
             joint.settle()
-        if joint.pairs:
-            break
-    else:
+    joint = max(searched, key=lambda each: each.agreeing())
+    if not joint.pairs:
         raise EvaluationError(
             f"the path shows no surface twice, within {_SIGMAS:g} standard deviations of its drift, that tells where "
             "it is: cross an earlier part of the path over a surface with features"
@@ -423,10 +423,18 @@ class _Alignment:
         return False
 
     def _agrees(self, pair: tuple[int, int]) -> bool:
+        fits = self._fits(pair)
+        return bool(np.count_nonzero(fits) >= _FEWEST and np.mean(fits) > _SHARE)
+
+    def _fits(self, pair: tuple[int, int]) -> np.ndarray:
+        """Whether each match (Q,) of a pair agrees within five of its standard deviations."""
         a, b = pair
         found = distances_between(self.moved(b), np.eye(4), self.moved(a), np.eye(4), reach_mm=self._reach())
-        fits = np.abs(found.distance_mm) < 5 * found.std_mm
-        return bool(np.count_nonzero(fits) >= _FEWEST and np.mean(fits) > _SHARE)
+        return np.abs(found.distance_mm) < 5 * found.std_mm
+
+    def agreeing(self) -> int:
+        """Number of patches that agree in all crossings."""
+        return sum(int(np.count_nonzero(self._fits(pair))) for pair in self.pairs)
 
     def settle(self) -> None:
         """Estimate the path and the shares of its drift by turns; pairs that do not agree then are given up."""
