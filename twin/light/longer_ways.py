@@ -19,7 +19,7 @@ import numpy as np
 from twin.backend.arrays import Bool, Float, to_jit
 from twin.light.camera import CameraView
 from twin.light.image_sampling import NODE_SPACING_PX
-from twin.light.smoothing import Findings, blurred, estimated, interpolated
+from twin.light.smoothing import FoundLight, blurred, estimated, interpolated
 from twin.light.walk import Walker
 
 WALK_CELL_PX = 8
@@ -70,7 +70,7 @@ def light_on_longer_ways(view: CameraView, walker: Walker, sources: Sources, *, 
     row_in_stripe, column_in_stripe = np.nonzero(sources.lit)
     large = np.repeat(np.arange(rows * columns), times.ravel())
     small = np.repeat(np.arange(len(row_in_stripe)), times_in_stripe)
-    kinds = [(Findings(rows, columns), Findings(1, len(row_in_stripe))) for _ in NOISE_SHARES]
+    kinds = [(FoundLight(rows, columns), FoundLight(1, len(row_in_stripe))) for _ in NOISE_SHARES]
     for cell, *parts in walked(
         view,
         walker,

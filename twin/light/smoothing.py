@@ -41,7 +41,7 @@ _STEPS = 40
 """Further steps of the likelihood change the light by less than its noise."""
 
 
-class Findings:
+class FoundLight:
     """Light that walks found in cells (rows, columns), by its class, and the sum of its squares."""
 
     def __init__(self, rows: int, columns: int):
@@ -99,7 +99,7 @@ class Findings:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class SmoothLight:
     """Mean light of a walk: in cells (rows, columns), and what its features alone say of it there.
 
     ``classes`` (K) are those of the walks, ``weights`` (K, J) the features' in each, ``portions`` (K,) the light of a
@@ -115,7 +115,7 @@ class Estimate:
     noise_share: float
 
     def at(
-        self, rows: np.ndarray, columns: np.ndarray, features: np.ndarray, findings: Findings, walks: int
+        self, rows: np.ndarray, columns: np.ndarray, features: np.ndarray, findings: FoundLight, walks: int
     ) -> np.ndarray:
         """Light (P,) in places at ``rows`` and ``columns`` (P,) of the cells, with features (J, P) of their own.
 
@@ -132,8 +132,8 @@ class Estimate:
 
 
 def estimated(
-    findings: Findings, walks: np.ndarray, features: np.ndarray, *, tolerance: float, noise_share: float
-) -> Estimate:
+    findings: FoundLight, walks: np.ndarray, features: np.ndarray, *, tolerance: float, noise_share: float
+) -> SmoothLight:
     """Light in cells that were given ``walks`` (rows, columns) each, described by features (J, rows, columns).
 
     Noise of up to ``tolerance``, or the share ``noise_share`` of the light where that is more, is left.
@@ -154,7 +154,7 @@ def estimated(
         cells += _corrected(found, expected, exposure, portion, allowed)
     # Over all walks, nothing is added or lost.
     cells *= light.sum(dtype=float) / max((exposure * cells).sum(dtype=float), float(np.finfo(np.float32).tiny))
-    return Estimate(cells, described, classes, weights, portions, tolerance, noise_share)
+    return SmoothLight(cells, described, classes, weights, portions, tolerance, noise_share)
 
 
 def _corrected(

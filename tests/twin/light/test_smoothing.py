@@ -10,7 +10,7 @@ from scipy import stats
 
 from tests.bench.light import in_named_water
 from twin.light.renderer import Renderer
-from twin.light.smoothing import Findings, blurred, estimated, interpolated
+from twin.light.smoothing import FoundLight, blurred, estimated, interpolated
 from twin.options import Options
 from twin.scene.description import load_scene
 
@@ -30,11 +30,11 @@ def features() -> np.ndarray:
     return np.stack([np.ones(SHAPE, np.float32), *(blurred(line, width) for width in (0.7, 2.1, 6.3, 19.0))])
 
 
-def walks_of(light: np.ndarray, walks: int, *, rng: np.random.Generator) -> Findings:
+def walks_of(light: np.ndarray, walks: int, *, rng: np.random.Generator) -> FoundLight:
     """Walks (rows, columns, ``walks``) of a mean light: log-normal, so that one in a thousand finds 100 times more."""
     spread = 1.5
     each = light[..., None] * rng.lognormal(-0.5 * spread**2, spread, (*light.shape, walks))
-    findings = Findings(*light.shape)
+    findings = FoundLight(*light.shape)
     findings.add(np.repeat(np.arange(light.size), walks), each.astype(np.float32).ravel())
     return findings
 
@@ -71,7 +71,7 @@ def test_more_walks_in_some_cells_are_weighed():
     rng = np.random.default_rng(1)
     light = halo()
     walks = np.where(COLUMNS < 32, 4, 64)
-    findings = Findings(*SHAPE)
+    findings = FoundLight(*SHAPE)
     for left, count in ((True, 4), (False, 64)):
         cells = np.flatnonzero((COLUMNS < 32) == left)
         each = light.ravel()[cells][:, None] * rng.exponential(1.0, (len(cells), count))
@@ -84,10 +84,10 @@ def test_more_walks_in_some_cells_are_weighed():
 
 def test_no_walks_and_dark_features_are_no_light():
     nothing = estimated(
-        Findings(*SHAPE), np.ones(SHAPE), np.zeros((2, *SHAPE), np.float32), tolerance=0.0, noise_share=0.05
+        FoundLight(*SHAPE), np.ones(SHAPE), np.zeros((2, *SHAPE), np.float32), tolerance=0.0, noise_share=0.05
     )
     assert (nothing.cells == 0).all()
-    findings = Findings(*SHAPE)
+    findings = FoundLight(*SHAPE)
     findings.add(np.array([70]), np.array([1.0], np.float32))
     dark = np.stack([np.zeros(SHAPE, np.float32), np.ones(SHAPE, np.float32)])
     spread = estimated(findings, np.ones(SHAPE), dark, tolerance=1e-3, noise_share=0.05).cells
@@ -103,7 +103,7 @@ def test_small_places_take_the_light_of_the_cells_about_them():
     estimate = estimated(findings, np.full(SHAPE, walks), features(), tolerance=0.05, noise_share=0.05)
     rows, columns = np.array([20.25, 23.0, 30.5]), np.array([10.0, 30.5, 50.25])
     own = np.stack([interpolated(feature, rows, columns) for feature in features()])
-    found = estimate.at(rows, columns, own, Findings(1, 3), 1)
+    found = estimate.at(rows, columns, own, FoundLight(1, 3), 1)
     assert found == pytest.approx(interpolated(light, rows, columns), rel=0.25)
 
 

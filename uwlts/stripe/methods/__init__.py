@@ -27,6 +27,8 @@ def method_names() -> tuple[str, ...]:
 
 def place_centre(method: str, peak: PeakWindow) -> tuple[np.ndarray, np.ndarray]:
     """Centre (M,) float32 of the peak in each window, px from its first pixel, and amplitude as of `amplitudes`."""
+    if not peak.start.size:
+        return np.empty(0, np.float32), np.empty(0, np.float32)
     centre = _method(method)(peak)
     return centre, amplitudes(peak, centre)
 
