@@ -209,13 +209,14 @@ def test_light_scattered_any_number_of_times_is_stocks(broad, asymmetry, names):
 
     Stock finds the sheet by chance, its bright part near the laser most seldom: the haze of most runs is a little too
     dark, that of a few far too bright, the more so the more the fog scatters forwards. Where a test's time gives no
-    mean the haze is left out: at an asymmetry of 0.5 before the plate, at 0.9 on both sides of the stripe.
+    mean the haze is left out: at an asymmetry of 0.5 before the plate, at 0.9 on both sides of the stripe. With so many
+    samples the twin's walks are hardly smoothed; what smoothing does to few of them `test_smoothing` bounds.
     """
     scene, medium = scene_of(plate(side=800.0)), turbid(asymmetry)
     stock = stock_irradiance(
         broad, medium, scene, integrator="volpath", max_depth=-1, spp=1024, runs=24, pixel_px=BLOCK_PX
     )
-    twin = twin_irradiance(broad, medium, scene, spp=32, runs=8)
+    twin = twin_irradiance(broad, medium, scene, spp=512, runs=8)
     once = twin_irradiance(broad, medium, scene, *SINGLY, spp=32, runs=1)
     direct = twin_irradiance(broad, medium, scene, *SINGLY, "haze", spp=32, runs=1)[0]
     away = off_stripe(direct)
