@@ -259,8 +259,8 @@ def _mount_agrees_with_the_board(capture: Capture, calibration: Calibration, air
     expected = _by_corners(poses, calibration, air) @ calibration.object_transform()
     apart = np.linalg.norm(expected[:3, 3] - mount.transform()[:3, 3])
     turn = Rotation.from_matrix(expected[:3, :3] @ mount.transform()[:3, :3].T).magnitude()
-    # Both take the camera as exact, of which the focal length has a standard uncertainty of 1.5 %: twice that are 6 mm of
-    # the distance to the plate.
+    # Both take the camera as exact, whose focal length has a standard uncertainty of 1.5 %: twice that are 6 mm of the
+    # distance to the plate.
     assert apart < 6.0 and np.degrees(turn) < 4.0
 
 
