@@ -7,7 +7,8 @@
     twin record runs/inspection/flanges.toml --out runs/inspection/flanges
 
 A pipe of 300 mm diameter and 0.5 % ovality: smooth, with a grid of small pits for the probability of detection, and
-with large pits; and one seen from six sides. All surfaces are known in closed form (`radius_mm`).
+with large pits; and one seen from six sides; welds; a thin plate from both sides. All surfaces are known in closed form
+(`radius_mm`). A number after the folder draws other pits and welds, for `twin record --seed` of the same number.
 """
 
 import sys
@@ -41,10 +42,10 @@ class Pits:
 NO_PITS = Pits(*(np.zeros(0) for _ in range(4)))
 
 
-def small_pits() -> Pits:
+def small_pits(draw: int = 0) -> Pits:
     """A grid of pits of 2, 3 and 5 mm diameter whose depths run evenly, in logarithms, from 0.006 to 0.4 mm."""
     along, around = np.meshgrid(7.0 * np.arange(-4, 5), 7.0 * (np.arange(22) - 10.5), indexing="ij")
-    count, rng = along.size, np.random.default_rng(21)
+    count, rng = along.size, np.random.default_rng(21 + draw)
     order = rng.permutation(count)
     diameter = np.array([2.0, 3.0, 5.0])[order % 3]
     depth = np.exp(np.interp((order // 3 + rng.random(count)) / (count / 3), [0, 1], np.log([0.006, 0.4])))
@@ -52,13 +53,32 @@ def small_pits() -> Pits:
     return Pits(along.ravel() + shift[0], around.ravel() + shift[1], diameter, depth)
 
 
-def large_pits() -> Pits:
+def large_pits(draw: int = 0) -> Pits:
     """Pits of 0.3 to 5 mm depth, as corrosion leaves them, apart from each other."""
     along = [-18.0, 16.0, -14.0, 12.0, -17.0, 15.0, 0.0, -1.0, 2.0]
     around = [-58.0, -55.0, -22.0, -18.0, 22.0, 24.0, 52.0, 0.0, -40.0]
     diameter = [10.0, 16.0, 20.0, 14.0, 24.0, 12.0, 18.0, 3.0, 5.0]
     depth = [1.0, 2.0, 3.0, 4.0, 5.0, 0.5, 1.5, 0.3, 0.4]
-    return Pits(*(np.array(each, float) for each in (along, around, diameter, depth)))
+    pits = Pits(*(np.array(each, float) for each in (along, around, diameter, depth)))
+    if draw:
+        rng = np.random.default_rng(draw)
+        pits = Pits(
+            pits.along, pits.around, *(each * rng.uniform(0.8, 1.05, 9) for each in (pits.diameter, pits.depth))
+        )
+    return pits
+
+
+def welds(draw: int = 0) -> list[dict[str, Any]]:
+    """Objects of welds with undercuts: one of round figures, and more by a draw other than 0."""
+    weld = {"kind": "weld", "beads": 1, "plate_mm": [80.0, 120.0], "length_mm": 60.0, "width_mm": 12.0}
+    weld |= {"height_mm": 2.0, "undercut_depth_mm": 0.5, "undercut_width_mm": 2.5, "finish": "painted"}
+    rng, result = np.random.default_rng(draw), [weld]
+    for seed in range(1, 1 + (5 if draw else 0)):
+        ranges = {"width_mm": (9, 14), "height_mm": (1.2, 2.5), "irregularity": (0.02, 0.1)}
+        ranges |= {"undercut_depth_mm": (0.2, 0.9), "undercut_width_mm": (1.8, 3.2)}
+        drawn = {name: float(rng.uniform(*ends)) for name, ends in ranges.items()}
+        result.append(weld | drawn | {"seed": 10 * draw + seed})
+    return result
 
 
 def radius_mm(along: np.ndarray, angle: np.ndarray, pits: Pits) -> np.ndarray:
@@ -93,7 +113,7 @@ def _scene(title: str, thing: dict[str, Any], motion: dict[str, Any]) -> dict[st
     return {"title": title, "medium": "water", "motion": motion, "objects": [thing]}
 
 
-def scenes(folder: Path) -> dict[str, dict[str, Any]]:
+def scenes(folder: Path, draw: int = 0) -> dict[str, dict[str, Any]]:
     """Scenes by their names; the meshes are written into the folder."""
 
     def pipe(mesh: str, turn_deg: float = 0.0) -> dict[str, Any]:
@@ -102,8 +122,8 @@ def scenes(folder: Path) -> dict[str, dict[str, Any]]:
 
     for name, pits, half_length, half_arc in (
         ("pipe-before", NO_PITS, 60.0, None),
-        ("pipe-after", small_pits(), 36.0, 105.0),
-        ("pipe-corroded", large_pits(), 36.0, 105.0),
+        ("pipe-after", small_pits(draw), 36.0, 105.0),
+        ("pipe-corroded", large_pits(draw), 36.0, 105.0),
     ):
         pipe_mesh(pits, half_length=half_length, half_arc=half_arc).export(folder / f"{name}.ply")
     found = {
@@ -114,16 +134,16 @@ def scenes(folder: Path) -> dict[str, dict[str, Any]]:
     for side in SIDES_DEG:
         motion = {"start_mm": -20.0, "step_mm": 10.0, "count": 5}
         found[f"pipe-side-{side}"] = _scene(f"Pipe turned by {side} deg", pipe("pipe-before", side), motion)
-    weld = {"kind": "weld", "beads": 1, "plate_mm": [80.0, 120.0], "length_mm": 60.0, "width_mm": 12.0}
-    weld |= {"height_mm": 2.0, "undercut_depth_mm": 0.5, "undercut_width_mm": 2.5, "finish": "painted"}
-    found["weld"] = _scene("Weld with undercut", weld, {"start_mm": -25.0, "step_mm": 1.0, "count": 51})
+    for number, weld in enumerate(welds(draw)):
+        motion = {"start_mm": -25.0, "step_mm": 1.0, "count": 51}
+        found[f"weld-{number}" if number else "weld"] = _scene("Weld with undercut", weld, motion)
     return found
 
 
-def main(folder: Path) -> None:
+def main(folder: Path, draw: int = 0) -> None:
     """Write meshes, scenes and campaigns."""
     folder.mkdir(parents=True, exist_ok=True)
-    names = scenes(folder)
+    names = scenes(folder, draw)
     for water in WATERS:
         for name, scene in names.items():
             (folder / f"{name}-{water}.toml").write_text(tomli_w.dumps({"water": water} | scene), encoding="utf-8")
@@ -157,4 +177,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), *map(int, sys.argv[2:]))

@@ -83,11 +83,15 @@ DEFINITIONS: dict[FeatureKind, dict[str, Definition]] = {
         "height": Definition(
             "mm", "greatest height above the line between both plates, mean of the sections", "ISO 5817, 502"
         ),
-        "largest height": Definition("mm", "the same in the highest section", "ISO 5817, 502"),
+        "largest height": Definition(
+            "mm", "the same in the three neighbouring sections that are highest", "ISO 5817, 502"
+        ),
         "width": Definition("mm", "distance of the toes, median of the sections", "ISO 5817, 502, b"),
         "undercut left": Definition("mm", "depth of the groove at the left toe, mean along the weld", _UNDERCUT),
         "undercut right": Definition("mm", "depth of the groove at the right toe, mean along the weld", _UNDERCUT),
-        "largest undercut": Definition("mm", "depth of the groove where it is deepest", "ISO 5817, 5012"),
+        "largest undercut": Definition(
+            "mm", "mean depth of the groove in the five neighbouring sections that are deepest", "ISO 5817, 5012"
+        ),
         "toe angle left": Definition(
             "deg", "180 deg less the slope of the flank from 10 to 50 % height, median", "ISO 5817, 505"
         ),

@@ -15,9 +15,10 @@ import numpy as np
 from scipy import ndimage, sparse
 
 from uwlts.metrology.evaluation import TOWARDS_SENSOR
-from uwlts.metrology.features import Feature, FeatureKind, FeatureValue, Inspection
+from uwlts.metrology.features import COVERAGE_FACTOR, DEFINITIONS, Feature, FeatureKind, FeatureValue, Inspection
 from uwlts.metrology.fits import fit_plane
 from uwlts.metrology.least_squares import MAD_TO_STD, evenly_thinned, fit_robustly, principal_axes
+from uwlts.metrology.noisy_extremes import Largest, largest_mean
 from uwlts.metrology.point_spacing import footprint_on
 from uwlts.metrology.propagation import NormalErrors, normal_errors, plain_value
 from uwlts.model.errors import EvaluationError
@@ -27,8 +28,8 @@ _FEWEST = 500
 _TO_START = 20_000
 _DRAWS, _SEED = 32, 635
 """The standard deviation of so many is right to 13 %."""
-_TOGETHER = 5
-"""Sections of which an undercut's depth is the mean."""
+_TOGETHER_HIGH, _TOGETHER_DEEP = 3, 5
+"""Neighbouring sections of which the largest height and undercut are means: of single ones they would be the noise's."""
 _MOST_SECTIONS = 100
 _POINTS_IN_SECTION = 80
 _BANDWIDTH_SHARE = 0.04
@@ -273,44 +274,90 @@ _NAMES = (
 )  # fmt: skip
 
 
+@dataclass(frozen=True, eq=False)
+class _Figures:
+    """Values by the names `_NAMES`, the largest ones not yet known (NaN), and those of each section: heights of the crest
+    (W,), and depths of the grooves at both toes (W,); NaN where no bottom was seen.
+
+    Those of sections are of the smooth profiles, whose noise is less, with what putting back smoothing changes on
+    average.
+    """
+
+    values: np.ndarray
+    crest: np.ndarray
+    grooves: tuple[np.ndarray, np.ndarray]
+
+
 def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...], np.ndarray]:
     profiles = bead.profiles.of(bead.raw_mm)
     tops = _tops(bead, profiles)
     high = tops > _WHOLE_SHARE * float(np.median(tops[np.isfinite(tops)]))
     whole = np.flatnonzero(high & np.isfinite(tops))
     toes = _toes_and_slopes(bead, profiles, whole)[:, :2]
-    seen = _figures(bead, bead.raw_mm, whole, toes)
+    first = _figures(bead, bead.raw_mm, whole, toes)
+    largest = {
+        "largest height": largest_mean([first.crest], _TOGETHER_HIGH),
+        "largest undercut": largest_mean(first.grooves, _TOGETHER_DEEP),
+    }
+
+    def figures(heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
+        """Values for heights (n,) of the points; the largest move with those of the sections where they are."""
+        found, moved = _figures(bead, heights, whole, toes, steps=steps, share=share), {}
+        moved["largest height"] = [found.crest - first.crest]
+        moved["largest undercut"] = [now - then for now, then in zip(found.grooves, first.grooves, strict=True)]
+        values = found.values.copy()
+        for name, top in largest.items():
+            shift = sum(float(np.nansum(w * by)) for w, by in zip(top.weights, moved[name], strict=True))
+            values[_NAMES.index(name)] = top.value + shift
+        return values
+
+    seen = figures(bead.raw_mm)
     rng = np.random.default_rng(_SEED)
     noise = np.maximum(bead.noise_mm, errors.single_mm)
     drawn = []
     for _ in range(_DRAWS):
         moves = rng.standard_normal(len(noise)) * noise
         moves += errors.drawn_of_images(rng)
-        drawn.append(_figures(bead, bead.raw_mm + moves, whole, toes) - seen)
+        drawn.append(figures(bead.raw_mm + moves) - seen)
     random, bias = np.nanstd(drawn, axis=0), np.zeros(len(seen))
     # The extreme of a noisy profile is too far out, by about as much as with as much noise again.
     extremes = ["undercut" in name or "height" in name for name in _NAMES]
     bias[extremes] = np.maximum(np.nanmean(drawn, axis=0)[extremes], 0)
     # What smoothing may still hide: as much as once more would put back, and what hangs on the footprint's size.
-    resolution = [
-        _figures(bead, bead.raw_mm, whole, toes, steps=2),
-        _figures(bead, bead.raw_mm, whole, toes, share=1 - bead.footprint_std),
-    ]
+    resolution = [figures(bead.raw_mm, steps=2), figures(bead.raw_mm, share=1 - bead.footprint_std)]
     resolved = np.nan_to_num(np.array(resolution) - seen)
-    random = np.sqrt(random**2 + bias**2 + np.sum(resolved**2, axis=0))
+    fixed = np.sqrt(bias**2 + np.sum(resolved**2, axis=0))
     plain = np.where(extremes, np.maximum(seen - bias, 0), seen)
     common = None
     if errors.patterns_mm is not None:
-        moved = [_figures(bead, bead.raw_mm + pattern, whole, toes) - seen for pattern in errors.patterns_mm]
+        moved = [figures(bead.raw_mm + pattern) - seen for pattern in errors.patterns_mm]
         common = np.sqrt(np.nansum(np.square(moved), axis=0))
-    values = tuple(
-        plain_value(
-            FeatureKind.WELD, name, float(value), float(random[k]), None if common is None else common[k], least=0
-        )
-        for k, (name, value) in enumerate(zip(_NAMES, plain, strict=True))
-        if np.isfinite(value)
+    values = []
+    for k, (name, value) in enumerate(zip(_NAMES, plain, strict=True)):
+        if not np.isfinite(value):
+            continue
+        shared, top = None if common is None else float(common[k]), largest.get(name)
+        if top is None:
+            by_noise = float(np.hypot(random[k], fixed[k]))
+            values.append(plain_value(FeatureKind.WELD, name, float(value), by_noise, shared, least=0))
+        else:
+            # The interval of the largest holds the noise; what remains widens it on both sides.
+            other = float(np.hypot(fixed[k], shared or 0.0))
+            values.append(_widened(name, float(value), top, float(fixed[k]), shared, other))
+    return tuple(values), np.array([bead.length_mm, float(plain[2]), float(plain[1])])
+
+
+def _widened(name: str, value: float, top: Largest, fixed: float, shared: float | None, other: float) -> FeatureValue:
+    """A largest value with its interval and what other standard uncertainties make of that."""
+    ends = [
+        np.hypot(top.value - top.low, COVERAGE_FACTOR * other),
+        np.hypot(top.high - top.value, COVERAGE_FACTOR * other),
+    ]
+    random = np.hypot((top.high - top.low) / (2 * COVERAGE_FACTOR), fixed)
+    unit = DEFINITIONS[FeatureKind.WELD][name].unit
+    return FeatureValue(
+        name, value, unit, float(random), shared, max(value - float(ends[0]), 0.0), value + float(ends[1])
     )
-    return values, np.array([bead.length_mm, float(plain[2]), float(plain[1])])
 
 
 def _tops(bead: _Bead, profiles: np.ndarray) -> np.ndarray:
@@ -327,36 +374,27 @@ def _toes_and_slopes(bead: _Bead, profiles: np.ndarray, whole: np.ndarray) -> np
 
 def _figures(
     bead: _Bead, raw: np.ndarray, whole: np.ndarray, toes: np.ndarray, *, steps: int = 1, share: float = 1.0
-) -> np.ndarray:
-    """Values in the order of `_NAMES` for heights (n,) of the points.
+) -> _Figures:
+    """Figures for heights (n,) of the points, of the sections ``whole`` (W,).
 
-    Of the sections ``whole`` (W,); undercuts are looked for beyond the ``toes`` (W, 2). The largest of many are taken
-    of the smooth profiles, whose noise is less, with what putting back smoothing changes on average.
+    Undercuts are looked for beyond the ``toes`` (W, 2).
     """
     profiles, smooth = bead.profiles.of(raw, steps=steps, share=share), bead.profiles.of(raw, steps=0)
     tops, flanks = _tops(bead, profiles)[whole], _toes_and_slopes(bead, profiles, whole)
     width = float(np.nanmedian(flanks[:, 1] - flanks[:, 0]))
     angles = 180 - np.degrees(np.arctan(np.nanmedian(flanks[:, 2:], axis=0)))
-    means, deepest = [], []
+    means, grooves = [], []
     for side in (0, 1):
         depths, flat = (_undercuts(bead, each[whole], toes[:, side], side) for each in (profiles, smooth))
         known = np.isfinite(depths) & np.isfinite(flat)
         means.append(float(np.mean(depths[known])) if known.any() else np.nan)
-        if known.any():
-            # Of neighbouring sections together: the deepest of single ones would be the noise's.
-            deepest.append(_largest_mean(flat[known], _TOGETHER) + float(np.mean((depths - flat)[known])))
+        grooves.append(np.where(known, flat + np.mean((depths - flat)[known]), np.nan) if known.any() else depths)
     smooth_tops = _tops(bead, smooth)[whole]
+    crest = smooth_tops + float(np.mean(tops - smooth_tops))
     middle = [float((rows @ raw)[0]) for _, rows in bead.profiles.plates]
-    values = [
-        float(np.mean(tops)),
-        _largest_mean(smooth_tops, 3) + float(np.mean(tops - smooth_tops)),
-        width,
-        *means,
-        max(deepest, default=np.nan),
-        *(float(angle) for angle in angles),
-        abs(middle[1] - middle[0]),
-    ]
-    return np.array(values)
+    offset = abs(middle[1] - middle[0])
+    values = np.array([float(np.mean(tops)), np.nan, width, *means, np.nan, *angles, offset])
+    return _Figures(values, crest, (grooves[0], grooves[1]))
 
 
 def _undercuts(bead: _Bead, profiles: np.ndarray, toes: np.ndarray, side: int) -> np.ndarray:
@@ -370,12 +408,6 @@ def _undercuts(bead: _Bead, profiles: np.ndarray, toes: np.ndarray, side: int) -
     beside = [profiles[rows, np.clip(lowest + step, 0, len(grid) - 1)] for step in (-1, 1)]
     known = np.isfinite(groove).any(axis=1) & np.isfinite(beside).all(axis=0)
     return np.where(known, -groove[rows, lowest], np.nan)
-
-
-def _largest_mean(values: np.ndarray, count: int) -> float:
-    """Largest mean of so many neighbours."""
-    count = min(count, len(values))
-    return float(np.max(np.mean(np.lib.stride_tricks.sliding_window_view(values, count), axis=-1)))
 
 
 def _flanks(grid: np.ndarray, profile: np.ndarray, top: float) -> tuple[float, float, float, float]:
