@@ -29,7 +29,7 @@ _TO_START = 20_000
 _DRAWS, _SEED = 32, 635
 """The standard deviation of so many is right to 13 %."""
 _TOGETHER_HIGH, _TOGETHER_DEEP = 3, 5
-"""Neighbouring sections of which the largest height and undercut are means: of single ones they would be the noise's."""
+"""Neighbouring sections of which the largest height and undercut are means: single ones would be the noise's."""
 _MOST_SECTIONS = 100
 _POINTS_IN_SECTION = 80
 _BANDWIDTH_SHARE = 0.04
@@ -97,12 +97,16 @@ class _Profiles:
     seen: sparse.csr_array
     sharp: sparse.csr_array
 
+    def levelled(self, heights: np.ndarray) -> np.ndarray:
+        """Heights (n,) of the points over the plates."""
+        return heights - sum(base @ (rows @ heights) for base, rows in self.plates)
+
     def of(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
         """Profiles (S, G) for heights (n,) of the points.
 
         What smoothing hides is put back in so many ``steps``, with a ``share`` of what the footprint makes of that.
         """
-        left = heights - sum(base @ (rows @ heights) for base, rows in self.plates)
+        left = self.levelled(heights)
         profiles = self.smooth @ left
         known = np.isfinite(profiles)
         # Beside lost lines nothing can be put back.
@@ -120,7 +124,7 @@ class _Bead:
 
     ``axes`` (3, 3) are along, across and outwards, ``chosen`` (n,) the points on and beside the bead, ``raw_mm`` (n,)
     their heights over the middle, ``heights_mm`` (n,) those over the plates, ``half_mm`` about half of its width and
-    ``noise_mm`` the standard deviation of a point that gives local means their scatter; ``footprint_std`` is the
+    ``noise_mm`` (n,) the standard deviation of points that gives local means their scatter; ``footprint_std`` is the
     relative standard uncertainty of the points' squared footprint.
     """
 
@@ -132,7 +136,7 @@ class _Bead:
     on_bead: np.ndarray
     half_mm: float
     length_mm: float
-    noise_mm: float
+    noise_mm: np.ndarray
     profiles: _Profiles
     footprint_std: float
 
@@ -176,8 +180,25 @@ def _bead_of(cloud: PointCloud, section_mm: float | None) -> _Bead:
     means = profiles.of(raw, steps=0).ravel()[beside]
     expected = np.sqrt(np.asarray(smooth.power(2).sum(axis=1)).ravel()[beside])
     seen = MAD_TO_STD * float(np.nanmedian(np.abs(means) / expected))
+    scatter = _local_scatter(profiles, raw, across, bandwidth)
+    seen = seen * np.maximum(scatter / float(np.median(scatter[np.abs(across) > half * (1 + _BEYOND_SHARE)])), 1)
     on_bead = np.abs(across) < half
     return _Bead(axes, middle, chosen, raw, heights, on_bead, half, length, seen, profiles, footprint_std)
+
+
+def _local_scatter(profiles: _Profiles, raw: np.ndarray, across: np.ndarray, bandwidth: float) -> np.ndarray:
+    """Scatter (n,) of the points about their section's profile at their place across the weld, of all sections."""
+    depths = profiles.of(raw).ravel()
+    whole = abs(profiles.sharp) @ ~np.isfinite(depths) < _NOTHING
+    off = np.abs(profiles.levelled(raw) - profiles.sharp @ np.nan_to_num(depths))
+    cell = ((across - across.min()) / (2 * bandwidth)).astype(int)
+    spread = np.full(cell.max() + 1, np.nan)
+    for k in range(len(spread)):
+        own = off[(cell == k) & whole]
+        if len(own) >= _FEWEST_BESIDE:
+            spread[k] = MAD_TO_STD * float(np.median(own))
+    spread = np.where(np.isfinite(spread), spread, np.nanmedian(spread))
+    return np.maximum(spread[cell], 1e-12)
 
 
 def _found(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
@@ -276,8 +297,9 @@ _NAMES = (
 
 @dataclass(frozen=True, eq=False)
 class _Figures:
-    """Values by the names `_NAMES`, the largest ones not yet known (NaN), and those of each section: heights of the crest
-    (W,), and depths of the grooves at both toes (W,); NaN where no bottom was seen.
+    """Values by the names `_NAMES`, the largest ones not yet known (NaN), and those of each section.
+
+    These are heights of the crest (W,), and depths of the grooves at both toes (W,), NaN where lines were lost in one.
 
     Those of sections are of the smooth profiles, whose noise is less, with what putting back smoothing changes on
     average.
@@ -293,7 +315,8 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
     tops = _tops(bead, profiles)
     high = tops > _WHOLE_SHARE * float(np.median(tops[np.isfinite(tops)]))
     whole = np.flatnonzero(high & np.isfinite(tops))
-    toes = _toes_and_slopes(bead, profiles, whole)[:, :2]
+    # A toe beside lost lines may be far off: the middle one of neighbours.
+    toes = ndimage.generic_filter(_toes_and_slopes(bead, profiles, whole)[:, :2], np.nanmedian, (_TOGETHER_DEEP, 1))
     first = _figures(bead, bead.raw_mm, whole, toes)
     largest = {
         "largest height": largest_mean([first.crest], _TOGETHER_HIGH),
@@ -398,16 +421,11 @@ def _figures(
 
 
 def _undercuts(bead: _Bead, profiles: np.ndarray, toes: np.ndarray, side: int) -> np.ndarray:
-    """Depths (W,) of the grooves of profiles (W, G) beyond the toes (W,) of a side; NaN where no bottom was seen."""
-    grid = bead.profiles.across_mm
-    beyond = (-1.0, 1.0)[side] * (grid - toes[:, None]) / (2 * bead.half_mm)
-    groove = np.where((beyond > -_INSIDE_SHARE) & (beyond < _BEYOND_SHARE), profiles, np.nan)
-    lowest = np.argmin(np.where(np.isfinite(groove), groove, np.inf), axis=1)
-    # Where the lines beside the deepest one were lost, that is not the groove's bottom.
-    rows = np.arange(len(profiles))
-    beside = [profiles[rows, np.clip(lowest + step, 0, len(grid) - 1)] for step in (-1, 1)]
-    known = np.isfinite(groove).any(axis=1) & np.isfinite(beside).all(axis=0)
-    return np.where(known, -groove[rows, lowest], np.nan)
+    """Depths (W,) of the grooves of profiles (W, G) beyond the toes (W,) of a side; NaN where lines were lost there."""
+    beyond = (-1.0, 1.0)[side] * (bead.profiles.across_mm - toes[:, None]) / (2 * bead.half_mm)
+    groove = (beyond > -_INSIDE_SHARE) & (beyond < _BEYOND_SHARE)
+    seen = np.all(np.isfinite(profiles) | ~groove, axis=1) & groove.any(axis=1)
+    return np.where(seen, -np.min(np.where(groove, profiles, np.inf), axis=1), np.nan)
 
 
 def _flanks(grid: np.ndarray, profile: np.ndarray, top: float) -> tuple[float, float, float, float]:
