@@ -15,7 +15,14 @@ from uwlts.model.mount import Mount
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory
-from uwlts.optics.brightness import beside_sheet, beside_std, footprint_mm, sharp_lines, slopes_of_brightness
+from uwlts.optics.brightness import (
+    beside_sheet,
+    beside_std,
+    footprint_mm,
+    footprint_std,
+    sharp_lines,
+    slopes_of_brightness,
+)
 from uwlts.optics.reconstruction import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.storage.calibration_file import loaded_calibration
@@ -244,7 +251,7 @@ def _footprint(capture: Capture | FrameTable, calibration: Calibration, kept: Fo
         return {}
     sensor = capture.header.sensor
     size = footprint_mm(calibration, sensor, kept.line, kept.centre_px, kept.width_px, medium_index=index)
-    return {FOOTPRINT: list(size), FOOTPRINT_STD: beside_std(sensor.uncertainty)}
+    return {FOOTPRINT: list(size), FOOTPRINT_STD: footprint_std(sensor.uncertainty)}
 
 
 def _posed(points: np.ndarray, capture: Capture | FrameTable, frame: np.ndarray) -> np.ndarray:

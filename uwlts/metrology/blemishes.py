@@ -18,13 +18,15 @@ from scipy import ndimage, sparse
 from scipy.spatial import KDTree
 
 from uwlts.metrology.blemish_search import BlemishSearch, Indication, UnrolledSurface
-from uwlts.metrology.features import FeatureKind, FeatureValue
+from uwlts.metrology.features import COVERAGE, COVERAGE_FACTOR, FeatureKind, FeatureValue
 from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.metrology.propagation import NormalErrors, plain_value
 from uwlts.model.errors import EvaluationError
 
-_DRAWS, _SEED = 48, 635
-"""The standard deviation of so many is right to 10 %."""
+_DRAWS, _TO_LEVEL, _SEED = 120, 48, 635
+"""Three are beyond either end of a 95 % interval; a standard deviation of the second number is right to 10 %."""
+_EXPONENTS = 1, 2, 3
+"""Of bells (1 - t^2)^p: from a paraboloid with a sharp edge to one that runs out slowly."""
 _BANDWIDTH, _POINTS = 0.35, 150
 """Radius of the local quadratic in the blemish's, with which it lowers the depth of a bell by 0.3 %, or less where a
 smaller one holds so many points: with these the noise is a sixth of one point's."""
@@ -78,31 +80,32 @@ def measure_blemish(
     sign = float(np.sign(indication.height_mm))
     heights = sign * surface.heights[field.near]
     depths = field.depths(heights)
-    # Its place by the smoothed surface: the deepest place of a noisy one is too deep.
-    smooth = field.depths(heights, steps=0)
-    deepest = int(np.argmax(np.where(field.region, smooth, -np.inf)))
-    between = field.vertex(smooth, deepest) - float(smooth[deepest])
+    deepest, between = field.deepest(heights)
     depth = float(depths[deepest]) + between
     # Single points that, were they independent, would scatter local means as these do.
     noise = indication.noise_mm * surface.std[field.near] / float(np.median(surface.std))
     rng, own = np.random.default_rng(_SEED), errors[field.near]
-    noisy = [field.depths(rng.standard_normal(len(noise)) * noise + own.drawn_of_images(rng)) for _ in range(_DRAWS)]
-    by_noise = np.std(noisy, axis=0, ddof=1)
+    moves = [rng.standard_normal(len(noise)) * noise + own.drawn_of_images(rng) for _ in range(_DRAWS)]
+    inside = np.arange(len(noise)) < len(indication.points)
+    scale = np.where(inside, field.scatter_over(heights, moves[:_TO_LEVEL], inside), 1.0)
+    moves = [scale * each for each in moves]
+    by_noise = np.std([field.depths(each) for each in moves[:_TO_LEVEL]], axis=0, ddof=1)
     edge = max(_EDGE_SHARE * depth, _EDGE_STD * float(np.median(by_noise[field.region])))
     seen = field.figures(depths, edge, deepest)
     seen[0] += between
-    drawn = [field.figures(depths + each, edge, deepest) - seen for each in noisy]
-    # Half of the middle 68 %: some draws let the contour run into its neighbour.
-    random = 0.5 * np.diff(np.quantile(drawn, [0.1587, 0.8413], axis=0), axis=0)[0]
-    # A noisy contour reaches farther, by about as much as it does with as much noise again.
-    bias = np.median(drawn, axis=0)
-    bias[0], random[0] = 0.0, by_noise[deepest]
+    # Errors of blemishes of this size, known exactly, that are seen by these points: noise, sampling and smoothing.
+    wrong = []
+    for move in moves:
+        bell = _Bell.like(seen, edge, field.grid[deepest], indication.radius_mm, rng)
+        shift = rng.uniform(-0.5, 0.5, 2) * search.smallest_mm
+        wrong.append(field.measured(field.seen_of(bell, shift) + move, edge) - bell.figures(edge))
+    low, bias, high = np.quantile(wrong, [0.5 - 0.5 * COVERAGE, 0.5, 0.5 + 0.5 * COVERAGE], axis=0)
+    random = 0.5 * (high - low) / COVERAGE_FACTOR
     plain = np.maximum(seen - bias, 0)
-    # What smoothing may still hide: as much as once more would put back, and what hangs on the footprint's size.
-    resolution = [field.depths(heights, steps=2), field.depths(heights, share=1 - field.footprint_std)]
-    resolved = np.array([field.figures(each, edge, deepest) - seen for each in resolution])
-    resolved[:, 0] += between
-    random = np.sqrt(random**2 + bias**2 + np.sum(resolved**2, axis=0))
+    # What hangs on the footprint's size.
+    resolved = field.figures(field.depths(heights, share=1 - field.footprint_std), edge, deepest) - seen
+    resolved[0] += between
+    random = np.sqrt(random**2 + bias**2 + resolved**2)
     common = None
     if own.patterns_mm is not None:
         moved = np.array([field.figures(depths + field.depths(p), edge, deepest) - seen for p in own.patterns_mm])
@@ -126,15 +129,49 @@ def measure_blemish(
 
 
 @dataclass(frozen=True, eq=False)
+class _Bell:
+    """A blemish depth (1 - t^2)^p of elliptic outline with half axes (2,) about a middle (2,), mm."""
+
+    middle: np.ndarray
+    half: np.ndarray
+    depth: float
+    exponent: int
+
+    @classmethod
+    def like(cls, seen: np.ndarray, edge: float, middle: np.ndarray, radius: float, rng: np.random.Generator) -> _Bell:
+        """One with the depth, length and width that were ``seen`` at an edge; of the radius where they are zero."""
+        exponent = int(rng.choice(_EXPONENTS))
+        rim = float(np.sqrt(1 - min(edge / seen[0], 0.99) ** (1 / exponent)))
+        half = np.where(seen[1:3] > 0, 0.5 * seen[1:3] / rim, radius)
+        return cls(middle, half, float(seen[0]), exponent)
+
+    def at(self, places: np.ndarray) -> np.ndarray:
+        """Depths (N,) at places (N, 2)."""
+        t2 = np.sum(np.square((places - self.middle) / self.half), axis=1)
+        return self.depth * np.maximum(1 - t2, 0) ** self.exponent
+
+    def figures(self, edge: float) -> np.ndarray:
+        """Depth; length, width, area and lost area within the contour of an edge's depth."""
+        rim = float(np.sqrt(1 - min(edge / self.depth, 1.0) ** (1 / self.exponent)))
+        t = np.linspace(0, rim, 101)
+        lost = 2 * self.half[0] * self.depth * float(np.trapezoid((1 - t * t) ** self.exponent, t))
+        length, width = 2 * self.half * rim
+        return np.array([self.depth, length, width, 0.25 * np.pi * length * width, lost])
+
+
+@dataclass(frozen=True, eq=False)
 class _Field:
     """Depths on a grid (G, 2) of shape ``shape`` as sums over the points ``near`` (n,).
 
-    ``smooth`` (G, n) are local quadratics, ``design`` (n, 3) and ``plane`` (3, n) the undamaged plane's terms and their
-    sums over the points, ``seen`` (n, G) is what points of their footprint see of depths on the grid, ``sharp`` (n, G)
-    what points without one would. ``region`` (G,) are the cells of the blemish, ``stride`` half a bandwidth in cells.
+    ``places`` and ``size`` (n, 2) are those of the points and their footprints, ``smooth`` (G, n) are local
+    quadratics, ``design`` (n, 3) and ``plane`` (3, n) the undamaged plane's terms and their sums over the points,
+    ``seen`` (n, G) is what points of their footprint see of depths on the grid, ``sharp`` (n, G) what points without
+    one would. ``region`` (G,) are the cells of the blemish, ``stride`` half a bandwidth in cells.
     """
 
     near: np.ndarray
+    places: np.ndarray
+    size: np.ndarray
     grid: np.ndarray
     shape: tuple[int, int]
     cell: float
@@ -181,9 +218,8 @@ class _Field:
             parts = [weight * _interpolation((places + node * size - grid[0]) / cell, shape) for node, weight in _NODES]
             seen = sparse.csr_array(sum(parts[1:], parts[0]))
         design = np.column_stack([np.ones(len(places)), places])
-        return cls(
-            near, grid + middle, shape, cell, smooth, design, plane, seen, sharp, surface.footprint_std, stride, region
-        )
+        known = surface.places[near], size, grid + middle, shape, cell
+        return cls(near, *known, smooth, design, plane, seen, sharp, surface.footprint_std, stride, region)
 
     def depths(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
         """Heights (G,) over the undamaged surface for heights (n,) of the points.
@@ -199,6 +235,39 @@ class _Field:
                 there = share * there + (1 - share) * (self.sharp @ depths)
             depths = depths + self.smooth @ (left - there)
         return depths
+
+    def deepest(self, heights: np.ndarray) -> tuple[int, float]:
+        """The deepest cell of the smooth surface, as a sharp one's noise is too deep, and how much cells miss."""
+        smooth = self.depths(heights, steps=0)
+        top = int(np.argmax(np.where(self.region, smooth, -np.inf)))
+        return top, self.vertex(smooth, top) - float(smooth[top])
+
+    def measured(self, heights: np.ndarray, edge: float) -> np.ndarray:
+        """Figures of heights (n,) at their own deepest place."""
+        top, between = self.deepest(heights)
+        found = self.figures(self.depths(heights), edge, top)
+        found[0] += between
+        return found
+
+    def scatter_over(self, heights: np.ndarray, moves: list[np.ndarray], inside: np.ndarray) -> float:
+        """Scatter of heights (n,) about their depths ``inside`` (n,) over that around it; 1 at least.
+
+        Each is over that of the noise ``moves``, as depths take up a part of it. On the slopes of a blemish a stripe
+        scatters more than beside it.
+        """
+
+        def squares(each: np.ndarray) -> np.ndarray:
+            left = each - self.design @ (self.plane @ each) - self.seen @ self.depths(each)
+            return np.array([np.mean(np.square(left[part])) for part in (inside, ~inside)])
+
+        own, around = squares(heights) / np.maximum(np.mean([squares(each) for each in moves], axis=0), 1e-300)
+        return max(1.0, float(np.sqrt(own / max(around, 1e-300))))
+
+    def seen_of(self, bell: _Bell, shift: np.ndarray) -> np.ndarray:
+        """Heights (n,) that the points, with their footprints, would see of a bell elsewhere."""
+        if not np.any(self.size > 0):
+            return bell.at(self.places - shift)
+        return sum((weight * bell.at(self.places - shift + node * self.size) for node, weight in _NODES), np.zeros(1))
 
     def vertex(self, depths: np.ndarray, top: int) -> float:
         """Largest depth between the cells: of the parabolas through the deepest cell and its neighbours."""

@@ -56,7 +56,32 @@ def test_the_footprint_is_that_of_sheet_and_blur(thesis):
     calibration = nominal_calibration(thesis, medium=MEDIUM)
     line, centre = np.full(50, pixels[0, 0]), np.full(50, pixels[0, 1])
     found = footprint_mm(calibration, thesis, line, centre, np.full(50, width), medium_index=WATER)
-    assert found == pytest.approx((sigma, blur_px * per_line), rel=0.01)
+    assert found == pytest.approx((np.sqrt(3) * sigma, blur_px * per_line), rel=0.01)
+
+
+@pytest.mark.parametrize("blur_px", [0.4, 1.5])
+def test_a_point_is_the_mean_of_the_footprint(blur_px):
+    """Stripes on paraboloids of both signs, by what each pixel sees: the radiance of the place where its ray ends.
+
+    A bend of 2 b moves the centre by b times the variance of the footprint across the sheet, 3 times the sheet's. The
+    limit is twice the uncertainty that is stated for the method's weights; of 2000 lines noise makes 0.1.
+    """
+    sheet_px, bend = 1.2, 0.01
+    fine = np.arange(-60, 60, 0.02)
+    u = np.linspace(-8, 8, 4001)
+    blur = np.exp(-0.5 * (np.arange(-6, 6.01, 0.02) / blur_px) ** 2)
+    centres = []
+    for sign in (-1, 1):
+        radiance = np.interp(fine, u + sign * bend * u**2, np.exp(-0.5 * (u / sheet_px) ** 2), left=0, right=0)
+        image = np.convolve(radiance, blur / blur.sum(), "same").reshape(-1, 50).mean(axis=1)
+        # The same speckle of 30 % for both.
+        rng = np.random.default_rng(5)
+        light = 180 * image[:, None] * rng.gamma(1 / 0.09, 0.09, (len(image), 2000))
+        grey = np.clip(light + rng.normal(0, 1, light.shape) + 5, 0, 255).astype(np.uint8)
+        found = extract_stripe(grey, stripe_along="width")
+        centres.append(float(np.nanmean(found.centre_px)))
+    seen = (centres[1] - centres[0]) / (2 * bend * sheet_px**2)
+    assert seen == pytest.approx(3, rel=0.33)
 
 
 def test_points_lie_where_the_light_comes_from(thesis, tmp_path):
