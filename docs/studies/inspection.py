@@ -4,6 +4,7 @@
     cd runs/inspection/calibration && uwlts calibrate --air target-bare.h5 target-air.h5 --water target-water.h5 \
         --step step-near-water.h5 step-standoff-water.h5 step-far-water.h5 --out calibration.json
     python docs/studies/inspection.py runs/inspection docs/pictures
+    python docs/studies/inspection.py runs/inspection-5 5         # pits and welds of another draw
 
 Prints the tables of the documentation: the probability of detection of pits by their depth (hit or miss, logistic in
 the logarithm of the depth, with the bound of its likelihood ratio: MIL-HDBK-1823A, appendix G), errors and coverage of
@@ -30,6 +31,7 @@ from uwlts.storage.capture import CaptureWriter
 
 HOLLOWS = FeatureKind.PIT, FeatureKind.DENT
 BLEMISHES = *HOLLOWS, FeatureKind.PROTRUSION
+HEAD = ["of", "value", "number", "bias", "spread", "stated std", "truth within the 95 % interval"]
 
 
 def cloud_of(folder: Path, water: str, name: str) -> uwlts.PointCloud:
@@ -162,7 +164,10 @@ def true_weld(weld: Weld) -> dict[str, float]:
         angles.append(slopes)
     left, right = np.median(angles, axis=0)
     undercuts = dict.fromkeys(("undercut left", "undercut right", "largest undercut"), weld.undercut_depth_mm)
-    sizes = {"height": float(sections.max(axis=1).mean()), "width": float(np.median(toes))} | undercuts
+    crest = sections.max(axis=1)
+    # Sections are as long as profiles are apart, 1 mm; three of them.
+    highest = float(np.convolve(crest, np.full(12, 1 / 12), "valid").max())
+    sizes = {"height": float(crest.mean()), "largest height": highest, "width": float(np.median(toes))} | undercuts
     return sizes | {"toe angle left": left, "toe angle right": right, "misalignment": 0.0}
 
 
@@ -175,9 +180,9 @@ def pit_pairs(found: list[Feature | None], pits: Pits, chosen: np.ndarray) -> li
     ]
 
 
-def small_pits_in(folder: Path, water: str) -> tuple[list[list[str]], list[list[str]], dict]:
+def small_pits_in(folder: Path, water: str, draw: int = 0) -> tuple[list[list[str]], list[list[str]], dict]:
     """Rows of detection and of figures, and what a curve of each diameter is drawn from."""
-    pits, inspected = small_pits(), uwlts.inspect(cloud_of(folder, water, "pipe-after"))
+    pits, inspected = small_pits(draw), uwlts.inspect(cloud_of(folder, water, "pipe-after"))
     found = matched(inspected, pits)
     hit = np.array([each is not None for each in found])
     plain = uwlts.inspect(cloud_of(folder, water, "pipe-before"))
@@ -194,9 +199,9 @@ def small_pits_in(folder: Path, water: str) -> tuple[list[list[str]], list[list[
     return seen, figures, curves
 
 
-def large_pits_in(folder: Path, water: str) -> list[list[str]]:
+def large_pits_in(folder: Path, water: str, draw: int = 0) -> list[list[str]]:
     """Rows of the figures of large pits; each is printed."""
-    pits, inspected = large_pits(), uwlts.inspect(cloud_of(folder, water, "pipe-corroded"), wall_mm=9.5)
+    pits, inspected = large_pits(draw), uwlts.inspect(cloud_of(folder, water, "pipe-corroded"), wall_mm=9.5)
     found = matched(inspected, pits)
     print(f"{water}: large pits found: {sum(each is not None for each in found)}, false: {false_ones(inspected, pits)}")
     for k, each in enumerate(found):
@@ -213,10 +218,18 @@ def wholes_in(folder: Path, water: str) -> list[list[str]]:
     sections = pipe.of(FeatureKind.SECTION)
     rows += figure_rows(f"{water}, sections", [(each, {"ovality": truth["ovality"]}) for each in sections])
     print(f"{water}: blemishes on the smooth pipe from six sides: {len(pipe.of(*BLEMISHES))}")
-    weld = load_scene(str(folder / f"weld-{water}.toml")).objects[0]
-    assert isinstance(weld, Weld)
-    bead = uwlts.inspect(cloud_of(folder, water, "weld"), "weld").features[0]
-    return rows + figure_rows(f"{water}, weld", [(bead, true_weld(weld))])
+    return rows + welds_in(folder, water)
+
+
+def welds_in(folder: Path, water: str) -> list[list[str]]:
+    """Rows of the figures of welds."""
+    pairs = []
+    for path in sorted(folder.glob(f"weld*-{water}.toml")):
+        weld = load_scene(str(path)).objects[0]
+        assert isinstance(weld, Weld)
+        found = uwlts.inspect(cloud_of(folder, water, path.stem.removesuffix(f"-{water}")), "weld")
+        pairs.append((found.features[0], true_weld(weld)))
+    return figure_rows(f"{water}, weld", pairs)
 
 
 def unchanged_in(folder: Path, water: str) -> None:
@@ -243,22 +256,29 @@ def flanges_in(folder: Path, water: str) -> list[list[str]]:
     return rows + figure_rows(f"{water}, holes of the flange", holes)
 
 
+def draw_again(folder: Path, draw: int) -> None:
+    """Print the figures of the pits and welds of another draw."""
+    rows = []
+    for water in WATERS:
+        rows += small_pits_in(folder, water, draw)[1] + large_pits_in(folder, water, draw) + welds_in(folder, water)
+    print(table(HEAD, rows))
+
+
 def main(folder: Path, pictures: Path) -> None:
     """Print all tables and draw the pictures."""
-    head = ["of", "value", "number", "bias", "spread", "stated std", "truth within the 95 % interval"]
     seen, figures, curves = [], [], {}
     for water in WATERS:
         detected, rows, drawn = small_pits_in(folder, water)
         seen, figures, curves = seen + detected, figures + rows, curves | drawn
         figures += large_pits_in(folder, water)
         unchanged_in(folder, water)
-        print(table(head, wholes_in(folder, water)))
+        print(table(HEAD, wholes_in(folder, water)))
     print(table(["water", "diameter mm", "found", "a90 mm", "a90/95 mm"], seen))
-    print(table(head, figures))
+    print(table(HEAD, figures))
     draw_curves(curves, pictures / "inspection-detection.svg")
     draw_map(folder, pictures / "inspection-pits.png")
     for water in WATERS:
-        print(table(head, flanges_in(folder, water)))
+        print(table(HEAD, flanges_in(folder, water)))
 
 
 def draw_curves(curves: dict, path: Path) -> None:
@@ -332,4 +352,7 @@ def draw_map(folder: Path, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))
+    if sys.argv[2].isdecimal():
+        draw_again(Path(sys.argv[1]), int(sys.argv[2]))
+    else:
+        main(Path(sys.argv[1]), Path(sys.argv[2]))

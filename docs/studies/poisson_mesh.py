@@ -1,7 +1,7 @@
-"""Screened Poisson reconstruction by Open3D of the points that docs/studies/rendered_mesh.py saved.
+"""Screened Poisson reconstruction by Open3D of the points that rendered_mesh.py and thin_wall.py saved.
 
 Runs where `pip install open3d` is, apart from the project's environment; normals are Open3D's own from 30 neighbours,
-the depth of its octree gives cells of about half a millimetre.
+turned to the side from which each point was seen; the depth of its octree gives cells of about half a millimetre.
 """
 
 import sys
@@ -15,13 +15,19 @@ CELL_MM = 0.5
 
 def main(folder: Path) -> None:
     for path in sorted(folder.glob("mesh-*.npz")):
-        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(np.load(path)["points"]))
+        if path.stem.endswith(".poisson"):
+            continue
+        saved = np.load(path)
+        cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(saved["points"]))
         cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(30))
-        cloud.orient_normals_to_align_with_direction(np.array([0.0, 0.0, -1.0]))
+        normals = np.asarray(cloud.normals)
+        towards = saved["towards"] if "towards" in saved else np.array([0.0, 0.0, -1.0])
+        away = np.sum(normals * towards, axis=1) < 0
+        cloud.normals = open3d.utility.Vector3dVector(np.where(away[:, None], -normals, normals))
         size = 1.1 * float(np.max(cloud.get_max_bound() - cloud.get_min_bound()))
         depth = int(np.ceil(np.log2(size / CELL_MM)))
         made, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth)
-        np.save(path.with_suffix(".poisson.npy"), np.asarray(made.vertices))
+        np.savez(path.with_suffix(".poisson.npz"), vertices=np.asarray(made.vertices), faces=np.asarray(made.triangles))
         print(path.name, len(made.vertices), flush=True)
 
 

@@ -79,9 +79,9 @@ def main(folder: Path) -> None:
             rows.append(row(f"{name}, {water}", made.vertices_mm, made.std_mm, off(made.vertices_mm), cloud.points_mm))
             saved = folder / f"mesh-{name.split()[-1]}-{water}.npz"
             np.savez(saved, points=cloud.points_mm)
-            poisson = saved.with_suffix(".poisson.npy")
+            poisson = saved.with_suffix(".poisson.npz")
             if poisson.exists():
-                vertices = np.load(poisson)
+                vertices = np.load(poisson)["vertices"]
                 rows.append(row(f"{name}, {water}, Open3D", vertices, None, off(vertices), cloud.points_mm))
             print(rows[-1], flush=True)
     head = [

@@ -107,6 +107,7 @@ def inspect(
     section_mm: float | None = None,
     wall_mm: float | None = None,
     false_alarm: float = 0.05,
+    largest_ovality: float = 0.02,
     datum: Path | None = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -122,6 +123,7 @@ def inspect(
         section_mm: Length of a section along a pipe (up to twelve unless given) or a weld.
         wall_mm: Thickness of a pipe's undamaged wall, for the wall that remains.
         false_alarm: Probability that anything is found on the whole of a pipe's surface where nothing is.
+        largest_ovality: Ovality over the diameter that a pipe may have where less than half of it was seen.
         datum: Cloud of another face in the same frame, to which a flange's face is to be parallel.
     """
     from uwlts.storage.json_files import write_record
@@ -130,7 +132,15 @@ def inspect(
         if path:
             refuse_unsuitable(path, overwrite=overwrite)
     measured = uwlts.read_cloud(cloud)
-    found = uwlts.inspect(measured, kind, section_mm=section_mm, wall_mm=wall_mm, false_alarm=false_alarm, datum=datum)
+    found = uwlts.inspect(
+        measured,
+        kind,
+        section_mm=section_mm,
+        wall_mm=wall_mm,
+        false_alarm=false_alarm,
+        largest_ovality=largest_ovality,
+        datum=datum,
+    )
     show(found.lines())
     if coloured:
         uwlts.write_cloud(coloured, replace(measured, deviation_mm=found.deviation_mm), overwrite=overwrite)
@@ -185,6 +195,7 @@ def findings_report(
     section_mm: float | None = None,
     wall_mm: float | None = None,
     false_alarm: float = 0.05,
+    largest_ovality: float = 0.02,
     datum: Path | None = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -205,6 +216,7 @@ def findings_report(
         section_mm: Length of a section along a pipe (up to twelve unless given) or a weld.
         wall_mm: Thickness of a pipe's undamaged wall, for the wall that remains.
         false_alarm: Probability that anything is found on the whole of a pipe's surface where nothing is.
+        largest_ovality: Ovality over the diameter that a pipe may have where less than half of it was seen.
         datum: Cloud of another face in the same frame, to which a flange's face is to be parallel.
     """
     found = uwlts.write_findings(
@@ -220,6 +232,7 @@ def findings_report(
         section_mm=section_mm,
         wall_mm=wall_mm,
         false_alarm=false_alarm,
+        largest_ovality=largest_ovality,
         datum=datum,
         overwrite=overwrite,
     )

@@ -15,14 +15,7 @@ from uwlts.model.mount import Mount
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory
-from uwlts.optics.brightness import (
-    beside_sheet,
-    beside_std,
-    footprint_mm,
-    footprint_std,
-    sharp_lines,
-    slopes_of_brightness,
-)
+from uwlts.optics.brightness import beside_sheet, footprint_mm, footprint_std, sharp_lines, slopes_of_brightness
 from uwlts.optics.reconstruction import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.storage.calibration_file import loaded_calibration

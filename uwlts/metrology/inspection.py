@@ -7,6 +7,7 @@ from typing import Literal, assert_never
 
 from uwlts.metrology.features import Inspection
 from uwlts.metrology.flat_inspection import inspect_flange, inspect_gap, inspect_step
+from uwlts.metrology.pipe_form import LARGEST_OVALITY
 from uwlts.metrology.pipe_inspection import inspect_pipe
 from uwlts.metrology.weld_inspection import inspect_weld
 from uwlts.model.errors import EvaluationError
@@ -22,6 +23,7 @@ def inspect(
     section_mm: float | None = None,
     wall_mm: float | None = None,
     false_alarm: float = 0.05,
+    largest_ovality: float = LARGEST_OVALITY,
     datum: PointCloud | str | os.PathLike[str] | None = None,
 ) -> Inspection:
     """Find the features of an object in a cloud and measure them, with uncertainty.
@@ -44,6 +46,9 @@ def inspect(
         Thickness of a pipe's undamaged wall, for the wall that remains.
     false_alarm
         Probability that anything is found on the whole of a pipe's surface where nothing is.
+    largest_ovality
+        Ovality over the diameter that a pipe may have where less than half of its circumference was seen: the tolerance
+        of its specification, where it still holds.
     datum
         Cloud of another face in the same frame, to which a flange's face is to be parallel.
 
@@ -61,6 +66,7 @@ def inspect(
     ...     print(pit.name, pit["depth"].value, pit["depth"].low, pit["depth"].high)
     """
     of_pipe = {"wall_mm": wall_mm is not None, "false_alarm": false_alarm != 0.05}
+    of_pipe["largest_ovality"] = largest_ovality != LARGEST_OVALITY
     foreign = {"section_mm": section_mm is not None and kind not in ("pipe", "weld")}
     foreign |= {name: given and kind != "pipe" for name, given in of_pipe.items()}
     foreign |= {"datum": datum is not None and kind != "flange"}
@@ -69,7 +75,13 @@ def inspect(
     measured = cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
     match kind:
         case "pipe":
-            return inspect_pipe(measured, section_mm=section_mm, wall_mm=wall_mm, false_alarm=false_alarm)
+            return inspect_pipe(
+                measured,
+                section_mm=section_mm,
+                wall_mm=wall_mm,
+                false_alarm=false_alarm,
+                largest_ovality=largest_ovality,
+            )
         case "weld":
             return inspect_weld(measured, section_mm=section_mm)
         case "step":

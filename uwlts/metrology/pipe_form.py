@@ -25,9 +25,9 @@ _SECTORS = 72
 """Sectors of 5 deg, as of a pipe standard (`uwlts.metrology.artefacts`)."""
 _LEAST_ARC = np.pi
 """Arc from which the ovality is known: of less a shift of the axis passes for it."""
-_MOST_OVALITY = 0.02
-"""Of the diameter: the largest out of roundness that a pipe may have where it cannot be seen (ISO 3183, Table 10). Up
-to that all are as likely, and all directions (JCGM 100:2008, 4.3.7)."""
+LARGEST_OVALITY = 0.02
+"""Of the diameter: the largest out of roundness that a pipe may have where it cannot be seen, unless the pipe's own
+specification is given. A choice: pipes bent in the yard or dented by handling are less round than new line pipe."""
 _WHOLE_ARC = np.radians(300.0)
 """Arc from which the third and fourth harmonics are fitted too, so that they do not pass for others."""
 _FEWEST_OF_SECTION = 60
@@ -44,7 +44,8 @@ class PipeForm:
     axis. ``along_mm``, ``angle``, ``distance_mm`` (N,) are places of all points along the axis from there, around it in
     rad from the first direction, and their distances from the form, positive outwards. ``used`` (U,) are the points
     that determine it, ``weights`` (K, U) those of the points in its ``coefficients`` (K,)
-    called ``terms``; places along the axis count in units of ``scale_mm``.
+    called ``terms``; places along the axis count in units of ``scale_mm``. ``largest_ovality`` is that, over the
+    diameter, which it may have where it was not seen.
     """
 
     point_mm: np.ndarray
@@ -59,6 +60,7 @@ class PipeForm:
     coefficients: np.ndarray
     weights: np.ndarray
     scale_mm: float
+    largest_ovality: float
 
     @property
     def outwards(self) -> np.ndarray:
@@ -77,7 +79,9 @@ class PipeForm:
         return self.arc >= _LEAST_ARC
 
 
-def fit_pipe(cloud: PointCloud, *, left_out: np.ndarray | None = None) -> PipeForm:
+def fit_pipe(
+    cloud: PointCloud, *, left_out: np.ndarray | None = None, largest_ovality: float = LARGEST_OVALITY
+) -> PipeForm:
     """Form of the pipe that most points of a cloud lie on; ``left_out`` (N,) bool are damaged places.
 
     A cylinder by orthogonal distances, then harmonics of the radial distance around (out of roundness) and along (bow,
@@ -120,7 +124,8 @@ def fit_pipe(cloud: PointCloud, *, left_out: np.ndarray | None = None) -> PipeFo
     along, angle, off = _cylindrical(cloud.points_mm, point, axes, radius)
     distance = off - _design(along, angle, scale, terms) @ coefficients
     used = fitted[counted]
-    return PipeForm(point, axes, radius, along, angle, distance, used, arc, terms, coefficients, weights, scale)
+    known = point, axes, radius, along, angle, distance, used, arc, terms, coefficients, weights, scale
+    return PipeForm(*known, largest_ovality)
 
 
 def _cylindrical(
@@ -289,9 +294,12 @@ def _diameter_of_arc(
 
 
 def _unseen_ovality(form: PipeForm, points: np.ndarray) -> np.ndarray:
-    """How the radii of points (N, 2) move by one standard deviation of each part of an ovality that was not seen."""
+    """How the radii of points (N, 2) move by one standard deviation of each part of an ovality that was not seen.
+
+    Up to the largest one all are as likely, and all directions (JCGM 100:2008, 4.3.7).
+    """
     # A fourth of the ovality is the amplitude; its square has a third of the largest one's, in each part half of it.
-    std = 2 * form.radius_mm * _MOST_OVALITY / 4 / np.sqrt(6.0)
+    std = 2 * form.radius_mm * form.largest_ovality / 4 / np.sqrt(6.0)
     return std * np.column_stack([np.cos(2 * form.angle[points]), np.sin(2 * form.angle[points])])
 
 

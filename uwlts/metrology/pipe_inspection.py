@@ -10,7 +10,7 @@ from uwlts.metrology.blemish_search import BlemishSearch, UnrolledSurface, searc
 from uwlts.metrology.blemishes import Blemish, measure_blemish
 from uwlts.metrology.features import Feature, FeatureKind, Inspection
 from uwlts.metrology.least_squares import MAD_TO_STD
-from uwlts.metrology.pipe_form import MOST_OFF_SHARE, PipeForm, fit_pipe, pipe_features
+from uwlts.metrology.pipe_form import LARGEST_OVALITY, MOST_OFF_SHARE, PipeForm, fit_pipe, pipe_features
 from uwlts.metrology.point_spacing import footprint_on
 from uwlts.metrology.propagation import normal_errors
 from uwlts.model.errors import EvaluationError
@@ -23,7 +23,12 @@ _FEWEST = 500
 
 
 def inspect_pipe(
-    cloud: PointCloud, *, section_mm: float | None = None, wall_mm: float | None = None, false_alarm: float = 0.05
+    cloud: PointCloud,
+    *,
+    section_mm: float | None = None,
+    wall_mm: float | None = None,
+    false_alarm: float = 0.05,
+    largest_ovality: float = LARGEST_OVALITY,
 ) -> Inspection:
     """Measure a pipe's form and find the blemishes of its outside.
 
@@ -43,6 +48,9 @@ def inspect_pipe(
         Thickness of the undamaged wall, for the wall that remains.
     false_alarm
         Probability that anything is found on the whole pipe where nothing is.
+    largest_ovality
+        Ovality over the diameter that the pipe may have where less than half of its circumference was seen: the
+        tolerance of its specification, where it still holds.
 
     Raises
     ------
@@ -60,9 +68,13 @@ def inspect_pipe(
         raise EvaluationError(f"wall_mm is {wall_mm:g}; expected a positive thickness in mm")
     if not 0 < false_alarm < 1:
         raise EvaluationError(f"false_alarm is {false_alarm:g}; expected a probability between 0 and 1")
+    if not 0 <= largest_ovality <= 0.2:
+        raise EvaluationError(
+            f"largest_ovality is {largest_ovality:g}; expected a share of the diameter from 0 to 0.2, such as 0.02"
+        )
     if len(cloud) < _FEWEST:
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST} are needed for a pipe")
-    form = fit_pipe(cloud)
+    form = fit_pipe(cloud, largest_ovality=largest_ovality)
     # Farther off lies what is not the pipe.
     seam = _cut_open(form, np.flatnonzero(np.abs(form.distance_mm) < MOST_OFF_SHARE * form.radius_mm))
     chosen, surface = seam.points, _unrolled(cloud, form, seam)
@@ -71,7 +83,7 @@ def inspect_pipe(
         # Once more without what was found, which pulls the form towards it.
         damaged = np.ones(len(cloud), bool)
         damaged[chosen[search.plain]] = False
-        form = fit_pipe(cloud, left_out=damaged)
+        form = fit_pipe(cloud, left_out=damaged, largest_ovality=largest_ovality)
         surface = _unrolled(cloud, form, seam)
     features = pipe_features(cloud, form, section_mm=section_mm)
     features += _blemish_features(cloud, form, surface, search, seam, wall_mm)
@@ -161,8 +173,8 @@ def _notes(cloud: PointCloud, form: PipeForm, search: BlemishSearch, false_alarm
     if not form.is_seen_round:
         seen = np.degrees(form.arc)
         notes.append(
-            f"{seen:.0f} deg of the circumference were seen: the ovality is not determined, and what it may do to the "
-            "diameter is in its interval"
+            f"{seen:.0f} deg of the circumference were seen: the ovality is not determined, and what one of up to "
+            f"{100 * form.largest_ovality:g} % may do to the diameter is in its interval"
         )
     level = float(np.nanmedian(search.level_mm)) if np.isfinite(search.level_mm).any() else np.nan
     notes.append(

@@ -23,6 +23,7 @@ from uwlts.metrology.features import (
     Inspection,
 )
 from uwlts.metrology.inspection import InspectionKind, inspect
+from uwlts.metrology.pipe_form import LARGEST_OVALITY
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.command_files import keeps_inputs
 from uwlts.model.errors import EvaluationError
@@ -103,6 +104,7 @@ def write_findings(
     section_mm: float | None = None,
     wall_mm: float | None = None,
     false_alarm: float = 0.05,
+    largest_ovality: float = LARGEST_OVALITY,
     datum: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
 ) -> Inspection:
@@ -110,7 +112,7 @@ def write_findings(
 
     Parameters
     ----------
-    cloud, kind, section_mm, wall_mm, false_alarm, datum
+    cloud, kind, section_mm, wall_mm, false_alarm, largest_ovality, datum
         As for `uwlts.inspect`.
     out
         Page to write; the JSON goes beside it.
@@ -152,7 +154,15 @@ def write_findings(
     sources += [
         Source("verification", Path(each).name, sha256_of(each), "by the same calibration") for each in verification
     ]
-    found = inspect(measured, kind, section_mm=section_mm, wall_mm=wall_mm, false_alarm=false_alarm, datum=datum)
+    found = inspect(
+        measured,
+        kind,
+        section_mm=section_mm,
+        wall_mm=wall_mm,
+        false_alarm=false_alarm,
+        largest_ovality=largest_ovality,
+        datum=datum,
+    )
     made = datetime.now(UTC).isoformat(timespec="seconds")
     text = _page(found, measured, sources, checks, title=title or f"Inspection of {path.name}", made=made)
     record: Table = {

@@ -101,6 +101,9 @@ def test_the_diameter_of_an_arc_may_be_that_of_an_oval():
         assert values[0].uncertainty < 4.0
         inside += [value.low <= 300.0 <= value.high for value in values]
     assert inside.min() >= 14, inside
+    # Of a pipe that is known to be round only the points' own uncertainty is left.
+    round_one = pipe_features(cloud, fit_pipe(cloud, largest_ovality=0.0))[0]["diameter"]
+    assert round_one.uncertainty < 0.1 * values[0].uncertainty
 
 
 @pytest.mark.slow
