@@ -32,12 +32,12 @@ class Largest(NamedTuple):
     weights: tuple[np.ndarray, ...]
 
 
-def largest_mean(profiles: Sequence[np.ndarray], count: int) -> Largest:
+def largest_mean(profiles: Sequence[np.ndarray], count: int, *, noise: float | None = None) -> Largest:
     """Largest mean of ``count`` neighbours in any of some profiles (n,) of values with independent noise of one kind.
 
-    Values that are NaN are not known; means are of known neighbours. NaN where nothing is known. The noise is that of
-    differences of neighbours (von Neumann et al., Annals of Mathematical Statistics 12, 1941), outliers aside, so that
-    what varies from one value to the next counts as noise.
+    Values that are NaN are not known; means are of known neighbours. NaN where nothing is known. Without a ``noise``,
+    its standard deviation, it is that of differences of neighbours (von Neumann et al., Annals of Mathematical
+    Statistics 12, 1941), outliers aside, so that what varies from one value to the next counts as noise.
     """
     known = [np.flatnonzero(np.isfinite(profile)) for profile in profiles]
     owns = [profile[own] for profile, own in zip(profiles, known, strict=True) if len(own)]
@@ -45,7 +45,8 @@ def largest_mean(profiles: Sequence[np.ndarray], count: int) -> Largest:
     if not owns:
         return Largest(np.nan, np.nan, np.nan, tuple(weights))
     jumps = np.concatenate([np.diff(own) for own in owns])
-    noise = MAD_TO_STD * float(np.median(np.abs(jumps))) / np.sqrt(2) if len(jumps) else 0.0
+    if noise is None:
+        noise = MAD_TO_STD * float(np.median(np.abs(jumps))) / np.sqrt(2) if len(jumps) else 0.0
     rng = np.random.default_rng(_SEED)
     means = [_means(own[None], count) for own in owns]
     drawn = [_means(noise * rng.standard_normal((_DRAWS, len(own))), count) for own in owns]

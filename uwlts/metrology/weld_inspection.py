@@ -318,15 +318,23 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
     # A toe beside lost lines may be far off: the middle one of neighbours.
     toes = ndimage.generic_filter(_toes_and_slopes(bead, profiles, whole)[:, :2], np.nanmedian, (_TOGETHER_DEEP, 1))
     first = _figures(bead, bead.raw_mm, whole, toes)
+    rng = np.random.default_rng(_SEED)
+    noise = np.maximum(bead.noise_mm, errors.single_mm)
+    noisy = []
+    for _ in range(_DRAWS):
+        moves = rng.standard_normal(len(noise)) * noise
+        moves += errors.drawn_of_images(rng)
+        noisy.append(_figures(bead, bead.raw_mm + moves, whole, toes))
+    # Ripples make neighbouring crests differ, which is no noise; grooves have none.
+    of_crest = float(np.median(np.std([each.crest for each in noisy], axis=0)))
     largest = {
-        "largest height": largest_mean([first.crest], _TOGETHER_HIGH),
+        "largest height": largest_mean([first.crest], _TOGETHER_HIGH, noise=of_crest),
         "largest undercut": largest_mean(first.grooves, _TOGETHER_DEEP),
     }
 
-    def figures(heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
-        """Values for heights (n,) of the points; the largest move with those of the sections where they are."""
-        found, moved = _figures(bead, heights, whole, toes, steps=steps, share=share), {}
-        moved["largest height"] = [found.crest - first.crest]
+    def values_of(found: _Figures) -> np.ndarray:
+        """All values; the largest move with those of the sections where they are."""
+        moved = {"largest height": [found.crest - first.crest]}
         moved["largest undercut"] = [now - then for now, then in zip(found.grooves, first.grooves, strict=True)]
         values = found.values.copy()
         for name, top in largest.items():
@@ -334,26 +342,23 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
             values[_NAMES.index(name)] = top.value + shift
         return values
 
-    seen = figures(bead.raw_mm)
-    rng = np.random.default_rng(_SEED)
-    noise = np.maximum(bead.noise_mm, errors.single_mm)
-    drawn = []
-    for _ in range(_DRAWS):
-        moves = rng.standard_normal(len(noise)) * noise
-        moves += errors.drawn_of_images(rng)
-        drawn.append(figures(bead.raw_mm + moves) - seen)
+    seen = values_of(first)
+    drawn = [values_of(each) - seen for each in noisy]
     random, bias = np.nanstd(drawn, axis=0), np.zeros(len(seen))
     # The extreme of a noisy profile is too far out, by about as much as with as much noise again.
     extremes = ["undercut" in name or "height" in name for name in _NAMES]
     bias[extremes] = np.maximum(np.nanmean(drawn, axis=0)[extremes], 0)
     # What smoothing may still hide: as much as once more would put back, and what hangs on the footprint's size.
-    resolution = [figures(bead.raw_mm, steps=2), figures(bead.raw_mm, share=1 - bead.footprint_std)]
+    resolution = [
+        values_of(_figures(bead, bead.raw_mm, whole, toes, steps=2)),
+        values_of(_figures(bead, bead.raw_mm, whole, toes, share=1 - bead.footprint_std)),
+    ]
     resolved = np.nan_to_num(np.array(resolution) - seen)
     fixed = np.sqrt(bias**2 + np.sum(resolved**2, axis=0))
     plain = np.where(extremes, np.maximum(seen - bias, 0), seen)
     common = None
     if errors.patterns_mm is not None:
-        moved = [figures(bead.raw_mm + pattern) - seen for pattern in errors.patterns_mm]
+        moved = [values_of(_figures(bead, bead.raw_mm + pattern, whole, toes)) - seen for pattern in errors.patterns_mm]
         common = np.sqrt(np.nansum(np.square(moved), axis=0))
     values = []
     for k, (name, value) in enumerate(zip(_NAMES, plain, strict=True)):
