@@ -232,10 +232,10 @@ def welds_in(folder: Path, water: str) -> list[list[str]]:
     return figure_rows(f"{water}, weld", pairs)
 
 
-def unchanged_in(folder: Path, water: str) -> None:
+def unchanged_in(folder: Path, water: str, draw: int = 0) -> None:
     """Print where change is claimed beside the pits, which is where nothing changed."""
     before = cloud_of(folder, water, "pipe-before")
-    for name, pits in (("pipe-after", small_pits()), ("pipe-corroded", large_pits())):
+    for name, pits in (("pipe-after", small_pits(draw)), ("pipe-corroded", large_pits(draw))):
         change = uwlts.compare_clouds(cloud_of(folder, water, name), before, same_water=True)
         reach = pits.diameter / 2 + change.disc_mm / 2
         clear = change.compared & np.all(distances(pits, change.points_mm) > reach, axis=1)
@@ -261,6 +261,7 @@ def draw_again(folder: Path, draw: int) -> None:
     rows = []
     for water in WATERS:
         rows += small_pits_in(folder, water, draw)[1] + large_pits_in(folder, water, draw) + welds_in(folder, water)
+        unchanged_in(folder, water, draw)
     print(table(HEAD, rows))
 
 

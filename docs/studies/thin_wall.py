@@ -56,7 +56,7 @@ def write_scenes(folder: Path) -> None:
     for side, turn in SIDES.items():
         plate = {"kind": "mesh", "path": "plate.ply", "reflectance": 0.4, "rotation_deg": [turn, 0.0, 0.0]}
         scene = {"title": f"Plate, {side}", "medium": "water", "water": "clear", "objects": [plate]}
-        scene["motion"] = {"start_mm": -26.0, "step_mm": 0.5, "count": 105}
+        scene["motion"] = {"start_mm": -26.0, "step_mm": 1.0, "count": 53}
         (folder / f"plate-{side}.toml").write_text(tomli_w.dumps(scene), encoding="utf-8")
     recordings = [{"name": f"plate-{side}", "scene": f"plate-{side}.toml"} for side in SIDES]
     campaign = {"base": "thesis", "title": "inspection, plate", "recordings": recordings}
