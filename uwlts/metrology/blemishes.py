@@ -11,6 +11,7 @@ through to every value: by each pattern that all points share, and by noise draw
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -281,13 +282,18 @@ class _Field:
                     depth -= (after - before) ** 2 / (8 * bend)
         return depth
 
+    @cached_property
+    def fine_region(self) -> np.ndarray:
+        """The cells of the blemish on the grid in which contours are followed."""
+        size = [_FINER * (n - 1) + 1 for n in self.shape]
+        return np.asarray(ndimage.zoom(self.region.reshape(self.shape), np.divide(size, self.shape), order=0))
+
     def figures(self, depths: np.ndarray, edge: float, deepest: int) -> np.ndarray:
         """Depth in the ``deepest`` cell; length, width, area and lost area within the contour of an edge's depth."""
         size = [_FINER * (n - 1) + 1 for n in self.shape]
         cell, top = self.cell / _FINER, tuple(_FINER * k for k in np.unravel_index(deepest, self.shape))
         fine = np.asarray(ndimage.zoom(depths.reshape(self.shape), np.divide(size, self.shape), order=3))
-        region = np.asarray(ndimage.zoom(self.region.reshape(self.shape), np.divide(size, self.shape), order=0))
-        labelled: Any = ndimage.label(region & (fine > edge), structure=np.ones((3, 3)))
+        labelled: Any = ndimage.label(self.fine_region & (fine > edge), structure=np.ones((3, 3)))
         labels, depth = labelled[0], float(depths[deepest])
         if (label := labels[top]) == 0:
             return np.array([depth, 0.0, 0.0, 0.0, 0.0])

@@ -45,11 +45,11 @@ def largest_mean(profiles: Sequence[np.ndarray], count: int, *, noise: float | N
     if not owns:
         return Largest(np.nan, np.nan, np.nan, tuple(weights))
     jumps = np.concatenate([np.diff(own) for own in owns])
-    if noise is None:
-        noise = MAD_TO_STD * float(np.median(np.abs(jumps))) / np.sqrt(2) if len(jumps) else 0.0
+    seen_noise = MAD_TO_STD * float(np.median(np.abs(jumps))) / np.sqrt(2) if len(jumps) else 0.0
+    std = seen_noise if noise is None else noise
     rng = np.random.default_rng(_SEED)
     means = [_means(own[None], count) for own in owns]
-    drawn = [_means(noise * rng.standard_normal((_DRAWS, len(own))), count) for own in owns]
+    drawn = [_means(std * rng.standard_normal((_DRAWS, len(own))), count) for own in owns]
     seen = max(float(each.max()) for each in means)
     alone = np.max([each.max(axis=1) for each in drawn], axis=0)
     again = np.max([(mean + move).max(axis=1) for mean, move in zip(means, drawn, strict=True)], axis=0)
