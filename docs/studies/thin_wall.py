@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from stripe_tables import table
 
 import uwlts
-from uwlts.storage.capture import CaptureWriter
+from uwlts.storage.capture_writer import CaptureWriter
 
 THICKNESS_MM, OUTER_MM, HOLE_MM = 2.0, 24.0, 6.0
 """Thickness and radii."""
