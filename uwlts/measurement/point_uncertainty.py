@@ -63,7 +63,8 @@ def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) 
 def _median(values: np.ndarray) -> float:
     """Median of values that are finite; NumPy's own takes several times as long for a few hundred."""
     middle = [(len(values) - 1) // 2, len(values) // 2]
-    return float(np.partition(values, middle)[middle].mean())
+    low, high = np.partition(values, middle)[middle].tolist()
+    return 0.5 * (low + high)
 
 
 def point_uncertainty(
@@ -76,6 +77,7 @@ def point_uncertainty(
     blur_px: np.ndarray | None = None,
     beside_mm: np.ndarray | None = None,
     mount_by: np.ndarray | None = None,
+    digest: str | None = None,
 ) -> PointUncertainty:
     """Uncertainty of the points that stripe centres (N,) of a capture give by a joint calibration.
 
@@ -85,7 +87,8 @@ def point_uncertainty(
     move the centres, and ``beside_mm`` (N, 3), how far points were moved to where their light comes from
     (`uwlts.optics.brightness`), are each wrong by some share, the same for all points. ``mount_by`` (6, P) are
     derivatives of the mount by the parameters of the joint estimate (`uwlts.model.mount.SensorShare`), where the frames
-    carry poses of a platform: what the calibration does to points and mount then belongs together.
+    carry poses of a platform: what the calibration does to points and mount then belongs together. ``digest`` is
+    that of the calibration where it is known.
 
     Raises
     ------
@@ -148,14 +151,14 @@ def point_uncertainty(
     random, patterns = moved(slice(None), weights)
     if not np.isfinite(random).all():
         raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
-    along = np.array(header.stage_direction)
-    position = np.where(posed[frame, :, 0], 0.0, header.sensor.uncertainty.stage_position_mm * along)
+    along = header.sensor.uncertainty.stage_position_mm * np.array(header.stage_direction)
+    position = np.where(posed[:, :, 0], 0.0, along).astype(np.float32)[frame]
     # All but blur is the sensor's, its stage's and its water's, whatever they scan in this medium.
-    source = f"{calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
+    source = f"{digest or calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
     name = sha256(source.encode()).hexdigest()[:16]
     of_sensor_parts = np.delete(weights, [0, 2], axis=0)
     shared = {f"{WATER} {name}": weights[2:3].T, f"sensor {name}": of_sensor_parts.T}
-    return PointUncertainty(random, position.astype(np.float32), patterns, shared=shared)
+    return PointUncertainty(random, position, patterns, shared=shared)
 
 
 @compiled

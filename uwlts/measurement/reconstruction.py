@@ -178,12 +178,13 @@ def reconstruct_stripes(
         points = points + beside
     points = _posed(points, capture, stripes.frame)
     good = np.flatnonzero(found.status == RayStatus.OK)
-    kept, known = stripes[good], None
+    kept, known, digest = stripes[good], None, calibration_digest(calibration)
     if with_uncertainty:
         if exact is None:
             raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (--water or --joint)")
         where = kept.frame, kept.line, kept.centre_px
-        known = point_uncertainty(capture, exact, *where, blur_px=blur[good], beside_mm=beside[good], mount_by=mount_by)
+        moved = {"blur_px": blur[good], "beside_mm": beside[good], "mount_by": mount_by}
+        known = point_uncertainty(capture, exact, *where, **moved, digest=digest)
     rays = np.bincount(found.status, minlength=len(RayStatus))
     return ScanCloud(
         points_mm=points[good],
@@ -197,7 +198,7 @@ def reconstruct_stripes(
             "medium": capture.header.medium_name,
             "medium_index": index,
             "artefact": capture.header.artefact,
-            "calibration": calibration_digest(calibration),
+            "calibration": digest,
             **({} if sheet is None else _footprint(capture, sheet, stripes)),
         },
         stripe=sharp[good],

@@ -64,8 +64,8 @@ class LitSheet:
 
     ``found`` are the points on the sheet's middle, OCS at the stage's position 0. ``of_slope`` (N, 3), mm2, is how far
     their light comes from beside them, along the camera's rays, for each 1/mm by which the brightness's logarithm grows
-    across the sheet; ``sigma_mm`` (N,) is the sheet's thickness, and ``per_sigma_px`` (N,) how far the stripe moves on a
-    surface square to the laser's axis where the sheet does so by its thickness.
+    across the sheet; ``sigma_mm`` (N,) is the sheet's thickness, and ``per_sigma_px`` (N,) how far the stripe moves on
+    a surface square to the laser's axis where the sheet does so by its thickness.
     """
 
     found: MeasuredPoints

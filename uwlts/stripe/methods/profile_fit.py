@@ -73,21 +73,16 @@ def centres(peak: PeakWindow) -> np.ndarray:
     _flank_noise(peak, sampled, flanks)
     # The floor: that of the usual line.
     middle = [(sampled.size - 1) // 2, sampled.size // 2]
-    noise = max(_LEAST_NOISE, math.sqrt(np.partition(flanks, middle)[middle].mean() / _MEDIAN_MEAN_SQUARE))
+    low, high = np.partition(flanks, middle)[middle].tolist()
+    noise = max(_LEAST_NOISE, math.sqrt(0.5 * (low + high) / _MEDIAN_MEAN_SQUARE))
     groups, most = -(-peak.start.size // _LANES), int(peak.reach.max())
     # Flat rows, of which the compiler knows that their parts do not overlap.
     signal = np.empty((groups, (2 * most + 1) * _LANES), np.float32)
     known, sums = np.empty((groups, _KNOWN * _LANES), np.float32), np.empty(14 * _LANES, np.float32)
-    _fit(peak, noise, sampled, signal, known, sums)
-    centre = np.floor(peak.middle + np.float32(0.5)) + known[:, _CENTRE : _CENTRE + _LANES].ravel()[: peak.start.size]
-    width = np.float32(FWHM_PER_SIGMA) * peak.sigma
-    haloed = np.flatnonzero((noise > _SPECKLED_HALO * peak.height) & (width > _PLATEAU))
-    if haloed.size:
-        window = peak.window[haloed]
-        plateau = np.count_nonzero(window == window.max(axis=1, keepdims=True), axis=1)
-        flat = haloed[plateau > np.maximum(_MOSTLY * width[haloed], _PLATEAU)]
-        if flat.size:
-            centre[flat] = quadratic.centres(peak.keep(flat))
+    centre, flat = np.empty(peak.start.size, np.float32), np.empty(peak.start.size, np.bool_)
+    _fit(peak, noise, sampled, signal, known, sums, centre, flat)
+    if flat.any():
+        centre[flat] = quadratic.centres(peak.keep(flat))
     return centre
 
 
@@ -106,9 +101,16 @@ def _flank_noise(peak: PeakWindow, sampled: np.ndarray, result: np.ndarray) -> N
 
 @compiled
 def _fit(
-    peak: PeakWindow, noise: float, sampled: np.ndarray, signal: np.ndarray, known: np.ndarray, sums: np.ndarray
+    peak: PeakWindow,
+    noise: float,
+    sampled: np.ndarray,
+    signal: np.ndarray,
+    known: np.ndarray,
+    sums: np.ndarray,
+    centre: np.ndarray,
+    flat: np.ndarray,
 ) -> None:
-    """Fit all lines; the fits are in ``known``, while ``signal`` and ``sums`` are room to work in."""
+    """Fill the centres (M,), and mark the lines (M,) with a plateau in a halo; all others are room to work in."""
     _set_side_by_side(peak, noise, signal, known)
     contrast = _USUAL_CONTRAST
     for step in range(_STEPS):
@@ -117,6 +119,16 @@ def _fit(
         for group in range(known.shape[0]):
             _sum_moments(known[group], signal[group], np.float32(contrast * contrast), sums)
             _step(known[group], sums)
+    size = peak.window.shape[1]
+    for m in range(centre.size):
+        centre[m] = math.floor(peak.middle[m] + np.float32(0.5)) + known[m // _LANES, _CENTRE + m % _LANES]
+        width, plateau = np.float32(FWHM_PER_SIGMA) * peak.sigma[m], 0
+        if noise > _SPECKLED_HALO * peak.height[m] and width > _PLATEAU:
+            window = peak.window[m]
+            highest = greatest(window, 0, size)
+            for k in range(size):
+                plateau += window[k] == highest
+        flat[m] = plateau > max(_MOSTLY * width, _PLATEAU)
 
 
 @compiled_part
@@ -174,7 +186,7 @@ def _sum_moments(known: np.ndarray, signal: np.ndarray, squared_contrast: np.flo
     From the middle outwards, both sides at a time, the model goes on by the ratio of neighbouring values, which falls
     by the same factor from pixel to pixel.
     """
-    most, reach = signal.size // (2 * _LANES), int(greatest(known[_REACH : _REACH + _LANES]))
+    most, reach = signal.size // (2 * _LANES), int(greatest(known, _REACH, _REACH + _LANES))
     y = signal[most * _LANES :][:_LANES]
     for k in range(_LANES):
         centre, inverse = known[_CENTRE + k], np.float32(1.0) / known[_SIGMA + k]
