@@ -44,12 +44,13 @@ class LineTable:
         places_px: tuple[float, float],
         *,
         tolerance: float | np.ndarray,
+        share: float = 0.0,
     ) -> LineTable | None:
         """Table of a function for the lines and places between two, ends included.
 
         ``exact`` gives the values (N, K) for lines (N,) and places (N,), both float. None where one is not finite, or
-        where the last terms of the series are not below the tolerance, of all values or of each (K,), as of a function
-        that is not smooth.
+        where the last terms of the series are not below the tolerance, of all values or of each (K,), or that ``share``
+        of the largest value where it is more, as of a function that is not smooth.
         """
         (line, half_lines), (place, half_places) = (
             (0.5 * (low + high), max(0.5 * (high - low), 0.5)) for low, high in (lines, places_px)
@@ -63,12 +64,13 @@ class LineTable:
             into_lines, into_places = map(_into_series, count)
             series = np.tensordot(into_places, values.reshape(*count[::-1], -1), (1, 0))
             series = np.tensordot(into_lines, series, (1, 1))
-            if (np.abs(series[-2:]) <= tolerance).all() and (np.abs(series[:, -2:]) <= tolerance).all():
+            error = np.maximum(tolerance, share * np.abs(values).max(axis=0))
+            if (np.abs(series[-2:]) <= error).all() and (np.abs(series[:, -2:]) <= error).all():
                 at_lines = (np.arange(lines[0], lines[1] + 1) - line) / half_lines
                 of_lines = chebyshev.chebvander(at_lines, count[0] - 1)
                 whole = cls(series, of_lines, lines[0], place - half_places, place + half_places)
                 # What is left out besides stays far below the tolerance.
-                return whole.shortened(1e-3 * tolerance)
+                return whole.shortened(1e-3 * error)
         return None
 
     @classmethod
@@ -79,12 +81,13 @@ class LineTable:
         place_px: np.ndarray,
         *,
         tolerance: float | np.ndarray,
+        share: float = 0.0,
     ) -> LineTable | None:
         """Table for all of the places (N,) on lines (N,) int; None also where they are too few to be worth one."""
         if len(line) < _WORTH or line.dtype.kind not in "iu" or not np.isfinite(place_px).all():
             return None
         lines, places_px = (int(line.min()), int(line.max())), (float(place_px.min()), float(place_px.max()))
-        return cls.of(exact, lines, places_px, tolerance=tolerance)
+        return cls.of(exact, lines, places_px, tolerance=tolerance, share=share)
 
     def combined(self, weights: np.ndarray) -> LineTable:
         """Table of the sums of its values with weights (K, M)."""
@@ -109,7 +112,7 @@ class LineTable:
     def values(self, line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
         """Values (N, K) for lines (N,) int and places (N,) within the table."""
         result = np.empty((len(line), self.terms.shape[2]))
-        _sum_series(*self.series(line, place_px), result)
+        sum_series(*self.series(line, place_px), result)
         return result
 
 
@@ -123,11 +126,11 @@ def _into_series(count: int) -> np.ndarray:
 def _needed(size: np.ndarray, tolerance: float | np.ndarray) -> int:
     """Number of the first terms, at least one, after which sizes (T, K) add up to no more than the tolerance."""
     left = np.cumsum(size[::-1], axis=0)[::-1]
-    return max(1, np.count_nonzero((left > tolerance).any(axis=1)))
+    return max(1, int(np.count_nonzero((left > tolerance).any(axis=1))))
 
 
 @compiled
-def _sum_series(series: np.ndarray, row: np.ndarray, at: np.ndarray, result: np.ndarray) -> None:
+def sum_series(series: np.ndarray, row: np.ndarray, at: np.ndarray, result: np.ndarray) -> None:
     """Sums of Chebyshev polynomials at places (N,)."""
     for n in range(row.size):
         sum_terms(series[row[n]], at[n], result[n])

@@ -274,7 +274,7 @@ def step_profiles(
 
 def line_start(evidence: StepProfileEvidence, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
     """The lower face's line (2,) at the parameters' start."""
-    points = evidence.on_sheet(parameters, global_values)
+    points = evidence.on_sheet(parameters, global_values).points()
     if points is None:
         raise CalibrationError("the stripe on a step meets no sheet at the calibration's start: check the window")
     up = evidence.upward @ points.points - evidence.upper_mm(parameters, global_values)

@@ -87,6 +87,21 @@ def window_values(window: WindowModel) -> dict[ParameterKey, float]:
 
 
 @dataclass(frozen=True, eq=False)
+class StripePoints:
+    """Points (3, N) of the sheet in mm, camera frame, and their derivatives (N, 3, 1 + P).
+
+    By the pixel across the stripe first, then by the global parameters.
+    """
+
+    points: np.ndarray
+    by: np.ndarray
+
+    def along(self, directions: np.ndarray) -> np.ndarray:
+        """Derivatives (N, 1 + P) of how far the points lie along directions (3, N)."""
+        return np.einsum("in,nic->nc", directions, self.by)
+
+
+@dataclass(frozen=True, eq=False)
 class Parameters:
     """Keys and places of the global parameters in one vector (P,).
 
@@ -152,6 +167,19 @@ class Parameters:
         if rays is None:
             return None
         return points_on_sheet(self.sheet, self._sheet_values(values), rays, self.medium_index(values, view))
+
+    def stripe_points(
+        self, values: np.ndarray, view: ViewMedium, pixels: np.ndarray, *, across: int
+    ) -> StripePoints | None:
+        """As `on_sheet`, for pixels (N, 2) of a stripe; the coordinate ``across``, 0 or 1, runs across it."""
+        found = self.on_sheet(values, view, pixels)
+        if found is None:
+            return None
+        by = np.empty((len(pixels), 3, 1 + len(self.keys)))
+        by[:, :, 0] = found.by_rays[across].T
+        for axis in range(3):
+            by[:, axis, 1:] = self.by_global(found.by_rays[:, axis], view, found.by_sheet[:, axis])
+        return StripePoints(found.points, by)
 
     def project(self, values: np.ndarray, view: ViewMedium, points: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) of points (N, 3) in the camera frame, seen through a view; NaN where there is none."""
