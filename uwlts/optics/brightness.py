@@ -24,7 +24,7 @@ from uwlts.model.stripe import pixels_of
 from uwlts.optics.line_table import LineTable
 from uwlts.optics.reconstruction import MeasuredPoints, rays_on_sheet, to_object
 from uwlts.optics.window import RayStatus
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_with_arrays
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 from uwlts.stripe.recording import FoundStripes
 
@@ -285,7 +285,7 @@ def _slopes_by_position(
     return slopes.ravel()[place]
 
 
-@compiled
+@compiled_with_arrays
 def _fit_planes(
     there: np.ndarray, z: np.ndarray, s: np.ndarray, rows: int, columns: int, least: float, slopes: np.ndarray
 ) -> None:

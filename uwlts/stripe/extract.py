@@ -222,6 +222,8 @@ def _found(
         nothing = np.zeros(len(found.status), bool)
         return found, nothing, nothing, None
     block = options.half_window_px // 2
+    # Read in the order of memory first, an image costs a third less than by the rows of its blocks alone.
+    brightest = profiles.max()
     high, low = block_extremes(profiles, block)
     # Blocks more at either end of the lines, so that what one window covers can be crossed out without a check.
     board = np.zeros((high.shape[0] + 2 * MARGIN, high.shape[1]), high.dtype)
@@ -235,7 +237,7 @@ def _found(
     status, wide, several, peak = search(profiles, left, detection.rules)
     glare = wide.copy()
     # A plateau wider than the window does not even stick out.
-    white = cv2.reduce(low, 0, cv2.REDUCE_MAX)[0] >= clip
+    white = low.max(axis=0) >= clip if brightest >= clip else np.zeros(len(status), np.bool_)
     wide |= white
     amplitude, width = np.full((2, len(status)), np.nan, np.float32)
     found = _Lines(np.full(len(status), np.nan), amplitude, width, status, wide, white)

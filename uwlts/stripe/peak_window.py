@@ -153,10 +153,10 @@ def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> 
         top += 1
     # Repeated border pixels may belong to the stripe itself, so that only the other side shows the background.
     ground = np.float32(-np.inf)
-    if start >= 0:
-        ground = _least(smooth, 0, block)
-    if start + size <= count:
-        ground = max(ground, _least(smooth, size - block, size))
+    for side in range(2):
+        begin = side * (size - block)
+        if start + begin >= 0 and start + begin + block <= count:
+            ground = max(ground, _least(smooth, begin, begin + block))
     rise = highest - ground
     level = ground + np.float32(0.5) * rise
 
