@@ -52,11 +52,13 @@ def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) 
     if len(off) < _FEWEST_NEIGHBOURS:
         raise CalibrationError(f"only {len(off)} stripe centres have two neighbours: too few to measure their noise")
     scale = MAD_TO_STD / np.sqrt(1.5)
-    noise = np.full(int(frame.max()) + 1, scale * _median(off))
+    noise = np.full(int(frame.max()) + 1, np.nan)
     starts = np.flatnonzero(np.r_[True, image[1:] != image[:-1], True])
     for start, end in pairwise(starts.tolist()):
         if end - start >= _FEWEST_NEIGHBOURS:
             noise[image[start]] = scale * _median(off[start:end])
+    if (few := np.isnan(noise)).any():
+        noise[few] = scale * _median(off)
     return noise[frame]
 
 
@@ -152,7 +154,8 @@ def point_uncertainty(
     if not np.isfinite(random).all():
         raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
     along = header.sensor.uncertainty.stage_position_mm * np.array(header.stage_direction)
-    position = np.where(posed[:, :, 0], 0.0, along).astype(np.float32)[frame]
+    position = np.where(posed[:, :, 0], 0.0, along).astype(np.float32)
+    position = position[frame] if posed.any() else np.broadcast_to(position[:1], (len(frame), 3))
     # All but blur is the sensor's, its stage's and its water's, whatever they scan in this medium.
     source = f"{digest or calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
     name = sha256(source.encode()).hexdigest()[:16]

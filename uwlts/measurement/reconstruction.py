@@ -177,7 +177,8 @@ def reconstruct_stripes(
         beside = _beside(capture, sheet, stripes)
         points = points + beside
     points = _posed(points, capture, stripes.frame)
-    good = np.flatnonzero(found.status == RayStatus.OK)
+    there = found.status == RayStatus.OK
+    good = slice(None) if there.all() else np.flatnonzero(there)
     kept, known, digest = stripes[good], None, calibration_digest(calibration)
     if with_uncertainty:
         if exact is None:

@@ -118,10 +118,12 @@ class Parameters:
     priors: dict[ParameterKey, Prior]
     earlier: EarlierEstimate | None = None
     keys: tuple[ParameterKey, ...] = field(init=False)
+    places: dict[ParameterKey, int] = field(init=False)
 
     def __post_init__(self) -> None:
         known = (key for key, prior in self.priors.items() if prior.std > 0 and not isinstance(key, LensParameter))
         object.__setattr__(self, "keys", (*self.intrinsics.keys, *known))
+        object.__setattr__(self, "places", {key: place for place, key in enumerate(self.keys)})
 
     def start(self, lens: np.ndarray) -> np.ndarray:
         """Vector (P,) with the lens's parameters as given and the others as known before."""
@@ -202,14 +204,14 @@ class Parameters:
 
     def value(self, values: np.ndarray, key: ParameterKey) -> float:
         """A parameter but the lens's; zero for one that there is not."""
-        if key in self.keys:
-            return float(values[self.keys.index(key)])
+        if (place := self.places.get(key)) is not None:
+            return float(values[place])
         return self.priors[key].mean if key in self.priors else 0.0
 
     def add(self, by_global: np.ndarray, key: ParameterKey, column: np.ndarray) -> None:
         """Add derivatives (N,) by a parameter to those of all (N, P), where it is estimated."""
-        if key in self.keys:
-            by_global[:, self.keys.index(key)] += column
+        if (place := self.places.get(key)) is not None:
+            by_global[:, place] += column
 
     def index_key(self, medium: int) -> MediumIndex:
         """The index of a medium by its number."""
