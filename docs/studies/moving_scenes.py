@@ -1,11 +1,12 @@
 """Rotary table, pipe from five sides and vehicle: figures of the rendered scenes against their truth.
 
-    python docs/studies/moving_recordings.py FOLDER rotary-sphere pipe-five-sides --sensors 1 --seeds 0 1 2
-    python docs/studies/moving_recordings.py FOLDER robot-sphere --sensors 1 --seeds 0 1 2 3 4 5 6 7 8 9
+    python docs/studies/moving_recordings.py FOLDER rotary-sphere --sensors 1 --seeds 0 1 2
+    python docs/studies/moving_recordings.py FOLDER robot-sphere --sensors 1 2 3 4 5 --seeds 0 1
+    python docs/studies/moving_recordings.py FOLDER pipe-five-sides --sensors 1 2 3 4 5 --seeds 0 1 --denser 4
     twin simulate vehicle-pipe --sensor thesis-small --out FOLDER/vehicle.h5
     python docs/studies/moving_scenes.py FOLDER
 
-Mounts for the pipe are those of the robot's captures by the same sensor.
+The mount for a pipe is that of the robot's capture of the same seed by the same sensor.
 """
 
 import sys
@@ -20,8 +21,10 @@ from twin.scene.description import Scene
 from twin.scene.platforms import Platform
 from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of
 from uwlts.model.calibration import Calibration
+from uwlts.model.mount import Mount
 from uwlts.storage.truth import Truth, read_truth, truth_path
 
+Form = tuple[float, float, float]
 VIEWS, PIPE_MM, OVALITY_MM = 5, 300.0, 1.2
 
 
@@ -56,11 +59,20 @@ def rotary(path: Path) -> str:
     )
 
 
-def pipe(profiles: CapturedProfiles, mount: np.ndarray) -> tuple[float, float, float]:
+def pipe(path: Path, calibration: Calibration, mount: Mount) -> tuple[Form, Form, float]:
+    """`form` as the poses have the views, and when they are registered; then the largest closure stated, mm."""
+    cloud = uwlts.reconstruct(path, calibration, mount=mount)
+    view = cloud.frame * VIEWS // (int(cloud.frame.max()) + 1)
+    views = [cloud.selected(view == number) for number in range(VIEWS)]
+    found = uwlts.register(views)
+    moved = [each.points_mm @ pose[:3, :3].T + pose[:3, 3] for each, pose in zip(views, found.poses, strict=True)]
+    closures = [pair.closure_mm for pair in found.pairs if pair.closure_mm is not None]
+    numbers = np.repeat(np.arange(VIEWS), [len(each) for each in moved])
+    return form(cloud.points_mm, view), form(np.vstack(moved), numbers), max(closures, default=np.nan)
+
+
+def form(points: np.ndarray, view: np.ndarray) -> Form:
     """Errors of diameter and ovality, and the largest step between neighbouring views, mm."""
-    placed = profiles.poses @ mount
-    points = np.vstack([p @ t[:3, :3].T + t[:3, 3] for p, t in zip(profiles.profiles, placed, strict=True)])
-    view = np.repeat(np.arange(len(placed)) * VIEWS // len(placed), [len(p) for p in profiles.profiles])
     angle = np.arctan2(points[:, 1], -points[:, 2])
     on_pipe = np.abs(np.hypot(points[:, 1], points[:, 2]) - PIPE_MM / 2) < 3
 
@@ -116,15 +128,23 @@ def main(folder: Path) -> None:
 
     for path in recorded("rotary-sphere"):
         print(rotary(path), flush=True)
-    mounts = []
-    for path in recorded("robot-sphere"):
-        first = captured(path).selected(np.arange(FOR_THE_MOUNT))
-        mounts.append(uwlts.calibrate_mount(first, radius_mm=RADIUS_MM).transform())
+    rows = []
     for path in recorded("pipe-five-sides"):
-        motion, profiles = truth_of(path)[0], captured(path)
-        figures = [pipe(profiles, mount) for mount in (motion.true_mount.matrix(), *mounts)]
-        print(f"{path.stem}: diameter, ovality and largest step, mm, with the true mount {np.round(figures[0], 3)}")
-        print("with mounts of the robot:", *np.round(figures[1:], 3), sep="\n", flush=True)
+        calibration = uwlts.load_calibration(path.parent / "calibration.json")
+        assert isinstance(calibration, Calibration)
+        robot = captured(path.parent / path.name.replace("pipe-five-sides", "robot-sphere"))
+        mount = uwlts.calibrate_mount(robot.selected(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
+        placed, registered, closure = pipe(path, calibration, mount)
+        rows.append((*placed, *registered, closure))
+        print(
+            f"{path.parent.name}, {path.stem}: diameter, ovality and largest step, mm, by the robot's mount "
+            f"{np.round(placed, 3)}, registered {np.round(registered, 3)}, largest closure {closure:.3f}",
+            flush=True,
+        )
+    if rows:
+        print(
+            f"mean of the sizes {np.round(np.mean(np.abs(rows), axis=0), 3)}, largest {np.round(np.max(np.abs(rows), axis=0), 3)}"
+        )
     if (path := folder / "vehicle.h5").exists():
         print(vehicle(path))
 
