@@ -1,6 +1,6 @@
 """Rotary table, pipe from five sides and vehicle: figures of the rendered scenes against their truth.
 
-    python docs/studies/moving_recordings.py FOLDER rotary-sphere --sensors 1 --seeds 0 1 2
+    python docs/studies/moving_recordings.py FOLDER rotary-sphere rotary-target --sensors 1 2 3 4 5 --seeds 0 1
     python docs/studies/moving_recordings.py FOLDER robot-sphere --sensors 1 2 3 4 5 --seeds 0 1
     python docs/studies/moving_recordings.py FOLDER pipe-five-sides --sensors 1 2 3 4 5 --seeds 0 1 --denser 4
     twin simulate vehicle-pipe --sensor thesis-small --out FOLDER/vehicle.h5
@@ -45,30 +45,40 @@ def captured(path: Path) -> CapturedProfiles:
 
 
 def rotary(path: Path) -> str:
-    """Error of a table's axis from a sphere on it, and its standard uncertainty."""
+    """Error of a table's axis from a sphere or target on it, and its standard uncertainty."""
     motion, truth = truth_of(path)
-    mount = uwlts.calibrate_mount(captured(path), radius_mm=RADIUS_MM, axis="-y")
+    if path.name.startswith("rotary-sphere"):
+        mount = uwlts.calibrate_mount(captured(path), radius_mm=RADIUS_MM, axis="-y")
+    else:
+        mount = uwlts.calibrate_mount(path, calibration=path.parent / "calibration.json", axis="-y")
     axis = np.linalg.inv(truth.pose[0]) @ motion.true_axis.matrix()
     found = np.linalg.inv(mount.transform())
     off = axis[:3, 3] - found[:3, 3]
     off -= off @ axis[:3, 2] * axis[:3, 2]
     turn, std = np.arccos(min(1.0, float(axis[:3, 2] @ found[:3, 2]))), mount.std()
     return (
-        f"{path.stem}: axis off by {np.degrees(turn):.3f} deg ({np.degrees(np.linalg.norm(std[3:5])):.3f} stated) and "
+        f"{path.parent.name}, {path.stem}: "
+        f"axis off by {np.degrees(turn):.3f} deg ({np.degrees(np.linalg.norm(std[3:5])):.3f} stated) and "
         f"{np.linalg.norm(off):.3f} mm ({np.linalg.norm(std[:2]):.3f} stated)"
     )
 
 
-def pipe(path: Path, calibration: Calibration, mount: Mount) -> tuple[Form, Form, float]:
-    """`form` as the poses have the views, and when they are registered; then the largest closure stated, mm."""
+def pipe(path: Path, calibration: Calibration, mount: Mount) -> np.ndarray:
+    """What is off, mm (3, 4): `form`, and the largest closure as stated.
+
+    Of views as the poses have them, registered with the start as known as two poses by the mount, and registered freely.
+    """
     cloud = uwlts.reconstruct(path, calibration, mount=mount)
     view = cloud.frame * VIEWS // (int(cloud.frame.max()) + 1)
     views = [cloud.selected(view == number) for number in range(VIEWS)]
-    found = uwlts.register(views)
-    moved = [each.points_mm @ pose[:3, :3].T + pose[:3, 3] for each, pose in zip(views, found.poses, strict=True)]
-    closures = [pair.closure_mm for pair in found.pairs if pair.closure_mm is not None]
-    numbers = np.repeat(np.arange(VIEWS), [len(each) for each in moved])
-    return form(cloud.points_mm, view), form(np.vstack(moved), numbers), max(closures, default=np.nan)
+    rows, numbers = [(*form(cloud.points_mm, view), np.nan)], np.repeat(np.arange(VIEWS), [len(each) for each in views])
+    shift, turn = np.sqrt(2 * np.mean(mount.std().reshape(2, 3) ** 2, axis=1)).tolist()
+    for known in ({"start_std_mm": shift, "start_std_deg": np.degrees(turn)}, {}):
+        found = uwlts.register(views, **known)
+        moved = [each.points_mm @ pose[:3, :3].T + pose[:3, 3] for each, pose in zip(views, found.poses, strict=True)]
+        closures = [pair.closure_mm for pair in found.pairs if pair.closure_mm is not None]
+        rows.append((*form(np.vstack(moved), numbers), max(closures, default=np.nan)))
+    return np.array(rows)
 
 
 def form(points: np.ndarray, view: np.ndarray) -> Form:
@@ -126,7 +136,7 @@ def main(folder: Path) -> None:
     def recorded(scene: str) -> list[Path]:
         return [path for path in sorted(folder.glob(f"sensor-*/{scene}-*.h5")) if ".truth." not in path.name]
 
-    for path in recorded("rotary-sphere"):
+    for path in recorded("rotary-sphere") + recorded("rotary-target"):
         print(rotary(path), flush=True)
     rows = []
     for path in recorded("pipe-five-sides"):
@@ -134,17 +144,13 @@ def main(folder: Path) -> None:
         assert isinstance(calibration, Calibration)
         robot = captured(path.parent / path.name.replace("pipe-five-sides", "robot-sphere"))
         mount = uwlts.calibrate_mount(robot.selected(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
-        placed, registered, closure = pipe(path, calibration, mount)
-        rows.append((*placed, *registered, closure))
-        print(
-            f"{path.parent.name}, {path.stem}: diameter, ovality and largest step, mm, by the robot's mount "
-            f"{np.round(placed, 3)}, registered {np.round(registered, 3)}, largest closure {closure:.3f}",
-            flush=True,
-        )
+        rows.append(pipe(path, calibration, mount))
+        print(f"{path.parent.name}, {path.stem}: diameter, ovality, largest step, largest closure, mm", flush=True)
+        print("by the robot's mount, registered with it known, registered freely:", *np.round(rows[-1], 3), sep="\n")
     if rows:
-        print(
-            f"mean of the sizes {np.round(np.mean(np.abs(rows), axis=0), 3)}, largest {np.round(np.max(np.abs(rows), axis=0), 3)}"
-        )
+        sizes = np.abs(rows)
+        print("mean of the sizes", *np.round(sizes.mean(axis=0), 3), sep="\n")
+        print("largest", *np.round(sizes.max(axis=0), 3), sep="\n")
     if (path := folder / "vehicle.h5").exists():
         print(vehicle(path))
 
