@@ -66,7 +66,8 @@ def rotary(path: Path) -> str:
 def pipe(path: Path, calibration: Calibration, mount: Mount) -> np.ndarray:
     """What is off, mm (3, 4): `form`, and the largest closure as stated.
 
-    Of views as the poses have them, registered with the start as known as two poses by the mount, and registered freely.
+    Of views as the poses have them, of views registered with the start as known as two poses by the mount, and of views
+    registered freely.
     """
     cloud = uwlts.reconstruct(path, calibration, mount=mount)
     view = cloud.frame * VIEWS // (int(cloud.frame.max()) + 1)
