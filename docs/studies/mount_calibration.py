@@ -4,8 +4,8 @@
     python docs/studies/mount_calibration.py 30 --artefact ring
     python docs/studies/mount_calibration.py 40 --sensors
 
-The second has a ring gauge of 50 mm in place of the sphere, or a step of 12 mm; the third draws a sensor for each campaign
-from the covariance of its calibration (`tests/uwlts/sensor_profiles.py`).
+The second has a ring gauge of 50 mm in place of the sphere, or a step of 12 mm; the third draws a sensor for each
+campaign from the covariance of its calibration (`tests/uwlts/sensor_profiles.py`).
 """
 
 import argparse

@@ -25,7 +25,7 @@ from uwlts.model.mount import Mount
 from uwlts.storage.truth import Truth, read_truth, truth_path
 
 Form = tuple[float, float, float]
-VIEWS, PIPE_MM, OVALITY_MM = 5, 300.0, 1.2
+VIEWS, PIPE_MM, OVALITY_MM, SPHERES_MM = 5, 300.0, 1.2, 16.0
 
 
 def truth_of(path: Path) -> tuple[Platform, Truth]:
@@ -64,17 +64,18 @@ def rotary(path: Path) -> str:
 
 
 def pipe(path: Path, calibration: Calibration, mount: Mount) -> np.ndarray:
-    """What is off, mm (3, 4): `form`, and the largest closure as stated.
+    """What is off, mm (4, 4): `form`, and the largest closure as stated.
 
-    Of views as the poses have them, of views registered with the start as known as two poses by the mount, and of views
-    registered freely.
+    Of views as the poses have them, and registered: freely, with the start as known as two poses by the mount, and with
+    the spheres besides.
     """
     cloud = uwlts.reconstruct(path, calibration, mount=mount)
     view = cloud.frame * VIEWS // (int(cloud.frame.max()) + 1)
     views = [cloud.selected(view == number) for number in range(VIEWS)]
     rows, numbers = [(*form(cloud.points_mm, view), np.nan)], np.repeat(np.arange(VIEWS), [len(each) for each in views])
     shift, turn = np.sqrt(2 * np.mean(mount.std().reshape(2, 3) ** 2, axis=1)).tolist()
-    for known in ({"start_std_mm": shift, "start_std_deg": np.degrees(turn)}, {}):
+    start = {"start_std_mm": shift, "start_std_deg": float(np.degrees(turn))}
+    for known in ({}, start, start | {"sphere_mm": SPHERES_MM}):
         found = uwlts.register(views, **known)
         moved = [each.points_mm @ pose[:3, :3].T + pose[:3, 3] for each, pose in zip(views, found.poses, strict=True)]
         closures = [pair.closure_mm for pair in found.pairs if pair.closure_mm is not None]
@@ -147,7 +148,11 @@ def main(folder: Path) -> None:
         mount = uwlts.calibrate_mount(robot.selected(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
         rows.append(pipe(path, calibration, mount))
         print(f"{path.parent.name}, {path.stem}: diameter, ovality, largest step, largest closure, mm", flush=True)
-        print("by the robot's mount, registered with it known, registered freely:", *np.round(rows[-1], 3), sep="\n")
+        print(
+            "by the mount; registered freely, with the mount known, with spheres besides:",
+            *np.round(rows[-1], 3),
+            sep="\n",
+        )
     if rows:
         sizes = np.abs(rows)
         print("mean of the sizes", *np.round(sizes.mean(axis=0), 3), sep="\n")
