@@ -74,8 +74,8 @@ def calibrate_mount(
     poses
         ``T_base_platform`` (P, 4, 4), mm, or a CSV file with one pose a line; not needed for a capture that holds them.
     artefact, radius_mm, height_mm
-        What is seen: a sphere, a plane, a step (two parallel faces), or a ring (a face, and a cylindrical wall square to
-        it). The radius of the sphere or of the ring's wall, or the height of the step, where it is known.
+        What is seen: a sphere, a plane, a step (two parallel faces), or a ring (a face, and a cylindrical wall square
+        to it). The radius of the sphere or of the ring's wall, or the height of the step, where it is known.
     calibration
         Of the sensor that took the capture, held fixed; what a joint estimate leaves open becomes part of the mount's
         covariance. A target's images go to `uwlts.calibration.mount_board`.
