@@ -14,7 +14,7 @@ from uwlts.calibration.mount_next_pose import axis_words, missing_turns, next_po
 from uwlts.calibration.mount_prediction import coverage_factor, held_out_mm, inverse, left_out_excess, misfits
 from uwlts.calibration.mount_profiles import LEAST_POINTS
 from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of, with_sensor
-from uwlts.calibration.mount_start import NoFit, start
+from uwlts.calibration.mount_start import NoFit, require_surfaces, start
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount, MountPose
@@ -214,6 +214,7 @@ class _Calibration:
         scatter = Scatter(max(noise, 1e-6), max(float(np.median(misfit)), noise), 1e-3)
         # What the first search got wrong in single profiles is searched again near the artefact that the others show.
         for _ in range(2):
+            require_surfaces(problem.selected(good))
             state, scatter = _refined(problem.selected(good), state, scatter)
             reach = 4 * float(np.hypot(scatter.point_mm, 2 * scatter.pose_mm))
             shapes = whole.seen_again(state, self.flat, reach, self.rng)
@@ -223,6 +224,7 @@ class _Calibration:
             self._require_enough(np.flatnonzero(kept))
         while True:
             used = problem.selected(good)
+            require_surfaces(used)
             state, scatter = _refined(used, state, scatter)
             excess = left_out_excess(used, state, scatter, probability=_FALSE_ALARM / len(kept))
             if excess.max() <= 1:

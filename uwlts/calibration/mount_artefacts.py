@@ -5,6 +5,7 @@ Values of an artefact are an array; its parameters are steps from them.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -23,6 +24,9 @@ from uwlts.model.mount import PlaneFound, RingFound, SphereFound, StepFound
 from uwlts.storage.mount_files import Artefact
 
 Seen = ProfileArc | ProfileLine
+
+_FEWEST_WALLS = 5
+"""Profiles with a ring's wall: for its place and radius, three unknowns, with some over."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,10 @@ class Shape(ABC):
     def numbers(self, part: np.ndarray) -> int:
         """How many numbers a profile determines, of whose points the surfaces are given: of a line two."""
         return 2
+
+    def missing(self, parts: Sequence[np.ndarray]) -> str | None:
+        """What too few profiles show, in words, or None; given the surfaces of the points of each."""
+        return None
 
     def parallel(self, part: np.ndarray) -> list[np.ndarray]:
         """Masks (n,) of the points on surfaces that a sheet cuts in parallel lines."""
@@ -234,6 +242,16 @@ class Ring(Shape):
 
     def numbers(self, part: np.ndarray) -> int:
         return 2 + 2 * bool(part.any())
+
+    def missing(self, parts: Sequence[np.ndarray]) -> str | None:
+        walls = sum(bool(part.any()) for part in parts)
+        if walls >= _FEWEST_WALLS:
+            return None
+        size = "" if self.size_mm is None else f" of radius {self.size_mm:g} mm"
+        return (
+            f"{walls} of {len(parts)} profiles show a wall{size} square to the ring's face; at least {_FEWEST_WALLS} "
+            "are needed: tilt the sensor so that the sheet meets the wall"
+        )
 
     def parallel(self, part: np.ndarray) -> list[np.ndarray]:
         return [part == run for run in np.unique(part)]

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount_artefacts import Plane, Ring, Seen, Shape, Sphere, Step, square_to
+from uwlts.calibration.mount_artefacts import Plane, Ring, Seen, Sphere, Step, square_to
 from uwlts.calibration.mount_model import MountState, Problem, Scatter, cross_matrix
 from uwlts.calibration.mount_prediction import inverse, misfits
 from uwlts.calibration.mount_profiles import ProfileArc, ProfileLine, circles_through
@@ -23,8 +23,8 @@ _RADII = (1.02, 1.15, 1.5)
 _REWEIGHTED = 10
 _FAR = 4.0
 """Standard uncertainties within which points of a ring's wall are sought; poses with as many misfits are left out."""
-_FEWEST_WALLS = 5
-"""Profiles with a wall: for its place and radius, three unknowns, with some over."""
+_CLEAR = 6.0
+"""Times the width within which its points are sought: a smaller circle is not told from others."""
 _CIRCLES, _JUDGED = 3000, 1500
 """Circles tried, and points by which each is judged: where a fifth of the points are on the wall, 24 circles are."""
 _ROUGH = Scatter(point_mm=0.1, pose_mm=0.3, turn_rad=3e-3)
@@ -260,27 +260,23 @@ def _start_of_ring(
     beside = rng.choice(beside, _JUDGED, p=1 / alike / np.sum(1 / alike)) if len(beside) else beside
     circle = _circle_of_most(base[beside] @ axes.T, shape.size_mm, reach, rng)
     if circle is None:
-        raise _without_wall(shape, 0, len(lines))
+        require_surfaces(problem)
+    assert circle is not None
     state = replace(
         state, artefact=np.concatenate([normal, circle[:2] @ axes + distance * normal, [shape.size_mm or circle[2]]])
     )
     flat = [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in whole.points]
     for narrower in (1.0, 3.0, 9.0):
         problem = whole.of_seen(whole.seen_again(state, flat, max(reach / narrower, 5 * noise), rng))
-        walls = sum(bool(part.any()) for part in problem.part)
-        if walls < _FEWEST_WALLS:
-            raise _without_wall(shape, walls, len(lines))
+        require_surfaces(problem)
         state = problem.solved(state, scatter, loss="cauchy")
     return state, problem
 
 
-def _without_wall(shape: Shape, walls: int, profiles: int) -> CalibrationError:
-    size = "" if shape.size_mm is None else f" of radius {shape.size_mm:g} mm"
-    words = (
-        f"{walls} of {profiles} profiles show a wall{size} square to the ring's face; at least {_FEWEST_WALLS} are "
-        "needed: tilt the sensor so that the sheet meets the wall"
-    )
-    return CalibrationError(words) if shape.size_mm is None else NoFit(words)
+def require_surfaces(problem: Problem) -> None:
+    """CalibrationError where too few profiles show a surface of the artefact; `NoFit` where its size may be wrong."""
+    if (words := problem.shape.missing(problem.part)) is not None:
+        raise CalibrationError(words) if problem.shape.size_mm is None else NoFit(words)
 
 
 def _circle_of_most(
@@ -291,7 +287,7 @@ def _circle_of_most(
         return None
     tried = points[rng.integers(len(points), size=(_CIRCLES, 3))]
     centres, radii = circles_through(tried)
-    proper = np.isfinite(radii) & (radii > 3 * reach_mm) & (radii < np.linalg.norm(np.ptp(points, axis=0)))
+    proper = np.isfinite(radii) & (radii > _CLEAR * reach_mm) & (radii < np.linalg.norm(np.ptp(points, axis=0)))
     if radius_mm is not None:
         proper &= np.abs(radii - radius_mm) < max(0.03 * radius_mm, reach_mm)
     if not proper.any():
