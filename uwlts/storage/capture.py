@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
+import hdf5plugin  # noqa: F401 - the frames' filter, for reading too
 import numpy as np
 
 from uwlts.model.calibration import is_rigid

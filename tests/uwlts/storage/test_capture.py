@@ -113,6 +113,13 @@ def test_everything_comes_back(tmp_path: Path, dtype: type, with_pose: bool):
         assert capture.laser_on.dtype == bool
 
 
+def test_a_process_that_only_reads_has_the_filter(tmp_path: Path):
+    path = record(tmp_path / "capture.h5", 1)
+    reading = "import sys; from uwlts.storage.capture import Capture; print(Capture(sys.argv[1]).seen(0).sum())"
+    read = subprocess.run([sys.executable, "-c", reading, path], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert read.stdout.split() == [str(a_frame(0).image.sum())], read.stderr
+
+
 def test_frames_by_light(tmp_path: Path):
     with Capture(record(tmp_path / "a.h5", 5)) as capture:
         assert [index for index, _ in capture.frames()] == [0, 1, 2, 3, 4]
