@@ -8,7 +8,7 @@ from tests.uwlts.joint_views import MEDIUM, seen
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.model.joint_estimate import JointEstimate
 from uwlts.model.placement import camera_from_object, laser_pose
-from uwlts.optics.brightness import beside_sheet, footprint_mm, moved_by_blur_px, sheet_sigma_mm, slopes_of_brightness
+from uwlts.optics.brightness import LitSheet, moved_by_blur_px, sheet_sigma_mm, slopes_of_brightness
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
@@ -56,8 +56,8 @@ def test_the_footprint_is_that_of_sheet_and_blur(thesis):
     width = 2.3548 * np.hypot(blur_px, sigma * per_mm)
     calibration = nominal_calibration(thesis, medium=MEDIUM)
     line, centre = np.full(50, pixels[0, 0]), np.full(50, pixels[0, 1])
-    found = footprint_mm(calibration, thesis, line, centre, np.full(50, width), medium_index=WATER)
-    assert found == pytest.approx((np.sqrt(3) * sigma, blur_px * per_line), rel=0.01)
+    sheet = LitSheet.of(calibration, thesis, line, centre, medium_index=WATER)
+    assert sheet.footprint_mm(np.full(50, width)) == pytest.approx((np.sqrt(3) * sigma, blur_px * per_line), rel=0.01)
 
 
 @pytest.mark.parametrize("blur_px", [0.4, 1.5])
@@ -122,7 +122,9 @@ def test_the_sheet_is_no_thicker_than_the_stripes_are_wide(thesis):
     laser = thesis.laser.model_copy(update={"waist_radius_mm": 3.0})
     calibration = nominal_calibration(thesis, thesis.media["water"])
     thick, thin = (
-        beside_sheet(calibration, sensor, line, centre, width, slopes, medium_index=WATER, stage_direction=(1, 0, 0))
+        LitSheet.of(calibration, sensor, line, centre, medium_index=WATER).beside(
+            width, slopes, stage_direction=(1, 0, 0)
+        )
         for sensor in (thesis.model_copy(update={"laser": laser}), thesis)
     )
     along_z = thick / thick[:, 2:]
@@ -130,6 +132,24 @@ def test_the_sheet_is_no_thicker_than_the_stripes_are_wide(thesis):
     sigma = np.sqrt(np.abs(thick[:, 0]) / 0.1)
     assert ((sigma > 0.1) & (sigma < 0.25)).all()
     np.testing.assert_allclose(np.sqrt(np.abs(thin[:, 0]) / 0.1), 0.15, rtol=0.1)
+
+
+def test_many_centres_see_the_sheet_as_few_do(thesis):
+    """By a table that errs by 1e-7 mm of points and 1e-6 of all else; ten times as much between its nodes."""
+    calibration = nominal_calibration(thesis, thesis.media["water"])
+    rng = np.random.default_rng(9)
+    line, centre = rng.integers(100, 1180, 6000), rng.uniform(300.0, 700.0, 6000)
+    many, few = (
+        LitSheet.of(calibration, thesis, line[:count], centre[:count], medium_index=WATER) for count in (6000, 400)
+    )
+    np.testing.assert_allclose(many.found.points_mm[:400], few.found.points_mm, rtol=0, atol=1e-6)
+    for name in ("of_slope", "sigma_mm", "per_sigma_px"):
+        found, expected = getattr(many, name)[:400], getattr(few, name)
+        assert np.abs(expected).max() > 1e-3
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+    width = np.full(6000, 4.0)
+    every = LitSheet.of(calibration, thesis, line + 0.0, centre, medium_index=WATER)
+    assert many.footprint_mm(width) == pytest.approx(every.footprint_mm(width), rel=1e-5)
 
 
 def ridge(lean, bend, fading, blur):
