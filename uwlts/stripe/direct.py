@@ -52,6 +52,10 @@ _BEHIND_CORNER = 1.5
 """The same for a stripe behind one that it meets: both begin in a corner, and the nearer one is the surface in which
 the other one is seen."""
 
+_CUT = 0.5
+"""Cost, in jumps, of a jump away from a stripe that goes on there, and of one into the middle of a stripe, if the rest has
+`_SOME_LINES` lines or more: where one surface ends before another one, both stripes have an end."""
+
 _MARGIN = 0.3
 """Jumps by which a path has to be the better one."""
 
@@ -241,9 +245,13 @@ def path_margins(
     cost = vote + _own_cost(line, centre_px, amplitude, stripe, farther)
     before, after = np.empty((2, len(line)))
     _slopes(line, centre_px, stripe, before, after)
+    enter, leave = np.empty((2, len(line)))
+    _cuts(stripe, enter, leave)
     through, backwards = np.empty((2, len(line)))
-    _least_cost(line, centre_px, before, after, cost, skipped, jump_px, through)
-    turned = [values[::-1].copy() for values in (line.max() - line, centre_px, -after, -before, cost, skipped)]
+    _least_cost(line, centre_px, before, after, cost, skipped, enter, leave, jump_px, through)
+    turned = [
+        values[::-1].copy() for values in (line.max() - line, centre_px, -after, -before, cost, skipped, leave, enter)
+    ]
     _least_cost(*turned, jump_px=jump_px, result=backwards)
     through += backwards[::-1] - cost
     return through - through.min()
@@ -257,16 +265,19 @@ def _own_cost(
     brightest = np.zeros(len(count))
     np.maximum.at(brightest, group, amplitude)
     dimmer = np.clip(np.log2(brightest[group] / np.maximum(amplitude, 1e-6)), 0.0, _OCTAVES)
-    behind, rivals = np.zeros(len(line)), np.bincount(stripe, count[group] > 1, minlength=len(line))
+    rivals = np.bincount(stripe, count[group] > 1, minlength=len(line))
+    cost = _DIMMER * dimmer / np.maximum(rivals[stripe], _SOME_LINES)
     if farther:
         order = np.lexsort((farther * centre_px, line))
-        apart = np.full(len(line), np.nan)
-        apart[order[1:]] = np.where(np.diff(line[order]) == 0, np.abs(np.diff(centre_px[order])), np.nan)
-        hidden = np.isfinite(apart)
-        for number in np.flatnonzero(np.bincount(stripe, hidden) > 0):
-            own = np.flatnonzero(hidden & (stripe == number))
-            behind[own] = _BEHIND_CORNER if _meets(line[own], apart[own]) else _BEHIND
-    return (_DIMMER * dimmer + behind) / np.maximum(rivals[stripe], _SOME_LINES)
+        behind = order[1:][np.diff(line[order]) == 0]
+        before = order[:-1][np.diff(line[order]) == 0]
+        apart = np.abs(centre_px[behind] - centre_px[before])
+        pairs = stripe[behind] * (len(line) + 1) + stripe[before]
+        for pair in np.unique(pairs):
+            own = pairs == pair
+            whole = _BEHIND_CORNER if _meets(line[behind[own]], apart[own]) else _BEHIND
+            cost[behind[own]] += whole / max(np.count_nonzero(own), _SOME_LINES)
+    return cost
 
 
 def _meets(line: np.ndarray, apart_px: np.ndarray) -> bool:
@@ -317,12 +328,15 @@ def _least_cost(
     after: np.ndarray,
     cost: np.ndarray,
     skipped: np.ndarray,
+    enter: np.ndarray,
+    leave: np.ndarray,
     jump_px: float,
     result: np.ndarray,
 ) -> None:
     """Cost (M,) of the best path that ends in each candidate, its own included.
 
-    ``before`` and ``after`` are the slopes of its stripe on either side of each.
+    ``before`` and ``after`` are the slopes of its stripe on either side of each, ``enter`` and ``leave`` what a jump to
+    it and from it costs more.
     """
     count = line.size
     # What it costs to pass by, from the first line on: the number of lines with candidates before each one.
@@ -332,11 +346,11 @@ def _least_cost(
     elsewhere, best_of_line, first = 0.0, np.inf, 0
     for k in range(count):
         if k > 0 and line[k] != line[k - 1]:
-            elsewhere = min(elsewhere + _SKIPPED, best_of_line + 1.0)
+            elsewhere = min(elsewhere + _SKIPPED, best_of_line)
             best_of_line = np.inf
         while line[k] - line[first] > _LONG_GAP:
             first += 1
-        best = elsewhere
+        best = elsewhere + enter[k]
         for j in range(first, k):
             apart = line[k] - line[j]
             if apart == 0:
@@ -349,7 +363,19 @@ def _least_cost(
                 way += min(max(off - _SMOOTH_PX, 0.0) * _ROUGH, _ROUGHEST)
                 best = min(best, way)
         result[k] = best + cost[k]
-        best_of_line = min(best_of_line, result[k])
+        best_of_line = min(best_of_line, result[k] + 1.0 + leave[k])
+
+
+@compiled
+def _cuts(stripe: np.ndarray, enter: np.ndarray, leave: np.ndarray) -> None:
+    """What it costs (M,) to jump to each candidate and from it, beyond the jump, by the rest of its stripe."""
+    seen = np.zeros(stripe.size)
+    for k in range(stripe.size):
+        enter[k] = seen[stripe[k]]
+        seen[stripe[k]] += 1.0
+    for k in range(stripe.size):
+        leave[k] = _CUT * min((seen[stripe[k]] - enter[k] - 1.0) / _SOME_LINES, 1.0)
+        enter[k] = _CUT * min(enter[k] / _SOME_LINES, 1.0)
 
 
 @compiled
