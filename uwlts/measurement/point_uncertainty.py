@@ -8,6 +8,7 @@ follows, correlations included, from calculating it again with each pattern adde
 
 from functools import partial
 from hashlib import sha256
+from itertools import pairwise
 
 import numpy as np
 
@@ -31,7 +32,8 @@ _NEGLIGIBLE_MM = 5e-5
 _FEWEST_NEIGHBOURS = 10
 # Points by which patterns are chosen: their root mean square is within some percent that of all.
 _SAMPLED = 500
-_TABLE_TOLERANCE_MM = 1e-6
+_TABLE_TOLERANCE_MM, _LEFT_OUT_MM = 1e-6, 1e-9
+"""Error of tabulated moves of points, and by what their last terms may add up that are left out."""
 
 
 def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
@@ -50,12 +52,21 @@ def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) 
     if len(off) < _FEWEST_NEIGHBOURS:
         raise CalibrationError(f"only {len(off)} stripe centres have two neighbours: too few to measure their noise")
     scale = MAD_TO_STD / np.sqrt(1.5)
-    noise = np.full(int(frame.max()) + 1, scale * np.median(off))
-    starts = np.flatnonzero(np.r_[True, image[1:] != image[:-1]])
-    for number, values in zip(image[starts], np.split(off, starts[1:]), strict=True):
-        if len(values) >= _FEWEST_NEIGHBOURS:
-            noise[number] = scale * np.median(values)
+    noise = np.full(int(frame.max()) + 1, np.nan)
+    starts = np.flatnonzero(np.r_[True, image[1:] != image[:-1], True])
+    for start, end in pairwise(starts.tolist()):
+        if end - start >= _FEWEST_NEIGHBOURS:
+            noise[image[start]] = scale * _median(off[start:end])
+    if (few := np.isnan(noise)).any():
+        noise[few] = scale * _median(off)
     return noise[frame]
+
+
+def _median(values: np.ndarray) -> float:
+    """Median of values that are finite; NumPy's own takes several times as long for a few hundred."""
+    middle = [(len(values) - 1) // 2, len(values) // 2]
+    low, high = np.partition(values, middle)[middle].tolist()
+    return 0.5 * (low + high)
 
 
 def point_uncertainty(
@@ -68,6 +79,7 @@ def point_uncertainty(
     blur_px: np.ndarray | None = None,
     beside_mm: np.ndarray | None = None,
     mount_by: np.ndarray | None = None,
+    digest: str | None = None,
 ) -> PointUncertainty:
     """Uncertainty of the points that stripe centres (N,) of a capture give by a joint calibration.
 
@@ -77,7 +89,8 @@ def point_uncertainty(
     move the centres, and ``beside_mm`` (N, 3), how far points were moved to where their light comes from
     (`uwlts.optics.brightness`), are each wrong by some share, the same for all points. ``mount_by`` (6, P) are
     derivatives of the mount by the parameters of the joint estimate (`uwlts.model.mount.SensorShare`), where the frames
-    carry poses of a platform: what the calibration does to points and mount then belongs together.
+    carry poses of a platform: what the calibration does to points and mount then belongs together. ``digest`` is
+    that of the calibration where it is known.
 
     Raises
     ------
@@ -125,7 +138,7 @@ def point_uncertainty(
             values = exact(*where) @ of_axes
             series, row, at = values[:, None], np.arange(len(values)), np.zeros(len(values))
         else:
-            series, row, at = table.combined(of_axes).series(*where)
+            series, row, at = table.combined(of_axes).shortened(_LEFT_OUT_MM).series(*where)
         random, sums = np.empty((len(row), 6), np.float32), np.empty((weights.shape[1], len(row), 3), np.float32)
         image, error, by_blur, off = (np.ascontiguousarray(each[some]) for each in (frame, noise, blur, beside))
         of_blur, of_beside, of_stage = weights[0], weights[1], np.ascontiguousarray(by_stage.T @ weights[2:])
@@ -140,14 +153,15 @@ def point_uncertainty(
     random, patterns = moved(slice(None), weights)
     if not np.isfinite(random).all():
         raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
-    along = np.array(header.stage_direction)
-    position = np.where(posed[frame, :, 0], 0.0, header.sensor.uncertainty.stage_position_mm * along)
+    along = header.sensor.uncertainty.stage_position_mm * np.array(header.stage_direction)
+    position = np.where(posed[:, :, 0], 0.0, along).astype(np.float32)
+    position = position[frame] if posed.any() else np.broadcast_to(position[:1], (len(frame), 3))
     # All but blur is the sensor's, its stage's and its water's, whatever they scan in this medium.
-    source = f"{calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
+    source = f"{digest or calibration_digest(calibration)} {header.medium_name} {header.stage_direction}"
     name = sha256(source.encode()).hexdigest()[:16]
     of_sensor_parts = np.delete(weights, [0, 2], axis=0)
     shared = {f"{WATER} {name}": weights[2:3].T, f"sensor {name}": of_sensor_parts.T}
-    return PointUncertainty(random, position.astype(np.float32), patterns, shared=shared)
+    return PointUncertainty(random, position, patterns, shared=shared)
 
 
 @compiled
@@ -179,17 +193,20 @@ def _move(
     for n in range(row.size):
         sum_terms(series[row[n]], at[n], flat)
         turn, far = turns[frame[n]], stage[frame[n]]
-        for m in range(1 + count):
-            a, b, c = value[0, m], value[1, m], value[2, m]
-            for axis in range(3):
-                value[axis, m] = turn[axis, 0] * a + turn[axis, 1] * b + turn[axis, 2] * c
+        if turn[0, 0] != 1.0 or turn[1, 1] != 1.0:
+            for m in range(1 + count):
+                a, b, c = value[0, m], value[1, m], value[2, m]
+                for axis in range(3):
+                    value[axis, m] = turn[axis, 0] * a + turn[axis, 1] * b + turn[axis, 2] * c
         x, y, z = value[0, 0] * noise[n], value[1, 0] * noise[n], value[2, 0] * noise[n]
         random[n, 0], random[n, 1], random[n, 2] = x * x, x * y, x * z
         random[n, 3], random[n, 4], random[n, 5] = y * y, y * z, z * z
+        for axis in range(3):
+            of_all, moved, by_stage = value[axis], value[axis, 0] * blur[n], of_stage[axis]
+            for m in range(count):
+                of_all[1 + m] += moved * of_blur[m] + beside[n, axis] * of_beside[m] + by_stage[m] * far
         for m in range(count):
-            for axis in range(3):
-                own = value[axis, 0] * blur[n] * of_blur[m] + beside[n, axis] * of_beside[m]
-                sums[m, n, axis] = value[axis, 1 + m] + own + of_stage[axis, m] * far
+            sums[m, n, 0], sums[m, n, 1], sums[m, n, 2] = value[0, 1 + m], value[1, 1 + m], value[2, 1 + m]
 
 
 def _in_sensor(mount_by: np.ndarray, header: CaptureHeader) -> np.ndarray:

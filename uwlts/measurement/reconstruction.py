@@ -15,8 +15,8 @@ from uwlts.model.mount import Mount
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory
-from uwlts.optics.brightness import beside_sheet, beside_std, footprint_mm, sharp_lines, slopes_of_brightness
-from uwlts.optics.reconstruction import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile
+from uwlts.optics.brightness import LitSheet, beside_std, sharp_lines, slopes_of_brightness
+from uwlts.optics.reconstruction import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile, stage_travel
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, FrameTable, opened_capture, sensor_poses
@@ -170,16 +170,22 @@ def reconstruct_stripes(
         blurred = len(stripes.line) - len(sharp)
         lines = lines | {"ok": lines.get("ok", 0) - blurred, "blurred": blurred}
         stripes = stripes[sharp]
-    found = _points(capture, calibration, stripes, index)
-    beside = np.zeros((len(sharp), 3)) if exact is None else _beside(capture, exact, stripes, index)
-    points = _posed(found.points_mm + beside, capture, stripes.frame)
-    good = np.flatnonzero(found.status == RayStatus.OK)
-    kept, known = stripes[good], None
+    sheet = _lit_sheet(capture, calibration, stripes, index)
+    found = _points(capture, calibration, stripes, index, sheet)
+    beside, points = np.zeros((len(sharp), 3)), found.points_mm
+    if exact is not None and sheet is not None:
+        beside = _beside(capture, sheet, stripes)
+        points = points + beside
+    points = _posed(points, capture, stripes.frame)
+    there = found.status == RayStatus.OK
+    good = slice(None) if there.all() else np.flatnonzero(there)
+    kept, known, digest = stripes[good], None, calibration_digest(calibration)
     if with_uncertainty:
         if exact is None:
             raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (--water or --joint)")
         where = kept.frame, kept.line, kept.centre_px
-        known = point_uncertainty(capture, exact, *where, blur_px=blur[good], beside_mm=beside[good], mount_by=mount_by)
+        moved = {"blur_px": blur[good], "beside_mm": beside[good], "mount_by": mount_by}
+        known = point_uncertainty(capture, exact, *where, **moved, digest=digest)
     rays = np.bincount(found.status, minlength=len(RayStatus))
     return ScanCloud(
         points_mm=points[good],
@@ -193,8 +199,8 @@ def reconstruct_stripes(
             "medium": capture.header.medium_name,
             "medium_index": index,
             "artefact": capture.header.artefact,
-            "calibration": calibration_digest(calibration),
-            **(_footprint(capture, calibration, kept, index) if isinstance(calibration, Calibration) else {}),
+            "calibration": digest,
+            **({} if sheet is None else _footprint(capture, sheet, stripes)),
         },
         stripe=sharp[good],
         lines_by_status=lines,
@@ -203,8 +209,22 @@ def reconstruct_stripes(
     )
 
 
-def _points(
+def _lit_sheet(
     capture: Capture | FrameTable, calibration: AnyCalibration, stripes: FoundStripes, index: float
+) -> LitSheet | None:
+    """What stripe centres see of the sheet; none with poses, or by polynomials."""
+    if isinstance(calibration, PolynomialCalibration) or np.isfinite(capture.pose).any():
+        return None
+    sensor = capture.header.sensor
+    return LitSheet.of(calibration, sensor, stripes.line, stripes.centre_px, medium_index=index)
+
+
+def _points(
+    capture: Capture | FrameTable,
+    calibration: AnyCalibration,
+    stripes: FoundStripes,
+    index: float,
+    sheet: LitSheet | None,
 ) -> MeasuredPoints:
     """Points in the OCS of stripe centres, by whichever kind of calibration, with the stage's motion added."""
     direction = np.array(capture.header.stage_direction)
@@ -214,6 +234,8 @@ def _points(
     if isinstance(calibration, PolynomialCalibration):
         return reconstruct_by_polynomials(calibration, line, centre, stage_mm=stage, stage_direction=direction)
     direction = np.array(calibration.stage_direction_of(capture.header.stage_direction))
+    if sheet is not None:
+        return replace(sheet.found, points_mm=sheet.found.points_mm + stage_travel(stage, direction).T)
     if not capture.header.sensor.camera.window.mounted:
         calibration = calibration.model_copy(update={"window": None})
     return reconstruct_profile(calibration, line, centre, medium_index=index, stage_mm=stage, stage_direction=direction)
@@ -228,23 +250,18 @@ def _row_delay_s(capture: Capture | FrameTable, stripes: FoundStripes) -> np.nda
     return 1e-6 * detector.line_time_us * (row - (camera.height_px - 1) / 2)
 
 
-def _beside(capture: Capture | FrameTable, calibration: Calibration, stripes: FoundStripes, index: float) -> np.ndarray:
+def _beside(capture: Capture | FrameTable, sheet: LitSheet, stripes: FoundStripes) -> np.ndarray:
     """From points on the sheet's middle to where their light comes from (N, 3), OCS."""
-    if np.isfinite(capture.pose).any():
-        return np.zeros((len(stripes.line), 3))
     slopes = slopes_of_brightness(stripes.frame, stripes.line, stripes.amplitude, capture.stage_mm, capture.exposure_ms)
-    where = (capture.header.sensor, stripes.line, stripes.centre_px, stripes.width_px, slopes)
-    direction = capture.header.stage_direction
-    return beside_sheet(calibration, *where, medium_index=index, stage_direction=direction)
+    return sheet.beside(stripes.width_px, slopes, stage_direction=capture.header.stage_direction)
 
 
-def _footprint(capture: Capture | FrameTable, calibration: Calibration, kept: FoundStripes, index: float) -> Table:
-    """Metadata of how much of the surface a point is the mean of; none of clouds of moved sensors."""
-    if np.isfinite(capture.pose).any() or not np.isfinite(kept.width_px).any():
+def _footprint(capture: Capture | FrameTable, sheet: LitSheet, stripes: FoundStripes) -> Table:
+    """Metadata of how much of the surface a point is the mean of; none where that is not known."""
+    if not np.isfinite(stripes.width_px[sheet.found.status == RayStatus.OK]).any():
         return {}
-    sensor = capture.header.sensor
-    size = footprint_mm(calibration, sensor, kept.line, kept.centre_px, kept.width_px, medium_index=index)
-    return {FOOTPRINT: list(size), FOOTPRINT_STD: beside_std(sensor.uncertainty)}
+    std = beside_std(capture.header.sensor.uncertainty)
+    return {FOOTPRINT: list(sheet.footprint_mm(stripes.width_px)), FOOTPRINT_STD: std}
 
 
 def _posed(points: np.ndarray, capture: Capture | FrameTable, frame: np.ndarray) -> np.ndarray:

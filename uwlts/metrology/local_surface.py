@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.runtime.compiled import compiled
+from uwlts.runtime.compiled import compiled, compiled_with_arrays
 
 _SAME_SIDE = 0.5
 """Cosine of the angle between normals up to which points lie on the same side of a wall or an edge: 60 deg."""
@@ -155,7 +155,7 @@ def _row(keys, low, shape, cell, place, row):
     return start, np.searchsorted(keys, first + min(z + 1, shape[2] - 1), side="right")
 
 
-@compiled
+@compiled_with_arrays
 def _moments(places, points, keys, low, shape, radius, moments):
     """Second central moments (P, 6) xx, xy, xz, yy, yz, zz of the points within the radius of each place."""
     for number in range(len(places)):
@@ -176,7 +176,7 @@ def _moments(places, points, keys, low, shape, radius, moments):
                 column += 1
 
 
-@compiled
+@compiled_with_arrays
 def _patches(
     places,
     points,

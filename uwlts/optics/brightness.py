@@ -9,8 +9,11 @@ The image is blurred, too. Where a stripe leans or bends in the image and fades 
 blur moves light from one line to the next and with it the centre that is seen there.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,8 +22,9 @@ from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Laser, Sensor, Uncertainty, Vector
 from uwlts.model.stripe import pixels_of
 from uwlts.optics.line_table import LineTable
-from uwlts.optics.reconstruction import reconstruct_pixels
-from uwlts.runtime.compiled import compiled
+from uwlts.optics.reconstruction import MeasuredPoints, rays_on_sheet, to_object
+from uwlts.optics.window import RayStatus
+from uwlts.runtime.compiled import compiled, compiled_with_arrays
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 from uwlts.stripe.recording import FoundStripes
 
@@ -43,111 +47,120 @@ _LINES, _BEND_LINES, _LEAST_SHARE = 12, 6, 0.2
 _LEAST_ACROSS = 0.3
 """Least cosine between the stage's motion and the sheet's normal for which a scan shows what lies beside the sheet."""
 
-_TABLE_TOLERANCE = 1e-6
-"""Error of the tabulated shift per slope, mm^2, and of the largest thickness over the described one, per px."""
+_TABLE_TOLERANCE = np.array([1e-7] * 3 + [1e-6] * 5)
+"""Error of the tabulated points, mm, of the shift per slope, mm^2, of the thickness, mm, and of pixels for it."""
 
 _MOST_FOR_FOOTPRINT = 1000
 _PIXEL_VARIANCE = 1.0 / 12.0
 """Of a pixel's own width, px2: an image is blurred at least by that."""
 
-_MOVED_MM, _MOVED_PX = 0.05, 0.5
-"""Steps of sheet and pixel for the derivatives of the points: some sigma of the sheet, within one pixel."""
+_MOVED_PX = 0.5
+"""Step for the derivatives of the points by the pixel."""
 
 
-def beside_sheet(
-    calibration: Calibration,
-    sensor: Sensor,
-    line: np.ndarray,
-    centre_px: np.ndarray,
-    width_px: np.ndarray,
-    slopes: np.ndarray,
-    *,
-    medium_index: float,
-    stage_direction: Vector,
-) -> np.ndarray:
-    """From points on the sheet's middle to where their light comes from, along the camera's rays: (N, 3), OCS, mm.
+@dataclass(frozen=True, eq=False)
+class LitSheet:
+    """What stripe centres (N,) see of a sheet that has a thickness.
 
-    The sheet is as thick as described, but no thicker than the stripes would make it on a surface square to the laser.
-    ``width_px`` (N,) is the stripe's full width at half maximum, ``slopes`` (N,) those of `slopes_of_brightness`,
-    ``stage_direction`` as the capture describes it.
+    ``found`` are the points on the sheet's middle, OCS at the stage's position 0. ``of_slope`` (N, 3), mm2, is how far
+    their light comes from beside them, along the camera's rays, for each 1/mm by which the brightness's logarithm grows
+    across the sheet; ``sigma_mm`` (N,) is the sheet's thickness, and ``per_sigma_px`` (N,) how far the stripe moves on
+    a surface square to the laser's axis where the sheet does so by its thickness.
     """
-    direction = np.array(calibration.stage_direction_of(stage_direction))
-    frame = calibration.object_transform()
-    across = float(np.array(calibration.sheet.normal) @ frame[:3, :3] @ direction)
-    if abs(across) < _LEAST_ACROSS or not slopes.any():
-        return np.zeros((len(slopes), 3))
-    on_sheet = _on_sheet(calibration, sensor, medium_index=medium_index)
 
-    def exact(line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
-        values = on_sheet(line, place_px)
-        sigma = _sigma_at(values[:, :3], calibration, sensor, medium_index=medium_index)
-        per_mm, per_px = values[:, 3:6], values[:, 6:]
-        return np.column_stack([per_mm * (sigma**2)[:, None], per_px[:, 2] / (per_mm[:, 2] * sigma)])
+    found: MeasuredPoints
+    of_slope: np.ndarray
+    sigma_mm: np.ndarray
+    per_sigma_px: np.ndarray
+    calibration: Calibration
+    line: np.ndarray
+    centre_px: np.ndarray
+    at: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
-    table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE)
-    values = exact(line, centre_px) if table is None else table.values(line, centre_px)
-    known = width_px[np.isfinite(width_px)]
-    # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
-    thickest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA * values[:, 3]
-    return values[:, :3] * (slopes / across * np.minimum(1.0, thickest**2))[:, None]
+    @classmethod
+    def of(
+        cls, calibration: Calibration, sensor: Sensor, line: np.ndarray, centre_px: np.ndarray, *, medium_index: float
+    ) -> LitSheet:
+        """The sheet as described of a sensor by a calibration, without a window where the sensor has none."""
+        if not sensor.camera.window.mounted:
+            calibration = calibration.model_copy(update={"window": None})
+        known = _on_sheet(calibration, sensor, medium_index=medium_index)
+        status = np.full(len(line), RayStatus.OK, dtype=np.uint8)
 
+        def exact(line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
+            return known(line, place_px)[0]
 
-def footprint_mm(
-    calibration: Calibration,
-    sensor: Sensor,
-    line: np.ndarray,
-    centre_px: np.ndarray,
-    width_px: np.ndarray,
-    *,
-    medium_index: float,
-) -> tuple[float, float]:
-    """Standard deviations of the part of a surface square to the laser that a point is the mean of, mm.
+        table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE)
+        if table is None:
+            values, status = known(line, centre_px)
+        else:
+            exact, values = table.values, table.values(line, centre_px)
+        found = MeasuredPoints(values[:, :3], status)
+        return cls(found, values[:, 3:6], values[:, 6], values[:, 7], calibration, line, centre_px, exact)
 
-    Across the sheet (X) that of its thickness, and along the stripe (Y) that of the image's blur, which is what the
-    sheet leaves of the stripe's width; medians over the stripe centres (N,).
-    """
-    chosen = np.flatnonzero(np.isfinite(width_px))
-    chosen = chosen[:: max(1, len(chosen) // _MOST_FOR_FOOTPRINT)]
-    exact = _on_sheet(calibration, sensor, medium_index=medium_index)
-    values, beside = exact(line[chosen], centre_px[chosen]), exact(line[chosen] + 1.0, centre_px[chosen])
-    # Where the surface is square to the laser's axis, Z stays.
-    per_mm, per_px = np.abs(values[:, 5]), np.abs(values[:, 8])
-    width = width_px[chosen] / FWHM_PER_SIGMA
-    sigma = np.minimum(
-        _sigma_at(values[:, :3], calibration, sensor, medium_index=medium_index), width * per_px / per_mm
-    )
-    blur = np.sqrt(np.maximum(width**2 - (sigma * per_mm / per_px) ** 2, _PIXEL_VARIANCE))
-    return float(np.median(sigma)), float(np.median(blur * np.abs(beside[:, 1] - values[:, 1])))
+    def beside(self, width_px: np.ndarray, slopes: np.ndarray, *, stage_direction: Vector) -> np.ndarray:
+        """From the points on the sheet's middle to where their light comes from, along the camera's rays: (N, 3), mm.
+
+        The sheet is as thick as described, but no thicker than the stripes would make it on a surface square to the
+        laser. ``width_px`` (N,) is the stripe's full width at half maximum, ``slopes`` (N,) those of
+        `slopes_of_brightness`, ``stage_direction`` as the capture describes it.
+        """
+        direction = np.array(self.calibration.stage_direction_of(stage_direction))
+        across = float(
+            np.array(self.calibration.sheet.normal) @ self.calibration.object_transform()[:3, :3] @ direction
+        )
+        if abs(across) < _LEAST_ACROSS or not slopes.any():
+            return np.zeros((len(slopes), 3))
+        known = width_px[np.isfinite(width_px)]
+        widest = (np.median(known) if len(known) else np.inf) / FWHM_PER_SIGMA
+        return self.of_slope * (slopes / across * np.minimum(1.0, (widest / self.per_sigma_px) ** 2))[:, None]
+
+    def footprint_mm(self, width_px: np.ndarray) -> tuple[float, float]:
+        """Standard deviations of the part of a surface square to the laser that a point is the mean of, mm.
+
+        Across the sheet (X) that of its thickness, and along the stripe (Y) that of the image's blur, which is what the
+        sheet leaves of the stripe's width (N,); medians over the stripe centres.
+        """
+        chosen = np.flatnonzero(np.isfinite(width_px) & (self.found.status == RayStatus.OK))
+        chosen = chosen[:: max(1, len(chosen) // _MOST_FOR_FOOTPRINT)]
+        line, place = self.line[chosen], self.centre_px[chosen]
+        # To the neighbouring line, within the table.
+        beside = self.at(line + np.where(line < line.max(), 1, -1), place)
+        width, sigma = width_px[chosen] / FWHM_PER_SIGMA, self.sigma_mm[chosen]
+        of_sheet = np.minimum(self.per_sigma_px[chosen], width)
+        blur = np.sqrt(np.maximum(width**2 - of_sheet**2, _PIXEL_VARIANCE))
+        spacing = np.abs(beside[:, 1] - self.found.points_mm[chosen, 1])
+        thickness = sigma * of_sheet / self.per_sigma_px[chosen]
+        return float(np.median(thickness)), float(np.median(blur * spacing))
 
 
 def _on_sheet(
     calibration: Calibration, sensor: Sensor, *, medium_index: float
-) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """Points on the sheet, OCS, and their derivatives by a shift of the sheet, mm, and by the pixel across: (N, 9)."""
-    sheet = calibration.sheet
-    window = calibration.window if sensor.camera.window.mounted else None
+) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Values (N, 8) for lines and places (N,), points, and ``of_slope`` to ``per_sigma_px``; and status (N,)."""
+    frame = calibration.object_transform()
+    origin_mm = laser_pose(sensor).origin_mm
 
-    def points(line: np.ndarray, place_px: np.ndarray, further_mm: float = 0.0) -> np.ndarray:
-        shifted = sheet.model_copy(update={"offset_mm": sheet.offset_mm + further_mm})
-        moved = calibration.model_copy(update={"sheet": shifted, "window": window})
-        pixels = pixels_of(line, place_px, stripe_along=calibration.stripe_along)
+    def exact(line: np.ndarray, place_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        count = len(line)
+        places = np.concatenate([place_px, place_px + _MOVED_PX])
+        pixels = pixels_of(np.concatenate([line, line]), places, stripe_along=calibration.stripe_along)
+        found, ray, slope = rays_on_sheet(calibration, pixels, medium_index=medium_index)
+        in_camera = found.points_mm[:count]
+        sigma = sheet_sigma_mm(sensor.laser, np.linalg.norm(in_camera - origin_mm, axis=1), medium_index=medium_index)
+        # A sheet that moves by 1 mm moves the point along its ray by so much over the slope.
+        per_mm = ray[:count] @ frame[:3, :3] / slope[:count, None]
+        per_px = (found.points_mm[count:, :] - in_camera) @ frame[:3, 2] / _MOVED_PX
+        result = np.empty((count, 8))
         at_start = {"stage_mm": 0.0, "stage_direction": np.array([1.0, 0.0, 0.0])}
-        return reconstruct_pixels(moved, pixels, medium_index=medium_index, **at_start).points_mm
-
-    def exact(line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
-        here = points(line, place_px)
-        per_mm = (points(line, place_px, _MOVED_MM) - here) / _MOVED_MM
-        return np.hstack([here, per_mm, (points(line, place_px + _MOVED_PX) - here) / _MOVED_PX])
+        result[:, :3] = to_object(calibration, in_camera, **at_start)
+        result[:, 3:6] = per_mm * (sigma**2)[:, None]
+        result[:, 6] = sigma
+        # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
+        result[:, 7] = np.abs(per_mm[:, 2] * sigma / per_px)
+        return result, found.status[:count]
 
     return exact
-
-
-def _sigma_at(on_sheet: np.ndarray, calibration: Calibration, sensor: Sensor, *, medium_index: float) -> np.ndarray:
-    """Standard deviation (N,) of the sheet's profile at points (N, 3) on it, OCS, mm."""
-    frame = calibration.object_transform()
-    in_camera = on_sheet @ frame[:3, :3].T + frame[:3, 3]
-    away = np.linalg.norm(in_camera - laser_pose(sensor).origin_mm, axis=1)
-    return sheet_sigma_mm(sensor.laser, away, medium_index=medium_index)
 
 
 def slopes_of_brightness(
@@ -163,17 +176,19 @@ def slopes_of_brightness(
     """
     if not np.isfinite(amplitude).all():
         return np.zeros(len(frame))
+    there = np.bincount(frame, minlength=len(stage_mm)) > 0
     order = np.argsort(stage_mm, kind="stable")
-    used, row = np.unique(np.argsort(order)[frame], return_inverse=True)
-    position = stage_mm[order][used]
+    order = order[there[order]]
+    row_of = np.zeros(len(there), np.intp)
+    row_of[order] = np.arange(len(order))
+    position = stage_mm[order]
     within = np.searchsorted(position, position + _REACH_MM, side="right") - np.arange(len(position)) - 1
     whole = position <= position[-1] - _REACH_MM
     reach = int(np.median(within[whole])) if whole.any() else len(position) - 1
     if reach < 1:
         return np.zeros(len(frame))
-    exposure = exposure_ms[frame] if np.all(exposure_ms[np.unique(frame)] > 0) else 1.0
-    by_stage, _ = _slopes(row, line, np.log(amplitude / exposure), position, rows=reach, columns=_LINES)
-    return by_stage
+    bright = np.log(amplitude / exposure_ms[frame] if np.all(exposure_ms[there] > 0) else amplitude)
+    return _slopes_by_position(row_of[frame], line, bright, position, rows=reach)
 
 
 def beside_std(uncertainty: Uncertainty) -> float:
@@ -201,11 +216,14 @@ def moved_by_blur_px(
     with e of that deviation: beside y(x) by b^2 (y' (ln A)' + y'' / 2) to second order. The stripe's width squared,
     less what it owes to leaning, stands for b^2, of which it is the largest possible value.
     """
-    row = np.unique(frame, return_inverse=True)[1]
-    rows = np.arange(row.max() + 1.0)
-    _, lean = _slopes(row, line, centre_px, rows, rows=0, columns=_BEND_LINES)
-    _, bend = _slopes(row, line, lean, rows, rows=0, columns=_BEND_LINES)
-    _, fading = _slopes(row, line, np.log(amplitude), rows, rows=0, columns=_LINES)
+    if np.any((frame[1:] < frame[:-1]) | ((frame[1:] == frame[:-1]) & (line[1:] < line[:-1]))):
+        order, moved = np.lexsort((line, frame)), np.empty(len(line))
+        columns = frame, line, centre_px, amplitude, width_px
+        moved[order] = moved_by_blur_px(*(column[order] for column in columns))
+        return moved
+    lean = _slopes_along(frame, line, centre_px, _BEND_LINES)
+    bend = _slopes_along(frame, line, lean, _BEND_LINES)
+    fading = _slopes_along(frame, line, np.log(amplitude), _LINES)
     variance = (width_px / FWHM_PER_SIGMA) ** 2 / (1.0 + lean**2)
     return variance * (lean * fading + 0.5 * bend)
 
@@ -224,34 +242,52 @@ def sharp_lines(stripes: FoundStripes) -> tuple[np.ndarray, np.ndarray]:
     return sharp, moved[sharp]
 
 
-def _slopes(
-    row: np.ndarray, column: np.ndarray, values: np.ndarray, position: np.ndarray, *, rows: int, columns: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes (N,) by position and by column of planes fitted to the values within so many rows and columns."""
-    first = column.min()
-    shape = len(position), int(column.max() - first) + 1
-    there, z = np.zeros(shape, np.bool_), np.zeros(shape)
-    there[row, column - first] = True
-    z[row, column - first] = values - values.mean()
-    s = position - position.mean()
-    # Neighbours in a row, or in images taken nearly at one place, do not show the slope across it.
-    step = np.median(position[rows:] - position[:-rows]) / rows if rows else 0.0
-    least = max(0.15 * step**2, _LEAST_APART_MM**2)
-    by_position, by_column = np.zeros(shape), np.zeros(shape)
-    _fit_planes(there, z, np.ascontiguousarray(s, dtype=float), rows, columns, least, by_position, by_column)
-    return by_position[row, column - first], by_column[row, column - first]
+def _slopes_along(frame: np.ndarray, line: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
+    """Slopes (N,) by line of straight lines through the values so many lines around, of images in order."""
+    slopes = np.zeros(len(line))
+    _fit_lines(frame, line, np.ascontiguousarray(values, dtype=float), reach, slopes)
+    return slopes
 
 
 @compiled
+def _fit_lines(frame: np.ndarray, line: np.ndarray, values: np.ndarray, reach: int, slopes: np.ndarray) -> None:
+    """Fill the slopes (N,) that are known; sums over the window are running ones."""
+    first, last, n, x1, x2, z1, xz = 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    origin, base = 0, 0.0
+    for k in range(line.size):
+        if k == 0 or frame[k] != frame[k - 1]:
+            first, last, n, x1, x2, z1, xz = k, k, 0.0, 0.0, 0.0, 0.0, 0.0
+            origin, base = line[k], values[k]
+        while last < line.size and frame[last] == frame[k] and line[last] <= line[k] + reach:
+            x, z = float(line[last] - origin), values[last] - base
+            n, x1, x2, z1, xz, last = n + 1.0, x1 + x, x2 + x * x, z1 + z, xz + x * z, last + 1
+        while line[first] < line[k] - reach:
+            x, z = float(line[first] - origin), values[first] - base
+            n, x1, x2, z1, xz, first = n - 1.0, x1 - x, x2 - x * x, z1 - z, xz - x * z, first + 1
+        square = x2 / n - (x1 / n) ** 2
+        if n > _LEAST_SHARE * (2 * reach + 1) and square > 1.0:
+            slopes[k] = (xz / n - x1 / n * z1 / n) / square
+
+
+def _slopes_by_position(
+    row: np.ndarray, column: np.ndarray, values: np.ndarray, position: np.ndarray, *, rows: int
+) -> np.ndarray:
+    """Slopes (N,) by position of planes fitted to the values within so many rows."""
+    first = column.min()
+    shape = len(position), int(column.max() - first) + 1
+    there, z, slopes = np.zeros(shape, np.bool_), np.zeros(shape), np.zeros(shape)
+    place = row * shape[1] + (column - first)
+    there.ravel()[place] = True
+    z.ravel()[place] = values - values.mean()
+    # Images taken nearly at one place do not show the slope across it.
+    least = max(0.15 * (np.median(position[rows:] - position[:-rows]) / rows) ** 2, _LEAST_APART_MM**2)
+    _fit_planes(there, z, position - position.mean(), rows, _LINES, least, slopes)
+    return slopes.ravel()[place]
+
+
+@compiled_with_arrays
 def _fit_planes(
-    there: np.ndarray,
-    z: np.ndarray,
-    s: np.ndarray,
-    rows: int,
-    columns: int,
-    least: float,
-    by_position: np.ndarray,
-    by_column: np.ndarray,
+    there: np.ndarray, z: np.ndarray, s: np.ndarray, rows: int, columns: int, least: float, slopes: np.ndarray
 ) -> None:
     """Slopes (F, L) of planes through the values z (F, L) that are there, at positions s (F,), 0 where unknown.
 
@@ -296,8 +332,7 @@ def _fit_planes(
             xx, xz = total[2, at] / n - mx * mx, total[4, at] / n - mx * mz
             if xx <= 1.0:
                 continue
-            by_column[k - rows, at] = xz / xx
             ss, sx, sz = total[6, at] / n - ms * ms, total[7, at] / n - ms * mx, total[8, at] / n - ms * mz
             of_both = ss * xx - sx * sx
             if least < ss < _REACH_MM**2 and of_both > 1e-3 * ss * xx:
-                by_position[k - rows, at] = (sz * xx - xz * sx) / of_both
+                slopes[k - rows, at] = (sz * xx - xz * sx) / of_both

@@ -15,8 +15,8 @@ from numpy.polynomial import chebyshev
 
 from uwlts.runtime.compiled import compiled, compiled_part
 
-_NODES = (12, 24)
-"""Numbers of nodes along either direction that are tried, one after another."""
+_NODES = (12, 8), (24, 24)
+"""Numbers of nodes along lines and places that are tried, one after another."""
 
 _WORTH = 5000
 """Places from which a table is worth making: it costs as much as some thousand of them."""
@@ -43,29 +43,34 @@ class LineTable:
         lines: tuple[int, int],
         places_px: tuple[float, float],
         *,
-        tolerance: float,
+        tolerance: float | np.ndarray,
+        share: float = 0.0,
     ) -> LineTable | None:
         """Table of a function for the lines and places between two, ends included.
 
         ``exact`` gives the values (N, K) for lines (N,) and places (N,), both float. None where one is not finite, or
-        where the last terms of the series are not below the tolerance, as of a function that is not smooth.
+        where the last terms of the series are not below the tolerance, of all values or of each (K,), or that ``share``
+        of the largest value where it is more, as of a function that is not smooth.
         """
         (line, half_lines), (place, half_places) = (
             (0.5 * (low + high), max(0.5 * (high - low), 0.5)) for low, high in (lines, places_px)
         )
         for count in _NODES:
-            nodes = chebyshev.chebpts1(count)
-            into_series = 2.0 / count * chebyshev.chebvander(nodes, count - 1).T
-            into_series[0] *= 0.5
-            at_line, at_place = np.meshgrid(line + half_lines * nodes, place + half_places * nodes)
-            values = exact(at_line.ravel(), at_place.ravel()).reshape(count, count, -1)
+            at_line, at_place = np.meshgrid(*map(chebyshev.chebpts1, count))
+            values = exact(line + half_lines * at_line.ravel(), place + half_places * at_place.ravel())
             if not np.isfinite(values).all():
                 return None
             # Axes: term of the line, term of the place, value.
-            series = np.tensordot(into_series, np.tensordot(into_series, values, (1, 0)), (1, 1))
-            if max(np.abs(series[-2:]).max(), np.abs(series[:, -2:]).max()) <= tolerance:
-                of_lines = chebyshev.chebvander((np.arange(lines[0], lines[1] + 1) - line) / half_lines, count - 1)
-                return cls(series, of_lines, lines[0], place - half_places, place + half_places)
+            into_lines, into_places = map(_into_series, count)
+            series = np.tensordot(into_places, values.reshape(*count[::-1], -1), (1, 0))
+            series = np.tensordot(into_lines, series, (1, 1))
+            error = np.maximum(tolerance, share * np.abs(values).max(axis=0))
+            if (np.abs(series[-2:]) <= error).all() and (np.abs(series[:, -2:]) <= error).all():
+                at_lines = (np.arange(lines[0], lines[1] + 1) - line) / half_lines
+                of_lines = chebyshev.chebvander(at_lines, count[0] - 1)
+                whole = cls(series, of_lines, lines[0], place - half_places, place + half_places)
+                # What is left out besides stays far below the tolerance.
+                return whole.shortened(1e-3 * error)
         return None
 
     @classmethod
@@ -75,17 +80,25 @@ class LineTable:
         line: np.ndarray,
         place_px: np.ndarray,
         *,
-        tolerance: float,
+        tolerance: float | np.ndarray,
+        share: float = 0.0,
     ) -> LineTable | None:
         """Table for all of the places (N,) on lines (N,) int; None also where they are too few to be worth one."""
         if len(line) < _WORTH or line.dtype.kind not in "iu" or not np.isfinite(place_px).all():
             return None
         lines, places_px = (int(line.min()), int(line.max())), (float(place_px.min()), float(place_px.max()))
-        return cls.of(exact, lines, places_px, tolerance=tolerance)
+        return cls.of(exact, lines, places_px, tolerance=tolerance, share=share)
 
     def combined(self, weights: np.ndarray) -> LineTable:
         """Table of the sums of its values with weights (K, M)."""
         return replace(self, terms=self.terms @ weights)
+
+    def shortened(self, tolerance: float | np.ndarray) -> LineTable:
+        """Table without the last terms, of lines and of places, that add up to no more than the tolerance in each."""
+        size = np.abs(self.terms)
+        of_lines, of_places = (_needed(size.sum(axis=axis), tolerance) for axis in (1, 0))
+        terms = np.ascontiguousarray(self.terms[:of_lines, :of_places])
+        return replace(self, terms=terms, of_lines=np.ascontiguousarray(self.of_lines[:, :of_lines]))
 
     def series(self, line: np.ndarray, place_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Series (L, n, K) of lines and, for lines (N,) int and places (N,), their rows (N,) and arguments (N,)."""
@@ -99,12 +112,25 @@ class LineTable:
     def values(self, line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
         """Values (N, K) for lines (N,) int and places (N,) within the table."""
         result = np.empty((len(line), self.terms.shape[2]))
-        _sum_series(*self.series(line, place_px), result)
+        sum_series(*self.series(line, place_px), result)
         return result
 
 
+def _into_series(count: int) -> np.ndarray:
+    """Matrix that makes a Chebyshev series' terms of the values at so many nodes."""
+    into_series = 2.0 / count * chebyshev.chebvander(chebyshev.chebpts1(count), count - 1).T
+    into_series[0] *= 0.5
+    return into_series
+
+
+def _needed(size: np.ndarray, tolerance: float | np.ndarray) -> int:
+    """Number of the first terms, at least one, after which sizes (T, K) add up to no more than the tolerance."""
+    left = np.cumsum(size[::-1], axis=0)[::-1]
+    return max(1, int(np.count_nonzero((left > tolerance).any(axis=1))))
+
+
 @compiled
-def _sum_series(series: np.ndarray, row: np.ndarray, at: np.ndarray, result: np.ndarray) -> None:
+def sum_series(series: np.ndarray, row: np.ndarray, at: np.ndarray, result: np.ndarray) -> None:
     """Sums of Chebyshev polynomials at places (N,)."""
     for n in range(row.size):
         sum_terms(series[row[n]], at[n], result[n])

@@ -100,14 +100,21 @@ def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_inde
     The pixels may be those of many frames. The index of the medium, relative to air, matters only behind a window.
     RangeError where a pixel is not finite, or the index is not finite and positive.
     """
+    return rays_on_sheet(calibration, pixels, medium_index=medium_index)[0]
+
+
+def rays_on_sheet(
+    calibration: Calibration, pixels: np.ndarray, *, medium_index: float
+) -> tuple[MeasuredPoints, np.ndarray, np.ndarray]:
+    """As `points_on_sheet`, with the rays' directions (N, 3) in the medium and the sheet's gradient (N,) along them."""
     pixels = np.asarray(pixels, dtype=float)
     sheet = sheet_surface(calibration.sheet, medium_index=medium_index)
     found = []
     for block in np.split(pixels, range(_BLOCK, len(pixels), _BLOCK)):
         rays = trace_window(directions(calibration.camera, block), calibration.window, medium_index=medium_index)
-        found.append(_crossings(rays, sheet))
-    points, status = zip(*found, strict=True)
-    return MeasuredPoints(np.concatenate(points), np.concatenate(status))
+        found.append((*_crossings(rays, sheet), rays.directions))
+    points, status, slope, along = found[0] if len(found) == 1 else map(np.concatenate, zip(*found, strict=True))
+    return MeasuredPoints(points, status), along, slope
 
 
 def to_object(
@@ -138,8 +145,8 @@ def stage_travel(stage_mm: np.ndarray | float, stage_direction: np.ndarray) -> n
     return np.multiply.outer(stage_direction, stage_mm) if stage_mm.ndim else (stage_mm * stage_direction)[:, None]
 
 
-def _crossings(rays: RaysInMedium, sheet: SheetSurface) -> tuple[np.ndarray, np.ndarray]:
-    """Crossings (N, 3) and status (N,) of rays in the medium with the sheet (thesis Eq. 3.9 for a plane).
+def _crossings(rays: RaysInMedium, sheet: SheetSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Crossings (N, 3) of rays in the medium with the sheet (thesis Eq. 3.9 for a plane), status and slope (N,).
 
     A crossing that is not ahead of the ray is BEHIND if the light passed the sheet between the pupil and the medium,
     that is, if the two lie on different sides of it; otherwise the ray runs away from the sheet.
@@ -150,7 +157,9 @@ def _crossings(rays: RaysInMedium, sheet: SheetSurface) -> tuple[np.ndarray, np.
     parallel = np.abs(approach) <= _PARALLEL
     if parallel.any():
         approach[parallel] = np.nan
-    length = gap / approach if sheet.is_plane() else sheet.crossings(rays.origins.T, rays.directions.T)[0]
+    length, slope = gap / approach, approach
+    if not sheet.is_plane():
+        length, slope = sheet.crossings(rays.origins.T, rays.directions.T)
     points = (rays.origins.T + length * rays.directions.T).T
     status = rays.status
     if not np.all(length > 0):
@@ -158,7 +167,7 @@ def _crossings(rays: RaysInMedium, sheet: SheetSurface) -> tuple[np.ndarray, np.
         missed = (status == RayStatus.OK) & ~(length > 0)
         status = np.where(missed, np.where(passed, RayStatus.BEHIND, RayStatus.NO_CROSSING), status).astype(np.uint8)
         points[status != RayStatus.OK] = np.nan
-    return points, status
+    return points, status, slope
 
 
 def reconstruct_by_polynomials(

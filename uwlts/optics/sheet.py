@@ -108,7 +108,9 @@ def sheet_surface(sheet: SheetModel, *, medium_index: float) -> SheetSurface:
     if fan is None:
         return SheetSurface(normal, sheet.offset_mm)
     turn = fan.window_turn_rad * (1.0 - 1.0 / medium_index)
-    across = np.cross(np.cross(fan.axis, normal), normal)
+    axis = np.array(fan.axis)
+    # (axis x normal) x normal
+    across = (axis @ normal) * normal - (normal @ normal) * axis
     turned = np.cos(turn) * normal + np.sin(turn) * across
     return SheetSurface(
         normal=turned,

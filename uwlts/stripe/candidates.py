@@ -9,6 +9,7 @@ hot pixels or a second stripe in the surroundings do no harm.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from statistics import NormalDist
 
 import cv2
@@ -68,5 +69,10 @@ def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
         # Whole grey levels make the plain median jump; read it off the cumulative histogram with straight bins.
         below, equal = np.count_nonzero(sample < middle), np.count_nonzero(sample == middle)
         median += (0.5 * sample.size - below) / equal - 0.5
-    # Median contrast of a block of unit Gaussian noise: the largest of n minus the surroundings.
-    return max(median, 0.0) / (NormalDist().inv_cdf(0.5 ** (1.0 / block)) - MEDIAN_SURROUNDINGS)
+    return max(median, 0.0) / _median_contrast(block)
+
+
+@lru_cache
+def _median_contrast(block: int) -> float:
+    """Median contrast of a block of unit Gaussian noise: the largest of its pixels minus the surroundings."""
+    return NormalDist().inv_cdf(0.5 ** (1.0 / block)) - MEDIAN_SURROUNDINGS

@@ -18,7 +18,7 @@ import numpy as np
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import Stripe, StripeStatus
-from uwlts.runtime.compiled import compiled, compiled_part
+from uwlts.runtime.compiled import compiled, compiled_part, compiled_with_arrays
 from uwlts.stripe.ends import leave_ends_out
 from uwlts.stripe.result import StripeCandidates
 
@@ -297,7 +297,7 @@ def _meets(line: np.ndarray, apart_px: np.ndarray) -> bool:
     return False
 
 
-@compiled
+@compiled_with_arrays
 def _number_stripes(line: np.ndarray, centre: np.ndarray, jump_px: float, stripe: np.ndarray) -> None:
     """Number (M,) of the stripe of each candidate: that of the one before it that it goes on from most straight.
 
@@ -320,7 +320,7 @@ def _number_stripes(line: np.ndarray, centre: np.ndarray, jump_px: float, stripe
             slope[k] = slope[before] + _TURN * (step - slope[before])
 
 
-@compiled
+@compiled_with_arrays
 def _least_cost(
     line: np.ndarray,
     centre: np.ndarray,
@@ -466,7 +466,7 @@ def _take(line: np.ndarray, margin: np.ndarray, alone: np.ndarray, state: np.nda
         first = last
 
 
-@compiled
+@compiled_with_arrays
 def _refuse_alone(line: np.ndarray, stripe: np.ndarray, alone: np.ndarray, state: np.ndarray) -> None:
     """Refuse candidates that are alone, as noise hides the true one, between refused ones of the same stripe.
 
@@ -508,7 +508,7 @@ def _linked(line: np.ndarray, centre: np.ndarray, one: int, other: int, jump_px:
     return abs(centre[one] - centre[other]) <= jump_px + _SLACK_PX * max(abs(line[one] - line[other]) - 1, 0)
 
 
-@compiled
+@compiled_with_arrays
 def _refuse_crossings(
     line: np.ndarray, centre: np.ndarray, amplitude: np.ndarray, state: np.ndarray, jump_px: float
 ) -> None:

@@ -52,13 +52,14 @@ def _half_lit(good: np.ndarray, centre: np.ndarray, *, lines: int, jump_px: floa
     found = np.flatnonzero(good)
     if len(found) == 0:
         return found
-    count, place = len(found), centre[found]
-    # breaks[k] stands before found[k], the last one after all of them.
-    breaks = np.empty(count + 1, bool)
-    breaks[1:-1] = (found[1:] - found[:-1] > _SHORT_GAP + 1) | (np.abs(place[1:] - place[:-1]) > jump_px)
-    breaks[0], breaks[-1] = found[0] > _SHORT_GAP, len(good) - 1 - found[-1] > _SHORT_GAP
-    # Breaks before each place, from so many lines before the first one to so many after the last one.
-    before = np.zeros(count + 2 * lines + 2, np.int32)
-    np.cumsum(breaks, out=before[lines + 1 : lines + count + 2])
-    before[lines + count + 2 :] = before[lines + count + 1]
-    return found[before[2 * lines + 1 :][:count] > before[1 : count + 1]]
+    place = centre[found]
+    # Breaks stand before these of the lines found, and after all of them.
+    apart = (found[1:] - found[:-1] > _SHORT_GAP + 1) | (np.abs(place[1:] - place[:-1]) > jump_px)
+    breaks = 1 + np.flatnonzero(apart)
+    if found[0] > _SHORT_GAP:
+        breaks = np.append(breaks, 0)
+    if len(good) - 1 - found[-1] > _SHORT_GAP:
+        breaks = np.append(breaks, len(found))
+    beside = np.zeros(len(found) + 2 * lines, np.bool_)
+    beside[np.add.outer(breaks, np.arange(2 * lines))] = True
+    return found[beside[lines : lines + len(found)]]

@@ -17,7 +17,7 @@ from uwlts.stripe.learned import find_learned
 from uwlts.stripe.methods import amplitudes, place_centre
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
 from uwlts.stripe.result import LEARNED, PeakRule, StripeCandidates, StripeOptions
-from uwlts.stripe.search import MARGIN, look_at, search, search_all, with_rivals
+from uwlts.stripe.search import MARGIN, SearchRules, look_at, search, search_all, search_rules, with_rivals
 
 _LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
 
@@ -102,13 +102,12 @@ def see_stripes(
     lines = np.flatnonzero(found.several | found.glare)
     clear = (found.stripe.status[lines] == _OK) & ~found.glare[lines]
     if clear.any():
-        heights = {"coarse": seen.coarse, "fine": seen.fine}
-        of_rivals = with_rivals(found.profiles, seen.left, lines[clear], **heights, options=found.options)
+        of_rivals = with_rivals(found.profiles, seen.left, lines[clear], seen.rules)
         lines = np.sort(np.concatenate([of_rivals, lines[~clear]]))
     rivals = found.candidates(lines, rivals=True) if len(lines) else None
     if rivals is not None and len(rivals.line) == 0:
         rivals = None
-    return SeenStripes(found.stripe, rivals, seen.fine, jump_px, options.end_lines)
+    return SeenStripes(found.stripe, rivals, seen.rules.fine, jump_px, options.end_lines)
 
 
 def _extracted(
@@ -223,6 +222,8 @@ def _found(
         nothing = np.zeros(len(found.status), bool)
         return found, nothing, nothing, None
     block = options.half_window_px // 2
+    # Read in the order of memory first, an image costs a third less than by the rows of its blocks alone.
+    brightest = profiles.max()
     high, low = block_extremes(profiles, block)
     # Blocks more at either end of the lines, so that what one window covers can be crossed out without a check.
     board = np.zeros((high.shape[0] + 2 * MARGIN, high.shape[1]), high.dtype)
@@ -232,16 +233,16 @@ def _found(
     coarse = max(options.threshold_floor, noise * (4.0 - MEDIAN_SURROUNDINGS))
     fine = max(options.threshold_floor, options.threshold_sigmas * noise * noise_gain(options.smoothing_px))
     left = cv2.transpose(board)
-    detection = _Detection(board, left, noise, coarse, fine, clip)
-    status, wide, several, peak = search(profiles, left, coarse=coarse, fine=fine, options=options, clip=clip)
+    detection = _Detection(board, left, noise, search_rules(options, coarse=coarse, fine=fine, clip=clip))
+    status, wide, several, peak = search(profiles, left, detection.rules)
     glare = wide.copy()
     # A plateau wider than the window does not even stick out.
-    white = low.max(axis=0) >= clip
+    white = low.max(axis=0) >= clip if brightest >= clip else np.zeros(len(status), np.bool_)
     wide |= white
     amplitude, width = np.full((2, len(status)), np.nan, np.float32)
     found = _Lines(np.full(len(status), np.nan), amplitude, width, status, wide, white)
-    good = status == _OK
     if len(peak.start):
+        good = np.flatnonzero(status == _OK)
         centre, found.amplitude[good] = place_centre(options.method, peak)
         found.centre[good] = peak.start + centre.astype(np.float64)
         found.width[good] = peak.sigma * FWHM_PER_SIGMA
@@ -251,14 +252,12 @@ def _found(
 @dataclass(frozen=True)
 class _Detection:
     """Contrast of the blocks (B + 2 `MARGIN`, L), the same (L, B + 2 `MARGIN`) less what has been looked at, noise of a
-    pixel, least heights of blocks and peaks, and saturation."""
+    pixel, and the rules of the search."""
 
     board: np.ndarray
     left: np.ndarray
     noise: float
-    coarse: float
-    fine: float
-    clip: float
+    rules: SearchRules
 
 
 @dataclass(frozen=True)
@@ -294,8 +293,8 @@ class _Extracted:
             return StripeCandidates(lines, centre, amplitude, width, np.zeros(len(lines)), count, along)
         line, clear, peak = np.empty(0, np.intp), np.empty(0, np.bool_), None
         if len(lines):
-            board, heights = cv2.transpose(seen.board), {"coarse": seen.coarse, "fine": seen.fine}
-            line, clear, peak = search_all(self.profiles, board, lines, **heights, options=options, clip=seen.clip)
+            board = np.ascontiguousarray(seen.board[:, lines].T)
+            line, clear, peak = search_all(self.profiles, board, lines, seen.rules)
             kept = np.bincount(line, minlength=count)[line] >= 2 if rivals else clear
             line, clear, peak = line[kept], clear[kept], peak.keep(kept)
         place, amplitude = np.empty(len(line)), np.empty(len(line), np.float32)

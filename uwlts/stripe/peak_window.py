@@ -98,6 +98,11 @@ class PeakWindow(NamedTuple):
         *values, smoothing = self
         return PeakWindow(*(value[which] for value in values), smoothing=smoothing)
 
+    def first(self, count: int) -> PeakWindow:
+        """The first windows."""
+        *values, smoothing = self
+        return PeakWindow(*(value[:count] for value in values), smoothing=smoothing)
+
     def smooth(self) -> np.ndarray:
         """(M, W) float32: the windows after the low-pass."""
         kernel = low_pass(self.smoothing)
@@ -111,14 +116,9 @@ class PeakWindow(NamedTuple):
 @compiled_part
 def cut(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> None:
     """Pixels of one of the profiles (N, L) from `start` on, the border pixel repeated beyond the border."""
-    count, size = profiles.shape[0], out.size
-    if start >= 0 and start + size <= count:
-        pixels = profiles[start : start + size, line]
-        for k in range(size):
-            out[k] = pixels[k]
-    else:
-        for k in range(size):
-            out[k] = profiles[min(max(start + k, 0), count - 1), line]
+    last = profiles.shape[0] - 1
+    for k in range(out.size):
+        out[k] = profiles[min(max(start + k, 0), last), line]
 
 
 @compiled_part
@@ -147,16 +147,16 @@ def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> 
     """
     half, block = rules.half, rules.block
     size, first = smooth.size, half - block // 2
-    highest = greatest(smooth[first : first + 2 * block])
+    highest = greatest(smooth, first, first + 2 * block)
     top = first
     while smooth[top] != highest:
         top += 1
     # Repeated border pixels may belong to the stripe itself, so that only the other side shows the background.
     ground = np.float32(-np.inf)
-    if start >= 0:
-        ground = _least(smooth[:block])
-    if start + size <= count:
-        ground = max(ground, _least(smooth[size - block :]))
+    for side in range(2):
+        begin = side * (size - block)
+        if start + begin >= 0 and start + begin + block <= count:
+            ground = max(ground, _least(smooth, begin, begin + block))
     rise = highest - ground
     level = ground + np.float32(0.5) * rise
 
@@ -184,47 +184,50 @@ def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> 
     slope = (after - before) / np.float32(2 * reach + FLANK - 2)
     base = np.float32(0.5) * (before + after) + slope * (middle - np.float32(near))
     extent = size if rules.order == STRONGEST else reach + FLANK - 1
-    beside = max(
-        greatest(smooth[max(near - extent, 0) : left + 1]), greatest(smooth[right : min(near + extent + 1, size)])
-    )
+    begin, end = max(near - extent, 0), min(near + extent + 1, size)
+    beside = max(greatest(smooth, begin, left + 1), greatest(smooth, right, end))
     crowded = beside >= ground + np.float32(rules.share) * rise
-    if crowded and beside < level:
+    if crowded:
         # A tail that falls steadily is no second stripe.
-        share = np.float32(rules.share) * rise
-        crowded = _rises_again(smooth[max(near - extent, 0) : left + 1][::-1], ground, share, np.float32(rules.fine))
-        crowded |= _rises_again(smooth[right : min(near + extent + 1, size)], ground, share, np.float32(rules.fine))
+        crowded = beside < ground
+        for side in (-1, 1):
+            first, last = (left, begin - 1) if side < 0 else (right, end)
+            crowded |= _rises_again(smooth, first, last, side, ground, rise, rules)
     return Peak(top, middle, sigma, reach, base, slope, highest - (base if closed else ground), closed, crowded)
 
 
 @compiled_part
-def greatest(values: np.ndarray) -> np.float32:
+def greatest(values: np.ndarray, first: int, end: int) -> np.float32:
     """The greatest of some numbers; less than any where there are none."""
-    result = np.float32(-np.inf)
-    for k in range(values.size):
-        result = max(result, values[k])
+    result, part = np.float32(-np.inf), values[first:end]
+    for k in range(part.size):
+        result = max(result, part[k])
     return result
 
 
 @compiled_part
-def _rises_again(values: np.ndarray, ground: np.floating, share: np.floating, fine: np.float32) -> np.bool_:
-    """Whether values, from a peak outwards, reach a share above the ground after a valley of half their own height.
+def _least(values: np.ndarray, first: int, end: int) -> np.float32:
+    """The least of some numbers; more than any where there are none."""
+    result, part = np.float32(np.inf), values[first:end]
+    for k in range(part.size):
+        result = min(result, part[k])
+    return result
 
-    What rises by less than ``fine`` out of the valley may be noise.
+
+@compiled_part
+def _rises_again(
+    values: np.ndarray, first: int, end: int, step: int, ground: np.floating, rise: np.floating, rules: SearchRules
+) -> np.bool_:
+    """Whether values, from a peak outwards, reach half its height, or the given share of it after a valley.
+
+    The valley is half as high as they are themselves. What rises by less than ``fine`` out of it may be noise.
     """
-    lowest, found = values[0], values[0] > values[0]
-    for k in range(values.size):
-        lowest = min(lowest, values[k])
-        above = values[k] - ground
-        found |= above >= share and values[k] - lowest >= max(np.float32(0.5) * above, fine)
+    level, share, fine = np.float32(0.5) * rise, np.float32(rules.share) * rise, np.float32(rules.fine)
+    lowest, found = np.float32(np.inf), rise < 0
+    for k in range(first, end, step):
+        lowest, above = min(lowest, values[k]), values[k] - ground
+        found |= above >= level or (above >= share and values[k] - lowest >= max(np.float32(0.5) * above, fine))
     return found
-
-
-@compiled_part
-def _least(values: np.ndarray) -> np.float32:
-    result = np.float32(np.inf)
-    for k in range(values.size):
-        result = min(result, values[k])
-    return result
 
 
 @compiled_part

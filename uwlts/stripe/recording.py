@@ -47,8 +47,8 @@ class FoundStripes:
     width_px: np.ndarray
     lines_by_status: dict[str, int]
 
-    def __getitem__(self, some: np.ndarray) -> "FoundStripes":
-        """Those that an index array or mask chooses."""
+    def __getitem__(self, some: np.ndarray | slice) -> "FoundStripes":
+        """Those that a slice, an index array or a mask chooses."""
         columns = self.frame, self.line, self.centre_px, self.amplitude, self.width_px
         return FoundStripes(*(column[some] for column in columns), lines_by_status=self.lines_by_status)
 

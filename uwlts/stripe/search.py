@@ -55,84 +55,8 @@ _AMBIGUOUS, _BORDER = int(StripeStatus.AMBIGUOUS), int(StripeStatus.BORDER)
 _ORDER = {PeakRule.DIRECT: STRONGEST, PeakRule.STRONGEST: STRONGEST, PeakRule.FIRST: FIRST, PeakRule.LAST: LAST}
 
 
-def search(
-    profiles: np.ndarray, board: np.ndarray, *, coarse: float, fine: float, options: StripeOptions, clip: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, PeakWindow]:
-    """Look at the blocks that stick out, in the order of the rule, until each line has its stripe or no block left.
-
-    ``board`` (L, B + 2 `MARGIN`) holds the contrasts of the B blocks of each of the profiles (N, L), and zeros at
-    either end; blocks that are done with are set to 0 in it. Blocks lower than ``coarse`` and peaks lower than ``fine``
-    are noise. Under rule `strongest` a line with a stripe is searched once more for a second one.
-
-    Returns the status (L,) of each line, whether something bright was too wide to be measured (L,), whether more may
-    stand on it than one stripe (L,), and the windows of the lines with a stripe, in their order.
-    """
-    lines, rules = profiles.shape[1], _rules(options, coarse=coarse, fine=fine, clip=clip)
-    peaks = PeakWindow.empty(lines, 2 * rules.half + rules.block, options.smoothing_px)
-    status = np.full(lines, _NO_STRIPE, np.uint8)
-    wide, several = np.zeros((2, lines), np.bool_)
-    kernel = low_pass(options.smoothing_px)
-    # Numba compiles longest for arrays that compiled code makes itself.
-    smooth = np.empty(peaks.window.shape[1], np.float32)
-    pixels = np.empty(smooth.size + kernel.size - 1, np.float32)
-    _search_lines(profiles, board, kernel, pixels, smooth, rules, status, wide, several, peaks)
-    good = status == _OK
-    return status, wide, several, peaks if good.all() else peaks.keep(good)
-
-
-def search_all(
-    profiles: np.ndarray,
-    board: np.ndarray,
-    lines: np.ndarray,
-    *,
-    coarse: float,
-    fine: float,
-    options: StripeOptions,
-    clip: float,
-) -> tuple[np.ndarray, np.ndarray, PeakWindow]:
-    """All stripes on some lines (M,): the line of each, in their order, whether it can be measured, and its window.
-
-    Arguments as of `search`. Two stripes of which one reaches into the other's pixels cannot be measured, nor one that
-    is bright and too wide, or cut off by the border.
-    """
-    rules = _rules(options, coarse=coarse, fine=fine, clip=clip)._replace(order=FIRST)
-    peaks = PeakWindow.empty(_MOST * len(lines), 2 * rules.half + rules.block, options.smoothing_px)
-    kernel = low_pass(options.smoothing_px)
-    smooth = np.empty(peaks.window.shape[1], np.float32)
-    pixels = np.empty(smooth.size + kernel.size - 1, np.float32)
-    found, clear = np.empty(_MOST * len(lines), np.intp), np.empty(_MOST * len(lines), np.bool_)
-    count = _search_all(profiles, board, lines, kernel, pixels, smooth, rules, found, clear, peaks)
-    kept = np.flatnonzero(found[:count] >= 0)
-    return found[kept], clear[kept], peaks.keep(kept)
-
-
-def with_rivals(
-    profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, *, coarse: float, fine: float, options: StripeOptions
-) -> np.ndarray:
-    """Those of some lines (M,) on which something stands out in the board ``left`` by `search` that is no spike."""
-    rules = _rules(options, coarse=coarse, fine=fine, clip=np.inf)
-    found = np.zeros(len(lines), np.bool_)
-    _see_rivals(profiles, left, lines, np.empty(rules.block + 2, np.float32), rules, found)
-    return lines[found]
-
-
-def look_at(profiles: np.ndarray, lines: np.ndarray, centre: np.ndarray, options: StripeOptions) -> PeakWindow:
-    """Windows about stripes whose centres (M,) on M lines of the profiles (N, L) are known from elsewhere.
-
-    Their height is 0 where nothing stands out there.
-    """
-    rules = _rules(options, coarse=0.0, fine=0.0, clip=np.inf)
-    peaks = PeakWindow.empty(len(lines), 2 * rules.half + rules.block, options.smoothing_px)
-    peaks.start[:] = np.rint(centre).astype(np.intp) - rules.half - rules.block // 2
-    kernel = low_pass(options.smoothing_px)
-    smooth = np.empty(peaks.window.shape[1], np.float32)
-    pixels = np.empty(smooth.size + kernel.size - 1, np.float32)
-    _look_at_lines(profiles, lines, kernel, pixels, smooth, rules, peaks)
-    return peaks
-
-
-def _rules(options: StripeOptions, *, coarse: float, fine: float, clip: float) -> SearchRules:
-    """Rules of the search; parameters as of `search`."""
+def search_rules(options: StripeOptions, *, coarse: float, fine: float, clip: float) -> SearchRules:
+    """Rules of the search; blocks lower than ``coarse`` and peaks lower than ``fine`` are noise, and pixels clip."""
     half = options.half_window_px
     return SearchRules(
         half=half,
@@ -146,6 +70,74 @@ def _rules(options: StripeOptions, *, coarse: float, fine: float, clip: float) -
         fine=fine,
         bright=max(fine, _BRIGHT * clip),
     )
+
+
+def search(
+    profiles: np.ndarray, board: np.ndarray, rules: SearchRules
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, PeakWindow]:
+    """Look at the blocks that stick out, in the order of the rule, until each line has its stripe or no block left.
+
+    ``board`` (L, B + 2 `MARGIN`) holds the contrasts of the B blocks of each of the profiles (N, L), and zeros at
+    either end; blocks that are done with are set to 0 in it. Under rule `strongest` a line with a stripe is searched
+    once more for a second one.
+
+    Returns the status (L,) of each line, whether something bright was too wide to be measured (L,), whether more may
+    stand on it than one stripe (L,), and the windows of the lines with a stripe, in their order.
+    """
+    lines = profiles.shape[1]
+    peaks = _windows(lines, rules)
+    status = np.full(lines, _NO_STRIPE, np.uint8)
+    wide, several = np.zeros((2, lines), np.bool_)
+    count = _search_lines(profiles, board, *_room(peaks), rules, status, wide, several, peaks)
+    return status, wide, several, peaks.first(count)
+
+
+def _windows(count: int, rules: SearchRules) -> PeakWindow:
+    """Room for so many windows."""
+    return PeakWindow.empty(count, 2 * rules.half + rules.block, rules.smoothing)
+
+
+def _room(peaks: PeakWindow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The low-pass, and room for the pixels of a window with its borders and for the window after the low-pass.
+
+    Numba compiles longest for arrays that compiled code makes itself.
+    """
+    kernel, size = low_pass(peaks.smoothing), peaks.window.shape[1]
+    return kernel, np.empty(size + kernel.size - 1, np.float32), np.empty(size, np.float32)
+
+
+def search_all(
+    profiles: np.ndarray, board: np.ndarray, lines: np.ndarray, rules: SearchRules
+) -> tuple[np.ndarray, np.ndarray, PeakWindow]:
+    """All stripes on some lines (M,): the line of each, in their order, whether it can be measured, and its window.
+
+    ``board`` (M, B + 2 `MARGIN`) are the contrasts on these lines, else as of `search`. Two stripes of which one
+    reaches into the other's pixels cannot be measured, nor one that is bright and too wide, or cut off by the border.
+    """
+    rules, most = rules._replace(order=FIRST), _MOST * len(lines)
+    peaks, found, clear = _windows(most, rules), np.empty(most, np.intp), np.empty(most, np.bool_)
+    count = _search_all(profiles, board, lines, *_room(peaks), rules, found, clear, peaks)
+    kept = np.flatnonzero(found[:count] >= 0)
+    return found[kept], clear[kept], peaks.keep(kept)
+
+
+def with_rivals(profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, rules: SearchRules) -> np.ndarray:
+    """Those of some lines (M,) on which something stands out in the board ``left`` by `search` that is no spike."""
+    found = np.zeros(len(lines), np.bool_)
+    _see_rivals(profiles, left, lines, np.empty(rules.block + 2, np.float32), rules, found)
+    return lines[found]
+
+
+def look_at(profiles: np.ndarray, lines: np.ndarray, centre: np.ndarray, options: StripeOptions) -> PeakWindow:
+    """Windows about stripes whose centres (M,) on M lines of the profiles (N, L) are known from elsewhere.
+
+    Their height is 0 where nothing stands out there.
+    """
+    rules = search_rules(options, coarse=0.0, fine=0.0, clip=np.inf)
+    peaks = _windows(len(lines), rules)
+    peaks.start[:] = np.rint(centre).astype(np.intp) - rules.half - rules.block // 2
+    _look_at_lines(profiles, lines, *_room(peaks), rules, peaks)
+    return peaks
 
 
 @compiled
@@ -184,9 +176,11 @@ def _search_lines(
     wide: np.ndarray,
     several: np.ndarray,
     peaks: PeakWindow,
-) -> None:
-    """Fill `status`, `wide`, `several` and the windows of lines with a stripe; those of others are undefined."""
-    size, border = smooth.size, kernel.size // 2
+) -> int:
+    """Fill `status`, `wide`, `several` and the windows of the lines with a stripe; returns how many there are."""
+    size, border, count = smooth.size, kernel.size // 2, np.intp(0)
+    window = pixels[border : border + size]
+    near = window[rules.half - 1 : rules.half + rules.block + 1]
     for line in range(profiles.shape[1]):
         blocks, least = board[line], np.float32(rules.coarse)
         for _ in range(_LOOKS):
@@ -197,27 +191,26 @@ def _search_lines(
             if chosen < 0:
                 break
             there = np.float32(blocks[chosen])
-            start, window = (chosen - MARGIN) * rules.block - rules.half, pixels[border : border + size]
-            cut(profiles, line, start, window)
-            near = window[rules.half - 1 : rules.half + rules.block + 1]
-            if there < _CLEAR * rules.fine and _is_spike(near, there, rules.fine):
-                blocks[chosen] = 0
-                continue
-            start, peak = _followed(profiles, line, start, kernel, pixels, smooth, rules)
+            blocks[chosen] = 0
+            start = (chosen - MARGIN) * rules.block - rules.half
+            if there < _CLEAR * rules.fine:
+                cut(profiles, line, start + rules.half - 1, near)
+                if _is_spike(near, there, rules.fine):
+                    continue
+            start, peak = _followed(profiles, line, start, kernel, pixels, window, smooth, rules)
             verdict = _judged(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE:
                 wide[line] |= _is_too_wide(peak, rules)
-                blocks[chosen] = 0
                 continue
             # The window has been searched for rivals already.
             for k in range(chosen - MARGIN, chosen + MARGIN + 1):
                 blocks[k] = 0
             if status[line] == _OK:
                 # The flank of a wide stripe may stand out in a block of its own and lead back to the same stripe.
-                away = abs(start + peak.middle - (peaks.start[line] + peaks.middle[line]))
+                away = abs(start + peak.middle - (peaks.start[count] + peaks.middle[count]))
                 if (
-                    away > peaks.sigma[line] * np.float32(FWHM_PER_SIGMA)
-                    and peak.height >= rules.share * peaks.height[line]
+                    away > peaks.sigma[count] * np.float32(FWHM_PER_SIGMA)
+                    and peak.height >= rules.share * peaks.height[count]
                 ):
                     status[line] = _AMBIGUOUS
                     several[line] = True
@@ -227,11 +220,13 @@ def _search_lines(
             if verdict != _OK:
                 several[line] = True
                 break
-            peaks.start[line] = start
-            _keep(peaks, line, peak, window)
+            _keep(peaks, count, start, peak, window)
             if rules.order != STRONGEST:
                 break
             least = max(least, there * np.float32(rules.share * _COARSE_SLACK))
+        if status[line] == _OK:
+            count += 1
+    return count
 
 
 @compiled
@@ -262,9 +257,11 @@ def _search_all(
     peaks: PeakWindow,
 ) -> int:
     """Fill `found`, `clear` and the windows of all stripes on some lines; returns how many there are."""
-    size, border, count = smooth.size, kernel.size // 2, 0
-    for line in lines:
-        blocks, first = board[line], count
+    size, border, count = smooth.size, kernel.size // 2, np.intp(0)
+    window = pixels[border : border + size]
+    near = window[rules.half - 1 : rules.half + rules.block + 1]
+    for m in range(lines.size):
+        line, blocks, first = lines[m], board[m], count
         for _ in range(2 * _MOST):
             there = _greatest_block(blocks)
             if there < rules.coarse or there <= 0 or count == first + _MOST:
@@ -273,12 +270,12 @@ def _search_all(
             while blocks[chosen] != there:
                 chosen += 1
             blocks[chosen] = 0
-            start, window = (chosen - MARGIN) * rules.block - rules.half, pixels[border : border + size]
-            cut(profiles, line, start, window)
-            near = window[rules.half - 1 : rules.half + rules.block + 1]
-            if there < _CLEAR * rules.fine and _is_spike(near, np.float32(there), rules.fine):
-                continue
-            start, peak = _followed(profiles, line, start, kernel, pixels, smooth, rules)
+            start = (chosen - MARGIN) * rules.block - rules.half
+            if there < _CLEAR * rules.fine:
+                cut(profiles, line, start + rules.half - 1, near)
+                if _is_spike(near, np.float32(there), rules.fine):
+                    continue
+            start, peak = _followed(profiles, line, start, kernel, pixels, window, smooth, rules)
             verdict = _judged(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE and not _is_too_wide(peak, rules):
                 continue
@@ -288,8 +285,8 @@ def _search_all(
                 known |= apart <= np.float32(FWHM_PER_SIGMA) * max(peaks.sigma[k], peak.sigma)
             if known:
                 continue
-            found[count], clear[count], peaks.start[count] = line, verdict == _OK, start
-            _keep(peaks, count, peak, window)
+            found[count], clear[count] = line, verdict == _OK
+            _keep(peaks, count, start, peak, window)
             count += 1
         _leave_minor_out(first, count, rules, found, clear, peaks)
     return count
@@ -318,19 +315,25 @@ def _followed(
     start: int,
     kernel: np.ndarray,
     pixels: np.ndarray,
+    window: np.ndarray,
     smooth: np.ndarray,
     rules: SearchRules,
 ) -> tuple[int, Peak]:
-    """What stands in a window that has been cut out of a line, moved with its pixels to the peak, and its beginning."""
-    filtered(pixels, kernel, smooth)
-    peak = measured(smooth, start, profiles.shape[0], rules)
-    offset = _offset(peak, smooth.size, rules)
-    if offset != 0:
-        start += offset
-        cut(profiles, line, start, pixels[kernel.size // 2 :][: smooth.size])
+    """What stands in the window that begins at `start`, moved with its pixels to the peak, and its beginning.
+
+    ``window`` are the pixels without their borders.
+    """
+    offset = 0
+    while True:
+        cut(profiles, line, start + offset, window)
         filtered(pixels, kernel, smooth)
-        peak = measured(smooth, start, profiles.shape[0], rules)
-    return start, peak
+        peak = measured(smooth, start + offset, profiles.shape[0], rules)
+        if offset != 0:
+            break
+        offset = _offset(peak, smooth.size, rules)
+        if offset == 0:
+            break
+    return start + offset, peak
 
 
 @compiled_part
@@ -351,9 +354,10 @@ def _is_too_wide(peak: Peak, rules: SearchRules) -> bool:
 
 
 @compiled_part
-def _keep(peaks: PeakWindow, number: int, peak: Peak, window: np.ndarray) -> None:
+def _keep(peaks: PeakWindow, number: int, start: int, peak: Peak, window: np.ndarray) -> None:
     """Keep a peak and its window under a number."""
-    peaks.middle[number], peaks.sigma[number], peaks.reach[number] = peak.middle, peak.sigma, peak.reach
+    peaks.start[number], peaks.middle[number], peaks.sigma[number] = start, peak.middle, peak.sigma
+    peaks.reach[number] = peak.reach
     peaks.base[number], peaks.slope[number], peaks.height[number] = peak.base, peak.slope, peak.height
     for k in range(window.size):
         peaks.window[number, k] = window[k]

@@ -8,7 +8,7 @@ from tests.uwlts.joint_views import MEDIUM, seen
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.model.joint_estimate import JointEstimate
 from uwlts.model.placement import camera_from_object, laser_pose
-from uwlts.optics.brightness import beside_sheet, footprint_mm, moved_by_blur_px, sheet_sigma_mm, slopes_of_brightness
+from uwlts.optics.brightness import LitSheet, moved_by_blur_px, sheet_sigma_mm, slopes_of_brightness
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
@@ -56,8 +56,8 @@ def test_the_footprint_is_that_of_sheet_and_blur(thesis):
     width = 2.3548 * np.hypot(blur_px, sigma * per_mm)
     calibration = nominal_calibration(thesis, medium=MEDIUM)
     line, centre = np.full(50, pixels[0, 0]), np.full(50, pixels[0, 1])
-    found = footprint_mm(calibration, thesis, line, centre, np.full(50, width), medium_index=WATER)
-    assert found == pytest.approx((sigma, blur_px * per_line), rel=0.01)
+    sheet = LitSheet.of(calibration, thesis, line, centre, medium_index=WATER)
+    assert sheet.footprint_mm(np.full(50, width)) == pytest.approx((sigma, blur_px * per_line), rel=0.01)
 
 
 def test_points_lie_where_the_light_comes_from(thesis, tmp_path):
@@ -97,7 +97,9 @@ def test_the_sheet_is_no_thicker_than_the_stripes_are_wide(thesis):
     laser = thesis.laser.model_copy(update={"waist_radius_mm": 3.0})
     calibration = nominal_calibration(thesis, thesis.media["water"])
     thick, thin = (
-        beside_sheet(calibration, sensor, line, centre, width, slopes, medium_index=WATER, stage_direction=(1, 0, 0))
+        LitSheet.of(calibration, sensor, line, centre, medium_index=WATER).beside(
+            width, slopes, stage_direction=(1, 0, 0)
+        )
         for sensor in (thesis.model_copy(update={"laser": laser}), thesis)
     )
     along_z = thick / thick[:, 2:]

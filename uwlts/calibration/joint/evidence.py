@@ -1,7 +1,7 @@
 """Residuals in pixels of target points, stripes on the target and stripes on steps, with their derivatives."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Self
@@ -10,17 +10,20 @@ import cv2
 import numpy as np
 
 from uwlts.calibration.camera import centre_offsets
-from uwlts.calibration.joint.derivatives import COLUMNS, PointDerivatives
-from uwlts.calibration.joint.parameters import Parameters, ViewMedium
+from uwlts.calibration.joint.parameters import Parameters, StripePoints, ViewMedium
 from uwlts.calibration.target_images import Placement
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight, TargetParameter
 from uwlts.model.sensor import Uncertainty
+from uwlts.optics.line_table import LineTable, sum_series
 from uwlts.optics.window import leaning
 
 TARGET, STRIPE, STEP = "target", "stripe on the target", "stripe on the step"
 BENDS = (TargetParameter.BOW, TargetParameter.SADDLE)
 STRETCH = (TargetParameter.STRETCH_X, TargetParameter.STRETCH_Y)
 SHIFT = TargetParameter.STRIPE
+_TABLE_MM, _TABLE_SHARE = 1e-7, 1e-7
+"""Error of tabulated points of the sheet, and that of their derivatives as a share of the largest."""
+
 _TOGETHER = 2000
 """Pixels whose residuals are computed together: fewer take longer each, and those of more leave the cache."""
 
@@ -95,22 +98,16 @@ class StripeEvidence(ABC):
                 predicted[self.lit(part.image), self.across] -= np.where(kept, part.values, 0.0)
         return replace(self, predicted=predicted)
 
-    def on_sheet(
-        self,
-        parameters: Parameters,
-        global_values: np.ndarray,
-        here: np.ndarray | slice = slice(None),
-        *,
-        shifted_px: float = 0.0,
-    ) -> PointDerivatives | None:
-        """Points of the sheet that the pixels show, of a stripe shifted across itself; None where a ray misses it."""
+    def on_sheet(self, parameters: Parameters, global_values: np.ndarray, *, shifted_px: float = 0.0) -> "SeenSheet":
+        """Points of the sheet that the pixels show, of a stripe shifted across itself."""
         at_px = self.pixels if self.predicted is None else self.predicted
-        return parameters.on_sheet(global_values, self.view, at_px[here] - shifted_px * np.eye(2)[self.across])
+        at_px = at_px - shifted_px * np.eye(2)[self.across]
+        return SeenSheet.of(parameters, global_values, self.view, at_px, across=self.across)
 
     def stripe_residuals(
         self,
         parameters: Parameters,
-        points: PointDerivatives,
+        points: StripePoints,
         off: Distances,
         *,
         kind: str,
@@ -123,24 +120,73 @@ class StripeEvidence(ABC):
 
         Where a pixel moves the distance by less than ``least_share`` of how far it moves the point, that share counts.
         """
-        by_rays = np.einsum("in,cin->cn", off.outward, points.by_rays)
-        by_global = parameters.by_global(by_rays, self.view, np.einsum("in,cin->cn", off.outward, points.by_sheet))
+        by = points.along(off.outward)
+        by_px, by_global = by[:, 0], by[:, 1:]
         for key, column in off.by_global.items():
             parameters.add(by_global, key, column)
-        column = COLUMNS.index("uv"[self.across])
-        per_px, found_px = by_rays[column], self.pixels[here, self.across]
+        per_px, found_px = by_px, self.pixels[here, self.across]
         at_px = found_px if self.predicted is None else self.predicted[here, self.across]
         if least_share:
-            least = least_share * np.linalg.norm(points.by_rays[column], axis=0)
+            least = least_share * np.linalg.norm(points.by[:, :, 0], axis=1)
             per_px = np.copysign(np.maximum(np.abs(per_px), least), per_px)
         return Residuals(
             kind,
-            (found_px - at_px) * (by_rays[column] / per_px) + off.values_mm / per_px,
+            (found_px - at_px) * (by_px / per_px) + off.values_mm / per_px,
             by_global / per_px[:, None],
             off.by_local / per_px[:, None],
             local_columns,
             image,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSheet:
+    """Points of the sheet that stripe pixels (N, 2) show: calculated one by one, or by a table where there are many.
+
+    ``table`` are the series of lines, and the row and the argument (N,) of each pixel, as of `LineTable.series`.
+    """
+
+    exact: Callable[[np.ndarray], StripePoints | None]
+    pixels: np.ndarray
+    table: tuple[np.ndarray, np.ndarray, np.ndarray] | None
+
+    @classmethod
+    def of(
+        cls, parameters: Parameters, global_values: np.ndarray, view: ViewMedium, pixels: np.ndarray, *, across: int
+    ) -> "SeenSheet":
+        """That of a vector of the global parameters."""
+        exact = partial(parameters.stripe_points, global_values, view, across=across)
+        line, place = pixels[:, 1 - across].astype(np.intp), pixels[:, across]
+        if not (line == pixels[:, 1 - across]).all():
+            return cls(exact, pixels, None)
+
+        def values(line: np.ndarray, place: np.ndarray) -> np.ndarray:
+            found = exact(np.stack([line, place] if across else [place, line], axis=1))
+            if found is None:
+                return np.full((len(line), 1), np.nan)
+            return np.hstack([found.points.T, found.by.reshape(len(line), -1)])
+
+        table = LineTable.about(values, line, place, tolerance=_TABLE_MM, share=_TABLE_SHARE)
+        return cls(exact, pixels, None if table is None else table.series(line, place))
+
+    def places_mm(self) -> np.ndarray | None:
+        """The points (3, N) alone; None where the ray of one meets no sheet."""
+        if self.table is None:
+            found = self.exact(self.pixels)
+            return None if found is None else found.points
+        series, row, at = self.table
+        values = np.empty((len(row), 3))
+        sum_series(np.ascontiguousarray(series[:, :, :3]), row, at, values)
+        return values.T
+
+    def points(self, here: np.ndarray | slice = slice(None)) -> StripePoints | None:
+        """Those of some of the pixels (n,); None where the ray of one meets no sheet."""
+        if self.table is None:
+            return self.exact(self.pixels[here])
+        series, row, at = self.table
+        values = np.empty((len(row[here]), series.shape[2]))
+        sum_series(series, row[here], at[here], values)
+        return StripePoints(np.ascontiguousarray(values[:, :3].T), values[:, 3:].reshape(len(values), 3, -1))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -212,7 +258,9 @@ class TargetEvidence(StripeEvidence):
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
         """Those of the target's points and of the stripe, image by image; None where a ray meets nothing."""
         found: list[Residuals] = []
-        for of_kind, image in ((self._of_points, self.placement.image), (self._of_stripe, self.image)):
+        sheet = self.on_sheet(parameters, global_values, shifted_px=parameters.value(global_values, SHIFT))
+        of_stripe = partial(self._of_stripe, sheet)
+        for of_kind, image in ((self._of_points, self.placement.image), (of_stripe, self.image)):
             for here in _batches(image):
                 pose = _Poses(self, parameters, global_values, local, image[here])
                 if (parts := of_kind(parameters, global_values, pose, here)) is None:
@@ -271,10 +319,10 @@ class TargetEvidence(StripeEvidence):
         return pose.by_image(TARGET, values, to_pixels(by_global), by_local)
 
     def _of_stripe(
-        self, parameters: Parameters, global_values: np.ndarray, pose: "_Poses", here: np.ndarray
+        self, sheet: SeenSheet, parameters: Parameters, global_values: np.ndarray, pose: "_Poses", here: np.ndarray
     ) -> list[Residuals] | None:
         """Those of some of the stripe's pixels (n,), image after image."""
-        points = self.on_sheet(parameters, global_values, here, shifted_px=parameters.value(global_values, SHIFT))
+        points = sheet.points(here)
         if points is None:
             return None
         at = pose.into_target(points.points)
@@ -283,7 +331,7 @@ class TargetEvidence(StripeEvidence):
         steep = -2.0 / self.radius_mm**2 * np.array([[bow + saddle], [bow - saddle]])
         gradient = np.stack([*(steep * (at[:2] - self.middle_mm[:, None])), np.ones(at.shape[1])])
         outward = pose.rotation @ gradient
-        by_stripe = -np.sum(outward * points.by_rays[COLUMNS.index("uv"[self.across])], axis=0)
+        by_stripe = -np.einsum("in,ni->n", outward, points.by[:, :, 0])
         by_global = {SHIFT: by_stripe, StageParameter.SCALE: np.sum(pose.by_scale() * gradient, axis=0)}
         off = Distances(
             at[2] - bow * bends[0] - saddle * bends[1],
@@ -400,7 +448,7 @@ class StepProfileEvidence(StripeEvidence):
         return np.full(2, np.inf)
 
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
-        points = self.on_sheet(parameters, global_values)
+        points = self.on_sheet(parameters, global_values).points()
         if points is None:
             return None
         normal, by_slope = leaning(self.upward, self.along[None], local[:1])

@@ -37,7 +37,7 @@ from uwlts.model.parameter_keys import StepHeight
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import pixels_of
-from uwlts.optics.brightness import BLUR_STD, beside_sheet, beside_std
+from uwlts.optics.brightness import BLUR_STD, LitSheet, beside_std
 from uwlts.optics.camera import directions
 from uwlts.optics.reconstruction import reconstruct_pixels
 from uwlts.optics.window import trace_window
@@ -274,7 +274,7 @@ def step_profiles(
 
 def line_start(evidence: StepProfileEvidence, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
     """The lower face's line (2,) at the parameters' start."""
-    points = evidence.on_sheet(parameters, global_values)
+    points = evidence.on_sheet(parameters, global_values).points()
     if points is None:
         raise CalibrationError("the stripe on a step meets no sheet at the calibration's start: check the window")
     up = evidence.upward @ points.points - evidence.upper_mm(parameters, global_values)
@@ -300,8 +300,8 @@ def surface_scan(
         ).points_mm
 
     on_sheet = reconstructed(pixels, stage_mm)
-    width, slopes, along = stripes.width_px, stripes.slopes, tuple(direction.tolist())
-    beside = beside_sheet(start, sensor, line, centre, width, slopes, medium_index=medium_index, stage_direction=along)
+    sheet = LitSheet.of(start, sensor, line, centre, medium_index=medium_index)
+    beside = sheet.beside(stripes.width_px, stripes.slopes, stage_direction=tuple(direction.tolist()))
     points = on_sheet + beside
     # At the rims few points are left, and those are doubtful, as are those where the brightness changes fast.
     often = np.bincount(stripes.frame)[stripes.frame] >= _FEWEST_POINTS

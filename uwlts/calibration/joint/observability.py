@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwlts.calibration.joint.derivatives import COLUMNS
 from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, found_estimate, require_joint
 from uwlts.model.calibration import Calibration
@@ -110,13 +109,13 @@ def estimate_in(calibration: Calibration, region: SheetRegion) -> StoredEstimate
 def points_at(known: StoredEstimate, at_mm: np.ndarray) -> SheetSamples:
     """Points of the sheet at Y and Z (N, 2) of the OCS; CalibrationError where the camera does not see one of them."""
     pixels = pixels_at(known, at_mm)
-    points = known.parameters.on_sheet(known.values, known.view, pixels) if np.isfinite(pixels).all() else None
-    if points is None:
+    found = None
+    if np.isfinite(pixels).all():
+        found = known.parameters.stripe_points(known.values, known.view, pixels, across=known.across())
+    if found is None:
         raise CalibrationError("the calibration's covered volume lies outside the camera's view: calibrate again")
-    into_object = known.calibration.object_transform()[:3, :3].T
-    by = [known.parameters.by_global(points.by_rays[:, i], known.view, points.by_sheet[:, i]) for i in range(3)]
-    by_px = points.by_rays[COLUMNS.index("uv"[known.across()])].T @ into_object.T
-    return SheetSamples(at_mm, np.einsum("ij,jnp->nip", into_object, np.stack(by)), by_px)
+    by = np.einsum("ji,njp->nip", known.calibration.object_transform()[:3, :3], found.by)
+    return SheetSamples(at_mm, by[:, :, 1:], by[:, :, 0])
 
 
 def pixels_at(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:

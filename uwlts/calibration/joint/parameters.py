@@ -87,6 +87,21 @@ def window_values(window: WindowModel) -> dict[ParameterKey, float]:
 
 
 @dataclass(frozen=True, eq=False)
+class StripePoints:
+    """Points (3, N) of the sheet in mm, camera frame, and their derivatives (N, 3, 1 + P).
+
+    By the pixel across the stripe first, then by the global parameters.
+    """
+
+    points: np.ndarray
+    by: np.ndarray
+
+    def along(self, directions: np.ndarray) -> np.ndarray:
+        """Derivatives (N, 1 + P) of how far the points lie along directions (3, N)."""
+        return np.einsum("in,nic->nc", directions, self.by)
+
+
+@dataclass(frozen=True, eq=False)
 class Parameters:
     """Keys and places of the global parameters in one vector (P,).
 
@@ -103,10 +118,12 @@ class Parameters:
     priors: dict[ParameterKey, Prior]
     earlier: EarlierEstimate | None = None
     keys: tuple[ParameterKey, ...] = field(init=False)
+    places: dict[ParameterKey, int] = field(init=False)
 
     def __post_init__(self) -> None:
         known = (key for key, prior in self.priors.items() if prior.std > 0 and not isinstance(key, LensParameter))
         object.__setattr__(self, "keys", (*self.intrinsics.keys, *known))
+        object.__setattr__(self, "places", {key: place for place, key in enumerate(self.keys)})
 
     def start(self, lens: np.ndarray) -> np.ndarray:
         """Vector (P,) with the lens's parameters as given and the others as known before."""
@@ -153,6 +170,19 @@ class Parameters:
             return None
         return points_on_sheet(self.sheet, self._sheet_values(values), rays, self.medium_index(values, view))
 
+    def stripe_points(
+        self, values: np.ndarray, view: ViewMedium, pixels: np.ndarray, *, across: int
+    ) -> StripePoints | None:
+        """As `on_sheet`, for pixels (N, 2) of a stripe; the coordinate ``across``, 0 or 1, runs across it."""
+        found = self.on_sheet(values, view, pixels)
+        if found is None:
+            return None
+        by = np.empty((len(pixels), 3, 1 + len(self.keys)))
+        by[:, :, 0] = found.by_rays[across].T
+        for axis in range(3):
+            by[:, axis, 1:] = self.by_global(found.by_rays[:, axis], view, found.by_sheet[:, axis])
+        return StripePoints(found.points, by)
+
     def project(self, values: np.ndarray, view: ViewMedium, points: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) of points (N, 3) in the camera frame, seen through a view; NaN where there is none."""
         window = self.window_model(values) if view.window else None
@@ -174,14 +204,14 @@ class Parameters:
 
     def value(self, values: np.ndarray, key: ParameterKey) -> float:
         """A parameter but the lens's; zero for one that there is not."""
-        if key in self.keys:
-            return float(values[self.keys.index(key)])
+        if (place := self.places.get(key)) is not None:
+            return float(values[place])
         return self.priors[key].mean if key in self.priors else 0.0
 
     def add(self, by_global: np.ndarray, key: ParameterKey, column: np.ndarray) -> None:
         """Add derivatives (N,) by a parameter to those of all (N, P), where it is estimated."""
-        if key in self.keys:
-            by_global[:, self.keys.index(key)] += column
+        if (place := self.places.get(key)) is not None:
+            by_global[:, place] += column
 
     def index_key(self, medium: int) -> MediumIndex:
         """The index of a medium by its number."""

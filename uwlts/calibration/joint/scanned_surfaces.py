@@ -235,7 +235,7 @@ class SurfaceScanEvidence(StripeEvidence):
         return self.frame == image - self.image
 
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
-        points = self.on_sheet(parameters, global_values)
+        points = self.on_sheet(parameters, global_values).points()
         if points is None:
             return None
         count = len(local) - len(self.stage_mm)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from uwlts.calibration.intrinsics import DISTORTION, CameraOptions, Intrinsics
 from uwlts.calibration.joint.derivatives import DescribedSheet
 from uwlts.calibration.joint.estimate import Estimate, Evidence
-from uwlts.calibration.joint.evidence import TARGET
+from uwlts.calibration.joint.evidence import TARGET, SeenSheet
 from uwlts.calibration.joint.noise import outliers
 from uwlts.calibration.joint.parameters import Parameters, Prior, ViewMedium, window_values
 from uwlts.calibration.sheet import object_frame
@@ -87,7 +87,10 @@ def _joint_estimate(result: Estimate, evidence: Sequence[Evidence], object_frame
         rounds=result.rounds,
         stopped=result.stopped,
         images=tuple(images),
-        covered=tuple(_covered(result, view, np.vstack(pixels), object_frame) for view, pixels in lit.items()),
+        covered=tuple(
+            _covered(result, view, np.vstack(pixels), object_frame, across=evidence[0].across)
+            for view, pixels in lit.items()
+        ),
     )
 
 
@@ -103,17 +106,19 @@ def _lens_and_window(result: Estimate) -> dict[str, Table]:
     return figures
 
 
-def _covered(result: Estimate, view: ViewMedium, pixels: np.ndarray, object_frame: np.ndarray) -> CoveredRegion:
-    seen = result.parameters.on_sheet(result.values, view, pixels)
+def _covered(
+    result: Estimate, view: ViewMedium, pixels: np.ndarray, object_frame: np.ndarray, *, across: int
+) -> CoveredRegion:
+    seen = SeenSheet.of(result.parameters, result.values, view, pixels, across=across).places_mm()
     if seen is None:
         raise CalibrationError("a stripe that was used meets no sheet by the joint estimate")
-    at = (object_frame[:3, 1:3].T @ (seen.points - object_frame[:3, 3:4])).T
+    at = (object_frame[:3, 1:3].T @ (seen - object_frame[:3, 3:4])).T
     return CoveredRegion(
         medium=view.medium,
         name="air" if view.medium is None else result.parameters.media[view.medium],
         window=view.window,
         point_count=len(at),
-        camera_depth_mm=(float(seen.points[2].min()), float(seen.points[2].max())),
+        camera_depth_mm=(float(seen[2].min()), float(seen[2].max())),
         outline_mm=tuple(map(tuple, np.round(outline(at), 3).tolist())),
     )
 
@@ -149,18 +154,11 @@ class StoredEstimate:
         None where a centre has no point.
         """
         pixels = pixels_of(line, centre_px, stripe_along=self.calibration.stripe_along)
-        points = self.parameters.on_sheet(self.values, self.view, pixels)
-        if points is None:
+        found = self.parameters.stripe_points(self.values, self.view, pixels, across=self.across())
+        if found is None:
             return None
-        result = np.empty((len(line), 3, 1 + len(self.values)))
-        result[:, :, 0] = points.by_rays[self.across()].T
-        for axis in range(3):
-            result[:, axis, 1:] = self.parameters.by_global(
-                points.by_rays[:, axis], self.view, points.by_sheet[:, axis]
-            )
         frame = self.calibration.object_transform()
-        at = (points.points.T - frame[:3, 3]) @ frame[:3, :3]
-        return at, np.einsum("ji,njr->nir", frame[:3, :3], result)
+        return (found.points.T - frame[:3, 3]) @ frame[:3, :3], np.einsum("ji,njr->nir", frame[:3, :3], found.by)
 
     def frame_by(self) -> np.ndarray:
         """Derivatives (6, P) of the OCS by the parameters: shift, mm, and rotation, rad, along its own axes.

@@ -51,8 +51,8 @@ def _best_heights(peak: PeakWindow, centre: np.ndarray, result: np.ndarray) -> N
         near = min(max(math.floor(middle + np.float32(0.5)), 0), size - 1)
         # A Gaussian by recurrence on both sides; see `gaussian_moments`.
         sharpness, offset, half = np.float32(1.0) / (width * width), np.float32(near) - middle, np.float32(0.5)
-        weight = np.exp(-half * sharpness * offset * offset)
-        after, before = np.exp(-sharpness * (half + offset)), np.exp(-sharpness * (half - offset))
+        weight = math.exp(-half * sharpness * offset * offset)
+        after, before = math.exp(-sharpness * (half + offset)), math.exp(-sharpness * (half - offset))
         falling = after * before
         total, right, left = weight * (pixels[near] - ground), weight * after, weight * before
         for k in range(1, math.ceil(np.float32(4.0) * width) + 1):

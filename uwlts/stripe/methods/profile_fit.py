@@ -12,7 +12,7 @@ import numpy as np
 
 from uwlts.runtime.compiled import compiled, compiled_part
 from uwlts.stripe.methods import quadratic
-from uwlts.stripe.peak_window import FLANK, FWHM_PER_SIGMA, PeakWindow, greatest
+from uwlts.stripe.peak_window import FLANK, FWHM_PER_SIGMA, PeakWindow
 
 _STEPS, _FIRST_STEPS = 5, 2
 """Steps in all, and those before the contrast is taken from what the fit leaves."""
@@ -73,21 +73,16 @@ def centres(peak: PeakWindow) -> np.ndarray:
     _flank_noise(peak, sampled, flanks)
     # The floor: that of the usual line.
     middle = [(sampled.size - 1) // 2, sampled.size // 2]
-    noise = max(_LEAST_NOISE, math.sqrt(np.partition(flanks, middle)[middle].mean() / _MEDIAN_MEAN_SQUARE))
+    low, high = np.partition(flanks, middle)[middle].tolist()
+    noise = max(_LEAST_NOISE, math.sqrt(0.5 * (low + high) / _MEDIAN_MEAN_SQUARE))
     groups, most = -(-peak.start.size // _LANES), int(peak.reach.max())
     # Flat rows, of which the compiler knows that their parts do not overlap.
     signal = np.empty((groups, (2 * most + 1) * _LANES), np.float32)
     known, sums = np.empty((groups, _KNOWN * _LANES), np.float32), np.empty(14 * _LANES, np.float32)
-    _fit(peak, noise, sampled, signal, known, sums)
-    centre = np.floor(peak.middle + np.float32(0.5)) + known[:, _CENTRE : _CENTRE + _LANES].ravel()[: peak.start.size]
-    width = np.float32(FWHM_PER_SIGMA) * peak.sigma
-    haloed = np.flatnonzero((noise > _SPECKLED_HALO * peak.height) & (width > _PLATEAU))
-    if haloed.size:
-        window = peak.window[haloed]
-        plateau = np.count_nonzero(window == window.max(axis=1, keepdims=True), axis=1)
-        flat = haloed[plateau > np.maximum(_MOSTLY * width[haloed], _PLATEAU)]
-        if flat.size:
-            centre[flat] = quadratic.centres(peak.keep(flat))
+    centre, flat = np.empty(peak.start.size, np.float32), np.empty(peak.start.size, np.bool_)
+    _fit(peak, noise, sampled, signal, known, sums, centre, flat)
+    if flat.any():
+        centre[flat] = quadratic.centres(peak.keep(flat))
     return centre
 
 
@@ -106,9 +101,16 @@ def _flank_noise(peak: PeakWindow, sampled: np.ndarray, result: np.ndarray) -> N
 
 @compiled
 def _fit(
-    peak: PeakWindow, noise: float, sampled: np.ndarray, signal: np.ndarray, known: np.ndarray, sums: np.ndarray
+    peak: PeakWindow,
+    noise: float,
+    sampled: np.ndarray,
+    signal: np.ndarray,
+    known: np.ndarray,
+    sums: np.ndarray,
+    centre: np.ndarray,
+    flat: np.ndarray,
 ) -> None:
-    """Fit all lines; the fits are in ``known``, while ``signal`` and ``sums`` are room to work in."""
+    """Fill the centres (M,), and mark the lines (M,) with a plateau in a halo; all others are room to work in."""
     _set_side_by_side(peak, noise, signal, known)
     contrast = _USUAL_CONTRAST
     for step in range(_STEPS):
@@ -117,6 +119,17 @@ def _fit(
         for group in range(known.shape[0]):
             _sum_moments(known[group], signal[group], np.float32(contrast * contrast), sums)
             _step(known[group], sums)
+    size = peak.window.shape[1]
+    for m in range(centre.size):
+        centre[m] = math.floor(peak.middle[m] + np.float32(0.5)) + known[m // _LANES, _CENTRE + m % _LANES]
+        width, plateau, highest = np.float32(FWHM_PER_SIGMA) * peak.sigma[m], 0, np.float32(-np.inf)
+        if noise > _SPECKLED_HALO * peak.height[m] and width > _PLATEAU:
+            window = peak.window[m]
+            for k in range(size):
+                highest = max(highest, window[k])
+            for k in range(size):
+                plateau += window[k] == highest
+        flat[m] = plateau > max(_MOSTLY * width, _PLATEAU)
 
 
 @compiled_part
@@ -143,7 +156,8 @@ def _set_side_by_side(peak: PeakWindow, noise: float, signal: np.ndarray, known:
             known[group, _CENTRE + k], known[group, _HEIGHT + k] = centre, max(peak.height[m], _TINY)
             known[group, _SIGMA + k], known[group, _WIDEST + k] = broad, broad * np.float32(_WIDENING)
             known[group, _FIRST + k], known[group, _LAST + k] = centre - half_width, centre + half_width
-            known[group, _FLOOR + k] = np.float32(noise * noise) + (np.float32(_UNMODELLED) * peak.height[m]) ** 2
+            unmodelled = np.float32(_UNMODELLED) * peak.height[m]
+            known[group, _FLOOR + k] = np.float32(noise * noise) + unmodelled * unmodelled
             known[group, _REACH + k] = peak.reach[m]
 
 
@@ -154,13 +168,14 @@ def _contrast(known: np.ndarray, signal: np.ndarray, sampled: np.ndarray, noise:
     The degrees of freedom of the fit are not accounted for.
     """
     most = signal.shape[1] // (2 * _LANES)
-    total, count = _PRIOR_PIXELS * _USUAL_CONTRAST**2, _PRIOR_PIXELS
+    total, count = _PRIOR_PIXELS * _USUAL_CONTRAST * _USUAL_CONTRAST, _PRIOR_PIXELS
     for m in sampled:
         fit, k = known[m // _LANES], m % _LANES
         centre, height, sigma = fit[_CENTRE + k], fit[_HEIGHT + k], fit[_SIGMA + k]
         half = 0.5 * FWHM_PER_SIGMA * sigma
         for x in range(max(math.ceil(centre - half), -most), min(math.floor(centre + half), most) + 1):
-            model = height * math.exp(-0.5 * ((x - centre) / sigma) ** 2)
+            away = (x - centre) / sigma
+            model = height * math.exp(-0.5 * away * away)
             left = signal[m // _LANES, (most + x) * _LANES + k] - model
             total += (left * left - noise * noise) / (model * model)
             count += 1.0
@@ -174,7 +189,9 @@ def _sum_moments(known: np.ndarray, signal: np.ndarray, squared_contrast: np.flo
     From the middle outwards, both sides at a time, the model goes on by the ratio of neighbouring values, which falls
     by the same factor from pixel to pixel.
     """
-    most, reach = signal.size // (2 * _LANES), int(greatest(known[_REACH : _REACH + _LANES]))
+    most, reach = signal.size // (2 * _LANES), 0
+    for k in range(_LANES):
+        reach = max(reach, int(known[_REACH + k]))
     y = signal[most * _LANES :][:_LANES]
     for k in range(_LANES):
         centre, inverse = known[_CENTRE + k], np.float32(1.0) / known[_SIGMA + k]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import KDTree
 
-from uwlts.runtime.compiled import compiled, compiled_part
+from uwlts.runtime.compiled import compiled, compiled_part, compiled_with_arrays
 from uwlts.targets.detection.blobs import Blobs, checked_grey, find_blobs, noise_level
 
 PASSES = 2
@@ -256,7 +256,7 @@ def _moved(grey, ellipses, longest, noise):
     return moved, whole & (np.linalg.eigvalsh(shapes)[:, 0] > 1.0)
 
 
-@compiled
+@compiled_with_arrays
 def _measure_edges(
     grey, centres, shapes, inverses, reaches, shares, directions, sign, disturbed, room, normal, right, figures
 ):
