@@ -245,8 +245,7 @@ def path_margins(
     cost = vote + _own_cost(line, centre_px, amplitude, stripe, farther)
     before, after = np.empty((2, len(line)))
     _slopes(line, centre_px, stripe, before, after)
-    enter, leave = np.empty((2, len(line)))
-    _cuts(stripe, enter, leave)
+    enter, leave = _cuts(stripe)
     through, backwards = np.empty((2, len(line)))
     _least_cost(line, centre_px, before, after, cost, skipped, enter, leave, jump_px, through)
     turned = [
@@ -278,6 +277,16 @@ def _own_cost(
             whole = _BEHIND_CORNER if _meets(line[behind[own]], apart[own]) else _BEHIND
             cost[behind[own]] += whole / max(np.count_nonzero(own), _SOME_LINES)
     return cost
+
+
+def _cuts(stripe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What it costs (M,) to jump to each candidate, and from it, beyond the jump, by the rest of its stripe."""
+    order = np.argsort(stripe, kind="stable")
+    before = np.empty(len(stripe))
+    before[order] = np.arange(len(stripe)) - np.searchsorted(stripe[order], stripe[order])
+    after = np.bincount(stripe)[stripe] - 1 - before
+    enter, leave = (_CUT * np.minimum(rest / _SOME_LINES, 1.0) for rest in (before, after))
+    return enter, leave
 
 
 def _meets(line: np.ndarray, apart_px: np.ndarray) -> bool:
@@ -364,18 +373,6 @@ def _least_cost(
                 best = min(best, way)
         result[k] = best + cost[k]
         best_of_line = min(best_of_line, result[k] + 1.0 + leave[k])
-
-
-@compiled
-def _cuts(stripe: np.ndarray, enter: np.ndarray, leave: np.ndarray) -> None:
-    """What it costs (M,) to jump to each candidate and from it, beyond the jump, by the rest of its stripe."""
-    seen = np.zeros(stripe.size)
-    for k in range(stripe.size):
-        enter[k] = seen[stripe[k]]
-        seen[stripe[k]] += 1.0
-    for k in range(stripe.size):
-        leave[k] = _CUT * min((seen[stripe[k]] - enter[k] - 1.0) / _SOME_LINES, 1.0)
-        enter[k] = _CUT * min(enter[k] / _SOME_LINES, 1.0)
 
 
 @compiled
