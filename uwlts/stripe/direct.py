@@ -60,8 +60,9 @@ _MARGIN = 0.3
 """Jumps by which a path has to be the better one."""
 
 
-_VOTE = 0.01
-"""Cost, in jumps, of a candidate that an image beside refuses at its place, and what one costs less that it takes."""
+_VOTE, _VOTES = 0.01, 100
+"""Cost, in jumps, of a candidate that an image beside refuses at its place, and what one costs less that it takes; and
+from how many lines on the votes for a stripe count no more: a stripe may end between two images."""
 
 _REFUSED_BESIDE = 3
 """Lines between which a reflection that two stripes' crossing hides is the same one."""
@@ -197,7 +198,7 @@ class _Paths:
         """What each candidate costs (M,) by what another image has decided at its place."""
         result = np.zeros(len(self.line))
         _vote(self.line, self.centre_px, other.line, other.centre_px, other.state, other.alone, self.jump_px, result)
-        return result
+        return result * np.minimum(_VOTES / np.bincount(self.number)[self.number], 1.0)
 
     def stripe(self, before: Stripe) -> Stripe:
         """The stripe of the taken candidates; lines without any that had one are AMBIGUOUS."""
