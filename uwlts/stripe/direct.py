@@ -53,8 +53,8 @@ _BEHIND_CORNER = 1.5
 the other one is seen."""
 
 _CUT = 0.5
-"""Cost, in jumps, of a jump away from a stripe that goes on there, and of one into the middle of a stripe, if the rest has
-`_SOME_LINES` lines or more: where one surface ends before another one, both stripes have an end."""
+"""Cost, in jumps, of a jump away from a stripe that goes on there, and of one into the middle of a stripe, if the rest
+has `_SOME_LINES` lines or more: where one surface ends before another one, both stripes have an end."""
 
 _MARGIN = 0.3
 """Jumps by which a path has to be the better one."""
