@@ -50,7 +50,7 @@ show, but brighter than the own stripe of a mirror."""
 
 _BEHIND_CORNER = 1.5
 """The same for a stripe behind one that it meets: both begin in a corner, and the nearer one is the surface in which
-the other one is seen."""
+the other one is seen; not where that goes on alone beyond it for more than twice as long."""
 
 _CUT = 0.5
 """Cost, in jumps, of a jump away from a stripe that goes on there, and of one into the middle of a stripe, if the rest
@@ -274,9 +274,12 @@ def _own_cost(
         apart = np.abs(centre_px[behind] - centre_px[before])
         pairs = stripe[behind] * (len(line) + 1) + stripe[before]
         for pair in np.unique(pairs):
-            own = pairs == pair
-            whole = _BEHIND_CORNER if _meets(line[behind[own]], apart[own]) else _BEHIND
-            cost[behind[own]] += whole / max(np.count_nonzero(own), _SOME_LINES)
+            own = behind[pairs == pair]
+            corner = _corner(line[own], apart[pairs == pair])
+            alone = line[(stripe == stripe[own[0]]) & (count[group] == 1)]
+            beyond = np.count_nonzero(alone > line[own[-1]] if corner < 0 else alone < line[own[0]])
+            whole = _BEHIND_CORNER if corner and beyond <= 2 * len(own) else _BEHIND
+            cost[own] += whole / max(len(own), _SOME_LINES)
     return cost
 
 
@@ -290,21 +293,22 @@ def _cuts(stripe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return enter, leave
 
 
-def _meets(line: np.ndarray, apart_px: np.ndarray) -> bool:
-    """Whether distances (K,) of a stripe from the one before it shrink to nothing beyond one of its ends.
+def _corner(line: np.ndarray, apart_px: np.ndarray) -> int:
+    """Whether distances (K,) of a stripe from the one before it shrink to nothing: -1 before its first line, 1 behind its
+    last one, 0 nowhere.
 
     By the median slope (Theil and Sen), as the one before it may be lost on lines where still another one is seen.
     """
     if len(line) < _CROSSING_LINES:
-        return False
+        return 0
     for end, inwards in ((slice(None, _CORNER_LINES), 1), (slice(-_CORNER_LINES, None), -1)):
         lines, apart = line[end], apart_px[end]
         away = inwards * (lines - lines[0 if inwards > 0 else -1])
         one, other = np.triu_indices(len(lines), 1)
         growth = float(np.median((apart[other] - apart[one]) / (away[other] - away[one])))
         if growth > _OPENING and np.median(apart - growth * away) <= _LONGEST_CROSSING * growth:
-            return True
-    return False
+            return -inwards
+    return 0
 
 
 @compiled_with_arrays
