@@ -1,21 +1,24 @@
 """Mounts calibrated from simulated profiles of a sphere: errors, coverage, and points on a sphere that was held out.
 
     python docs/studies/mount_calibration.py 60
+    python docs/studies/mount_calibration.py 30 --artefact ring
     python docs/studies/mount_calibration.py 40 --sensors
 
-The second draws a sensor for each campaign from the covariance of its calibration (`tests/uwlts/sensor_profiles.py`).
+The second has a ring gauge of 50 mm in place of the sphere, or a step of 12 mm; the third draws a sensor for each
+campaign from the covariance of its calibration (`tests/uwlts/sensor_profiles.py`).
 """
 
 import argparse
 import sys
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from stripe_tables import table
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from tests.uwlts.mount_views import MOUNT, RADIUS_MM, Campaign, errors_of, sphere_campaign
+from tests.uwlts.mount_views import MOUNT, RADIUS_MM, Campaign, errors_of, ring_campaign, sphere_campaign, step_campaign
 from tests.uwlts.sensor_profiles import captured_by, joint_estimate
 from uwlts.calibration.mount import calibrate_mount
 from uwlts.model.library import load_sensor
@@ -65,6 +68,27 @@ def by_sensors(campaigns: int) -> None:
     )
 
 
+def by_faces(campaigns: int, artefact: Literal["step", "ring"]) -> None:
+    """Print the errors and coverage of mounts by a step or ring, by ideal robots and, for the ring, others."""
+    for robot in (0.0, 0.05) if artefact == "ring" else (0.0,):
+        rows = []
+        for seed in range(campaigns):
+            rng = np.random.default_rng([seed, 24])
+            campaign = ring_campaign(rng, robot_mm=robot) if artefact == "ring" else step_campaign(rng, height_mm=12.0)
+            mount = calibrate_mount(*_of(campaign), artefact=artefact)
+            shift, turn = errors_of(mount.transform())
+            within = np.mean(np.abs([*shift, *turn]) < mount.coverage_factor * mount.std())
+            rows.append((np.linalg.norm(shift), np.degrees(np.linalg.norm(turn)), within))
+        shifts, turns, within = np.transpose(rows)
+        print(
+            f"{campaigns} campaigns, robot {robot:g} mm: "
+            f"shift {np.median(shifts):.3f} / {np.quantile(shifts, 0.95):.3f} mm, "
+            f"turn {np.median(turns):.4f} / {np.quantile(turns, 0.95):.4f} deg (median / 95 %); within 95 % intervals "
+            f"{100 * within.mean():.1f} %",
+            flush=True,
+        )
+
+
 def main(campaigns: int) -> None:
     """Print the table of the documentation."""
     rows = []
@@ -111,5 +135,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser()
     parser.add_argument("campaigns", type=int)
     parser.add_argument("--sensors", action="store_true")
+    parser.add_argument("--artefact", choices=["sphere", "step", "ring"], default="sphere")
     given = parser.parse_args()
-    (by_sensors if given.sensors else main)(given.campaigns)
+    if given.artefact != "sphere":
+        by_faces(given.campaigns, given.artefact)
+    else:
+        (by_sensors if given.sensors else main)(given.campaigns)

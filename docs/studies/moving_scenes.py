@@ -1,11 +1,12 @@
 """Rotary table, pipe from five sides and vehicle: figures of the rendered scenes against their truth.
 
-    python docs/studies/moving_recordings.py FOLDER rotary-sphere pipe-five-sides --sensors 1 --seeds 0 1 2
-    python docs/studies/moving_recordings.py FOLDER robot-sphere --sensors 1 --seeds 0 1 2 3 4 5 6 7 8 9
+    python docs/studies/moving_recordings.py FOLDER rotary-sphere rotary-target --sensors 1 2 3 4 5 --seeds 0 1
+    python docs/studies/moving_recordings.py FOLDER robot-sphere --sensors 1 2 3 4 5 --seeds 0 1
+    python docs/studies/moving_recordings.py FOLDER pipe-five-sides --sensors 1 2 3 4 5 --seeds 0 1 --denser 4
     twin simulate vehicle-pipe --sensor thesis-small --out FOLDER/vehicle.h5
     python docs/studies/moving_scenes.py FOLDER
 
-Mounts for the pipe are those of the robot's captures by the same sensor.
+The mount for a pipe is that of the robot's capture of the same seed by the same sensor.
 """
 
 import sys
@@ -20,9 +21,11 @@ from twin.scene.description import Scene
 from twin.scene.platforms import Platform
 from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of
 from uwlts.model.calibration import Calibration
+from uwlts.model.mount import Mount
 from uwlts.storage.truth import Truth, read_truth, truth_path
 
-VIEWS, PIPE_MM, OVALITY_MM = 5, 300.0, 1.2
+Form = tuple[float, float, float]
+VIEWS, PIPE_MM, OVALITY_MM, SPHERES_MM = 5, 300.0, 1.2, 16.0
 
 
 def truth_of(path: Path) -> tuple[Platform, Truth]:
@@ -42,25 +45,46 @@ def captured(path: Path) -> CapturedProfiles:
 
 
 def rotary(path: Path) -> str:
-    """Error of a table's axis from a sphere on it, and its standard uncertainty."""
+    """Error of a table's axis from a sphere or target on it, and its standard uncertainty."""
     motion, truth = truth_of(path)
-    mount = uwlts.calibrate_mount(captured(path), radius_mm=RADIUS_MM, axis="-y")
+    if path.name.startswith("rotary-sphere"):
+        mount = uwlts.calibrate_mount(captured(path), radius_mm=RADIUS_MM, axis="-y")
+    else:
+        mount = uwlts.calibrate_mount(path, calibration=path.parent / "calibration.json", axis="-y")
     axis = np.linalg.inv(truth.pose[0]) @ motion.true_axis.matrix()
     found = np.linalg.inv(mount.transform())
     off = axis[:3, 3] - found[:3, 3]
     off -= off @ axis[:3, 2] * axis[:3, 2]
     turn, std = np.arccos(min(1.0, float(axis[:3, 2] @ found[:3, 2]))), mount.std()
     return (
-        f"{path.stem}: axis off by {np.degrees(turn):.3f} deg ({np.degrees(np.linalg.norm(std[3:5])):.3f} stated) and "
+        f"{path.parent.name}, {path.stem}: "
+        f"axis off by {np.degrees(turn):.3f} deg ({np.degrees(np.linalg.norm(std[3:5])):.3f} stated) and "
         f"{np.linalg.norm(off):.3f} mm ({np.linalg.norm(std[:2]):.3f} stated)"
     )
 
 
-def pipe(profiles: CapturedProfiles, mount: np.ndarray) -> tuple[float, float, float]:
+def pipe(path: Path, calibration: Calibration, mount: Mount) -> np.ndarray:
+    """What is off, mm (4, 4): `form`, and the largest closure as stated.
+
+    Of views as the poses have them, and registered: freely, with the start as known as two poses by the mount, and with
+    the spheres besides.
+    """
+    cloud = uwlts.reconstruct(path, calibration, mount=mount)
+    view = cloud.frame * VIEWS // (int(cloud.frame.max()) + 1)
+    views = [cloud.selected(view == number) for number in range(VIEWS)]
+    rows, numbers = [(*form(cloud.points_mm, view), np.nan)], np.repeat(np.arange(VIEWS), [len(each) for each in views])
+    shift, turn = np.sqrt(2 * np.mean(mount.std().reshape(2, 3) ** 2, axis=1)).tolist()
+    start = {"start_std_mm": shift, "start_std_deg": float(np.degrees(turn))}
+    for known in ({}, start, start | {"sphere_mm": SPHERES_MM}):
+        found = uwlts.register(views, **known)
+        moved = [each.points_mm @ pose[:3, :3].T + pose[:3, 3] for each, pose in zip(views, found.poses, strict=True)]
+        closures = [pair.closure_mm for pair in found.pairs if pair.closure_mm is not None]
+        rows.append((*form(np.vstack(moved), numbers), max(closures, default=np.nan)))
+    return np.array(rows)
+
+
+def form(points: np.ndarray, view: np.ndarray) -> Form:
     """Errors of diameter and ovality, and the largest step between neighbouring views, mm."""
-    placed = profiles.poses @ mount
-    points = np.vstack([p @ t[:3, :3].T + t[:3, 3] for p, t in zip(profiles.profiles, placed, strict=True)])
-    view = np.repeat(np.arange(len(placed)) * VIEWS // len(placed), [len(p) for p in profiles.profiles])
     angle = np.arctan2(points[:, 1], -points[:, 2])
     on_pipe = np.abs(np.hypot(points[:, 1], points[:, 2]) - PIPE_MM / 2) < 3
 
@@ -114,17 +138,25 @@ def main(folder: Path) -> None:
     def recorded(scene: str) -> list[Path]:
         return [path for path in sorted(folder.glob(f"sensor-*/{scene}-*.h5")) if ".truth." not in path.name]
 
-    for path in recorded("rotary-sphere"):
+    for path in recorded("rotary-sphere") + recorded("rotary-target"):
         print(rotary(path), flush=True)
-    mounts = []
-    for path in recorded("robot-sphere"):
-        first = captured(path).selected(np.arange(FOR_THE_MOUNT))
-        mounts.append(uwlts.calibrate_mount(first, radius_mm=RADIUS_MM).transform())
+    rows = []
     for path in recorded("pipe-five-sides"):
-        motion, profiles = truth_of(path)[0], captured(path)
-        figures = [pipe(profiles, mount) for mount in (motion.true_mount.matrix(), *mounts)]
-        print(f"{path.stem}: diameter, ovality and largest step, mm, with the true mount {np.round(figures[0], 3)}")
-        print("with mounts of the robot:", *np.round(figures[1:], 3), sep="\n", flush=True)
+        calibration = uwlts.load_calibration(path.parent / "calibration.json")
+        assert isinstance(calibration, Calibration)
+        robot = captured(path.parent / path.name.replace("pipe-five-sides", "robot-sphere"))
+        mount = uwlts.calibrate_mount(robot.selected(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
+        rows.append(pipe(path, calibration, mount))
+        print(f"{path.parent.name}, {path.stem}: diameter, ovality, largest step, largest closure, mm", flush=True)
+        print(
+            "by the mount; registered freely, with the mount known, with spheres besides:",
+            *np.round(rows[-1], 3),
+            sep="\n",
+        )
+    if rows:
+        sizes = np.abs(rows)
+        print("mean of the sizes", *np.round(sizes.mean(axis=0), 3), sep="\n")
+        print("largest", *np.round(sizes.max(axis=0), 3), sep="\n")
     if (path := folder / "vehicle.h5").exists():
         print(vehicle(path))
 

@@ -1,6 +1,6 @@
 """Alignment of a pass of 20 m with three crossings, 0.3 m and 1 deg of drift: errors of the path and of lengths.
 
-    python -m docs.studies.trajectory_alignment --seeds 3
+    python -m docs.studies.trajectory_alignment --seeds 0 1 2
 
 The vehicle, its navigation and the sea bed are those of `tests/uwlts/path_views.py`; ``--walk`` adds a random walk, a
 multiple of the drift. First it prints by which factor the best linear estimate of a drift of known kind lowers the path
@@ -29,7 +29,7 @@ CROSSINGS = (0.057, 0.500), (0.124, 0.608), (0.351, 0.691)
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--drift-mm", type=float, default=300.0)
     parser.add_argument("--drift-deg", type=float, default=1.0)
     parser.add_argument("--walk", type=float, default=0.0)
@@ -45,7 +45,7 @@ def main() -> None:
         kinds = ("steady rate", "wandering rate", "random walk")
         words = ", ".join(f"{kind} {100 * share:.0f} %" for kind, share in zip(kinds, shares, strict=True) if share)
         print(f"{words}: at best {min(best(*shares), 1000):.1f} times")
-    for seed in range(given.seeds):
+    for seed in given.seeds:
         drift = {"drift_mm": given.drift_mm, "drift_deg": given.drift_deg}
         cloud, reported, true = ride(np.random.default_rng(seed), PASS_MM, walk=given.walk, **drift)
         found = uwlts.align_trajectory(cloud, reported, **drift)

@@ -3,30 +3,27 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import assert_never
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
+from uwlts.calibration.mount_artefacts import SHAPES
 from uwlts.calibration.mount_board import mount_by_board
 from uwlts.calibration.mount_model import Motion, MountState, Problem, Scatter
 from uwlts.calibration.mount_next_pose import axis_words, missing_turns, next_pose
-from uwlts.calibration.mount_prediction import coverage_factor, held_out_mm, inverse, left_out_excess
-from uwlts.calibration.mount_profiles import LEAST_POINTS, ProfileArc, ProfileLine, find_arc, find_line, find_step
+from uwlts.calibration.mount_prediction import coverage_factor, held_out_mm, inverse, left_out_excess, misfits
+from uwlts.calibration.mount_profiles import LEAST_POINTS
 from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of, with_sensor
-from uwlts.calibration.mount_start import misfits, start_of_plane, start_of_sphere, start_of_step, start_on_table
+from uwlts.calibration.mount_start import NoFit, require_surfaces, start
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError, DescriptionError
-from uwlts.model.mount import Mount, MountPose, PlaneFound, SphereFound, StepFound
+from uwlts.model.mount import Mount, MountPose
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.mount_files import SENSOR_AXES, Artefact, MountEvidence, SensorAxis, read_mount_evidence
 from uwlts.storage.pose_files import PoseFormat, Unit, read_poses
 
-_FEWEST_POSES = {"sphere": 5, "plane": 8, "step": 8}
-"""Poses whose profiles have more numbers (three each, or two) than there are unknowns (nine or ten), with some over."""
 _MOST_POINTS = 100_000
 """Points of all profiles together; more take time and hardly lower the uncertainty, as poses err too."""
 _ROUNDS = 8
@@ -77,8 +74,8 @@ def calibrate_mount(
     poses
         ``T_base_platform`` (P, 4, 4), mm, or a CSV file with one pose a line; not needed for a capture that holds them.
     artefact, radius_mm, height_mm
-        What is seen: a sphere, a plane, or a step, two parallel faces. The radius of the sphere or the height of the
-        step, where it is known.
+        What is seen: a sphere, a plane, a step (two parallel faces), or a ring (a face, and a cylindrical wall square
+        to it). The radius of the sphere or of the ring's wall, or the height of the step, where it is known.
     calibration
         Of the sensor that took the capture, held fixed; what a joint estimate leaves open becomes part of the mount's
         covariance. A target's images go to `uwlts.calibration.mount_board`.
@@ -145,20 +142,16 @@ def calibrate_mount(
     )
     try:
         return _Calibration(evidence, captured).result()
-    except _NoFit as error:
+    except NoFit as error:
         raise CalibrationError(f"{error}. {_advice(evidence)}") from error
-
-
-class _NoFit(CalibrationError):
-    """Profiles and poses contradict each other."""
 
 
 def _advice(evidence: MountEvidence) -> str:
     """What makes the profiles fit, of the usual mistakes, in words."""
     inverse = "the poses are T_platform_base: give their inverses"
     mistakes = [(replace(evidence, poses=np.linalg.inv(evidence.poses)), inverse)]
-    if evidence.radius_mm is not None:
-        mistakes.append((replace(evidence, radius_mm=None), "the sphere has another radius"))
+    if evidence.size_mm is not None:
+        mistakes.append((replace(evidence, size_mm=None), f"the {evidence.artefact} has another {evidence.size}"))
     for name, poses in evidence.other_readings():
         mistakes.append((replace(evidence, poses=poses), f"the poses are {name}, not {evidence.pose_format}"))
     for changed, words in mistakes:
@@ -168,8 +161,9 @@ def _advice(evidence: MountEvidence) -> str:
             continue
         used = sum(pose.reason is None for pose in found.poses)
         if 2 * used > len(found.poses):
-            size = f", {found.artefact.radius_mm:.3f} mm" if isinstance(found.artefact, SphereFound) else ""
-            where = size if changed.radius_mm is None and evidence.radius_mm is not None else ""
+            where = ""
+            if changed.size_mm is None and evidence.size_mm is not None:
+                where = f", {found.size_mm():.3f} mm"
             return f"They do fit, with {found.rms_mm:.3g} mm rms, if {words}{where}"
     return (
         "Are the poses T_base_platform, is their format right, are the units right, and do profiles and poses come in "
@@ -183,7 +177,7 @@ class _Calibration:
     def __init__(self, evidence: MountEvidence, captured: CapturedProfiles | None = None) -> None:
         self.evidence = evidence
         self.captured = captured
-        self.sphere, self.step = evidence.artefact == "sphere", evidence.artefact == "step"
+        self.shape = SHAPES[evidence.artefact](evidence.size_mm)
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
         self.rows = [_thinned(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
@@ -194,52 +188,46 @@ class _Calibration:
 
     def result(self) -> Mount:
         """The mount with all that is known of it."""
-        shapes = [self._shape(points) for points in self.flat]
+        shapes = [self.shape.find(points, self.rng) for points in self.flat]
         for number, shape in enumerate(shapes):
             if shape is None:
                 self.reasons[number] = f"no {self.evidence.artefact} found in the profile"
         self._require_enough()
         kept = np.array([shape is not None for shape in shapes])
-        members = [self._members(p, s) for p, s in zip(self.flat, shapes, strict=True)]
         whole = Problem(
             self.profiles,
             _motion(self.evidence),
             self.sheet[:3, 1],
-            self.sphere,
-            self.evidence.radius_mm,
+            self.shape,
+            [np.zeros(len(each), dtype=int) for each in self.profiles],
             self.evidence.scale,
             self.evidence.time,
             self.evidence.axis is not None,
-            second=[np.zeros(len(each), dtype=bool) for each in self.profiles] if self.step else None,
-            height_mm=self.evidence.height_mm,
         )
-        problem = self._of_members(whole, kept, members, self._faces(shapes, members))
-        arcs = [shape for shape in shapes if isinstance(shape, ProfileArc)]
-        lines = [shape for shape in shapes if isinstance(shape, ProfileLine)]
-        if self.evidence.axis is not None:
-            state = start_on_table(problem, arcs, self.sheet, SENSOR_AXES[self.evidence.axis])
-        elif self.sphere:
-            state = start_of_sphere(problem, arcs, self.sheet, self.rng)
-        else:
-            state = (start_of_step if self.step else start_of_plane)(problem, lines, self.sheet, self.rng)
+        problem = whole.of_seen(shapes)
+        seen = [shape for shape in shapes if shape is not None]
+        towards = None if self.evidence.axis is None else SENSOR_AXES[self.evidence.axis]
+        state, problem = start(problem, whole.selected(kept), seen, self.sheet, towards, self.rng)
         misfit = misfits(problem, state)
         noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
         good = misfit < max(_LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
         scatter = Scatter(max(noise, 1e-6), max(float(np.median(misfit)), noise), 1e-3)
         # What the first search got wrong in single profiles is searched again near the artefact that the others show.
         for _ in range(2):
+            require_surfaces(problem.selected(good))
             state, scatter = _refined(problem.selected(good), state, scatter)
-            members, faces = self._found_again(whole, state, scatter)
-            kept = np.array([np.count_nonzero(each) >= LEAST_POINTS for each in members])
-            problem = self._of_members(whole, kept, members, faces)
+            reach = 4 * float(np.hypot(scatter.point_mm, 2 * scatter.pose_mm))
+            shapes = whole.seen_again(state, self.flat, reach, self.rng)
+            kept = np.array([shape is not None for shape in shapes])
+            problem = whole.of_seen(shapes)
             good = np.ones(len(problem.points), dtype=bool)
             self._require_enough(np.flatnonzero(kept))
         while True:
             used = problem.selected(good)
+            require_surfaces(used)
             state, scatter = _refined(used, state, scatter)
-            limit = float(chi2.isf(_FALSE_ALARM / len(kept), used.per_pose))
-            excess = left_out_excess(used, state, scatter)
-            if excess.max() <= limit:
+            excess = left_out_excess(used, state, scatter, probability=_FALSE_ALARM / len(kept))
+            if excess.max() <= 1:
                 break
             good[np.flatnonzero(good)[np.argmax(excess)]] = False
             self._require_enough(np.flatnonzero(kept)[good])
@@ -254,75 +242,27 @@ class _Calibration:
             else:
                 self.reasons.setdefault(number, f"no {self.evidence.artefact} found where the other poses show it")
         self._require_fit(used, state, scatter)
+        empty = [np.zeros(len(each), dtype=bool) for each in self.flat]
+        members = [own if shape is None else shape.members for own, shape in zip(empty, shapes, strict=True)]
         return self._summary(used, state, scatter, members)
 
-    def _shape(self, points: np.ndarray) -> ProfileArc | ProfileLine | None:
-        match self.evidence.artefact:
-            case "sphere":
-                return find_arc(points, self.evidence.radius_mm, self.rng)
-            case "plane":
-                return find_line(points, self.rng)
-            case "step":
-                return find_step(points, self.evidence.height_mm, self.rng)
-            case _:
-                assert_never(self.evidence.artefact)
-
-    @staticmethod
-    def _members(points: np.ndarray, shape: ProfileArc | ProfileLine | None) -> np.ndarray:
-        return np.zeros(len(points), dtype=bool) if shape is None else shape.members
-
-    @staticmethod
-    def _faces(shapes: Sequence[ProfileArc | ProfileLine | None], members: list[np.ndarray]) -> list[np.ndarray]:
-        """Masks (N,) of the points on the second face of a step; nowhere set without one."""
-        found = [shape.second if isinstance(shape, ProfileLine) else None for shape in shapes]
-        return [np.zeros_like(own) if face is None else face for face, own in zip(found, members, strict=True)]
-
-    def _of_members(
-        self, whole: Problem, kept: np.ndarray, members: list[np.ndarray], faces: list[np.ndarray]
-    ) -> Problem:
-        points = [each[own] for each, own in zip(self.profiles, members, strict=True)]
-        second = [each[own] for each, own in zip(faces, members, strict=True)] if self.step else None
-        return whole.selected(kept, points, second)
-
     def _require_enough(self, numbers: np.ndarray | None = None) -> None:
-        poses, needed = len(self.profiles), _FEWEST_POSES[self.evidence.artefact]
+        poses, needed = len(self.profiles), self.shape.fewest_poses
         usable = poses - len(self.reasons) if numbers is None else len(numbers)
         if usable < needed:
             raise CalibrationError(
                 f"{usable} of {poses} profiles show the {self.evidence.artefact} and agree; at least {needed} are "
-                "needed. Record more poses, or check artefact, radius and units"
+                "needed. Record more poses, or check artefact, size and units"
             )
 
     def _require_fit(self, used: Problem, state: MountState, scatter: Scatter) -> None:
         extent = float(np.median([np.linalg.norm(np.ptp(each, axis=0)) for each in self.flat if len(each)]))
-        limit = _NO_FIT * (state.artefact[3] if self.sphere else 0.1 * extent)
+        limit = _NO_FIT * (0.1 * extent if self.shape.flat else state.artefact[3])
         if scatter.pose_mm > limit:
-            raise _NoFit(
+            raise NoFit(
                 f"no mount makes the profiles fit: {len(used.points)} of {len(self.profiles)} poses would be wrong by "
                 f"{scatter.pose_mm:.3g} mm (rms)"
             )
-
-    def _found_again(
-        self, whole: Problem, state: MountState, scatter: Scatter
-    ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Masks of the points near the artefact as all poses show it, and of those on the second face of a step."""
-        signed = whole.distances(state)
-        off = np.abs(signed)
-        if self.step:
-            off = np.minimum(off, np.abs(signed - state.artefact[4]))
-        reach = 4 * np.hypot(scatter.point_mm, 2 * scatter.pose_mm)
-        found, faces = [], []
-        for points, own in zip(self.flat, np.split(off, np.cumsum(whole.counts)[:-1]), strict=True):
-            near = own < reach
-            mask, face = np.zeros((2, len(points)), dtype=bool)
-            shape = self._shape(points[near])
-            if shape is not None:
-                mask[near] = shape.members
-                if isinstance(shape, ProfileLine) and shape.second is not None:
-                    face[near] = shape.second
-            found.append(mask)
-            faces.append(face)
-        return found, faces
 
     def _summary(self, used: Problem, state: MountState, scatter: Scatter, members: list[np.ndarray]) -> Mount:
         information = used.information(state, scatter)
@@ -348,19 +288,8 @@ class _Calibration:
                     reason=self.reasons.get(number),
                 )
             )
-        std, at = np.sqrt(np.diag(covariance)), 9 + used.size_unknown
-        x, y, z, *sizes = state.artefact.tolist()
-        size_std = float(std[9]) if used.size_unknown else None
-        match self.evidence.artefact:
-            case "sphere":
-                found = SphereFound(centre_mm=(x, y, z), radius_mm=sizes[0], radius_std_mm=size_std)
-            case "plane":
-                found = PlaneFound(normal=(x, y, z), distance_mm=sizes[0])
-            case "step":
-                distance, height = sizes
-                found = StepFound(normal=(x, y, z), distance_mm=distance, height_mm=height, height_std_mm=size_std)
-            case _:
-                assert_never(self.evidence.artefact)
+        std, at = np.sqrt(np.diag(covariance)), 6 + self.shape.count
+        found = self.shape.found(state.artefact, float(std[at - 1]) if self.shape.size_unknown else None)
         transform = np.eye(4)
         transform[:3, :3], transform[:3, 3] = Rotation.from_matrix(state.rotation).as_matrix(), state.translation
         weights = used.counts / used.counts.sum()
@@ -398,7 +327,7 @@ class _Calibration:
             moved.append(np.einsum("ni,niq->nq", own, by))
         whitened = used.whitening(state, scatter)
         derivatives, together = whitened(used.derivatives(state)), np.vstack(moved)
-        off = whitened(together if self.sphere else used.on_lines(together))
+        off = whitened(used.on_lines(together))
         return -used.free @ inverse(derivatives.T @ derivatives) @ derivatives.T @ off
 
     def _require_determined(self, used: Problem, state: MountState, scatter: Scatter, covariance: np.ndarray) -> None:
@@ -407,8 +336,8 @@ class _Calibration:
         if shift <= _OPEN_MM and turn <= _OPEN_RAD:
             return
         # A wrong radius or format also makes the scatter large.
-        if self.sphere and scatter.pose_mm > 0.2 * _NO_FIT * state.artefact[3]:
-            raise _NoFit(f"no mount makes the profiles fit: the poses would be wrong by {scatter.pose_mm:.3g} mm (rms)")
+        if not self.shape.flat and scatter.pose_mm > 0.2 * _NO_FIT * state.artefact[3]:
+            raise NoFit(f"no mount makes the profiles fit: the poses would be wrong by {scatter.pose_mm:.3g} mm (rms)")
         numbers = [name for n, name in enumerate(self.evidence.names) if n not in self.reasons]
         advised = next_pose(used, state, scatter, self.sheet, numbers)
         raise CalibrationError(

@@ -1,4 +1,4 @@
-"""Model of a profiler on a platform before a fixed sphere, plane or step: distances, derivatives and weights."""
+"""Model of a profiler on a platform before a fixed artefact: distances, derivatives and weights."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -7,6 +7,9 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
+
+from uwlts.calibration.mount_artefacts import Seen, Shape
+from uwlts.calibration.mount_profiles import LEAST_POINTS
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 """Rotations (P, 3, 3) and positions (P, 3) of the platform in the base frame for a time offset, s."""
@@ -20,11 +23,7 @@ _LEAST_SHARE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class MountState:
-    """Values of all unknowns: mount, artefact, scale and offset.
-
-    The artefact is a sphere's centre and radius (4,), a plane's normal and distance (4,), or a step's (5,): those of
-    its face at smaller z of the profiles, and how far along the normal the other one lies.
-    """
+    """Values of all unknowns: mount, artefact (as its `Shape` says), scale and offset."""
 
     rotation: np.ndarray
     translation: np.ndarray
@@ -35,7 +34,7 @@ class MountState:
 
 @dataclass(frozen=True)
 class Scatter:
-    """Standard deviations: of a point, of each coordinate of a pose, and of its turn (planes only; rad)."""
+    """Standard deviations: of a point, of each coordinate of a pose, and of its turn (rad; flat artefacts only)."""
 
     point_mm: float
     pose_mm: float
@@ -46,25 +45,21 @@ class Scatter:
 class Problem:
     """Points (n, 3) of every pose in the sensor's frame, mm, and which unknowns there are.
 
-    The parameters are steps from a `MountState`: translation (3), rotation about the platform's axes (3), centre (3)
-    and, if it is unknown, radius of a sphere, or two turns of the normal and the distance of a plane or of a step's
-    first face and, if it is unknown, the height of the step, then scale and offset.
+    The parameters are steps from a `MountState`: translation (3), rotation about the platform's axes (3), those of the
+    artefact, then scale and offset. ``part`` says of each point (n,) on which surface of the artefact it lies.
     """
 
     points: Sequence[np.ndarray]
     motion: Motion
     across: np.ndarray
     """Normal (3,) of the sheet in the sensor's frame: points have no noise along it."""
-    sphere: bool
-    radius_mm: float | None
+    shape: Shape
+    part: Sequence[np.ndarray]
     scale: bool = False
     time: bool = False
     table: bool = False
     """Whether the platform turns about its own z axis only, as a rotary table: shift along it and turn about it change
     nothing, and are no parameters."""
-    second: Sequence[np.ndarray] | None = None
-    """Of a step, which points (n,) of every pose lie on its second face; None for a plane."""
-    height_mm: float | None = None
 
     @cached_property
     def counts(self) -> np.ndarray:
@@ -87,62 +82,65 @@ class Problem:
     @cached_property
     def free(self) -> np.ndarray:
         """Steps (K, size) of all K values by the parameters."""
-        every = np.eye(9 + self.size_unknown + self.scale + self.time)
+        every = np.eye(6 + self.shape.count + self.scale + self.time)
         return np.delete(every, (2, 5), axis=1) if self.table else every
 
-    @property
-    def size_unknown(self) -> bool:
-        """Whether the radius of the sphere, or the height of the step, is a parameter."""
-        return self.radius_mm is None if self.sphere else self.second is not None and self.height_mm is None
-
     @cached_property
-    def _level(self) -> np.ndarray:
-        """1 for each of the points (N,) on the second face of a step, else 0."""
-        return np.zeros(len(self._all)) if self.second is None else np.concatenate(self.second).astype(np.float64)
+    def _parts(self) -> np.ndarray:
+        return np.concatenate(self.part)
 
     def of_all(self, covariance: np.ndarray) -> np.ndarray:
         """Covariance (K, K) of all values from that of the parameters: 0 for what is none."""
         return self.free @ covariance @ self.free.T
 
-    @property
-    def per_pose(self) -> int:
-        """Numbers that the profile of one pose determines: a circle's three, or a line's two."""
-        return 3 if self.sphere else 2
+    @cached_property
+    def numbers(self) -> int:
+        """How many numbers all profiles determine together: three for a circle, two for a line."""
+        return sum(self.shape.numbers(part) for part in self.part)
 
     def selected(
-        self, kept: np.ndarray, points: Sequence[np.ndarray] | None = None, second: Sequence[np.ndarray] | None = None
+        self, kept: np.ndarray, points: Sequence[np.ndarray] | None = None, part: Sequence[np.ndarray] | None = None
     ) -> "Problem":
         """The problem of some of the poses (a mask), perhaps with other points of all poses."""
-        given, motion, numbers = points or self.points, self.motion, np.flatnonzero(kept)
-        levels = second or self.second
+        motion, numbers = self.motion, np.flatnonzero(kept)
+        given, parts = points or self.points, part or self.part
         return replace(
             self,
             points=[given[number] for number in numbers.tolist()],
-            second=None if levels is None else [levels[number] for number in numbers.tolist()],
+            part=[parts[number] for number in numbers.tolist()],
             motion=lambda offset: tuple(each[numbers] for each in motion(offset)),
         )
+
+    def of_seen(self, seen: Sequence[Seen | None]) -> "Problem":
+        """The problem of the points of the artefact, as seen in all poses or (None) not."""
+        pairs = [(n, each) for n, each in enumerate(seen) if each is not None]
+        points, part = list(self.points), list(self.part)
+        for number, each in pairs:
+            points[number], part[number] = self.points[number][each.members], each.part[each.members]
+        return self.selected(np.array([each is not None for each in seen]), points, part)
+
+    def seen_again(
+        self, state: MountState, flat: Sequence[np.ndarray], reach_mm: float, rng: np.random.Generator
+    ) -> list[Seen | None]:
+        """The artefact near where a state has it, in the profiles (N, 2) of all poses, or None."""
+        off = np.split(self.shape.off(state.artefact, self.base(state)), np.cumsum(self.counts)[:-1])
+        again = [self.shape.find_again(each, own, reach_mm, rng) for each, own in zip(flat, off, strict=True)]
+        return [each if each is not None and each.members.sum() >= LEAST_POINTS else None for each in again]
 
     def thinned(self, most: int) -> "Problem":
         """The problem with at most so many points of each pose, evenly chosen."""
         rows = [np.unique(np.linspace(0, len(each) - 1, most).astype(int)) for each in self.points]
-        points, second = (
-            None if given is None else [each[own] for each, own in zip(given, rows, strict=True)]
-            for given in (self.points, self.second)
+        points, part = (
+            [each[own] for each, own in zip(given, rows, strict=True)] for given in (self.points, self.part)
         )
-        return replace(self, points=points, second=second)
+        return replace(self, points=points, part=part)
 
     def stepped(self, state: MountState, step: np.ndarray) -> MountState:
         """The state after a step of the parameters."""
         step = self.free @ step
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ state.rotation
-        if self.sphere:
-            radius = state.artefact[3] + (step[9] if self.radius_mm is None else 0.0)
-            artefact, used = np.append(state.artefact[:3] + step[6:9], radius), 9 + (self.radius_mm is None)
-        else:
-            normal = state.artefact[:3] + step[6:8] @ _across(state.artefact[:3])
-            normal /= np.linalg.norm(normal)
-            height = state.artefact[4:] + (step[9] if self.size_unknown else 0.0)
-            artefact, used = np.concatenate([normal, [state.artefact[3] + step[8]], height]), 9 + self.size_unknown
+        used = 6 + self.shape.count
+        artefact = self.shape.stepped(state.artefact, step[6:used])
         return MountState(
             turned,
             state.translation + step[:3],
@@ -154,13 +152,10 @@ class Problem:
     def distances(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
         """Signed distances (N,) of all points from the artefact, mm, after a step from a state."""
         state = state if step is None else self.stepped(state, step)
-        base = self._base(state)
-        if self.sphere:
-            return np.linalg.norm(base - state.artefact[:3], axis=1) - state.artefact[3]
-        off = base @ state.artefact[:3] - state.artefact[3]
-        return off if self.second is None else off - state.artefact[4] * self._level
+        return self.shape.distances(state.artefact, self.base(state), self._parts)
 
-    def _base(self, state: MountState) -> np.ndarray:
+    def base(self, state: MountState) -> np.ndarray:
+        """All points (N, 3) in the base frame, mm."""
         rotations, positions = self.motion(state.offset_s)
         platform = self._all @ state.rotation.T + state.translation
         return np.einsum("nij,nj->ni", rotations[self.poses], platform) + state.scale * positions[self.poses]
@@ -168,13 +163,15 @@ class Problem:
     def errors(self, state: MountState) -> np.ndarray:
         """Derivatives (N, K) of the distances by the error of their pose.
 
-        A pose errs by a shift in three directions of the base. Beside a plane it errs by a shift along the normal, and
-        by a turn that inclines the line of the profile. (A turn that a sphere sees is a shift of its centre.)
+        A pose errs by a shift in three directions of the base, and by a turn about the middle of its profile where the
+        artefact is flat. (A turn that a sphere sees is a shift of its centre.)
         """
-        base = self._base(state)
-        if self.sphere:
-            return self._normals(base, state)
-        return np.column_stack([np.ones(len(base)), self._along])
+        normals = self._normals(self.base(state), state)
+        if not self.shape.flat:
+            return normals
+        middles = np.repeat([own.mean(axis=0) for own in self.points], self.counts, axis=0)
+        arms = np.einsum("nij,nj->ni", self.motion(state.offset_s)[0][self.poses] @ state.rotation, self._all - middles)
+        return self.on_lines(np.hstack([normals, np.cross(arms, normals)]))
 
     def derivatives(self, state: MountState) -> np.ndarray:
         """Derivatives (N, size) of the distances at a state by the parameters."""
@@ -183,61 +180,56 @@ class Problem:
     def normals(self, state: MountState) -> np.ndarray:
         """Derivatives (N, 3) of the distances by the points, along the axes of the sensor."""
         rotations = self.motion(state.offset_s)[0]
-        return np.einsum("nij,ni->nj", rotations[self.poses], self._normals(self._base(state), state)) @ state.rotation
+        return np.einsum("nij,ni->nj", rotations[self.poses], self._normals(self.base(state), state)) @ state.rotation
 
     def _normals(self, base: np.ndarray, state: MountState) -> np.ndarray:
-        """Normals (N, 3) of the artefact at points of the base frame, away from the sphere's centre."""
-        if not self.sphere:
-            return np.broadcast_to(state.artefact[:3], base.shape)
-        away = base - state.artefact[:3]
-        return away / np.linalg.norm(away, axis=1, keepdims=True)
+        """Normals (N, 3) of the artefact at points of the base frame."""
+        return self.shape.normals(state.artefact, base, self._parts)
 
     def _derivatives(self, state: MountState) -> np.ndarray:
         """Derivatives (N, K) by all values."""
         rotations, positions = self.motion(state.offset_s)
-        turned, base = self._all @ state.rotation.T, self._base(state)
+        turned, base = self._all @ state.rotation.T, self.base(state)
         normals = self._normals(base, state)
         in_platform = np.einsum("nij,ni->nj", rotations[self.poses], normals)
         columns = [in_platform, np.cross(turned, in_platform)]
-        if self.sphere:
-            columns += [-normals, *([np.full((len(base), 1), -1.0)] if self.radius_mm is None else [])]
-        else:
-            columns += [base @ _across(state.artefact[:3]).T, np.full((len(base), 1), -1.0)]
-            columns += [-self._level[:, None]] if self.size_unknown else []
+        columns.append(self.shape.derivatives(state.artefact, base, self._parts))
         if self.scale:
             columns.append(np.sum(normals * positions[self.poses], axis=1, keepdims=True))
         if self.time:
             later, earlier = (
-                self._base(replace(state, offset_s=state.offset_s + s)) for s in (_TIME_STEP_S, -_TIME_STEP_S)
+                self.base(replace(state, offset_s=state.offset_s + s)) for s in (_TIME_STEP_S, -_TIME_STEP_S)
             )
             columns.append(np.sum(normals * (later - earlier), axis=1, keepdims=True) / (2 * _TIME_STEP_S))
-        derivatives = np.hstack(columns)
-        if self.sphere:
-            return derivatives
-        return self.on_lines(derivatives)
+        return self.on_lines(np.hstack(columns))
 
     @cached_property
     def _along(self) -> np.ndarray:
-        """Positions (N,) along the line, or the two parallel lines, of each profile from its middle, mm."""
+        """Positions (N,) along the parallel lines of each profile, or its wall, from its middle, mm."""
         along = []
-        for own, level in zip(self.points, np.split(self._level, np.cumsum(self.counts)[:-1]), strict=True):
-            lines = [own[level == face] for face in (0, 1) if np.any(level == face)]
-            centred = np.vstack([line - line.mean(axis=0) for line in lines])
-            along.append((own - own.mean(axis=0)) @ np.linalg.svd(centred, full_matrices=False)[2][0])
+        for own, part in zip(self.points, self.part, strict=True):
+            result = np.zeros(len(own))
+            for rows in self.shape.parallel(part):
+                lines = [own[rows & (part == face)] for face in np.unique(part[rows])]
+                centred = np.vstack([line - line.mean(axis=0) for line in lines])
+                direction = np.linalg.svd(centred, full_matrices=False)[2][0]
+                result[rows] = (own[rows] - own[rows].mean(axis=0)) @ direction
+            along.append(result)
         return np.concatenate(along)
 
     @cached_property
     def _lines(self) -> list[np.ndarray]:
-        """Orthonormal bases (n, K) of what shift and turn of each profile's line, and a step, do to its distances."""
-        faces = [] if self.second is None else [self._level]
-        every = np.column_stack([np.ones(len(self._along)), self._along, *faces])
-        return [np.linalg.qr(each)[0] for each in np.split(every, np.cumsum(self.counts)[:-1])]
+        """Orthonormal bases (n, K) of what can change in each profile besides noise."""
+        along = np.split(self._along, np.cumsum(self.counts)[:-1])
+        return [np.linalg.qr(self.shape.lines(own, part))[0] for own, part in zip(along, self.part, strict=True)]
 
     def on_lines(self, values: np.ndarray) -> np.ndarray:
-        """Values (N, ...) beside a plane as those of the lines of the profiles.
+        """Values (N, ...) beside a flat artefact as those of the lines of the profiles; others as they are.
 
         With the points' own noise in them, a plane far from the true one would seem to explain this noise.
         """
+        if not self.shape.flat:
+            return values
         ends = np.cumsum(self.counts)[:-1]
         parts = zip(self._lines, np.split(values, ends), strict=True)
         return np.concatenate([basis @ (basis.T @ own) for basis, own in parts])
@@ -248,16 +240,16 @@ class Problem:
         A plane that leans against the sheet shows less of it. If this were left out, a plane along the sheet would fit
         points without any noise. Spheres are cut near their middle.
         """
-        if self.sphere:
+        if not self.shape.flat:
             return np.ones((len(self.poses), 1))
-        normals = self.motion(state.offset_s)[0] @ (state.rotation @ self.across)
-        return np.sqrt(np.maximum(1 - (normals @ state.artefact[:3]) ** 2, _LEAST_SHARE**2))[self.poses, None]
+        out_of_sheet = self.normals(state) @ self.across
+        return np.sqrt(np.maximum(1 - out_of_sheet**2, _LEAST_SHARE**2))[:, None]
 
     def whitening(self, state: MountState, scatter: Scatter) -> Callable[[np.ndarray], np.ndarray]:
         """Function that gives distances (N,) or their derivatives (N, ...) near a state the unit covariance."""
         share = self.noise_along(state)
         errors = self.errors(state) / share
-        sizes = _sizes(errors.shape[1], scatter)
+        sizes = sizes_of(errors.shape[1], scatter)
         parts = []
         for own in np.split(np.arange(len(errors)), np.cumsum(self.counts)[:-1]):
             basis, upper = np.linalg.qr(errors[own] * sizes)
@@ -283,8 +275,7 @@ class Problem:
             return whitened(derivatives @ self.free)
 
         def misfit(step: np.ndarray) -> np.ndarray:
-            off = self.distances(state, step)
-            return whitened(off if self.sphere else self.on_lines(off))
+            return whitened(self.on_lines(self.distances(state, step)))
 
         found = least_squares(
             misfit,
@@ -321,11 +312,11 @@ class Problem:
                 point, *(max(each, _SMALLEST_SHARE * point * unit) for each, unit in zip(others, units, strict=True))
             )
 
-        units = [1.0] if k == 3 else [1.0, 1e-3]
+        units = [1.0, 1e-3] if self.shape.flat else [1.0]
 
         def minus_twice_likelihood(logs: np.ndarray) -> float:
             scatter = scatter_of(logs)
-            sizes, variance = _sizes(k, scatter), scatter.point_mm**2
+            sizes, variance = sizes_of(k, scatter), scatter.point_mm**2
             inner = np.eye(k) * variance + sizes[:, None] * grams[:, :k, :k] * sizes
             cross = sizes[:, None] * grams[:, :k, k:]
             left = (grams[:, k:, k:] - np.swapaxes(cross, 1, 2) @ np.linalg.solve(inner, cross)).sum(axis=0) / variance
@@ -334,23 +325,16 @@ class Problem:
             weights = (total - poses * k) * np.log(variance) + np.linalg.slogdet(inner)[1].sum()
             return float(weights + np.linalg.slogdet(information)[1] + squares)
 
-        begin = np.log([start.point_mm, start.pose_mm, *([start.turn_rad] if k == 2 else [])])
+        begin = np.log([start.point_mm, start.pose_mm, *([start.turn_rad] if self.shape.flat else [])])
         found = minimize(
             minus_twice_likelihood, begin, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-3, "maxiter": 300}
         )
         return scatter_of(found.x)
 
 
-def _sizes(k: int, scatter: Scatter) -> np.ndarray:
-    """Standard deviations (K,) of the errors of a pose."""
-    return np.full(3, scatter.pose_mm) if k == 3 else np.array([scatter.pose_mm, scatter.turn_rad])
-
-
-def _across(normal: np.ndarray) -> np.ndarray:
-    """Unit directions (2, 3) square to a normal and to each other."""
-    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    first /= np.linalg.norm(first)
-    return np.array([first, np.cross(normal, first)])
+def sizes_of(k: int, scatter: Scatter) -> np.ndarray:
+    """Standard deviations (K,) of the errors of a pose: three shifts, and three turns of a flat artefact."""
+    return np.repeat([scatter.pose_mm, scatter.turn_rad], 3)[:k]
 
 
 def cross_matrix(vector: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwlts.calibration.mount_artefacts import Sphere
 from uwlts.calibration.mount_model import MountState, Problem, Scatter, cross_matrix
 from uwlts.model.mount import NextPose
 
@@ -48,11 +49,12 @@ def next_pose(
         turned = rotations[nearest] @ Rotation.from_rotvec(side * _TURN_RAD * np.eye(3)[axis]).as_matrix()
         for points, seen, where in _views(problem, state, sheet):
             platform = state.rotation @ seen + state.translation
-            if problem.sphere:
+            if isinstance(problem.shape, Sphere):
                 position = (state.artefact[:3] - turned @ platform) / state.scale
             else:
                 normal = state.artefact[:3]
-                off = normal @ (turned @ platform + state.scale * positions[nearest]) - state.artefact[3]
+                there = turned @ platform + state.scale * positions[nearest]
+                off = problem.shape.distances(state.artefact, there[None], np.zeros(1, dtype=int))[0]
                 position = positions[nearest] - off * normal / state.scale
                 points = _on_plane(points, seen, turned @ state.rotation, normal, sheet)
             if points is None:
@@ -62,7 +64,7 @@ def next_pose(
             if best is None or after < best[0]:
                 words = (
                     f"turn the platform by {np.degrees(side * _TURN_RAD):+.0f} deg about its {'xyz'[axis]} axis from "
-                    f"pose {names[nearest]}, with the {_kind(problem)} {where}"
+                    f"pose {names[nearest]}, with the {problem.shape.kind} {where}"
                 )
                 pose = np.eye(4)
                 pose[:3, :3], pose[:3, 3] = turned, position
@@ -78,14 +80,10 @@ def next_pose(
     )
 
 
-def _kind(problem: Problem) -> str:
-    return "sphere" if problem.sphere else "plane" if problem.second is None else "step"
-
-
 def _one_pose(problem: Problem, points: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> Problem:
     # Without a trajectory the pose says nothing about the offset of the times.
-    second = None if problem.second is None else [np.zeros(len(points), dtype=bool)]
-    return replace(problem, points=[points], second=second, motion=lambda offset: (rotation[None], position[None]))
+    part = [np.zeros(len(points), dtype=int)]
+    return replace(problem, points=[points], part=part, motion=lambda offset: (rotation[None], position[None]))
 
 
 def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
@@ -93,7 +91,7 @@ def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple
     flat = [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in problem.points]
     low, high = np.quantile(np.vstack(flat), (0.1, 0.9), axis=0)
     views = []
-    if problem.sphere:
+    if isinstance(problem.shape, Sphere):
         rotations, positions = problem.motion(state.offset_s)
         platform = np.einsum("pji,pj->pi", rotations, state.artefact[:3] - state.scale * positions) - state.translation
         centres = (platform @ state.rotation - sheet[:3, 3]) @ sheet[:3, :3]

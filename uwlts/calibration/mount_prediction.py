@@ -1,10 +1,18 @@
 """How well poses of a mount calibration predict each other, and how wide its intervals are."""
 
 import numpy as np
-from scipy.stats import t
+from scipy.stats import chi2, t
 
-from uwlts.calibration.mount_model import MountState, Problem, Scatter
-from uwlts.calibration.mount_start import misfits
+from uwlts.calibration.mount_model import MountState, Problem, Scatter, sizes_of
+
+_LEAST_SPAN = 1e-6
+"""Of the largest thing that a pose's errors do to its profile: less counts as nothing."""
+
+
+def misfits(problem: Problem, state: MountState) -> np.ndarray:
+    """Root mean square distance (P,) of the points of each pose."""
+    squares = problem.distances(state) ** 2
+    return np.sqrt(np.bincount(problem.poses, squares) / problem.counts)
 
 
 def held_out_mm(problem: Problem, state: MountState, scatter: Scatter, information: np.ndarray) -> np.ndarray:
@@ -13,24 +21,28 @@ def held_out_mm(problem: Problem, state: MountState, scatter: Scatter, informati
     return np.array([misfits(problem, problem.stepped(state, step))[n] for n, (step, _) in enumerate(left_out)])
 
 
-def left_out_excess(problem: Problem, state: MountState, scatter: Scatter) -> np.ndarray:
-    """How far each pose lies from what the others predict (P,), chi-square with as many degrees as its profile says."""
+def left_out_excess(problem: Problem, state: MountState, scatter: Scatter, *, probability: float) -> np.ndarray:
+    """How far each pose lies from what the others predict (P,), in units of what it exceeds with a probability.
+
+    Squares are chi-square with as many degrees of freedom as a profile determines numbers.
+    """
     share = problem.noise_along(state)
     derivatives, errors = problem.derivatives(state) / share, problem.errors(state) / share
     split = np.cumsum(problem.counts)[:-1]
     excess = []
     left_out = _each_left_out(problem, state, scatter, problem.information(state, scatter))
     moved = [np.split(problem.distances(state, step) / share[:, 0], split)[n] for n, (step, _) in enumerate(left_out)]
-    sizes = np.full(3, scatter.pose_mm) if problem.sphere else np.array([scatter.pose_mm, scatter.turn_rad])
+    sizes = sizes_of(errors.shape[1], scatter)
     for off, rows, error, (_, covariance) in zip(
         moved, np.split(derivatives, split), np.split(errors, split), left_out, strict=True
     ):
         # All that poses, mount and artefact can do lies in what the errors of the pose span.
-        basis = np.linalg.qr(error)[0]
+        basis, spans, _ = np.linalg.svd(error / np.linalg.norm(error, axis=0).clip(1e-30), full_matrices=False)
+        basis = basis[:, spans > _LEAST_SPAN * spans[0]]
         across, by_pose = basis.T @ rows, basis.T @ (error * sizes)
         spread = across @ covariance @ across.T + by_pose @ by_pose.T + scatter.point_mm**2 * np.eye(basis.shape[1])
         seen = basis.T @ off
-        excess.append(float(seen @ np.linalg.solve(spread, seen)))
+        excess.append(float(seen @ np.linalg.solve(spread, seen) / chi2.isf(probability, len(seen))))
     return np.array(excess)
 
 
@@ -45,8 +57,8 @@ def coverage_factor(
     by_points = inverse(problem.information(state, Scatter(scatter.point_mm, 0.0)).sum(axis=0))
     total, by_poses = np.diag(covariance)[:6], np.maximum(np.diag(own - problem.of_all(by_points))[:6], 0.0)
     share = 1 - float(np.mean(by_poses[total > 0] / total[total > 0]))
-    of_poses = max(problem.per_pose * len(problem.points) - problem.size, 1)
-    of_points = max(int(problem.counts.sum()) - problem.per_pose * len(problem.points), 1)
+    of_poses = max(problem.numbers - problem.size, 1)
+    of_points = max(int(problem.counts.sum()) - problem.numbers, 1)
     return float(t.ppf(0.975, 1 / (share**2 / of_points + (1 - share) ** 2 / of_poses)))
 
 

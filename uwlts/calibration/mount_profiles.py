@@ -1,6 +1,6 @@
-"""The part of a profile that shows the artefact: an arc of a sphere, the line of a plane, the two lines of a step."""
+"""The part of a profile that shows the artefact: an arc of a sphere, the line of a plane, those of a step or ring."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -16,9 +16,13 @@ _REJECTED_BEYOND = 4.0
 """Robust standard deviations; of normal noise six points in a hundred thousand lie farther out."""
 _LEAST_ARC = np.radians(30)
 """Smaller arcs are like straight lines, and their centres move by more than the noise along the sagitta."""
+LEAST_WALL = 6
+"""Points on a ring's wall that are used: twice the three numbers of their curve."""
+_LARGEST_GAP = 5
+"""Times the usual distance between neighbours by which points of one wall may lie apart, in number and in space."""
 _LARGEST_ROUNDS = 20
 _LINES = 4
-"""Lines sought in a profile of a step: its faces, and what lies beside them."""
+"""Lines sought in a profile of a step or ring: its faces, and what lies beside them."""
 _PARALLEL = 2e-3
 """By how much faces of a step may seem to be turned against each other besides noise, rad: bow of the profiler."""
 _LEAST_SEEN, _LEAST_SEEN_COSINE = 0.95, 0.5
@@ -34,20 +38,44 @@ class ProfileArc:
     radius_mm: float
     std_mm: float
 
+    @property
+    def part(self) -> np.ndarray:
+        """Surface of each point (N,): there is one."""
+        return np.zeros(len(self.members), dtype=int)
+
+    def among(self, chosen: np.ndarray) -> "ProfileArc":
+        """The same in the profile from which the points were chosen by a mask."""
+        return replace(self, members=_among(self.members, chosen))
+
 
 @dataclass(frozen=True, eq=False)
 class ProfileLine:
-    """Points of a profile on a line: their mask (N,), their middle (2,), the line's direction (2,) and the scatter.
+    """Points of a profile on a line: their mask (N,), their middle (2,), the line's direction (2,), scatter and length.
 
-    Of a step these are the points of both faces, middle and direction of the first, and ``second`` (N,) is the mask of
-    the other face's.
+    Of a step these are the points of both faces, middle and direction of the first, of a ring those of its face and
+    wall; ``part`` (N,) says which lie on another surface than the first, and on which.
     """
 
     members: np.ndarray
     middle_mm: np.ndarray
     direction: np.ndarray
     std_mm: float
-    second: np.ndarray | None = None
+    length_mm: float
+    part: np.ndarray
+
+    def among(self, chosen: np.ndarray) -> "ProfileLine":
+        """The same in the profile from which the points were chosen by a mask."""
+        return replace(self, members=_among(self.members, chosen), part=_among(self.part, chosen))
+
+    def with_parts(self, others: np.ndarray) -> "ProfileLine":
+        """The line with points of other surfaces, whose numbers (N,) are not 0."""
+        return replace(self, members=self.members | (others > 0), part=np.where(others > 0, others, self.part))
+
+
+def _among(own: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    every = np.zeros(len(chosen), dtype=own.dtype)
+    every[chosen] = own
+    return every
 
 
 def noise_of(points: np.ndarray) -> float:
@@ -73,7 +101,7 @@ def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generat
     span = rng.integers(LEAST_POINTS // 2, max(count // 2, LEAST_POINTS // 2 + 1), size=_TRIALS)
     first = (rng.random(_TRIALS) * np.maximum(count - 2 * span, 1)).astype(int)
     picked = points[np.minimum(first[:, None] + span[:, None] * np.arange(3), count - 1)]
-    centres, radii = _circles_through(picked)
+    centres, radii = circles_through(picked)
     fits = np.isfinite(radii) & (radii < largest) & (radii > 10 * tolerance)
     if not fits.any():
         return None
@@ -86,7 +114,7 @@ def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generat
     return None
 
 
-def _circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Centres (M, 2) and radii (M,) of circles through triples (M, 3, 2); infinite where these lie on a line."""
     b, c = triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -156,7 +184,8 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
         before, members = members, np.abs(off) < min(max(_REJECTED_BEYOND * std, 1e-4), 2 * tolerance)
         if np.array_equal(before, members):
             break
-    return ProfileLine(members, middle, direction, std)
+    length = float(np.ptp(points[members] @ direction))
+    return ProfileLine(members, middle, direction, std, length, np.zeros(len(points), dtype=int))
 
 
 def find_step(points: np.ndarray, height_mm: float | None, rng: np.random.Generator) -> ProfileLine | None:
@@ -165,6 +194,67 @@ def find_step(points: np.ndarray, height_mm: float | None, rng: np.random.Genera
     The first is that at smaller z. Of a step of known height they lie as far apart as a sheet shows it that leans by up
     to 60 deg.
     """
+    best: tuple[int, float, np.ndarray, np.ndarray, ProfileLine] | None = None
+    for (rows, first), (others, second) in combinations(_lines_of(points, rng), 2):
+        apart = _apart(first, second)
+        if apart is None:
+            continue
+        if height_mm is not None and not _LEAST_SEEN * height_mm < abs(apart) < height_mm / _LEAST_SEEN_COSINE:
+            continue
+        if best is None or len(rows) + len(others) > best[0]:
+            nearer, farther, line = (rows, others, first) if apart > 0 else (others, rows, second)
+            best = len(rows) + len(others), max(first.std_mm, second.std_mm, 1e-4), nearer, farther, line
+    if best is None:
+        return None
+    _, noise, nearer, farther, line = best
+    members, part = np.zeros(len(points), bool), np.zeros(len(points), int)
+    members[nearer] = members[farther] = part[farther] = True
+    return ProfileLine(members, line.middle_mm, line.direction, noise, line.length_mm, part)
+
+
+def find_face(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | None:
+    """Of the best supported line in a profile (N, 2) and those parallel to it that at smallest z, mm, or None."""
+    lines = _lines_of(points, rng)
+    if not lines:
+        return None
+    beside = [(0.0, *lines[0])]
+    beside += [(apart, *line) for line in lines[1:] if (apart := _apart(lines[0][1], line[1])) is not None]
+    _, rows, face = min(beside, key=lambda each: each[0])
+    members = np.zeros(len(points), dtype=bool)
+    members[rows] = True
+    return replace(face, members=members, part=np.zeros(len(points), dtype=int))
+
+
+def find_walls(points: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Number (N,) of the wall on which each point of a profile (N, 2) lies, from 1; 0 for none.
+
+    Walls are the runs of points ``near`` (N,) the artefact's wall, without those that lie beside their smooth curve.
+    """
+    rows = np.flatnonzero(near)
+    walls, number = np.zeros(len(points), dtype=int), 0
+    if len(rows) < LEAST_WALL:
+        return walls
+    apart = np.linalg.norm(np.diff(points[rows], axis=0), axis=1)
+    ends = (np.diff(rows) > _LARGEST_GAP) | (apart > _LARGEST_GAP * np.median(apart))
+    for run in np.split(rows, np.flatnonzero(ends) + 1):
+        for _ in range(_LARGEST_ROUNDS):
+            if len(run) < LEAST_WALL:
+                break
+            centred = points[run] - points[run].mean(axis=0)
+            along, off = (centred @ np.linalg.svd(centred, full_matrices=False)[2].T).T
+            curve = np.vander(along / max(np.ptp(along), 1e-9), 3)
+            off = off - curve @ np.linalg.lstsq(curve, off, rcond=None)[0]
+            kept = np.abs(off) <= max(_REJECTED_BEYOND * MAD_TO_STD * float(np.median(np.abs(off))), 1e-4)
+            if kept.all():
+                number += 1
+                walls[run] = number
+                break
+            run = run[kept]
+    return walls
+
+
+def _lines_of(points: np.ndarray, rng: np.random.Generator) -> list[tuple[np.ndarray, ProfileLine]]:
+    """Rows (n,) of the points on the best supported lines of a profile, and these lines."""
     lines: list[tuple[np.ndarray, ProfileLine]] = []
     left = np.arange(len(points))
     for _ in range(_LINES):
@@ -173,26 +263,16 @@ def find_step(points: np.ndarray, height_mm: float | None, rng: np.random.Genera
             break
         lines.append((left[line.members], line))
         left = left[~line.members]
-    best: tuple[int, float, np.ndarray, np.ndarray, ProfileLine] | None = None
-    for (rows, first), (others, second) in combinations(lines, 2):
-        normal = np.array([-first.direction[1], first.direction[0]]) * np.sign(first.direction[0] or 1.0)
-        apart = float((second.middle_mm - first.middle_mm) @ normal)
-        noise = max(first.std_mm, second.std_mm, 1e-4)
-        lean = [
-            line.std_mm / max(np.ptp(points[own] @ line.direction), 1e-9) * np.sqrt(12 / len(own))
-            for own, line in ((rows, first), (others, second))
-        ]
-        turned = abs(float(first.direction[0] * second.direction[1] - first.direction[1] * second.direction[0]))
-        if turned > _REJECTED_BEYOND * float(np.hypot(*lean)) + _PARALLEL or abs(apart) < 2 * _REJECTED_BEYOND * noise:
-            continue
-        if height_mm is not None and not _LEAST_SEEN * height_mm < abs(apart) < height_mm / _LEAST_SEEN_COSINE:
-            continue
-        if best is None or len(rows) + len(others) > best[0]:
-            nearer, farther, line = (rows, others, first) if apart > 0 else (others, rows, second)
-            best = len(rows) + len(others), noise, nearer, farther, line
-    if best is None:
+    return lines
+
+
+def _apart(first: ProfileLine, second: ProfileLine) -> float | None:
+    """How far a line lies beyond another to larger z, mm; None where they are not parallel, or are one."""
+    normal = np.array([-first.direction[1], first.direction[0]]) * np.sign(first.direction[0] or 1.0)
+    apart = float((second.middle_mm - first.middle_mm) @ normal)
+    noise = max(first.std_mm, second.std_mm, 1e-4)
+    lean = [line.std_mm / max(line.length_mm, 1e-9) * np.sqrt(12 / line.members.sum()) for line in (first, second)]
+    turned = abs(float(first.direction[0] * second.direction[1] - first.direction[1] * second.direction[0]))
+    if turned > _REJECTED_BEYOND * float(np.hypot(*lean)) + _PARALLEL or abs(apart) < 2 * _REJECTED_BEYOND * noise:
         return None
-    _, noise, nearer, farther, line = best
-    members, second = np.zeros(len(points), bool), np.zeros(len(points), bool)
-    members[nearer] = members[farther] = second[farther] = True
-    return ProfileLine(members, line.middle_mm, line.direction, noise, second)
+    return apart

@@ -1,12 +1,16 @@
-"""Start values of a mount: in closed form from circles of a sphere, or by search from lines of a plane or step."""
+"""Start values of a mount: in closed form from circles of a sphere, or by search from lines of flat artefacts."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount_model import MountState, Problem, Scatter
-from uwlts.calibration.mount_profiles import ProfileArc, ProfileLine
+from uwlts.calibration.mount_artefacts import Plane, Ring, Seen, Sphere, Step, square_to
+from uwlts.calibration.mount_model import MountState, Problem, Scatter, cross_matrix
+from uwlts.calibration.mount_prediction import inverse, misfits
+from uwlts.calibration.mount_profiles import ProfileArc, ProfileLine, circles_through
+from uwlts.model.errors import CalibrationError
 
 _SUBSETS, _SUBSET = 40, 8
 """Random choices of poses: with a fifth of the poses wrong one of six choices of eight has none of these."""
@@ -17,11 +21,54 @@ _TURNS, _TURNS_TRIED = 5000, 10
 _RADII = (1.02, 1.15, 1.5)
 """Radius of an unknown sphere over that of its largest section."""
 _REWEIGHTED = 10
+_FAR = 4.0
+"""Standard uncertainties within which points of a ring's wall are sought; poses with as many misfits are left out."""
+_CLEAR = 6.0
+"""Times the width within which its points are sought: a smaller circle is not told from others."""
+_CIRCLES, _JUDGED = 3000, 1500
+"""Circles tried, and points by which each is judged: where a fifth of the points are on the wall, 24 circles are."""
 _ROUGH = Scatter(point_mm=0.1, pose_mm=0.3, turn_rad=3e-3)
 """Scatter for the weights of the search, whose robust loss begins beyond it."""
 
 
-def start_of_sphere(
+class NoFit(CalibrationError):
+    """Profiles, poses and what is known of the artefact contradict each other."""
+
+
+def start(
+    problem: Problem,
+    whole: Problem,
+    seen: Sequence[Seen],
+    sheet: np.ndarray,
+    towards: np.ndarray | None,
+    rng: np.random.Generator,
+) -> tuple[MountState, Problem]:
+    """State near the solution from what was seen in the profiles, and the problem with all points that it shows.
+
+    ``whole`` holds all points of the profiles; ``sheet`` (4, 4) maps the sheet's frame to the sensor's. ``towards``
+    (3,) of the sensor's frame is nearest to the axis of a rotary table.
+
+    Raises
+    ------
+    CalibrationError
+        Too few profiles show a wall of the ring.
+    """
+    arcs = [each for each in seen if isinstance(each, ProfileArc)]
+    lines = [each for each in seen if isinstance(each, ProfileLine)]
+    match problem.shape:
+        case Sphere() if towards is not None:
+            return _start_on_table(problem, arcs, sheet, towards), problem
+        case Sphere():
+            return _start_of_sphere(problem, arcs, sheet, rng), problem
+        case Step():
+            return _start_of_step(problem, lines, sheet, rng), problem
+        case Ring():
+            return _start_of_ring(problem, whole, lines, sheet, rng)
+        case _:
+            return _start_of_plane(problem, lines, sheet, rng), problem
+
+
+def _start_of_sphere(
     problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, rng: np.random.Generator
 ) -> MountState:
     """State near the solution from the arcs found in the profiles; ``sheet`` (4, 4) maps the sheet's frame to the
@@ -39,7 +86,7 @@ def start_of_sphere(
         subsets += [rng.choice(everything, _SUBSET, replace=False) for _ in range(_SUBSETS)]
     found: list[tuple[float, MountState]] = []
     largest = float(np.quantile(radii, 0.9))
-    for radius in [problem.radius_mm] if problem.radius_mm else [share * largest for share in _RADII]:
+    for radius in [problem.shape.size_mm] if problem.shape.size_mm else [share * largest for share in _RADII]:
         depth = np.sqrt(np.maximum(radius**2 - radii**2, 0))
         for subset in subsets:
             for state in _linear_solutions(rotations, positions, centres, depth, subset, radius):
@@ -49,8 +96,8 @@ def start_of_sphere(
     return _best(rough, [_in_sensor_frame(state, sheet) for _, state in found[:_TRIED]])
 
 
-def start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, towards: np.ndarray) -> MountState:
-    """State near the solution from the arcs of a sphere on a rotary table; ``sheet`` as in `start_of_sphere`.
+def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, towards: np.ndarray) -> MountState:
+    """State near the solution from the arcs of a sphere on a rotary table; ``sheet`` as in `start`.
 
     At angle h the sphere's centre is q + a cos h + b sin h in the sensor's frame, linear in the six coordinates in the
     sheet. As a and b have the same length and are square to each other, their parts across it are the complex root
@@ -70,13 +117,13 @@ def start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, 
         weights = 1 / np.sqrt(1 + (off / max(2 * float(np.median(off)), 1e-6)) ** 2)
     largest, states = float(np.quantile(radii, 0.9)), []
     root = np.sqrt(complex(flat[2] @ flat[2] - flat[1] @ flat[1], -2 * flat[1] @ flat[2]))
-    for radius in [problem.radius_mm] if problem.radius_mm else [share * largest for share in _RADII]:
+    for radius in [problem.shape.size_mm] if problem.shape.size_mm else [share * largest for share in _RADII]:
         depth = np.sqrt(np.maximum(radius**2 - radii**2, 0))
-        for across in (root, -root):
-            moving = np.cos(angles) * across.real + np.sin(angles) * across.imag
+        for other in (root, -root):
+            moving = np.cos(angles) * other.real + np.sin(angles) * other.imag
             tried = np.concatenate([depth - moving, -depth - moving])
             middle = tried[np.argmin(np.median(np.abs(np.abs(tried[:, None] + moving) - depth), axis=1))]
-            q, a, b = (np.array([u, y, w]) for (u, w), y in zip(flat, (middle, across.real, across.imag), strict=True))
+            q, a, b = (np.array([u, y, w]) for (u, w), y in zip(flat, (middle, other.real, other.imag), strict=True))
             axis = np.cross(a, b)
             if axis @ (sheet[:3, :3].T @ towards) <= 0:
                 continue
@@ -143,10 +190,10 @@ def _in_sensor_frame(state: MountState, sheet: np.ndarray) -> MountState:
     return MountState(rotation, state.translation - rotation @ sheet[:3, 3], state.artefact)
 
 
-def start_of_plane(
+def _start_of_plane(
     problem: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
 ) -> MountState:
-    """State near the solution from the lines found in the profiles; ``sheet`` as in `start_of_sphere`.
+    """State near the solution from the lines found in the profiles; ``sheet`` as in `start`.
 
     The lines' directions in the base are square to the plane's normal whatever the translation: of many rotations the
     best are kept by the smallest eigenvalue of the directions' scatter, whose vector is the normal. Translation and
@@ -165,22 +212,102 @@ def start_of_plane(
         for turn in (turns[number], turns[number] * np.array([-1.0, 1.0, -1.0])):
             places = np.einsum("pij,jk,pk->pi", rotations, turn, middles) + positions
             design = np.column_stack([np.einsum("pji,j->pi", rotations, normal), -np.ones(len(lines))])
-            solution = np.linalg.lstsq(design, -places @ normal, rcond=1e-10)[0]
+            solution = _robust(design, -places @ normal)
             states.append(MountState(turn, solution[:3], np.append(normal, solution[3])))
     return _best(problem.thinned(_THINNED), [_in_sensor_frame(state, sheet) for state in states])
 
 
-def start_of_step(
+def _start_of_step(
     problem: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
 ) -> MountState:
     """State near the solution from the lines of both faces of a step: as of a plane from the first, then the height."""
-    assert problem.second is not None
-    first = [points[np.logical_not(own)] for points, own in zip(problem.points, problem.second, strict=True)]
-    state = start_of_plane(replace(problem, points=first, second=None), lines, sheet, rng)
+    first = [points[part == 0] for points, part in zip(problem.points, problem.part, strict=True)]
+    none = [np.zeros(len(points), dtype=int) for points in first]
+    state = _start_of_plane(replace(problem, points=first, part=none, shape=Plane()), lines, sheet, rng)
     state = replace(state, artefact=np.append(state.artefact, 0.0))
-    found = float(np.median(problem.distances(state)[np.concatenate(problem.second)]))
-    height = found if problem.height_mm is None else float(np.copysign(problem.height_mm, found))
+    found = float(np.median(problem.distances(state)[np.concatenate(problem.part) > 0]))
+    height = found if problem.shape.size_mm is None else float(np.copysign(problem.shape.size_mm, found))
     return replace(state, artefact=np.append(state.artefact[:4], height))
+
+
+def _start_of_ring(
+    problem: Problem, whole: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
+) -> tuple[MountState, Problem]:
+    """State from the lines of the face, as of a plane; then the wall is the circle on which most other points lie.
+
+    The mount by the face alone places points along the face as well as its covariance says: so wide is the circle.
+    """
+    shape, plane = problem.shape, replace(problem, shape=Plane())
+    state = _start_of_plane(plane, lines, sheet, rng)
+    off = misfits(plane, state)
+    noise = float(np.median([line.std_mm for line in lines]))
+    scatter = Scatter(max(noise, 1e-6), max(float(np.median(off)), noise), 1e-3)
+    used = plane.selected(off < _FAR * np.median(off) + 5 * noise)
+    state = used.solved(state, scatter)
+    covariance = inverse(used.information(state, scatter).sum(axis=0))[:6, :6]
+    middle = state.rotation @ np.vstack(used.points).mean(axis=0)
+    to_point = np.hstack([np.eye(3), -cross_matrix(middle)])
+    known = float(np.sqrt(np.linalg.eigvalsh(to_point @ covariance @ to_point.T)[-1]))
+    reach = _FAR * float(np.hypot(known, scatter.pose_mm))
+    base = whole.base(state)
+    normal, distance = state.artefact[:3], state.artefact[3]
+    axes = square_to(normal)
+    height = base @ normal - distance
+    beside = np.flatnonzero(np.abs(height) > reach)
+    # Every height counts alike: a table has many points, and all at one height.
+    heights = np.sort(height[beside])
+    alike = np.searchsorted(heights, height[beside] + reach) - np.searchsorted(heights, height[beside] - reach)
+    beside = rng.choice(beside, _JUDGED, p=1 / alike / np.sum(1 / alike)) if len(beside) else beside
+    circle = _circle_of_most(base[beside] @ axes.T, shape.size_mm, reach, rng)
+    if circle is None:
+        require_surfaces(problem)
+    assert circle is not None
+    state = replace(
+        state, artefact=np.concatenate([normal, circle[:2] @ axes + distance * normal, [shape.size_mm or circle[2]]])
+    )
+    flat = [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in whole.points]
+    for narrower in (1.0, 3.0, 9.0):
+        problem = whole.of_seen(whole.seen_again(state, flat, max(reach / narrower, 5 * noise), rng))
+        require_surfaces(problem)
+        state = problem.solved(state, scatter, loss="cauchy")
+    return state, problem
+
+
+def require_surfaces(problem: Problem) -> None:
+    """CalibrationError where too few profiles show a surface of the artefact; `NoFit` where its size may be wrong."""
+    if (words := problem.shape.missing(problem.part)) is not None:
+        raise CalibrationError(words) if problem.shape.size_mm is None else NoFit(words)
+
+
+def _circle_of_most(
+    points: np.ndarray, radius_mm: float | None, reach_mm: float, rng: np.random.Generator
+) -> np.ndarray | None:
+    """Centre and radius (3,) of the circle with most of the points (N, 2) near it, beyond those inside and outside."""
+    if not len(points):
+        return None
+    tried = points[rng.integers(len(points), size=(_CIRCLES, 3))]
+    centres, radii = circles_through(tried)
+    proper = np.isfinite(radii) & (radii > _CLEAR * reach_mm) & (radii < np.linalg.norm(np.ptp(points, axis=0)))
+    if radius_mm is not None:
+        proper &= np.abs(radii - radius_mm) < max(0.03 * radius_mm, reach_mm)
+    if not proper.any():
+        return None
+    off = np.abs(np.linalg.norm(points - centres[proper, None], axis=2) - radii[proper, None])
+    # Surfaces that are no wall fill a disc, and have as many points beside the circle.
+    near, beside = (np.count_nonzero(off < reach, axis=1) for reach in (reach_mm, 3 * reach_mm))
+    score = 1.5 * near - 0.5 * beside
+    best = int(np.argmax(score))
+    return np.append(centres[proper][best], radii[proper][best]) if score[best] > 0 else None
+
+
+def _robust(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Solution of linear equations of which some are wrong, by Cauchy's weights."""
+    weights, solution = np.ones(len(design)), np.zeros(design.shape[1])
+    for _ in range(_REWEIGHTED):
+        solution = np.linalg.lstsq(design * weights[:, None], wanted * weights, rcond=1e-10)[0]
+        off = np.abs(design @ solution - wanted)
+        weights = 1 / np.sqrt(1 + (off / max(2 * float(np.median(off)), 1e-6)) ** 2)
+    return solution
 
 
 def _in_space(flat: np.ndarray) -> np.ndarray:
@@ -193,9 +320,3 @@ def _best(rough: Problem, states: list[MountState]) -> MountState:
     fixed = replace(rough, scale=False, time=False)
     refined = [fixed.solved(state, _ROUGH, loss="cauchy") for state in states]
     return min(refined, key=lambda state: float(np.median(misfits(fixed, state))))
-
-
-def misfits(problem: Problem, state: MountState) -> np.ndarray:
-    """Root mean square distance (P,) of the points of each pose."""
-    squares = problem.distances(state) ** 2
-    return np.sqrt(np.bincount(problem.poses, squares) / problem.counts)

@@ -195,7 +195,7 @@ def mount(
     poses: Path | None = None,
     *,
     out: Path,
-    artefact: Literal["sphere", "plane", "step"] = "sphere",
+    artefact: Literal["sphere", "plane", "step", "ring"] = "sphere",
     radius_mm: float | None = None,
     height_mm: float | None = None,
     calibration: Path | None = None,
@@ -207,8 +207,8 @@ def mount(
     time: Flag = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Calibrate the mount of any laser profiler on a robot or stage, from its profiles of a sphere, plane or step; or
-    that of a calibrated sensor, from a capture of one of them or of a target; or the axis of a rotary table.
+    """Calibrate the mount of any laser profiler on a robot or stage, from its profiles of a sphere, plane, step or
+    ring; or that of a calibrated sensor, from a capture of one of them or of a target; or the axis of a rotary table.
 
     The artefact stands still at an unknown place. Prints the transform from the sensor to the platform with its
     uncertainty, the poses that were left out, what the motions determine badly, and the pose to add next.
@@ -223,7 +223,7 @@ def mount(
             those of the capture unless given.
         out: Mount to write (JSON).
         artefact: What the profiles show.
-        radius_mm: Radius of the sphere; estimated unless given.
+        radius_mm: Radius of the sphere, or of the ring's wall; estimated unless given.
         height_mm: Height of the step; estimated unless given.
         calibration: Calibration of the sensor that took the capture.
         pose_format: matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about the moved

@@ -25,6 +25,7 @@ def reconstruct(
     pose_format: str = "matrix",
     pose_unit: Literal["mm", "m"] = "mm",
     clock_offset_s: float | None = None,
+    clock_drift_ppm: float = 0.0,
     pose_correlation_s: float | None = None,
     index: Index = None,
     method: Method = None,
@@ -51,6 +52,8 @@ def reconstruct(
         pose_unit: Unit of the trajectory's positions.
         clock_offset_s: What to add to the times of the images for those of the trajectory; as the mount says unless
             given.
+        clock_drift_ppm: By how many parts in a million the trajectory's clock runs faster than the camera's, from the
+            first laser image on.
         pose_correlation_s: Time over which errors of poses stay alike, inf where all err together. Unless given, poses
             in the capture err each by itself, and those of a trajectory as a navigation filter's of its covariances.
         peak: Which of several stripes on a line counts; the direct one, or as the sensor's table [stripe] says.
@@ -65,6 +68,7 @@ def reconstruct(
             mount=mount,
             trajectory=path,
             clock_offset_s=clock_offset_s,
+            clock_drift_ppm=clock_drift_ppm,
             pose_correlation_s=pose_correlation_s,
             stripe=stripe_settings(stripe, method, peak),
             index=index,
@@ -158,6 +162,7 @@ def align(
     pose_format: str = "quaternion-xyzw",
     pose_unit: Literal["mm", "m"] = "mm",
     clock_offset_s: float = 0.0,
+    clock_drift_ppm: float = 0.0,
     drift_mm: float | None = None,
     drift_deg: float | None = None,
     overwrite: Overwrite = False,
@@ -176,6 +181,7 @@ def align(
         pose_format: Format of the trajectory, as for uwlts reconstruct.
         pose_unit: Unit of the trajectory's positions.
         clock_offset_s: What to add to the times of the points for those of the trajectory.
+        clock_drift_ppm: By how many parts in a million the trajectory's clock runs faster, as for uwlts reconstruct.
         drift_mm: Standard uncertainty of the navigation at the end, along each axis; as the trajectory's covariance
             says unless given.
         drift_deg: The same of its turns.
@@ -189,7 +195,13 @@ def align(
     path = uwlts.read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
     with progress_bar(f"aligning {cloud.name}") as progress:
         found = uwlts.align_trajectory(
-            cloud, path, clock_offset_s=clock_offset_s, drift_mm=drift_mm, drift_deg=drift_deg, progress=progress
+            cloud,
+            path,
+            clock_offset_s=clock_offset_s,
+            clock_drift_ppm=clock_drift_ppm,
+            drift_mm=drift_mm,
+            drift_deg=drift_deg,
+            progress=progress,
         )
     show(found.lines())
     uwlts.write_trajectory(out, found.trajectory, overwrite=overwrite)

@@ -16,7 +16,7 @@ from uwlts.calibration.joint.stored_estimate import covariance_root
 from uwlts.measurement.point_uncertainty import independent_patterns
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount
-from uwlts.model.trajectory import Trajectory
+from uwlts.model.trajectory import Trajectory, on_clock
 from uwlts.storage.capture import Capture, FrameTable
 from uwlts.storage.cloud import PointUncertainty
 
@@ -44,7 +44,12 @@ class Ride:
 
 
 def platform_ride(
-    capture: Capture, trajectory: Trajectory | None, *, mount: Mount | None, clock_offset_s: float | None
+    capture: Capture,
+    trajectory: Trajectory | None,
+    *,
+    mount: Mount | None,
+    clock_offset_s: float | None,
+    clock_drift_ppm: float = 0.0,
 ) -> Ride:
     """Poses of the platform at all images, by the trajectory at their times or as the capture holds them.
 
@@ -57,8 +62,8 @@ def platform_ride(
     """
     scale = 1.0 if mount is None or mount.robot_scale is None else mount.robot_scale
     if trajectory is None:
-        if clock_offset_s is not None:
-            raise DescriptionError("an offset of the clocks was given without a trajectory")
+        if clock_offset_s is not None or clock_drift_ppm:
+            raise DescriptionError("an offset or drift of the clocks was given without a trajectory")
         poses = capture.pose.copy()
         if missing := int(np.count_nonzero(capture.laser_on & ~np.isfinite(poses).all(axis=(1, 2)))):
             raise CalibrationError(
@@ -69,7 +74,7 @@ def platform_ride(
         return Ride(poses, capture.pose_covariance, capture.time_s)
     found = mount.time_offset_s if mount is not None else None
     offset, laser = clock_offset_s if clock_offset_s is not None else found or 0.0, capture.laser_on
-    times = capture.time_s[laser] + offset
+    times = on_clock(capture.time_s[laser], offset_s=offset, drift_ppm=clock_drift_ppm)
     poses, rates = np.full((len(laser), 4, 4), np.nan), np.full((len(laser), 6), np.nan)
     poses[laser], rates[laser] = trajectory.poses_at(times), trajectory.rates_at(times)
     covariance, stated = None, trajectory.covariance_at(times)

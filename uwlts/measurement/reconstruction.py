@@ -54,6 +54,7 @@ def reconstruct(
     mount: Mount | str | Path | None = None,
     trajectory: Trajectory | None = None,
     clock_offset_s: float | None = None,
+    clock_drift_ppm: float = 0.0,
     pose_correlation_s: float | None = None,
     stripe: StripeSettings = None,
     index: float | None = None,
@@ -73,6 +74,8 @@ def reconstruct(
         Path of the platform (of the sensor without a mount), in place of poses in the capture and of the stage.
     clock_offset_s : float, optional
         What to add to the times of the images for those of the trajectory; by default as the mount says, or nothing.
+    clock_drift_ppm : float, optional
+        By how many parts in a million the trajectory's clock runs faster than the camera's, from the first laser image.
     pose_correlation_s : float, optional
         Time over which errors of poses stay alike: 0 where each pose errs by itself, infinity where all err together.
         By default 0 for poses in the capture, and for a trajectory as the errors of a navigation filter that states
@@ -107,11 +110,13 @@ def reconstruct(
         check_fits(scan.header, calibration, source=scan.path.name)
         known = calibration.joint is not None if with_uncertainty is None else with_uncertainty
         alone = scan.header.T_platform_sensor is None and scan.pose_covariance is None
-        if alone and mount is None and trajectory is None and clock_offset_s is None:
+        if alone and mount is None and trajectory is None and clock_offset_s is None and not clock_drift_ppm:
             stripes = find_stripes(scan, options=stripe, progress=progress)
             return reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known)
         mount = read_mount(mount) if isinstance(mount, str | Path) else mount
-        ride = platform_ride(scan, trajectory, mount=mount, clock_offset_s=clock_offset_s)
+        ride = platform_ride(
+            scan, trajectory, mount=mount, clock_offset_s=clock_offset_s, clock_drift_ppm=clock_drift_ppm
+        )
         stripes = find_stripes(scan, options=stripe, progress=progress)
         table = carried(scan, ride, mount)
         apart, common = (None, None) if mount is None else mount.apart_from(calibration_digest(calibration))

@@ -267,7 +267,8 @@ class JointRegistration:
                 block[:, self.pattern_columns[number]] = sign * root @ marker.patterns_mm.T
             blocks.append(block)
             residuals.append(off)
-            weights.append(np.full(3, 2 / views))
+            # Where surfaces fit worse than stated, spheres do too: else they would decide, and keep surfaces apart.
+            weights.append(np.full(3, 2 / views / spread**2))
             deviations.append(np.ones(3))
         return PairEvidence(
             np.vstack(blocks),

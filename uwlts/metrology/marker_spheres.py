@@ -8,6 +8,7 @@ from itertools import permutations
 
 import numpy as np
 
+from uwlts.metrology.fits import fit_sphere
 from uwlts.metrology.spheres import find_sphere
 from uwlts.storage.cloud import PointCloud
 
@@ -35,12 +36,14 @@ def find_markers(cloud: PointCloud, diameter_mm: float) -> list[MarkerSphere]:
         sphere = find_sphere(cloud.points_mm, diameter_mm / 2, usable=usable, rng=rng)
         if sphere is None:
             break
-        fit, members = sphere.robust.fit, sphere.members[sphere.robust.inliers]
+        members = sphere.members[sphere.robust.inliers]
         usable[sphere.near] = False
+        # Of a cap, centre and radius are known together only; the diameter is given.
+        fit = fit_sphere(cloud.points_mm[members], diameter_mm / 2)
         outwards = cloud.points_mm[members] - fit.centre_mm
         outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
-        # A displacement moves centre and radius of the fit by least squares.
-        solve = np.linalg.pinv(np.column_stack([outwards, np.ones(len(outwards))]))[:3]
+        # A displacement moves the centre of the fit by least squares.
+        solve = np.linalg.pinv(outwards)
         patterns = np.zeros((0, 3))
         if cloud.uncertainty is not None:
             moved = np.einsum("mni,ni->mn", cloud.uncertainty.patterns_mm[:, members], outwards)

@@ -33,7 +33,7 @@ from uwlts.metrology.patches import (
 from uwlts.metrology.path_uncertainty import along_corrected_path
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
-from uwlts.model.trajectory import Trajectory
+from uwlts.model.trajectory import Trajectory, on_clock
 from uwlts.storage.cloud import PointCloud, read_cloud
 
 _TUKEY = 4.685
@@ -141,6 +141,7 @@ def align_trajectory(
     trajectory: Trajectory,
     *,
     clock_offset_s: float = 0.0,
+    clock_drift_ppm: float = 0.0,
     drift_mm: float | None = None,
     drift_deg: float | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -153,8 +154,9 @@ def align_trajectory(
         Cloud or its file, in the base frame by the trajectory, with the time of each point (`reconstruct`).
     trajectory
         Path of the platform (of the sensor without a mount).
-    clock_offset_s
-        What to add to the times of the points for those of the trajectory.
+    clock_offset_s, clock_drift_ppm
+        What to add to the times of the points for those of the trajectory, and by how many parts in a million its clock
+        runs faster than theirs.
     drift_mm, drift_deg
         Standard uncertainty that the navigation has gathered at the end, along each axis; from the covariance of the
         trajectory unless given.
@@ -171,7 +173,7 @@ def align_trajectory(
     cloud = cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
     if cloud.time_s is None:
         raise EvaluationError("the cloud has no times of its points: reconstruct it with a trajectory")
-    times = cloud.time_s + clock_offset_s
+    times = on_clock(cloud.time_s, offset_s=clock_offset_s, drift_ppm=clock_drift_ppm)
     path = _Path.of(trajectory, _drift(trajectory, drift_mm, drift_deg), times)
     pieces = _pieces(cloud, times, path)
     searched = [_Alignment(pieces, path, shares) for shares in (_SMOOTH, _ROUGH)]

@@ -1,6 +1,6 @@
 """The mount of a laser profiler on a moving platform, as `uwlts.calibrate_mount` finds it and `mount.json` holds it."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, assert_never
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -66,6 +66,16 @@ class StepFound(Description):
     height_std_mm: NotNegative | None = None
 
 
+class RingFound(Description):
+    """The ring: axis of its cylinder, centre and radius of the circle in which that meets the plane of the face."""
+
+    kind: Literal["ring"] = "ring"
+    axis: Vector
+    centre_mm: Vector
+    radius_mm: Positive
+    radius_std_mm: NotNegative | None = None
+
+
 class BoardFound(Description):
     """The target: ``T_base_target`` (4, 4), mm."""
 
@@ -103,7 +113,7 @@ class Mount(Description):
     T_platform_sensor: Rows
     covariance: Rows
     coverage_factor: Positive
-    artefact: Annotated[SphereFound | PlaneFound | StepFound | BoardFound, Field(discriminator="kind")]
+    artefact: Annotated[SphereFound | PlaneFound | StepFound | RingFound | BoardFound, Field(discriminator="kind")]
     robot_scale: Positive | None = None
     robot_scale_std: NotNegative | None = None
     time_offset_s: float | None = None
@@ -143,6 +153,18 @@ class Mount(Description):
     def std(self) -> np.ndarray:
         """Standard uncertainties (6,): translation, mm, and rotation about the platform's axes, rad."""
         return np.sqrt(np.diag(np.array(self.covariance)))
+
+    def size_mm(self) -> float:
+        """Radius or height of the artefact; 0 of one without a size."""
+        match self.artefact:
+            case SphereFound() | RingFound():
+                return self.artefact.radius_mm
+            case StepFound():
+                return abs(self.artefact.height_mm)
+            case PlaneFound() | BoardFound():
+                return 0.0
+            case _:
+                assert_never(self.artefact)
 
     def apart_from(self, calibration: str) -> tuple[np.ndarray, np.ndarray | None]:
         """Covariance (6, 6) that is independent of points by a calibration of the sensor, given by its digest.

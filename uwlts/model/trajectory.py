@@ -11,6 +11,8 @@ from uwlts.model.calibration import is_rigid
 from uwlts.model.errors import DescriptionError
 
 _ROUNDED = 1e-6
+_LARGEST_DRIFT_PPM = 10_000.0
+"""A hundred times the worst quartz: more is a mistaken unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +97,20 @@ class Trajectory:
         poses[:, :3, :3] = self._rotations(wanted).as_matrix()
         poses[:, :3, 3] = self._positions(wanted)
         return poses
+
+
+def on_clock(times_s: np.ndarray, *, offset_s: float, drift_ppm: float) -> np.ndarray:
+    """Times (N,) of a camera by the clock of its platform, s, which is ahead by ``offset_s`` at the first of them, and
+    runs faster by ``drift_ppm`` parts in a million.
+
+    DescriptionError where these are not finite, or the drift is larger than any clock's.
+    """
+    if not (np.isfinite(offset_s) and abs(drift_ppm) <= _LARGEST_DRIFT_PPM):
+        raise DescriptionError(
+            f"the platform's clock is ahead by {offset_s:g} s and drifts by {drift_ppm:g} ppm; expected finite "
+            f"numbers, and a drift of up to {_LARGEST_DRIFT_PPM:g} ppm"
+        )
+    return times_s + offset_s + 1e-6 * drift_ppm * (times_s - np.min(times_s, initial=np.inf))
 
 
 def _checked_covariances(values: np.ndarray, count: int) -> np.ndarray:

@@ -192,7 +192,7 @@ def slopes_of_brightness(
 
 
 def beside_std(uncertainty: Uncertainty) -> float:
-    """Relative standard uncertainty of `beside_sheet`, which goes with the square of the sheet's thickness."""
+    """Relative standard uncertainty of `LitSheet.beside`, which goes with the square of the sheet's thickness."""
     return 2.0 * uncertainty.sheet_thickness
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.model.mount import BoardFound, Mount, SphereFound, StepFound
+from uwlts.model.mount import BoardFound, Mount, RingFound, SphereFound, StepFound
 
 
 def mount_lines(mount: Mount) -> list[str]:
@@ -31,6 +31,10 @@ def mount_lines(mount: Mount) -> list[str]:
         known = "given" if found.height_std_mm is None else f"+-{mount.coverage_factor * found.height_std_mm:.3f}"
         place = f"normal {_vector(found.normal)}, distance {found.distance_mm:.3f} mm"
         lines.append(f"step                      {place}, height {abs(found.height_mm):.3f} mm ({known})")
+    elif isinstance(found, RingFound):
+        known = "given" if found.radius_std_mm is None else f"+-{mount.coverage_factor * found.radius_std_mm:.3f}"
+        place = f"axis {_vector(found.axis)} through {_vector(found.centre_mm)}"
+        lines.append(f"ring, mm                  {place}, radius {found.radius_mm:.3f} ({known})")
     else:
         lines.append(f"plane                     normal {_vector(found.normal)}, distance {found.distance_mm:.3f} mm")
     if mount.robot_scale is not None and mount.robot_scale_std is not None:

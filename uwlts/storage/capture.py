@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
+import hdf5plugin  # noqa: F401, gives HDF5 the filter by which frames are read
 import numpy as np
 
 from uwlts.model.calibration import is_rigid

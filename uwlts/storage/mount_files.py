@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -40,7 +40,9 @@ _OFTEN_MEANT = (
 _OFTEN_MEANT += ("euler-ZYZ-deg", "rotvec-deg", "rotvec-rad", "euler-ZYX-rad", "euler-xyz-rad", "euler-XYZ-rad")
 
 
-Artefact = Literal["sphere", "plane", "step"]
+Artefact = Literal["sphere", "plane", "step", "ring"]
+_SIZES: dict[Artefact, str] = {"sphere": "radius", "step": "height", "ring": "radius"}
+"""What is known of an artefact's size."""
 SensorAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 SENSOR_AXES: dict[SensorAxis, np.ndarray] = {
     sign + name: (-1.0 if sign else 1.0) * direction  # pyright: ignore[reportAssignmentType]
@@ -74,8 +76,7 @@ class MountEvidence:
     profiles: list[np.ndarray]
     poses: np.ndarray
     artefact: Artefact
-    radius_mm: float | None = None
-    height_mm: float | None = None
+    size_mm: float | None = None
     names: list[str]
     axis: SensorAxis | None = None
     scale: bool = False
@@ -85,6 +86,11 @@ class MountEvidence:
     pose_format: str = "matrix"
     rows: np.ndarray | None = None
     digests: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def size(self) -> str:
+        """Name of the artefact's size."""
+        return _SIZES.get(self.artefact, "size")
 
     def other_readings(self) -> Iterator[tuple[str, np.ndarray]]:
         """The same numbers as poses of other formats, by which they are often meant."""
@@ -130,14 +136,12 @@ def read_mount_evidence(
         pose_format = given.pose_format
         profile_unit, pose_unit, scale, time = given.profile_unit, given.pose_unit, given.scale, given.time
         axis = given.axis
-    if artefact not in ("sphere", "plane", "step"):
-        raise DescriptionError(f"the artefact is {artefact!r}; expected sphere, plane or step")
-    for name, size, of, wanted in (
-        ("radius_mm", radius_mm, "sphere", "radius"),
-        ("height_mm", height_mm, "step", "height"),
-    ):
-        if size is not None and not (np.isfinite(size) and size > 0 and artefact == of):
-            raise DescriptionError(f"{name} is {size:g} of a {artefact}; expected the positive {wanted} of a {of}")
+    if artefact not in get_args(Artefact):
+        raise DescriptionError(f"the artefact is {artefact!r}; expected one of {', '.join(get_args(Artefact))}")
+    for name, size in (("radius", radius_mm), ("height", height_mm)):
+        if size is not None and not (np.isfinite(size) and size > 0 and _SIZES.get(artefact) == name):
+            kinds = " or ".join(kind for kind, own in _SIZES.items() if own == name)
+            raise DescriptionError(f"{name}_mm is {size:g} of a {artefact}; expected the positive {name} of a {kinds}")
     if poses is None:
         raise DescriptionError("the poses are missing: give T_base_platform of every profile")
     if isinstance(profiles, str | Path):
@@ -171,8 +175,7 @@ def read_mount_evidence(
         profiles=checked,
         poses=matrices,
         artefact=artefact,
-        radius_mm=radius_mm,
-        height_mm=height_mm,
+        size_mm=radius_mm if height_mm is None else height_mm,
         names=names or [str(number + 1) for number in range(len(checked))],
         axis=axis,
         scale=scale,

@@ -178,7 +178,8 @@ def _search_lines(
     peaks: PeakWindow,
 ) -> int:
     """Fill `status`, `wide`, `several` and the windows of the lines with a stripe; returns how many there are."""
-    size, border, count = smooth.size, kernel.size // 2, np.intp(0)
+    # A number that is no literal, for which functions would be compiled once more.
+    size, border, count = smooth.size, kernel.size // 2, int(np.intp(0))
     window = pixels[border : border + size]
     near = window[rules.half - 1 : rules.half + rules.block + 1]
     for line in range(profiles.shape[1]):
@@ -260,7 +261,8 @@ def _search_all(
     peaks: PeakWindow,
 ) -> int:
     """Fill `found`, `clear` and the windows of all stripes on some lines; returns how many there are."""
-    size, border, count = smooth.size, kernel.size // 2, np.intp(0)
+    # A number that is no literal, for which functions would be compiled once more.
+    size, border, count = smooth.size, kernel.size // 2, int(np.intp(0))
     window = pixels[border : border + size]
     near = window[rules.half - 1 : rules.half + rules.block + 1]
     for m in range(lines.size):

@@ -90,6 +90,23 @@ def test_images_are_placed_along_the_trajectory_at_their_times(tmp_path, expecte
     np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
 
 
+def test_a_clock_may_run_faster_than_the_camera_s(tmp_path, expected):
+    path, ppm = record(tmp_path / "moving.h5"), 2000.0
+    times = 50.0 + (1 + 1e-6 * ppm) * np.array([-0.5, 0.3, 1.0, 2.9, 4.2])
+    poses = np.array([platform_at(STEP_MM * time) for time in (-0.5, 0.3, 1.0, 2.9, 4.2)])
+    clock = {"clock_offset_s": 50.0, "clock_drift_ppm": ppm}
+    cloud = uwlts.reconstruct(
+        path, CALIBRATION, mount=mount_of(MOUNT), trajectory=uwlts.Trajectory(times, poses), **clock
+    )
+    np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
+    with pytest.raises(uwlts.Error, match="drifts by 1e[+]06 ppm"):
+        uwlts.reconstruct(
+            path, CALIBRATION, trajectory=uwlts.Trajectory(times, poses), clock_offset_s=50.0, clock_drift_ppm=1e6
+        )
+    with pytest.raises(uwlts.Error, match="without a trajectory"):
+        uwlts.reconstruct(path, CALIBRATION, mount=mount_of(MOUNT), clock_drift_ppm=ppm)
+
+
 def test_a_trajectory_without_a_mount_is_the_sensor_s(tmp_path, expected):
     poses = np.array([platform_at(STEP_MM * time) for time in (0.0, 4.0)]) @ MOUNT
     trajectory = uwlts.Trajectory(np.array([0.0, 4.0]), poses)

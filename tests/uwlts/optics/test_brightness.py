@@ -109,6 +109,24 @@ def test_the_sheet_is_no_thicker_than_the_stripes_are_wide(thesis):
     np.testing.assert_allclose(np.sqrt(np.abs(thin[:, 0]) / 0.1), 0.15, rtol=0.1)
 
 
+def test_many_centres_see_the_sheet_as_few_do(thesis):
+    """By a table that errs by 1e-7 mm of points and 1e-6 of all else; ten times as much between its nodes."""
+    calibration = nominal_calibration(thesis, thesis.media["water"])
+    rng = np.random.default_rng(9)
+    line, centre = rng.integers(100, 1180, 6000), rng.uniform(300.0, 700.0, 6000)
+    many, few = (
+        LitSheet.of(calibration, thesis, line[:count], centre[:count], medium_index=WATER) for count in (6000, 400)
+    )
+    np.testing.assert_allclose(many.found.points_mm[:400], few.found.points_mm, rtol=0, atol=1e-6)
+    for name in ("of_slope", "sigma_mm", "per_sigma_px"):
+        found, expected = getattr(many, name)[:400], getattr(few, name)
+        assert np.abs(expected).max() > 1e-3
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+    width = np.full(6000, 4.0)
+    every = LitSheet.of(calibration, thesis, line + 0.0, centre, medium_index=WATER)
+    assert many.footprint_mm(width) == pytest.approx(every.footprint_mm(width), rel=1e-5)
+
+
 def ridge(lean, bend, fading, blur):
     """An image (H, W) of a thin bright curve under blur, and the curve's rows by column."""
     fine = np.arange(-20.0, 180.0, 0.1)

@@ -37,6 +37,30 @@ def test_combined_values_are_sums_whether_lines_or_places_are_more(count):
     np.testing.assert_allclose(table.combined(weights).values(line, place), sums, rtol=0, atol=5e-9)
 
 
+def test_terms_are_left_out_up_to_an_error():
+    table = LineTable.of(waves, (0, 1279), (0.0, 1023.0), tolerance=1e-10)
+    assert table is not None
+    short = table.shortened(1e-4)
+    assert short.terms.shape[0] < table.terms.shape[0] and short.terms.shape[1] < table.terms.shape[1]
+    rng = np.random.default_rng(6)
+    line, place = rng.integers(0, 1280, 500), rng.uniform(0, 1023, 500)
+    off = np.abs(short.values(line, place) - waves(line, place)).max(axis=0)
+    # Once for terms of lines, once for those of places; and some of it, else nothing was left out.
+    assert 1e-6 < off.max() <= 2e-4
+
+
+def test_the_error_is_a_share_of_each_value_where_that_is_more():
+    def large(line, place):
+        return waves(line, place) * [1e8, 1.0]
+
+    table = LineTable.of(large, (0, 1279), (0.0, 1023.0), tolerance=1e-9, share=1e-9)
+    assert table is not None
+    assert LineTable.of(large, (0, 1279), (0.0, 1023.0), tolerance=1e-14) is None
+    rng = np.random.default_rng(7)
+    line, place = rng.integers(0, 1280, 500), rng.uniform(0, 1023, 500)
+    assert (np.abs(table.values(line, place) - large(line, place)).max(axis=0) <= [1.0, 1e-8]).all()
+
+
 def test_there_is_none_of_what_is_not_smooth_or_not_everywhere():
     def kinked(line, place):
         return np.abs(place - 400.3)[:, None]

@@ -1,10 +1,15 @@
 """Compiled loops are kept on disk, and compiled anew when what they call has changed."""
 
+import gc
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from numba.core import event
+from numba.core.errors import TypingError
+
+from uwlts.runtime.compiled import compiled_part
 
 CALLER = """\
 from uwlts.runtime.compiled import compiled
@@ -44,3 +49,33 @@ def test_a_change_in_another_file_that_is_called_is_noticed(tmp_path: Path, othe
     assert run(packages) == ["6.0", "1"]
     called.write_text(CALLED.format("50.0"))
     assert run(packages) == ["100.0", "0"]
+
+
+@pytest.mark.parametrize("collects", [True, False])
+def test_garbage_is_collected_after_compilation_as_before_it(collects):
+    """Also where a function cannot be compiled."""
+    seen = []
+
+    class Listener(event.Listener):
+        def on_start(self, event):
+            seen.append(gc.isenabled())
+
+        def on_end(self, event):
+            pass
+
+    def doubled(x):
+        return x + x
+
+    def unknown(x):
+        return x.nothing
+
+    (gc.enable if collects else gc.disable)()
+    try:
+        with event.install_listener("numba:compile", Listener()):
+            assert compiled_part(doubled).compile("float64(float64)") is not None
+            with pytest.raises(TypingError):
+                compiled_part(unknown).compile("float64(float64)")
+        assert gc.isenabled() == collects
+    finally:
+        gc.enable()
+    assert seen == [False, False]

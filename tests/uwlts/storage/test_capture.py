@@ -113,6 +113,18 @@ def test_everything_comes_back(tmp_path: Path, dtype: type, with_pose: bool):
         assert capture.laser_on.dtype == bool
 
 
+def test_a_process_that_writes_no_capture_reads_one(tmp_path: Path):
+    """An even image, which is kept compressed; noise is not."""
+    path = tmp_path / "a.h5"
+    image = np.full((200, 300), 7, np.uint8)
+    with CaptureWriter(path, a_header(sensor=small_sensor(300, 200)), dtype=np.uint8) as writer:
+        writer.append(Frame(image, 0.0, True, 1.0, 0.0))
+    code = "import sys; from uwlts.storage.capture import Capture; print(Capture(sys.argv[1]).image(0).sum())"
+    read = subprocess.run([sys.executable, "-c", code, path], capture_output=True, text=True, cwd=ROOT)
+    assert read.returncode == 0, read.stderr
+    assert int(read.stdout) == 7 * image.size
+
+
 def test_frames_by_light(tmp_path: Path):
     with Capture(record(tmp_path / "a.h5", 5)) as capture:
         assert [index for index, _ in capture.frames()] == [0, 1, 2, 3, 4]
