@@ -294,7 +294,7 @@ def _cuts(stripe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _corner(line: np.ndarray, apart_px: np.ndarray) -> int:
-    """Whether distances (K,) of a stripe from the one before it shrink to nothing: -1 before the first line, 1 behind the
+    """Where distances (K,) of a stripe from the one before it shrink to nothing: -1 before the first line, 1 behind the
     last one, 0 nowhere.
 
     By the median slope (Theil and Sen), as the one before it may be lost on lines where still another one is seen.
