@@ -73,6 +73,11 @@ def over_corners(combine: np.ufunc, nodes: np.ndarray) -> np.ndarray:
     return combine(beside[:-1], beside[1:])
 
 
+def places(marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of what is marked in an image; several times faster than `numpy.nonzero` where little is."""
+    return np.unravel_index(np.flatnonzero(marked), marked.shape)
+
+
 def near_sheet(across: np.ndarray, reached: np.ndarray | bool = True) -> np.ndarray:
     """Cells with a corner within `LIT_SIGMAS` of the sheet's middle, or between whose corners it passes.
 

@@ -21,7 +21,7 @@ import numpy as np
 from twin.backend.arrays import Float, Point3f, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, ray_segments
 from twin.light.illumination import Light, lights
-from twin.light.image_sampling import NODE_SPACING_PX, lattice, near_sheet, over_corners, pupil_shifts, widened
+from twin.light.image_sampling import NODE_SPACING_PX, lattice, near_sheet, over_corners, places, pupil_shifts, widened
 from twin.light.longer_ways import Sources, falling_off, light_on_longer_ways
 from twin.light.particles import Body, spots
 from twin.light.pose import Rays, SensorPose, Travel
@@ -154,7 +154,7 @@ class Renderer:
         pose = SensorPose(scene_from_object, travel)
         direct, mirrored = lights(self._sheets, pose, self._mirrors)
         lit, haze, surfaces = self._laser_nodes(pose, direct, mirrored)
-        rows, columns = np.nonzero(self._repeated(lit))
+        rows, columns = places(self._repeated(lit))
         stripe, polarised, rough = self._stripe(pose, rows, columns, direct + mirrored, spp=spp)
         walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm)
         image = np.zeros_like(haze)
@@ -201,7 +201,7 @@ class Renderer:
                 for moment, (light, *_) in self._moments(pose, direct)
             ]
             self._own_stripe = pose, np.any(near, axis=0)
-        rows, columns = np.nonzero(self._repeated(self._own_stripe[1]))
+        rows, columns = places(self._repeated(self._own_stripe[1]))
         return rows, columns
 
     def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> tuple[Float, RaySegment]:
@@ -331,7 +331,7 @@ class Renderer:
         if pose.travel is not None:
             changes[:] = True  # what moves by may change any pixel
         image = 0.25 * over_corners(np.add, nodes)
-        for rows, columns in _parts(*np.nonzero(changes), spp=spp):
+        for rows, columns in _parts(*places(changes), spp=spp):
             fine = self._fine(self._evenly_lit, pose, rows, columns, ambient, spp=spp, shifted=True)
             image[rows, columns] = fine[0]
         return image
