@@ -262,8 +262,8 @@ class Renderer:
                 if index == 0:
                     own |= stripes[0]
                 if self.effects.defocus and near.any():
-                    blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
-                    reach = np.maximum(reach, np.where(near, over_corners(np.maximum, blur), 0))
+                    blur = self.view.blur_radius_px(depth.numpy().reshape(shape))
+                    reach[near] = np.fmax(reach, over_corners(np.fmax, blur))[near]
                 lit |= near
             if moment is pose and dr.width(haze) > 1:
                 image = self._repeated(0.25 * over_corners(np.add, haze.numpy().reshape(shape)))
@@ -326,8 +326,8 @@ class Renderer:
         low, high = over_corners(np.minimum, nodes), over_corners(np.maximum, nodes)
         changes = high - low > CHANGE_SHARE * nodes.max()
         if self.effects.defocus:
-            blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
-            changes = widened(changes, over_corners(np.maximum, blur), cell_px=1)
+            blur = self.view.blur_radius_px(depth.numpy().reshape(shape))
+            changes = widened(changes, np.fmax(over_corners(np.fmax, blur), 0), cell_px=1)
         if pose.travel is not None:
             changes[:] = True  # what moves by may change any pixel
         image = 0.25 * over_corners(np.add, nodes)
