@@ -318,8 +318,8 @@ class Renderer:
     def _lamp_frame(self, pose: SensorPose, *, spp: int, ambient: bool = False) -> np.ndarray:
         """Light (H, W) of the lamp or the day in W/mm2; only the pixels in which it changes are rendered finely."""
         bundle, shape = self.view.grid(1)
-        (value,) = self._evenly_lit(pose, bundle, None, ambient)
         segment = next(self._segments(pose, bundle, None))
+        value = self._evenly_lit(segment, ambient)
         depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
         dr.eval(value, depth)
         nodes = value.numpy().reshape(shape)
@@ -331,12 +331,15 @@ class Renderer:
         if pose.travel is not None:
             changes[:] = True  # what moves by may change any pixel
         image = 0.25 * over_corners(np.add, nodes)
+
+        def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None) -> tuple[Float]:
+            return (self._evenly_lit(next(self._segments(pose, bundle, after_s)), ambient),)
+
         for rows, columns in _parts(*places(changes), spp=spp):
-            fine = self._fine(self._evenly_lit, pose, rows, columns, ambient, spp=spp, shifted=True)
-            image[rows, columns] = fine[0]
+            image[rows, columns] = self._fine(evenly_lit, pose, rows, columns, spp=spp, shifted=True)[0]
         return image
 
-    def _evenly_lit(self, pose: SensorPose, bundle: Rays, after_s: Float | None, ambient: bool) -> tuple[Float]:
+    def _evenly_lit(self, segment: RaySegment, ambient: bool) -> Float:
         """Irradiance per ray in W/mm2 where every surface is evenly lit, seen through the water and its veil.
 
         A surface of albedo A that receives E sends back the radiance A E / pi. Daylight comes from all around, so the
@@ -344,7 +347,6 @@ class Renderer:
         is scattered backwards returns. Up to the distance t that veil is E / pi times the scattered share of the
         extinction, times 1 - exp(-c t) (Duntley 1963, Eq. 4, for an even light field).
         """
-        segment = next(self._segments(pose, bundle, after_s))
         lamp = self.sensor.lamp
         level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
         left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
@@ -356,7 +358,7 @@ class Renderer:
             radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
         if self._uneven_lamp and not ambient:
             radiance *= self._lamp_share(segment)
-        return (segment.weight * level * radiance,)
+        return segment.weight * level * radiance
 
     def _caustic(self, p: Point3f) -> Float:
         """Factor of the day's light on surfaces at points of the scene, focused by waves; about 1 in the mean.
