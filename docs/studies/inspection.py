@@ -26,7 +26,7 @@ from twin.scene.description import load_scene
 from twin.scene.forms import Flange, Weld
 from twin.scene.forms.weld import weld_height
 from uwlts.metrology.features import Feature, FeatureKind, Inspection
-from uwlts.storage.capture import CaptureWriter
+from uwlts.storage.capture_writer import CaptureWriter
 
 HOLLOWS = FeatureKind.PIT, FeatureKind.DENT
 BLEMISHES = *HOLLOWS, FeatureKind.PROTRUSION

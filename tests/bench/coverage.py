@@ -47,7 +47,8 @@ from uwlts.model.parameter_keys import (
 )
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.workers import work_through
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import FoundStripes
 
 CAMPAIGNS = 200

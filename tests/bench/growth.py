@@ -23,7 +23,8 @@ from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import CaptureHeader
 from uwlts.report.page_toolkit import new_figure
-from uwlts.storage.capture import Capture, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
 from uwlts.stripe import extract_stripe, find_stripes
 

@@ -20,7 +20,8 @@ from uwlts.hardware.replay import ReplayCamera
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 
 SHOWN, TAKEN, RATE_HZ = 50, 1000, 60.0
 # A cable of 1 Gbit/s takes 11 ms for a frame, to which the served camera adds its own time.

@@ -22,7 +22,8 @@ from uwlts import cli as uwlts_cli
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.storage.calibration_file import read_calibration, write_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame, part_path
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
 
 ROOT = Path(__file__).resolve().parents[2]

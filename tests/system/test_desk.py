@@ -22,7 +22,8 @@ from tests.waiting import within
 from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import Scene
 from uwlts.model.sensor import Sensor
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame, part_path
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.copc_file import write_copc
 
 if TYPE_CHECKING:

@@ -17,7 +17,8 @@ from uwlts import cli
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.calibration_file import write_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.targets import CircleTarget
 
 SENSOR = coarse_sensor(window_mounted=False)

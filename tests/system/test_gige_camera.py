@@ -16,7 +16,8 @@ from uwlts.hardware.camera import FrameStatus, Region
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.model.errors import HardwareError
 from uwlts.model.sensor import Sensor
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 
 WIDTH, HEIGHT = 1280, 1024
 # Well above what a frame takes, about 10 ms, on a machine that is busy with other things.

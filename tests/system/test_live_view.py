@@ -19,7 +19,8 @@ from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.errors import CaptureError
 from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 
 ROOT = Path(__file__).resolve().parents[2]
 

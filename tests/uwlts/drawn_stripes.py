@@ -6,7 +6,8 @@ import numpy as np
 
 from tests.uwlts.calibration_views import WATER, built_sensor, step_profile, through_window
 from uwlts.model.sensor import Distortion, Medium
-from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 
 RADIUS_MM, SPACING_MM = 25.06, 99.18
 SPHERES = {"kind": "spheres", "diameters_mm": (2 * RADIUS_MM,) * 2, "spacings_mm": (SPACING_MM,)}

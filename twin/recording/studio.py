@@ -34,7 +34,8 @@ from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium, Sensor, Table
 from uwlts.model.stripe import Coordinates
 from uwlts.model.trajectory import Trajectory
-from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame, Seen
+from uwlts.storage.capture import CaptureHeader, Frame, Seen
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.pose_files import trajectory_path, write_trajectory
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, truth_path, write_truth
 

@@ -204,6 +204,7 @@ class _OperatorPage:
         self._desk, self._instrument, self._board = desk, desk.instrument, desk.board
         self._view = BoardView(desk.board, picked=self._picked)
         self._only: list[tuple[ui.button, tuple[InstrumentState, ...]]] = []
+        self._refreshed = 0
         self._files: tuple[object, ...] = ()
 
     def build(self) -> None:
@@ -218,7 +219,7 @@ class _OperatorPage:
                 with ui.tabs().props("dense no-caps align=left") as tabs:
                     names = ["Connect", "Stage", "Calibrate", "Scan", "Files", "Measure"]
                     shown = {name: ui.tab(name) for name in names}
-                with ui.tab_panels(tabs, value=shown["Connect"]).classes("w-full").props("keep-alive"):
+                with ui.tab_panels(tabs, value=shown["Connect"], animated=False).classes("w-full").props("keep-alive"):
                     for name, part in zip(names, self._parts(), strict=True):
                         with ui.tab_panel(shown[name]).classes("gap-2"):
                             part()
@@ -263,8 +264,11 @@ class _OperatorPage:
         if (shown := self._exposure_now()) != self._exposed:
             # Not while the operator types in it.
             self._exposed, self._exposure.value = shown, shown[1]
+        # Refreshed when it is built, and then only while it is connected. What was typed before that comes a moment
+        # after the connection; a button that is pressed in this moment would be obeyed first.
+        self._refreshed += 1
         for element, states in self._only:
-            element.set_enabled(self._instrument.state in states)
+            element.set_enabled(self._refreshed > 2 and self._instrument.state in states)
 
     # Connect
 

@@ -23,7 +23,8 @@ from uwlts.metrology.least_squares import MAD_TO_STD
 from uwlts.model.errors import EvaluationError, HardwareError, RangeError
 from uwlts.model.sensor import CaptureHeader, Sensor
 from uwlts.model.stripe import Stripe
-from uwlts.storage.capture import CaptureWriter, Frame
+from uwlts.storage.capture import Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import stripe_in
 
 _SPARE_MM, _SPARE_S = 1.0, 0.3

@@ -26,7 +26,8 @@ from uwlts.model.command_files import keeps_inputs
 from uwlts.model.errors import DescriptionError, HardwareError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.calibration_file import load_calibration
-from uwlts.storage.capture import Capture, CaptureWriter, Frame, part_path
+from uwlts.storage.capture import Capture, Frame, part_path
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.files import refuse_unsuitable
 from uwlts.storage.import_.images import without_background
 from uwlts.stripe import Stripe, StripeStatus

@@ -1,4 +1,4 @@
-"""The capture file: what a camera saw of a scan, with everything known about it, written frame by frame.
+"""The capture file: what a camera saw of a scan, with everything known about it; `capture_writer` writes it.
 
 An HDF5 file with ``frames (N, H, W)`` (8 or 16 bit, one chunk per frame, Blosc zstd with bit shuffle, Fletcher-32
 checksum), per frame ``stage_mm``, ``pose`` (4, 4), ``laser_on``, ``exposure_ms`` and ``time_s``, perhaps
@@ -18,55 +18,43 @@ While it is being recorded the file is called ``NAME.part`` and every frame is f
 an interrupted recording keeps all its complete frames; closing it gives it its name.
 """
 
-import math
-import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import h5py
-import hdf5plugin
 import numpy as np
 
 from uwlts.model.calibration import is_rigid
-from uwlts.model.command_files import note_made, refuse_input
-from uwlts.model.errors import CaptureError, ImageError, OutputError
+from uwlts.model.errors import CaptureError, ImageError
 from uwlts.model.input_file import require_regular_file
 from uwlts.model.joint_estimate import CaptureSource
 from uwlts.model.sensor import Camera, CaptureHeader, Table
-from uwlts.model.stripe import ROWS, Stripe, StripeStatus, rows_of
-from uwlts.storage.files import refuse_unsuitable, sha256_of
+from uwlts.model.stripe import ROWS, Stripe, StripeStatus
+from uwlts.storage.files import sha256_of
 from uwlts.storage.hdf5_file import (
     UnfinishedFile,
     find_dataset,
-    forget_plan,
     has_writer,
     read_label,
     read_plan,
     require_small_chunks,
-    write_label,
-    write_plan,
 )
-from uwlts.storage.json_files import differences
-from uwlts.storage.one_writer import one_writer
 
 FORMAT = "uwlts-capture"
 VERSION = 2
 """Of captures with centre lines or a moving stage; those of images at rest have version 1."""
-_PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (), "time_s": ()}
-_COVARIANCE = "pose_covariance"
-_MORE = {"has_image": bool, "encoder": float, "speed_mm_per_s": float}
+PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (), "time_s": ()}
+"""Columns of every capture, with the shape of a frame's value."""
+COVARIANCE = "pose_covariance"
+MORE = {"has_image": bool, "encoder": float, "speed_mm_per_s": float}
 """Columns of version 2."""
 # What h5py raises on a damaged file depends on where the damage is.
 _DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 POSE_ROUNDED = 1e-4
 """By how much a pose's elements may be off a rotation, as tables give them with four decimals or more."""
-# Room for HDF5's own bookkeeping when a frame is added: its index and the chunks of the other datasets.
-_MARGIN_BYTES = 2**18
-
 
 Seen = np.ndarray | Stripe
 """What a camera gives of a moment: an image (H, W) of uint8 or uint16, or of a 3D camera the stripe that it found."""
@@ -154,23 +142,6 @@ def part_path(path: Path) -> Path:
     return path.with_name(path.name + ".part")
 
 
-def _cut_to_used(path: Path) -> None:
-    """Cut off space that was claimed and not used, as HDF5 does when a file is opened and closed once more."""
-    h5py.File(path, "r+", locking=False).close()
-
-
-def _recording_table(header: CaptureHeader, dtype: np.dtype, plan: Table | None, *, lines: bool, moving: bool) -> Table:
-    """What a recording is to hold, as JSON."""
-    held = f"{dtype}{' and centre lines' if lines else ''}{', moving' if moving else ''}"
-    return {"plan": plan, "images": held, "header": header.model_dump(mode="json")}
-
-
-def _arrays(file: h5py.File) -> dict[str, h5py.Dataset]:
-    """A capture's datasets by their names, in a file of this program's."""
-    names = ("frames", "centre_lines", "stage_reports", *_MORE, _COVARIANCE, *_PER_FRAME)
-    return {name: cast(h5py.Dataset, file[name]) for name in names if name in file}
-
-
 def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
     dataset = find_dataset(file, name, path=path)
     if dataset is None or dataset.ndim == 0:
@@ -178,244 +149,7 @@ def _dataset(file: h5py.File, name: str, path: Path) -> h5py.Dataset:
     return dataset
 
 
-class CaptureWriter(AbstractContextManager["CaptureWriter"]):
-    """Records a capture. A context manager: leaving it normally finishes the file, an exception keeps the part.
-
-    ``dtype`` is that of images; with ``centre_lines`` laser frames are centre lines, with ``moving`` frames have a
-    speed, and the stage's reports are added by `place`; with ``covariances`` frames may have that of their pose.
-    ``plan`` says, as JSON, what is to be recorded beyond what the header states; it is kept in the part and not in the
-    finished capture. OutputError where the file exists (give ``overwrite``), is an input of the running command or is
-    being written by another process, a part is left over (give ``resume`` or ``overwrite``), or storage fails;
-    CaptureError for ``resume`` of a part that is damaged, or of another header or plan.
-    """
-
-    def __init__(
-        self,
-        path: str | Path,
-        header: CaptureHeader,
-        *,
-        dtype: np.dtype,
-        centre_lines: bool = False,
-        moving: bool = False,
-        plan: Table | None = None,
-        covariances: bool = False,
-        overwrite: bool = False,
-        resume: bool = False,
-    ):
-        self.path, self.header, self._plan = Path(path), header, plan
-        self._per_frame = _PER_FRAME | ({_COVARIANCE: (6, 6)} if covariances else {})
-        self._last_s = -math.inf
-        self._part = part_path(self.path)
-        camera = header.sensor.camera
-        self._shape, self._dtype = (camera.height_px, camera.width_px), np.dtype(dtype)
-        self._lines, self._moving = camera.lines() if centre_lines else 0, moving
-        if self._dtype not in (np.uint8, np.uint16):
-            raise ImageError(f"a capture holds images of uint8 or uint16, not of {self._dtype}")
-        with self._storage(), ExitStack() as claimed:
-            refuse_unsuitable(self.path, overwrite=overwrite)
-            claimed.enter_context(one_writer(self.path))
-            if not resume:
-                refuse_input(self._part)
-            if self._part.exists() and not (resume or overwrite):
-                raise OutputError(
-                    f"{self._part} is left from an interrupted run; give --resume to go on or --overwrite"
-                )
-            with self._left_over() if resume and self._part.exists() else nullcontext(()) as unfinished:
-                self._begin(unfinished)
-            # Nothing is locked: whoever looks at a running recording must not stop it.
-            self._file = h5py.File(self._part, "r+", libver="latest", locking=False)
-            self._file.swmr_mode = True
-            self._arrays = _arrays(self._file)
-            self._claimed = claimed.pop_all()
-
-    def _left_over(self) -> "Capture":
-        """The unfinished recording to go on with; CaptureError where it is not one of this capture."""
-        try:
-            unfinished = Capture(self._part)
-        except CaptureError as error:
-            raise CaptureError(f"cannot resume: {error}; give --overwrite to start afresh") from error
-        held = unfinished.header, unfinished.dtype, unfinished.plan()
-        there = _recording_table(*held, lines=unfinished.holds_lines, moving=unfinished.moving)
-        kinds = {"lines": bool(self._lines), "moving": self._moving}
-        wanted = _recording_table(self.header, self._dtype, self._plan, **kinds)
-        if others := differences(there, wanted):
-            unfinished.close()
-            raise CaptureError(
-                f"{self._part} belongs to another recording: {others}. Go on with the plan of that one, give "
-                "another name, or --overwrite to start afresh"
-            )
-        return unfinished
-
-    def _begin(self, unfinished: "Capture | Sequence[Frame]") -> None:
-        """Put a valid part in place, empty or with the complete frames of the one left over.
-
-        HDF5 cannot append to a killed writer's file, so a new one is made; it is made aside, so that a run that is
-        killed meanwhile leaves the old one.
-        """
-        fresh = self._part.with_suffix(".fresh")
-        try:
-            with h5py.File(fresh, "w", libver="latest", locking=False) as self._file:
-                self._claim_space()
-                write_label(self._file, format=FORMAT, version=self._version(), header=self.header)
-                if self._plan is not None:
-                    write_plan(self._file, self._plan)
-                # The checksum finds damage that the compression would decode to a different picture.
-                parts = {"frames": (self._shape, self._dtype)}
-                if self._lines:
-                    parts["centre_lines"] = (len(ROWS), self._lines), np.dtype(float)
-                for name, (shape, dtype) in parts.items():
-                    self._file.create_dataset(
-                        name,
-                        (0, *shape),
-                        dtype,
-                        maxshape=(None, *shape),
-                        chunks=(1, *shape),
-                        fletcher32=True,
-                        **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.BITSHUFFLE),
-                    )
-                columns = self._per_frame | (dict.fromkeys(_MORE, ()) if self._version() > 1 else {})
-                if self._moving:
-                    self._file.create_dataset("stage_reports", (0, 2), float, maxshape=(None, 2), chunks=(256, 2))
-                for name, shape in columns.items():
-                    kind, chunks = _MORE.get(name, bool if name == "laser_on" else float), (256, *shape)
-                    # No checksum: a kill while 256 rows are rewritten would then lose them all, not only the last one.
-                    self._file.create_dataset(name, (0, *shape), kind, maxshape=(None, *shape), chunks=chunks)
-                self._arrays = _arrays(self._file)
-                for frame in unfinished:
-                    self._store(frame)
-            _cut_to_used(fresh)
-            os.replace(fresh, self._part)
-        finally:
-            fresh.unlink(missing_ok=True)
-
-    def _version(self) -> int:
-        return VERSION if self._lines or self._moving else 1
-
-    def __len__(self) -> int:
-        """Number of complete frames written."""
-        return len(self._arrays["time_s"])
-
-    def append(self, frame: Frame) -> None:
-        """Store one frame; once this returns, the frame survives the end of the program.
-
-        ImageError where what was seen has another size or type than the capture, or a laser frame is an image where the
-        capture has centre lines; CaptureError where stage position,
-        exposure, time or pose is not finite, the exposure is negative, the time is before the last frame's, or the pose
-        is no rotation with a shift (4, 4); OutputError where storage fails, the frames before being kept.
-        """
-        self._require_fitting(frame)
-        if frame.speed_mm_per_s and not self._moving:
-            raise CaptureError(f"a frame moves by {frame.speed_mm_per_s:g} mm/s in a capture of a stage at rest")
-        if not np.isfinite([frame.stage_mm, frame.exposure_ms, frame.time_s]).all() or frame.exposure_ms < 0:
-            raise CaptureError(
-                f"a frame at stage position {frame.stage_mm} mm, exposure {frame.exposure_ms} ms and time "
-                f"{frame.time_s} s cannot be stored: all three must be finite, the exposure not negative"
-            )
-        if frame.time_s < self._last_s:
-            raise CaptureError(
-                f"a frame at {frame.time_s} s cannot follow one at {self._last_s} s: give times that grow"
-            )
-        if frame.pose is not None and (np.shape(frame.pose) != (4, 4) or not np.isfinite(frame.pose).all()):
-            raise CaptureError(f"a pose is a finite array (4, 4); found {frame.pose}")
-        if frame.pose is not None and not is_rigid(frame.pose, within=POSE_ROUNDED):
-            raise CaptureError(f"a pose is a rotation, a shift and 0 0 0 1; found {frame.pose.tolist()}")
-        if frame.pose_covariance is not None:
-            if _COVARIANCE not in self._per_frame:
-                raise CaptureError("the capture was begun without covariances of poses: begin it with covariances=True")
-            _require_covariances(np.asarray(frame.pose_covariance)[None], self.path)
-        with self._storage():
-            self._store(frame)
-
-    def place(self, stage_mm: np.ndarray, speed_mm_per_s: np.ndarray, reports: np.ndarray) -> None:
-        """Correct positions and speeds (N,) of the frames, once the stage's ``reports`` (M, 2) are complete."""
-        with self._storage():
-            for name, values in (
-                ("stage_mm", stage_mm),
-                ("speed_mm_per_s", speed_mm_per_s),
-                ("stage_reports", reports),
-            ):
-                dataset = self._arrays[name]
-                dataset.resize(len(values), axis=0)
-                dataset[...] = values
-                dataset.flush()
-
-    def _require_fitting(self, frame: Frame) -> None:
-        seen = frame.seen
-        if isinstance(seen, Stripe):
-            if len(seen.centre_px) != self._lines:
-                held = f"centre lines of {self._lines} profile lines" if self._lines else "images"
-                raise ImageError(f"frame is a centre line of {len(seen.centre_px)} lines, the capture holds {held}")
-        elif seen.shape != self._shape or seen.dtype != self._dtype:
-            raise ImageError(f"frame is {seen.shape} {seen.dtype}, the capture holds {self._shape} {self._dtype}")
-        elif self._lines and frame.laser_on:
-            raise ImageError("frame is an image with the laser on, the capture holds centre lines for these")
-
-    def _store(self, frame: Frame) -> None:
-        self._claim_space()
-        pose = np.full((4, 4), np.nan) if frame.pose is None else frame.pose
-        values: dict[str, object] = {"stage_mm": frame.stage_mm, "pose": pose, "laser_on": frame.laser_on}
-        if self._version() > 1:
-            encoder = np.nan if frame.encoder is None else frame.encoder
-            values |= {"has_image": not isinstance(frame.seen, Stripe), "encoder": encoder}
-            values |= {"speed_mm_per_s": frame.speed_mm_per_s}
-        if isinstance(frame.seen, Stripe):
-            kept, seen = "centre_lines", rows_of(frame.seen)
-        else:
-            kept, seen = "frames", frame.seen
-        if _COVARIANCE in self._per_frame:
-            values[_COVARIANCE] = np.full((6, 6), np.nan) if frame.pose_covariance is None else frame.pose_covariance
-        # The time comes last: by its number frames are counted.
-        values |= {"exposure_ms": frame.exposure_ms, "time_s": frame.time_s}
-        count = len(self)
-        # A piece of a dataset that is not written takes no space.
-        for name in ("frames", "centre_lines") if self._lines else ("frames",):
-            dataset = self._arrays[name]
-            dataset.resize(count + 1, axis=0)
-            if name == kept:
-                dataset[count] = seen
-            dataset.flush()
-        for name, value in values.items():
-            dataset = self._arrays[name]
-            dataset.resize(count + 1, axis=0)
-            dataset[count] = value
-            dataset.flush()
-        self._last_s = frame.time_s
-
-    def _claim_space(self) -> None:
-        """Make the file long enough for one more frame, by zeros behind what HDF5 uses; OSError where the disk is full.
-
-        HDF5 does not survive a full disk: closing the file fails and the process may crash.
-        """
-        frame_bytes = self._shape[0] * self._shape[1] * self._dtype.itemsize
-        wanted = self._file.id.get_filesize() + frame_bytes + _MARGIN_BYTES
-        with open(self._file.filename, "r+b", buffering=0) as file:
-            size = file.seek(0, os.SEEK_END)
-            while size < wanted:
-                size += file.write(bytes(wanted - size))
-
-    @contextmanager
-    def _storage(self) -> Iterator[None]:
-        """A context in which failures of the storage become OutputErrors."""
-        try:
-            yield
-        except (OSError, RuntimeError) as error:
-            number = getattr(error, "errno", None)
-            reason = os.strerror(number) if number else " ".join(str(error).split())
-            kept = f"; complete frames are kept in {self._part.name}" if os.path.exists(self._part) else ""
-            raise OutputError(f"cannot write {self.path}: {reason}{kept}") from error
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        with self._claimed, self._storage():
-            self._file.close()
-            if kind is None:
-                if self._plan is not None:
-                    forget_plan(self._part)
-                _cut_to_used(self._part)
-                os.replace(self._part, self.path)
-                note_made(self.path)
-
-
-def _require_covariances(values: np.ndarray, path: Path) -> None:
+def require_covariances(values: np.ndarray, path: Path) -> None:
     """CaptureError where values (N, 6, 6) are no covariances."""
     if values.shape[1:] != (6, 6) or not np.isfinite(values).all():
         raise CaptureError(f"{path}: the covariance of a pose is a finite array (6, 6)")
@@ -494,7 +228,7 @@ class Capture(AbstractContextManager["Capture"]):
         if images.chunks != (1, *images.shape[1:]) or images.dtype.itemsize > 2:
             raise CaptureError(f"{self.path} is damaged: frames are {images.dtype} in chunks of {images.chunks}")
         columns = {
-            name: self._dataset(name, shape, "b" if name == "laser_on" else "f") for name, shape in _PER_FRAME.items()
+            name: self._dataset(name, shape, "b" if name == "laser_on" else "f") for name, shape in PER_FRAME.items()
         }
         for name, dataset in columns.items():
             require_small_chunks(dataset, name, path=self.path)
@@ -503,7 +237,7 @@ class Capture(AbstractContextManager["Capture"]):
         self.moving = "stage_reports" in self.file
         more = {
             name: self._dataset(name, (), "b" if kind is bool else "f")
-            for name, kind in _MORE.items()
+            for name, kind in MORE.items()
             if name in self.file
         }
         counted = [images, *columns.values(), *more.values()]
@@ -535,11 +269,11 @@ class Capture(AbstractContextManager["Capture"]):
         if not all(np.isfinite(values).all() for values in (self.stage_mm, self.exposure_ms, self.time_s)):
             raise CaptureError(f"{self.path} holds stage positions, exposures or times that are not finite")
         self.pose_covariance: np.ndarray | None = None
-        if _COVARIANCE in self.file:
-            covariances: np.ndarray = self._dataset(_COVARIANCE, (6, 6), "f")[: self._count]
+        if COVARIANCE in self.file:
+            covariances: np.ndarray = self._dataset(COVARIANCE, (6, 6), "f")[: self._count]
             known = np.isfinite(covariances).all(axis=(1, 2))
             if known.any():
-                _require_covariances(covariances[known], self.path)
+                require_covariances(covariances[known], self.path)
             self.pose_covariance = covariances
         finite = np.isfinite(self.pose).reshape(self._count, 16)
         if (finite.any(axis=1) != finite.all(axis=1)).any():
@@ -551,7 +285,7 @@ class Capture(AbstractContextManager["Capture"]):
         if unfinished and self._count > 1 and self.time_s[-1] < self.time_s[-2]:
             # The writer was killed between making room for its last frame and storing it.
             self._count -= 1
-            for name in (*_PER_FRAME, *_MORE, *([] if self.pose_covariance is None else [_COVARIANCE])):
+            for name in (*PER_FRAME, *MORE, *([] if self.pose_covariance is None else [COVARIANCE])):
                 setattr(self, name, getattr(self, name)[: self._count])
         if (np.diff(self.time_s) < 0).any():
             raise CaptureError(f"{self.path} holds times that run backwards")

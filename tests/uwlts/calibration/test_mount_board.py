@@ -15,7 +15,8 @@ from uwlts.model.calibration import KnownMedium
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import BoardFound
 from uwlts.optics.nominal import nominal
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.targets import parse_target
 
 MIDDLE = np.array([60.0, 40.0, 0.0])

@@ -30,7 +30,8 @@ from uwlts.optics.window import RayStatus
 from uwlts.report.inventory import describe
 from uwlts.runtime.console import run
 from uwlts.storage.calibration_file import load_calibration, read_polynomials, write_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import read_cloud
 from uwlts.targets import CircleTarget
 

@@ -23,7 +23,8 @@ from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Medium
 from uwlts.storage.calibration_file import read_calibration, write_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 
 POSITIONS = np.arange(5) * 40.0
 PLATE = {"kind": "circles", "diameter_mm": 6.0, "marker_diameter_mm": 2.5, "columns": 17, "rows": 17, "origin": (8, 8)}

@@ -20,7 +20,8 @@ from uwlts.hardware.replay import ReplayCamera
 from uwlts.model.errors import HardwareError, ImageError, SetupError
 from uwlts.model.sensor import Sensor
 from uwlts.runtime import shared_library
-from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 
 PRODUCER = Path(genicam.__file__).with_name("viky.cti")
 SHORT, DUPLICATED, DROPPED, LATE, OK = FrameStatus

@@ -10,7 +10,8 @@ from tests.uwlts.mount_views import MOUNT
 from uwlts.measurement.figure_uncertainty import shift_std_mm
 from uwlts.measurement.moving import Ride, with_platform
 from uwlts.model.mount import Mount, SphereFound
-from uwlts.storage.capture import CaptureHeader, CaptureWriter
+from uwlts.storage.capture import CaptureHeader
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointUncertainty
 
 START = np.eye(4)

@@ -22,7 +22,8 @@ from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import MediumIndex, StageParameter
 from uwlts.model.sensor import Medium
 from uwlts.optics.reconstruction import reconstruct_pixels
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame, source_of
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, source_of
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty, read_cloud, write_cloud
 
 BUILT = built_sensor()

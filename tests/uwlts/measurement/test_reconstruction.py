@@ -16,7 +16,8 @@ from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.reconstruction import reconstruct_profile
 from uwlts.storage.calibration_file import read_calibration, write_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame, FrameTable
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import StripeOptions, find_stripes
 from uwlts.targets import ChessboardTarget
 

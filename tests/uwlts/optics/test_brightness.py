@@ -10,7 +10,8 @@ from uwlts.model.joint_estimate import JointEstimate
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.optics.brightness import beside_sheet, footprint_mm, moved_by_blur_px, sheet_sigma_mm, slopes_of_brightness
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import FoundStripes, extract_stripe
 
 STAGE = 3.0 + np.arange(7.0)

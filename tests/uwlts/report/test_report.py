@@ -31,7 +31,8 @@ from uwlts.report.pictures import StripeView, draw_pictures, stripe_picture, wri
 from uwlts.report.summary_file import summary, write_summary
 from uwlts.report.tables import print_table, summary_table
 from uwlts.storage.calibration_file import write_calibration
-from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud, write_cloud
 from uwlts.storage.truth import Truth, TruthHeader, write_truth
 from uwlts.stripe import extract_stripe

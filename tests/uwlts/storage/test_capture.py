@@ -20,8 +20,9 @@ from hypothesis import strategies as st
 from uwlts.model.errors import CaptureError, Error, ImageError, OutputError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
-from uwlts.storage import capture as capture_module
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame, part_path
+from uwlts.storage import capture_writer
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.hdf5_file import has_writer, lookup3, read_label, write_label
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -488,14 +489,14 @@ def test_failing_close_keeps_the_part(tmp_path: Path, monkeypatch):
     def failing(path: Path) -> None:
         raise RuntimeError("Can't decrement id ref count")
 
-    monkeypatch.setattr(capture_module, "_cut_to_used", failing)
+    monkeypatch.setattr(capture_writer, "_cut_to_used", failing)
     path = tmp_path / "a.h5"
     with pytest.raises(OutputError, match="ref count"):
         record(path, 2)
     assert list(tmp_path.iterdir()) == []
     monkeypatch.undo()
     writer = CaptureWriter(path, a_header(), dtype=np.uint8)
-    monkeypatch.setattr(capture_module, "_cut_to_used", failing)
+    monkeypatch.setattr(capture_writer, "_cut_to_used", failing)
     with pytest.raises(OutputError, match=r"ref count; complete frames are kept in a\.h5\.part"), writer:
         writer.append(a_frame(0))
     with Capture(part_path(path)) as capture:

@@ -12,7 +12,8 @@ from tests.uwlts.storage.test_import import GIVEN, HEIGHT, WIDTH, lamp_image
 from uwlts.model.errors import CaptureError, DescriptionError, ImageError
 from uwlts.model.stripe import Coordinates
 from uwlts.report.pictures import stripe_picture, stripe_view
-from uwlts.storage.capture import Capture, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import StripeStatus, find_stripes
 
 SCALE, OFFSET = 1 / 16, -2.0

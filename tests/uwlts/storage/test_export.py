@@ -15,7 +15,8 @@ from tests.uwlts.storage.test_capture import a_header, record, small_sensor
 from uwlts import cli
 from uwlts.model.errors import OutputError, SetupError
 from uwlts.runtime.console import run
-from uwlts.storage.capture import Capture, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
 from uwlts.storage.export_ import CLOUD_FORMATS, export_capture, export_cloud
 from uwlts.storage.import_ import import_images

@@ -5,7 +5,8 @@ import pytest
 
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Medium
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import FoundStripes
 from uwlts.thesis.measurements import low_passed, thesis_stripes
 

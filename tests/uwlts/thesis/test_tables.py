@@ -15,7 +15,8 @@ from uwlts.model.errors import CaptureError, DescriptionError, OutputError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Medium
 from uwlts.report.page_toolkit import svg_of
-from uwlts.storage.capture import CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud, write_cloud
 from uwlts.thesis.campaign import CampaignFolder, campaign_folders
 from uwlts.thesis.report import (

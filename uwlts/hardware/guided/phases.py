@@ -47,7 +47,8 @@ from uwlts.hardware.scan_plan import Light, RigPlan
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.errors import CalibrationError, TargetError
 from uwlts.model.sensor import Sensor
-from uwlts.storage.capture import Capture, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.targets import TargetView
 
 _TRIES = 3

@@ -26,7 +26,8 @@ from uwlts.hardware.guided.plan import GuidedPlan, GuidedStage, GuidedStep
 from uwlts.hardware.rig import HandSwitchedLaser, LaserStage, Rig, with_provenance
 from uwlts.hardware.scanning import check_camera, left_over
 from uwlts.model.calibration import WindowModel
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, part_path
+from uwlts.storage.capture import Capture, CaptureHeader, part_path
+from uwlts.storage.capture_writer import CaptureWriter
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ import uwlts
 from uwlts.model.command_files import keeps_inputs
 from uwlts.model.errors import DescriptionError, ImageError
 from uwlts.model.sensor import Sensor, Table
-from uwlts.storage.capture import CaptureWriter, Frame, part_path
+from uwlts.storage.capture import Frame, part_path
+from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.files import refuse_unsuitable
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import ImageHeader

@@ -26,7 +26,8 @@ from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.reconstruction import reconstruct_profile
-from uwlts.storage.capture import Capture, CaptureHeader, CaptureWriter, Frame
+from uwlts.storage.capture import Capture, CaptureHeader, Frame
+from uwlts.storage.capture_writer import CaptureWriter
 
 SENSOR = square_sensor()
 STAGE = np.linspace(-18.0, 18.0, 13)
