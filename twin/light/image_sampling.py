@@ -76,7 +76,7 @@ def over_corners(combine: np.ufunc, nodes: np.ndarray) -> np.ndarray:
 
 
 def places(marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of what is marked in an image (H, W); several times faster than `numpy.nonzero` where little is."""
+    """Rows and columns of what is marked in an image (H, W), faster than by `numpy.nonzero` where little is."""
     row, column = np.divmod(np.flatnonzero(marked), marked.shape[1])
     return row, column
 
