@@ -115,7 +115,7 @@ NAMED = {
     "sphere on paint": scene(sphere(), block((160, 200, 10), (0, 0, 30), finish="painted"), turned=(5, 5, 0)),
 }
 
-LOOKED_AT, HELD_OUT = (*range(9), *range(1000, 1012)), tuple(range(9, 20))
+LOOKED_AT, HELD_OUT = (*range(20), *range(1000, 1012), *range(2000, 2024)), tuple(range(3000, 3016))
 """Seeds of scenes drawn at random whose images the rules were changed by, and of those whose were not."""
 
 

@@ -16,6 +16,8 @@ NODE_SPACING_PX = 2
 """Pixels from one ray of the coarse grid to the next, and side of its cells."""
 LIT_SIGMAS = 4.5
 """The stripe is rendered up to this many standard deviations of the sheet: 4e-5 of its peak."""
+_LARGEST_DISC = 24
+"""Radius in cells up to which dilation by a disc is faster than a map of distances."""
 _CANDIDATES = 64
 """Number of generators tried for every further axis; more improve the lattice by a few percent."""
 
@@ -73,6 +75,12 @@ def over_corners(combine: np.ufunc, nodes: np.ndarray) -> np.ndarray:
     return combine(beside[:-1], beside[1:])
 
 
+def places(marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of what is marked in an image (H, W), faster than by `numpy.nonzero` where little is."""
+    row, column = np.divmod(np.flatnonzero(marked), marked.shape[1])
+    return row, column
+
+
 def near_sheet(across: np.ndarray, reached: np.ndarray | bool = True) -> np.ndarray:
     """Cells with a corner within `LIT_SIGMAS` of the sheet's middle, or between whose corners it passes.
 
@@ -89,11 +97,22 @@ def near_sheet(across: np.ndarray, reached: np.ndarray | bool = True) -> np.ndar
 
 def widened(cells: np.ndarray, radius_px: np.ndarray, *, cell_px: int = NODE_SPACING_PX) -> np.ndarray:
     """Marked cells and all within each one's radius in px; radii are rounded up to one of eight."""
-    radius = np.where(cells, radius_px, 0) / cell_px
-    step = max(1.0, radius.max(initial=0) / 8)
+    marked = np.flatnonzero(cells)
+    radius = radius_px.ravel()[marked] / cell_px
+    step = max(1.0, float(radius.max(initial=0)) / 8)
     level = np.ceil(radius / step).astype(int)
     wide = cells.copy()
-    for k in np.unique(level[level > 0]):
-        away = cv2.distanceTransform((level != k).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        wide |= away <= k * step
+    for k in np.unique(level[level > 0]).tolist():
+        of_level = np.zeros(cells.shape, np.uint8)
+        of_level.ravel()[marked[level == k]] = 1
+        wide |= _within(of_level, k * step)
     return wide
+
+
+def _within(marked: np.ndarray, radius: float) -> np.ndarray:
+    """Cells whose distance from the next one that is 1 in ``marked``, uint8, is no larger than a radius in cells."""
+    if radius > _LARGEST_DISC:
+        return cv2.distanceTransform(1 - marked, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= radius
+    away = np.arange(-int(radius), int(radius) + 1)
+    disc = np.square(away)[:, None] + np.square(away) <= radius**2
+    return cv2.dilate(marked, disc.view(np.uint8)) > 0

@@ -18,7 +18,7 @@ import numpy as np
 
 from twin.backend.arrays import Bool, Float, to_jit
 from twin.light.camera import CameraView
-from twin.light.image_sampling import NODE_SPACING_PX
+from twin.light.image_sampling import NODE_SPACING_PX, places
 from twin.light.smoothing import FoundLight, blurred, estimated, interpolated
 from twin.light.walk import Walker
 
@@ -67,7 +67,7 @@ def light_on_longer_ways(view: CameraView, walker: Walker, sources: Sources, *, 
     rows, columns = -(-height // WALK_CELL_PX), -(-width // WALK_CELL_PX)
     times = np.where(_beside_stripe(sources.lit, rows, columns), _WALKS_BESIDE_STRIPE, 1)
     times_in_stripe = 1 if walker.scatters else _WALKS_IN_STRIPE
-    row_in_stripe, column_in_stripe = np.nonzero(sources.lit)
+    row_in_stripe, column_in_stripe = places(sources.lit)
     large = np.repeat(np.arange(rows * columns), times.ravel())
     small = np.repeat(np.arange(len(row_in_stripe)), times_in_stripe)
     kinds = [(FoundLight(rows, columns), FoundLight(1, len(row_in_stripe))) for _ in NOISE_SHARES]
@@ -131,7 +131,7 @@ def walked(
 def _beside_stripe(lit: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """Large cells (rows, columns) on the stripe, whose small cells are ``lit``, and next to it."""
     on_stripe = np.zeros((rows, columns), np.uint8)
-    row, column = np.nonzero(lit)
+    row, column = places(lit)
     on_stripe[row * NODE_SPACING_PX // WALK_CELL_PX, column * NODE_SPACING_PX // WALK_CELL_PX] = 1
     across = 2 * _CELLS_BESIDE_STRIPE + 1
     return cv2.dilate(on_stripe, np.ones((across, across), np.uint8)) > 0

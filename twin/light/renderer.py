@@ -21,7 +21,7 @@ import numpy as np
 from twin.backend.arrays import Float, Point3f, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, ray_segments
 from twin.light.illumination import Light, lights
-from twin.light.image_sampling import NODE_SPACING_PX, lattice, near_sheet, over_corners, pupil_shifts, widened
+from twin.light.image_sampling import NODE_SPACING_PX, lattice, near_sheet, over_corners, places, pupil_shifts, widened
 from twin.light.longer_ways import Sources, falling_off, light_on_longer_ways
 from twin.light.particles import Body, spots
 from twin.light.pose import Rays, SensorPose, Travel
@@ -154,7 +154,7 @@ class Renderer:
         pose = SensorPose(scene_from_object, travel)
         direct, mirrored = lights(self._sheets, pose, self._mirrors)
         lit, haze, surfaces = self._laser_nodes(pose, direct, mirrored)
-        rows, columns = np.nonzero(self._repeated(lit))
+        rows, columns = places(self._repeated(lit))
         stripe, polarised, rough = self._stripe(pose, rows, columns, direct + mirrored, spp=spp)
         walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm)
         image = np.zeros_like(haze)
@@ -201,7 +201,7 @@ class Renderer:
                 for moment, (light, *_) in self._moments(pose, direct)
             ]
             self._own_stripe = pose, np.any(near, axis=0)
-        rows, columns = np.nonzero(self._repeated(self._own_stripe[1]))
+        rows, columns = places(self._repeated(self._own_stripe[1]))
         return rows, columns
 
     def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> tuple[Float, RaySegment]:
@@ -262,8 +262,8 @@ class Renderer:
                 if index == 0:
                     own |= stripes[0]
                 if self.effects.defocus and near.any():
-                    blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
-                    reach = np.maximum(reach, np.where(near, over_corners(np.maximum, blur), 0))
+                    blur = self.view.blur_radius_px(depth.numpy().reshape(shape))
+                    reach[near] = np.fmax(reach, over_corners(np.fmax, blur))[near]
                 lit |= near
             if moment is pose and dr.width(haze) > 1:
                 image = self._repeated(0.25 * over_corners(np.add, haze.numpy().reshape(shape)))
@@ -318,25 +318,28 @@ class Renderer:
     def _lamp_frame(self, pose: SensorPose, *, spp: int, ambient: bool = False) -> np.ndarray:
         """Light (H, W) of the lamp or the day in W/mm2; only the pixels in which it changes are rendered finely."""
         bundle, shape = self.view.grid(1)
-        (value,) = self._evenly_lit(pose, bundle, None, ambient)
         segment = next(self._segments(pose, bundle, None))
+        value = self._evenly_lit(segment, ambient)
         depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
         dr.eval(value, depth)
         nodes = value.numpy().reshape(shape)
         low, high = over_corners(np.minimum, nodes), over_corners(np.maximum, nodes)
         changes = high - low > CHANGE_SHARE * nodes.max()
         if self.effects.defocus:
-            blur = np.nan_to_num(self.view.blur_radius_px(depth.numpy().reshape(shape)))
-            changes = widened(changes, over_corners(np.maximum, blur), cell_px=1)
+            blur = self.view.blur_radius_px(depth.numpy().reshape(shape))
+            changes = widened(changes, np.fmax(over_corners(np.fmax, blur), 0), cell_px=1)
         if pose.travel is not None:
             changes[:] = True  # what moves by may change any pixel
         image = 0.25 * over_corners(np.add, nodes)
-        for rows, columns in _parts(*np.nonzero(changes), spp=spp):
-            fine = self._fine(self._evenly_lit, pose, rows, columns, ambient, spp=spp, shifted=True)
-            image[rows, columns] = fine[0]
+
+        def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None) -> tuple[Float]:
+            return (self._evenly_lit(next(self._segments(pose, bundle, after_s)), ambient),)
+
+        for rows, columns in _parts(*places(changes), spp=spp):
+            image[rows, columns] = self._fine(evenly_lit, pose, rows, columns, spp=spp, shifted=True)[0]
         return image
 
-    def _evenly_lit(self, pose: SensorPose, bundle: Rays, after_s: Float | None, ambient: bool) -> tuple[Float]:
+    def _evenly_lit(self, segment: RaySegment, ambient: bool) -> Float:
         """Irradiance per ray in W/mm2 where every surface is evenly lit, seen through the water and its veil.
 
         A surface of albedo A that receives E sends back the radiance A E / pi. Daylight comes from all around, so the
@@ -344,7 +347,6 @@ class Renderer:
         is scattered backwards returns. Up to the distance t that veil is E / pi times the scattered share of the
         extinction, times 1 - exp(-c t) (Duntley 1963, Eq. 4, for an even light field).
         """
-        segment = next(self._segments(pose, bundle, after_s))
         lamp = self.sensor.lamp
         level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
         left = dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, dr.inf))
@@ -356,7 +358,7 @@ class Renderer:
             radiance += opaque(scattered / self.scattering.extinction) * (1 - left)
         if self._uneven_lamp and not ambient:
             radiance *= self._lamp_share(segment)
-        return (segment.weight * level * radiance,)
+        return segment.weight * level * radiance
 
     def _caustic(self, p: Point3f) -> Float:
         """Factor of the day's light on surfaces at points of the scene, focused by waves; about 1 in the mean.

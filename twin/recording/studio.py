@@ -4,17 +4,19 @@ The truth of a frame is the true stripe centres of all profile lines, the points
 """
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, fields
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import Float, UInt32, to_jit, to_numpy
+from twin.light.image_sampling import places
 from twin.light.pose import SensorPose, Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.options import Options
@@ -38,6 +40,8 @@ from uwlts.storage.pose_files import trajectory_path, write_trajectory
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, truth_path, write_truth
 
 Progress = Callable[[int, int], None]
+ShotLight: TypeAlias = tuple[np.ndarray, LaserFrame | None]
+"""Irradiance (H, W) of lamp and day before the lens in W/mm2, and the laser's light, None where it is off."""
 PROBE_SPP = 4
 """Samples per lit pixel of the images from which the exposure follows, which need not be known to a percent."""
 BRIGHT_SHARE = 0.98
@@ -233,8 +237,7 @@ class Studio:
         """Mean photo-electrons per ms (H, W) of a shot."""
         return self._electrons_per_ms(*self._light(shot, spp=spp, seed=seed, travel=travel), shot)
 
-    def _light(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None) -> tuple[np.ndarray, LaserFrame | None]:
-        """Irradiance (H, W) of lamp and day before the lens, and the laser's light, None where it is off."""
+    def _light(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None) -> ShotLight:
         others, pose = "lamp" if self.shows(shot, "lamp") else "day", self.pose(shot)
         even = self.renderer.irradiance(others, pose, spp=spp, travel=travel)
         if not self.shows(shot, "laser"):
@@ -281,8 +284,18 @@ class Studio:
         )
         return frame.irradiance(factors)
 
+    def light(self, shot: Shot, index: int) -> ShotLight:
+        """The light of image number ``index`` before the lens."""
+        self._shift_points(shot, index)
+        seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
+        return self._light(shot, spp=self.options.spp, seed=seed, travel=self.travel(shot))
+
     def frame(self, shot: Shot, index: int) -> Frame:
         """Image number ``index`` of the scan with what a capture records of it."""
+        return self.frame_of(self.light(shot, index), shot, index)
+
+    def frame_of(self, light: ShotLight, shot: Shot, index: int) -> Frame:
+        """As `frame`, of its light. It uses no renderer, so that the next light can be rendered meanwhile."""
         pose = covariance = None
         if isinstance(self.scene.motion, Platform):
             course = self.scene.motion.course()
@@ -290,7 +303,7 @@ class Studio:
             pose = course.reported[number]
             covariance = None if course.covariance is None else course.covariance[number]
         return Frame(
-            self.seen(shot, index),
+            self._seen(light, shot, index),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
             exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
@@ -300,9 +313,9 @@ class Studio:
             speed_mm_per_s=self.speed_mm_per_s(),
         )
 
-    def seen(self, shot: Shot, index: int) -> Seen:
+    def _seen(self, light: ShotLight, shot: Shot, index: int) -> Seen:
         """The image of a shot, or what a 3D camera finds in it."""
-        image = self.image(shot, index)
+        image = self._image_of(light, shot, index)
         if self.peak_finder is None or shot.light != "laser":
             return image
         camera = self.sensor.camera
@@ -312,12 +325,15 @@ class Studio:
 
     def image(self, shot: Shot, index: int) -> np.ndarray:
         """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
-        light = self._electrons_per_ms(*self._light_of(shot, index), shot)
-        return self._taken(light, index, exposure_ms=self.exposure_ms[shot.light] * shot.exposure)
+        return self._image_of(self.light(shot, index), shot, index)
+
+    def _image_of(self, light: ShotLight, shot: Shot, index: int) -> np.ndarray:
+        electrons_per_ms = self._electrons_per_ms(*light, shot)
+        return self._taken(electrons_per_ms, index, exposure_ms=self.exposure_ms[shot.light] * shot.exposure)
 
     def exposed(self, shot: Shot, index: int, *, exposure: float = 1.0) -> Exposed:
         """The image of a shot, as `image` gives it, with its light; ``exposure`` multiplies the time of exposure."""
-        even, laser = self._light_of(shot, index)
+        even, laser = self.light(shot, index)
         exposure_ms = exposure * self.exposure_ms[shot.light] * shot.exposure
         nothing = np.zeros_like(even)
         parts = [nothing] * 4
@@ -327,12 +343,6 @@ class Studio:
         parts = [exposure_ms * self._to_electrons(part) for part in (*parts, self._through_lens(even))]
         image = self._taken(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)
         return Exposed(image, exposure_ms, *(np.maximum(part, 0, dtype=np.float32) for part in parts))
-
-    def _light_of(self, shot: Shot, index: int) -> tuple[np.ndarray, LaserFrame | None]:
-        """The light of image number ``index`` before the lens, as `_light` returns it."""
-        self._shift_points(shot, index)
-        seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
-        return self._light(shot, spp=self.options.spp, seed=seed, travel=self.travel(shot))
 
     def _taken(self, electrons_per_ms: np.ndarray, index: int, *, exposure_ms: float) -> np.ndarray:
         noise_seed = [self.options.seed, index]
@@ -486,7 +496,7 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
     # Neighbours across the stripe share an edge.
     edges = np.zeros((camera.lines(), (camera.height_px if along_width else camera.width_px) + 1), np.float32)
     edges[line, cell] = edges[line, cell + 1] = 1
-    edge_line, edge = np.nonzero(edges)
+    edge_line, edge = places(edges)
     edges[edge_line, edge] = distance(to_jit(mi.Float, edge - 0.5), to_jit(mi.Float, edge_line)).numpy()
     below, above = edges[line, cell], edges[line, cell + 1]
     bracketed = (below <= 0) != (above <= 0)
@@ -645,15 +655,31 @@ def record_scene(
     lines = studio.peak_finder is not None
     kinds = {"centre_lines": lines, "moving": studio.speed_mm_per_s() != 0, "covariances": known}
     files = {"overwrite": overwrite, "resume": resume}
-    with CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer:
+    with (
+        CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer,
+        ThreadPoolExecutor(1) as camera,
+    ):
         done = len(writer)
-        for index, shot in enumerate(shots):
-            # The image first: the truth goes on from where it found the stripe.
-            if index >= done:
-                writer.append(studio.frame(shot, index))
-            truths.append(studio.truth(shot))
+
+        def take(light: ShotLight, shot: Shot, index: int) -> None:
+            writer.append(studio.frame_of(light, shot, index))
+
+        def end(index: int, taken: Future[None] | None) -> None:
+            if taken is not None:
+                taken.result()
             if progress is not None:
                 progress(index + 1, len(shots))
+
+        # An image is exposed and written while the light of the next one is rendered.
+        before: Future[None] | None = None
+        for index, shot in enumerate(shots):
+            # The light first: the truth goes on from where it found the stripe.
+            light = studio.light(shot, index) if index >= done else None
+            truths.append(studio.truth(shot))
+            if index > 0:
+                end(index - 1, before)
+            before = None if light is None else camera.submit(take, light, shot, index)
+        end(len(shots) - 1, before)
         if report is not None:
             write_trajectory(trajectory_path(path), Trajectory(*report), overwrite=overwrite or resume)
         described = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))

@@ -50,14 +50,19 @@ show, but brighter than the own stripe of a mirror."""
 
 _BEHIND_CORNER = 1.5
 """The same for a stripe behind one that it meets: both begin in a corner, and the nearer one is the surface in which
-the other one is seen."""
+the other one is seen; not where that goes on alone beyond it for more than twice as long."""
+
+_CUT = 0.5
+"""Cost, in jumps, of a jump away from a stripe that goes on there, and of one into the middle of a stripe, if the rest
+has `_SOME_LINES` lines or more: where one surface ends before another one, both stripes have an end."""
 
 _MARGIN = 0.3
 """Jumps by which a path has to be the better one."""
 
 
-_VOTE = 0.01
-"""Cost, in jumps, of a candidate that an image beside refuses at its place, and what one costs less that it takes."""
+_VOTE, _VOTES = 0.01, 100
+"""Cost, in jumps, of a candidate that an image beside refuses at its place, and what one costs less that it takes; and
+from how many lines on the votes for a stripe count no more: a stripe may end between two images."""
 
 _REFUSED_BESIDE = 3
 """Lines between which a reflection that two stripes' crossing hides is the same one."""
@@ -193,7 +198,7 @@ class _Paths:
         """What each candidate costs (M,) by what another image has decided at its place."""
         result = np.zeros(len(self.line))
         _vote(self.line, self.centre_px, other.line, other.centre_px, other.state, other.alone, self.jump_px, result)
-        return result
+        return result * np.minimum(_VOTES / np.bincount(self.number)[self.number], 1.0)
 
     def stripe(self, before: Stripe) -> Stripe:
         """The stripe of the taken candidates; lines without any that had one are AMBIGUOUS."""
@@ -241,9 +246,12 @@ def path_margins(
     cost = vote + _own_cost(line, centre_px, amplitude, stripe, farther)
     before, after = np.empty((2, len(line)))
     _slopes(line, centre_px, stripe, before, after)
+    enter, leave = _cuts(stripe)
     through, backwards = np.empty((2, len(line)))
-    _least_cost(line, centre_px, before, after, cost, skipped, jump_px, through)
-    turned = [values[::-1].copy() for values in (line.max() - line, centre_px, -after, -before, cost, skipped)]
+    _least_cost(line, centre_px, before, after, cost, skipped, enter, leave, jump_px, through)
+    turned = [
+        values[::-1].copy() for values in (line.max() - line, centre_px, -after, -before, cost, skipped, leave, enter)
+    ]
     _least_cost(*turned, jump_px=jump_px, result=backwards)
     through += backwards[::-1] - cost
     return through - through.min()
@@ -257,33 +265,50 @@ def _own_cost(
     brightest = np.zeros(len(count))
     np.maximum.at(brightest, group, amplitude)
     dimmer = np.clip(np.log2(brightest[group] / np.maximum(amplitude, 1e-6)), 0.0, _OCTAVES)
-    behind, rivals = np.zeros(len(line)), np.bincount(stripe, count[group] > 1, minlength=len(line))
+    rivals = np.bincount(stripe, count[group] > 1, minlength=len(line))
+    cost = _DIMMER * dimmer / np.maximum(rivals[stripe], _SOME_LINES)
     if farther:
         order = np.lexsort((farther * centre_px, line))
-        apart = np.full(len(line), np.nan)
-        apart[order[1:]] = np.where(np.diff(line[order]) == 0, np.abs(np.diff(centre_px[order])), np.nan)
-        hidden = np.isfinite(apart)
-        for number in np.flatnonzero(np.bincount(stripe, hidden) > 0):
-            own = np.flatnonzero(hidden & (stripe == number))
-            behind[own] = _BEHIND_CORNER if _meets(line[own], apart[own]) else _BEHIND
-    return (_DIMMER * dimmer + behind) / np.maximum(rivals[stripe], _SOME_LINES)
+        behind = order[1:][np.diff(line[order]) == 0]
+        before = order[:-1][np.diff(line[order]) == 0]
+        apart = np.abs(centre_px[behind] - centre_px[before])
+        pairs = stripe[behind] * (len(line) + 1) + stripe[before]
+        for pair in np.unique(pairs):
+            own = behind[pairs == pair]
+            corner = _corner(line[own], apart[pairs == pair])
+            alone = line[(stripe == stripe[own[0]]) & (count[group] == 1)]
+            beyond = np.count_nonzero(alone > line[own[-1]] if corner < 0 else alone < line[own[0]])
+            whole = _BEHIND_CORNER if corner and beyond <= 2 * len(own) else _BEHIND
+            cost[own] += whole / max(len(own), _SOME_LINES)
+    return cost
 
 
-def _meets(line: np.ndarray, apart_px: np.ndarray) -> bool:
-    """Whether distances (K,) of a stripe from the one before it shrink to nothing beyond one of its ends.
+def _cuts(stripe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What it costs (M,) to jump to each candidate, and from it, beyond the jump, by the rest of its stripe."""
+    order = np.argsort(stripe, kind="stable")
+    before = np.empty(len(stripe))
+    before[order] = np.arange(len(stripe)) - np.searchsorted(stripe[order], stripe[order])
+    after = np.bincount(stripe)[stripe] - 1 - before
+    enter, leave = (_CUT * np.minimum(rest / _SOME_LINES, 1.0) for rest in (before, after))
+    return enter, leave
+
+
+def _corner(line: np.ndarray, apart_px: np.ndarray) -> int:
+    """Where distances (K,) of a stripe from the one before it shrink to nothing: -1 before the first line, 1 behind the
+    last one, 0 nowhere.
 
     By the median slope (Theil and Sen), as the one before it may be lost on lines where still another one is seen.
     """
     if len(line) < _CROSSING_LINES:
-        return False
+        return 0
     for end, inwards in ((slice(None, _CORNER_LINES), 1), (slice(-_CORNER_LINES, None), -1)):
         lines, apart = line[end], apart_px[end]
         away = inwards * (lines - lines[0 if inwards > 0 else -1])
         one, other = np.triu_indices(len(lines), 1)
         growth = float(np.median((apart[other] - apart[one]) / (away[other] - away[one])))
         if growth > _OPENING and np.median(apart - growth * away) <= _LONGEST_CROSSING * growth:
-            return True
-    return False
+            return -inwards
+    return 0
 
 
 @compiled_with_arrays
@@ -317,12 +342,15 @@ def _least_cost(
     after: np.ndarray,
     cost: np.ndarray,
     skipped: np.ndarray,
+    enter: np.ndarray,
+    leave: np.ndarray,
     jump_px: float,
     result: np.ndarray,
 ) -> None:
     """Cost (M,) of the best path that ends in each candidate, its own included.
 
-    ``before`` and ``after`` are the slopes of its stripe on either side of each.
+    ``before`` and ``after`` are the slopes of its stripe on either side of each, ``enter`` and ``leave`` what a jump to
+    it and from it costs more.
     """
     count = line.size
     # What it costs to pass by, from the first line on: the number of lines with candidates before each one.
@@ -332,11 +360,11 @@ def _least_cost(
     elsewhere, best_of_line, first = 0.0, np.inf, 0
     for k in range(count):
         if k > 0 and line[k] != line[k - 1]:
-            elsewhere = min(elsewhere + _SKIPPED, best_of_line + 1.0)
+            elsewhere = min(elsewhere + _SKIPPED, best_of_line)
             best_of_line = np.inf
         while line[k] - line[first] > _LONG_GAP:
             first += 1
-        best = elsewhere
+        best = elsewhere + enter[k]
         for j in range(first, k):
             apart = line[k] - line[j]
             if apart == 0:
@@ -349,7 +377,7 @@ def _least_cost(
                 way += min(max(off - _SMOOTH_PX, 0.0) * _ROUGH, _ROUGHEST)
                 best = min(best, way)
         result[k] = best + cost[k]
-        best_of_line = min(best_of_line, result[k])
+        best_of_line = min(best_of_line, result[k] + 1.0 + leave[k])
 
 
 @compiled

@@ -183,7 +183,7 @@ def _search_lines(
     window = pixels[border : border + size]
     near = window[rules.half - 1 : rules.half + rules.block + 1]
     for line in range(profiles.shape[1]):
-        blocks, least = board[line], np.float32(rules.coarse)
+        blocks, least, rival, of_rival = board[line], np.float32(rules.coarse), np.intp(-1), np.float32(0.0)
         for _ in range(_LOOKS):
             highest = _greatest_block(blocks)
             if status[line] == _OK and highest >= _RIVAL * rules.coarse:
@@ -209,13 +209,13 @@ def _search_lines(
             if status[line] == _OK:
                 # The flank of a wide stripe may stand out in a block of its own and lead back to the same stripe.
                 away = abs(start + peak.middle - (peaks.start[count] + peaks.middle[count]))
-                if (
-                    away > peaks.sigma[count] * np.float32(FWHM_PER_SIGMA)
-                    and peak.height >= rules.share * peaks.height[count]
-                ):
+                if away <= peaks.sigma[count] * np.float32(FWHM_PER_SIGMA):
+                    continue
+                if peak.height >= rules.share * peaks.height[count]:
                     status[line] = _AMBIGUOUS
                     several[line] = True
                     break
+                rival, of_rival = chosen, there
                 continue
             status[line] = verdict
             if verdict != _OK:
@@ -227,6 +227,9 @@ def _search_lines(
             least = max(least, there * np.float32(rules.share * _COARSE_SLACK))
         if status[line] == _OK:
             count += 1
+        if rival >= 0:
+            # Too dim to make the line ambiguous; whoever looks for all stripes finds it in the board.
+            blocks[rival] = of_rival
     return count
 
 

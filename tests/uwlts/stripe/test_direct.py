@@ -16,11 +16,11 @@ BRIGHTEST = StripeOptions(peak="strongest", ambiguous_ratio=1.0)
 NOISE = 1.0
 
 
-def drawn(*stripes: tuple[np.ndarray, float]) -> np.ndarray:
+def drawn(*stripes: tuple[np.ndarray, float], seed: int = 3) -> np.ndarray:
     """(LENGTH, LINES) uint8: columns with stripes of sigma 2 px at places (LINES,), NaN for none, of some height."""
     rows = np.arange(LENGTH)[:, None]
     light = sum(np.nan_to_num(height * np.exp(-0.5 * ((rows - place) / 2.0) ** 2)) for place, height in stripes)
-    noise = np.random.default_rng(3).normal(0, NOISE, (LENGTH, LINES))
+    noise = np.random.default_rng(seed).normal(0, NOISE, (LENGTH, LINES))
     return np.clip(np.rint(10 + light + noise), 0, 255).astype(np.uint8)
 
 
@@ -89,6 +89,17 @@ def test_the_rest_of_a_reflection_is_not_taken_where_the_wall_is_too_dark_to_be_
     stripes = found(drawn((FLOOR, 120), (wall, 15), (TOP, 100), (on(200, 280, 240 - 0.1 * X), 110)))
     true = np.fmax(np.fmax(FLOOR, wall), TOP)[stripes.line]
     assert (np.abs(stripes.centre_px - true) < 3).all() and len(stripes.line) > 330
+
+
+def test_the_floor_in_a_wall_that_is_seen_in_pieces_is_not_taken():
+    """A reflection stands before the floor, too, so that the floor's own stripe lies behind on either side."""
+    wall = np.where((X > 236) & (X < 254), np.nan, on(200, 264, 220 - 1.5 * (X - 200)))
+    ghost, reflected = on(60, 140, 220 - 0.35 * (200 - X)), on(200, 320, 240 - 0.1 * X)
+    true = np.fmax(np.fmax(FLOOR, wall), TOP)
+    for seed in range(4):
+        stripes = found(drawn((FLOOR, 80), (wall, 20), (TOP, 40), (ghost, 50), (reflected, 70), seed=seed))
+        assert (np.abs(stripes.centre_px - true[stripes.line]) < 3).all()
+        assert len(stripes.line) > 280
 
 
 def test_a_dimmer_stripe_before_the_floor_that_nothing_joins_is_a_reflection():
