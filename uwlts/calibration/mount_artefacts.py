@@ -110,7 +110,7 @@ class Shape(ABC):
         return np.column_stack([np.ones(len(along)), along])
 
 
-class Sphere(Shape):
+class SphereShape(Shape):
     """Values: centre and radius (4,)."""
 
     kind, fewest_poses, flat, has_size = "sphere", 5, False, True
@@ -140,7 +140,7 @@ class Sphere(Shape):
         return SphereFound(centre_mm=(x, y, z), radius_mm=radius, radius_std_mm=size_std_mm)
 
 
-class Plane(Shape):
+class PlaneShape(Shape):
     """Values: normal and distance (4,). Parameters: two turns of the normal, and the distance."""
 
     kind, fewest_poses = "plane", 8
@@ -165,7 +165,7 @@ class Plane(Shape):
         return PlaneFound(normal=(x, y, z), distance_mm=distance)
 
 
-class Step(Plane):
+class StepShape(PlaneShape):
     """Values: normal and distance of the face at smaller z of the profiles, and how far along the normal the other lies
     (5,)."""
 
@@ -192,7 +192,7 @@ class Step(Plane):
         return StepFound(normal=(x, y, z), distance_mm=distance, height_mm=height, height_std_mm=size_std_mm)
 
 
-class Ring(Shape):
+class RingShape(Shape):
     """A cylinder's wall and a face square to its axis. Values: axis, centre on the face, radius (7,).
 
     Parameters: two turns of the axis about the centre, the centre, and the radius. Part 0 is the face; each run of
@@ -268,7 +268,7 @@ class Ring(Shape):
         return RingFound(axis=(a, b, c), centre_mm=(x, y, z), radius_mm=radius, radius_std_mm=size_std_mm)
 
 
-SHAPES: dict[Artefact, type[Shape]] = {each.kind: each for each in (Sphere, Plane, Step, Ring)}
+SHAPES: dict[Artefact, type[Shape]] = {each.kind: each for each in (SphereShape, PlaneShape, StepShape, RingShape)}
 
 
 def square_to(normal: np.ndarray) -> np.ndarray:

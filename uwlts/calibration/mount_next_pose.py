@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount_artefacts import Sphere
+from uwlts.calibration.mount_artefacts import SphereShape
 from uwlts.calibration.mount_model import MountState, Problem, Scatter, cross_matrix
 from uwlts.model.mount import NextPose
 
@@ -49,7 +49,7 @@ def next_pose(
         turned = rotations[nearest] @ Rotation.from_rotvec(side * _TURN_RAD * np.eye(3)[axis]).as_matrix()
         for points, seen, where in _views(problem, state, sheet):
             platform = state.rotation @ seen + state.translation
-            if isinstance(problem.shape, Sphere):
+            if isinstance(problem.shape, SphereShape):
                 position = (state.artefact[:3] - turned @ platform) / state.scale
             else:
                 normal = state.artefact[:3]
@@ -91,7 +91,7 @@ def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple
     flat = [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in problem.points]
     low, high = np.quantile(np.vstack(flat), (0.1, 0.9), axis=0)
     views = []
-    if isinstance(problem.shape, Sphere):
+    if isinstance(problem.shape, SphereShape):
         rotations, positions = problem.motion(state.offset_s)
         platform = np.einsum("pji,pj->pi", rotations, state.artefact[:3] - state.scale * positions) - state.translation
         centres = (platform @ state.rotation - sheet[:3, 3]) @ sheet[:3, :3]

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount_artefacts import Plane, Ring, Seen, Sphere, Step, square_to
+from uwlts.calibration.mount_artefacts import PlaneShape, RingShape, Seen, SphereShape, StepShape, square_to
 from uwlts.calibration.mount_model import MountState, Problem, Scatter, cross_matrix
 from uwlts.calibration.mount_prediction import inverse, misfits
 from uwlts.calibration.mount_profiles import ProfileArc, ProfileLine, circles_through
@@ -56,13 +56,13 @@ def start(
     arcs = [each for each in seen if isinstance(each, ProfileArc)]
     lines = [each for each in seen if isinstance(each, ProfileLine)]
     match problem.shape:
-        case Sphere() if towards is not None:
+        case SphereShape() if towards is not None:
             return _start_on_table(problem, arcs, sheet, towards), problem
-        case Sphere():
+        case SphereShape():
             return _start_of_sphere(problem, arcs, sheet, rng), problem
-        case Step():
+        case StepShape():
             return _start_of_step(problem, lines, sheet, rng), problem
-        case Ring():
+        case RingShape():
             return _start_of_ring(problem, whole, lines, sheet, rng)
         case _:
             return _start_of_plane(problem, lines, sheet, rng), problem
@@ -223,7 +223,7 @@ def _start_of_step(
     """State near the solution from the lines of both faces of a step: as of a plane from the first, then the height."""
     first = [points[part == 0] for points, part in zip(problem.points, problem.part, strict=True)]
     none = [np.zeros(len(points), dtype=int) for points in first]
-    state = _start_of_plane(replace(problem, points=first, part=none, shape=Plane()), lines, sheet, rng)
+    state = _start_of_plane(replace(problem, points=first, part=none, shape=PlaneShape()), lines, sheet, rng)
     state = replace(state, artefact=np.append(state.artefact, 0.0))
     found = float(np.median(problem.distances(state)[np.concatenate(problem.part) > 0]))
     height = found if problem.shape.size_mm is None else float(np.copysign(problem.shape.size_mm, found))
@@ -237,7 +237,7 @@ def _start_of_ring(
 
     The mount by the face alone places points along the face as well as its covariance says: so wide is the circle.
     """
-    shape, plane = problem.shape, replace(problem, shape=Plane())
+    shape, plane = problem.shape, replace(problem, shape=PlaneShape())
     state = _start_of_plane(plane, lines, sheet, rng)
     off = misfits(plane, state)
     noise = float(np.median([line.std_mm for line in lines]))

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from uwlts.calibration.camera import centre_offsets
-from uwlts.calibration.joint.parameters import Parameters, StripePoints, ViewMedium
+from uwlts.calibration.joint.parameters import Parameters, SheetPoints, ViewMedium
 from uwlts.calibration.target_images import Placement
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight, TargetParameter
 from uwlts.model.sensor import Uncertainty
@@ -107,7 +107,7 @@ class StripeEvidence(ABC):
     def stripe_residuals(
         self,
         parameters: Parameters,
-        points: StripePoints,
+        points: SheetPoints,
         off: Distances,
         *,
         kind: str,
@@ -146,7 +146,7 @@ class SeenSheet:
     ``table`` are the series of lines, and the row and the argument (N,) of each pixel, as of `LineTable.series`.
     """
 
-    exact: Callable[[np.ndarray], StripePoints | None]
+    exact: Callable[[np.ndarray], SheetPoints | None]
     pixels: np.ndarray
     table: tuple[np.ndarray, np.ndarray, np.ndarray] | None
 
@@ -179,14 +179,14 @@ class SeenSheet:
         sum_series(np.ascontiguousarray(series[:, :, :3]), row, at, values)
         return values.T
 
-    def points(self, here: np.ndarray | slice = slice(None)) -> StripePoints | None:
+    def points(self, here: np.ndarray | slice = slice(None)) -> SheetPoints | None:
         """Those of some of the pixels (n,); None where the ray of one meets no sheet."""
         if self.table is None:
             return self.exact(self.pixels[here])
         series, row, at = self.table
         values = np.empty((len(row[here]), series.shape[2]))
         sum_series(series, row[here], at[here], values)
-        return StripePoints(np.ascontiguousarray(values[:, :3].T), values[:, 3:].reshape(len(values), 3, -1))
+        return SheetPoints(np.ascontiguousarray(values[:, :3].T), values[:, 3:].reshape(len(values), 3, -1))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

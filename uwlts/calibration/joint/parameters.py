@@ -87,7 +87,7 @@ def window_values(window: WindowModel) -> dict[ParameterKey, float]:
 
 
 @dataclass(frozen=True, eq=False)
-class StripePoints:
+class SheetPoints:
     """Points (3, N) of the sheet in mm, camera frame, and their derivatives (N, 3, 1 + P).
 
     By the pixel across the stripe first, then by the global parameters.
@@ -172,7 +172,7 @@ class Parameters:
 
     def stripe_points(
         self, values: np.ndarray, view: ViewMedium, pixels: np.ndarray, *, across: int
-    ) -> StripePoints | None:
+    ) -> SheetPoints | None:
         """As `on_sheet`, for pixels (N, 2) of a stripe; the coordinate ``across``, 0 or 1, runs across it."""
         found = self.on_sheet(values, view, pixels)
         if found is None:
@@ -181,7 +181,7 @@ class Parameters:
         by[:, :, 0] = found.by_rays[across].T
         for axis in range(3):
             by[:, axis, 1:] = self.by_global(found.by_rays[:, axis], view, found.by_sheet[:, axis])
-        return StripePoints(found.points, by)
+        return SheetPoints(found.points, by)
 
     def project(self, values: np.ndarray, view: ViewMedium, points: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) of points (N, 3) in the camera frame, seen through a view; NaN where there is none."""
