@@ -95,11 +95,14 @@ def rendering() -> list[Row]:
 
 
 def light() -> list[Row]:
-    """Time and noise of frames with all effects, and the advantage over stock Mitsuba."""
+    """Time and noise of frames with all effects at the default samples, and the advantage over stock Mitsuba.
+
+    The limits of time were set for the noise that 64 samples had then.
+    """
     from tests.bench import light as bench_light
 
     rows = []
-    for water, limit in (("clear", 0.12), ("coastal", 0.25)):
+    for water, limit, most_noise in (("clear", 0.12, 0.25), ("coastal", 0.25, 0.66)):
         seconds, noise = bench_light.rendered_light(water)
         recorded = bench_light.recorded_frame(water)
         rows.append(
@@ -108,7 +111,7 @@ def light() -> list[Row]:
         rows.append(
             at_most(f"the same: its light alone, before speckle and detector, {water} water", seconds, "s", limit)
         )
-        rows.append(at_most(f"the same: noise of its light, {water} water", 100 * noise, "% of peak", 1.0))
+        rows.append(at_most(f"the same: noise of its light, {water} water", 100 * noise, "% of peak", most_noise))
     advantage, how = bench_light.equal_noise_advantage()
     rows.append(at_least(f"advantage over volpath at equal noise ({how})", advantage, "times", 1000))
     return rows

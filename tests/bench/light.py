@@ -20,7 +20,8 @@ from twin.scene.description import load_scene
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Medium, Sensor
 
-SPP = 64
+SPP = Options().spp
+STOCK_SPP = 64
 SEEDS = 12
 STRIPE_SHARE = 0.05
 """Pixels brighter than this share of the peak count as the stripe's."""
@@ -93,16 +94,18 @@ def equal_noise_advantage() -> tuple[float, str]:
     effects = replace(NONE, haze=True, multiple_scattering=True, secondary_light=True)
     renderer = Renderer(sensor, medium, scene, effects=effects)
     for seed in range(2):
-        renderer.irradiance("laser", np.eye(4), spp=SPP, seed=seed)
+        renderer.irradiance("laser", np.eye(4), spp=STOCK_SPP, seed=seed)
     start = time.perf_counter()
-    ours = np.stack([renderer.irradiance("laser", np.eye(4), spp=SPP, seed=seed) for seed in range(SEEDS)])
+    ours = np.stack([renderer.irradiance("laser", np.eye(4), spp=STOCK_SPP, seed=seed) for seed in range(SEEDS)])
     our_seconds = (time.perf_counter() - start) / SEEDS
-    truth = np.mean([renderer.irradiance("laser", np.eye(4), spp=8 * SPP, seed=100 + k) for k in range(8)], axis=0)
+    truth = np.mean(
+        [renderer.irradiance("laser", np.eye(4), spp=8 * STOCK_SPP, seed=100 + k) for k in range(8)], axis=0
+    )
     our_noise = stripe_noise(ours, truth)
     stock = stock_scene(thrown, medium, scene, across_texels=64)
     volpath = mi.load_dict({"type": "volpath", "max_depth": -1})
     start = time.perf_counter()
-    theirs = np.stack([np.array(mi.render(stock, integrator=volpath, spp=SPP, seed=k))[..., 0] for k in range(3)])
+    theirs = np.stack([np.array(mi.render(stock, integrator=volpath, spp=STOCK_SPP, seed=k))[..., 0] for k in range(3)])
     their_seconds = (time.perf_counter() - start) / len(theirs)
     mean = theirs.mean(axis=0)
     scale = truth.max() / np.quantile(mean[truth > 0.9 * truth.max()], 0.5)
@@ -110,7 +113,7 @@ def equal_noise_advantage() -> tuple[float, str]:
     ratio = (spread / our_noise) ** 2 * their_seconds / our_seconds
     how = (
         f"stock {their_seconds:.1f} s at noise {100 * spread:.1f} % of the peak, "
-        f"twin {our_seconds:.2f} s at {100 * our_noise:.2f} %, both {SPP} samples"
+        f"twin {our_seconds:.2f} s at {100 * our_noise:.2f} %, both {STOCK_SPP} samples"
     )
     return ratio, how
 

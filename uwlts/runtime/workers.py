@@ -186,18 +186,20 @@ class _Processes(Workers):
     def run(
         self, work: Callable[[Job, Send], Result], jobs: Iterable[Job], on_message: Send = lambda message: None
     ) -> Iterator[tuple[int, Job, Result | Lost]]:
-        """Number, job and result of each job as it is done."""
+        """Number, job and result of each job as it is done; its process has the next job by then."""
         waiting = enumerate(jobs)
         busy: dict[object, tuple[_Process, int, Job]] = {}
         idle = deque(self._processes)
-        while True:
+
+        def hand_out() -> None:
             for number, job in islice(waiting, self.count - len(busy)):
                 process = idle.popleft() if idle else _Process(self._threads)
                 self._processes.add(process)
                 busy[process.connection] = process, number, job
                 process.give(work, job)
-            if not busy:
-                return
+
+        hand_out()
+        while busy:
             for connection in wait([process.connection for process, _, _ in busy.values()]):
                 process, number, job = busy[connection]
                 match process.message():
@@ -214,6 +216,7 @@ class _Processes(Workers):
                     case _ as never:
                         assert_never(never)
                 del busy[connection]
+                hand_out()
                 yield number, job, result
 
 
@@ -313,6 +316,7 @@ def _serve(connection: Connection) -> None:
             stop()
 
     work: Callable[[Any, Send], Any] | None = None
+    frozen = False
     try:
         signal.signal(signal.SIGTERM, stop)
         threading.Thread(target=_end_when_stopped, args=(_signals(),), daemon=True).start()
@@ -329,9 +333,10 @@ def _serve(connection: Connection) -> None:
                     send("raised", error)
                 else:
                     send("done", result)
-                    if not gc.get_freeze_count():
+                    if not frozen:
                         # What is imported by now stays, and the collector need not look through it again.
                         gc.freeze()
+                        frozen = True
     finally:
         # Whatever the interrupt has become on its way through a library, there is nothing to say about it.
         if stopped.is_set():
