@@ -3,9 +3,8 @@
 A mirror, or the inside corner of shining faces, shows stripes once more. Neither brightness nor order tells the right
 one by itself: on a clean mirror the reflection of a painted sphere outshines the mirror's own stripe. But the laser's
 stripe goes on from line to line over the whole profile, across corners, while a reflection begins or ends in the void.
-Of all paths through the candidates of an image the one is sought that jumps least; where two hardly differ, the line
-stays ambiguous. Paths of least cost with their margins: the min-sum algorithm on a chain, forwards and backwards
-(Bishop, Pattern Recognition and Machine Learning, section 8.4.5).
+Of all paths through the candidates of an image the one is sought that jumps least (`path_cost`); where two hardly
+differ, the line stays ambiguous.
 """
 
 from __future__ import annotations
@@ -20,45 +19,14 @@ from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import Stripe, StripeStatus
 from uwlts.runtime.compiled import compiled, compiled_part, compiled_with_arrays
 from uwlts.stripe.ends import leave_ends_out
+from uwlts.stripe.path_cost import CROSSING_LINES, GAP, LONGEST_CROSSING, OPENING, SLACK_PX, own_cost, path_margins
 from uwlts.stripe.result import StripeCandidates
-
-_GAP, _LONG_GAP = 12, 24
-"""Lines that a dim stripe may be lost for and go on; and those after which it still does where it goes on straight."""
-
-_SLACK_PX = 2.0
-"""How much farther a stripe may have moved for each line that it was lost for."""
 
 _TURN = 0.3
 """Share of a new step in the slope with which a stripe is expected to go on."""
 
-_SMOOTH_PX, _ROUGH, _ROUGHEST = 1.5, 0.03, 0.15
-"""Departure from the straight way that noise explains, cost in jumps of each px beyond it, and the highest: stripes are
-smooth, and chains of speckles are not."""
-
-_SKIPPED, _LOST = 0.03, 0.005
-"""Cost, in jumps, of a line whose candidates the path passes by: of a clear stripe, and of a faint one, which noise may
-hide."""
-
-_FAINT, _CLEAR = 4.0, 12.0
-"""Mean heights, in least heights of a stripe, up to which one is faint and from which it is clear."""
-
-_BEHIND, _DIMMER, _OCTAVES, _SOME_LINES = 0.35, 0.15, 3.0, 20.0
-"""Cost, in jumps, of a stripe with another one nearer to the sensor on its lines, and of each halving of the brightness
-below the brightest, up to so many; less on fewer lines than so many. They decide between paths with equally many jumps.
-A surface hides what lies behind it, so that what is seen behind is a reflection; reflections are dimmer than what they
-show, but brighter than the own stripe of a mirror."""
-
-_BEHIND_CORNER = 1.5
-"""The same for a stripe behind one that it meets: both begin in a corner, and the nearer one is the surface in which
-the other one is seen; not where that goes on alone beyond it for more than twice as long."""
-
-_CUT = 0.5
-"""Cost, in jumps, of a jump away from a stripe that goes on there, and of one into the middle of a stripe, if the rest
-has `_SOME_LINES` lines or more: where one surface ends before another one, both stripes have an end."""
-
 _MARGIN = 0.3
 """Jumps by which a path has to be the better one."""
-
 
 _VOTE, _VOTES = 0.01, 100
 """Cost, in jumps, of a candidate that an image beside refuses at its place, and what one costs less that it takes; and
@@ -67,19 +35,15 @@ from how many lines on the votes for a stripe count no more: a stripe may end be
 _REFUSED_BESIDE = 3
 """Lines between which a reflection that two stripes' crossing hides is the same one."""
 
-_CROSSING_LINES, _FEWEST_LINES, _OPENING = 12, 6, 0.2
-"""Lines, at most and at least, from which two stripes' distance shows where they cross, and its least growth per
-line."""
+_FEWEST_LINES = 6
+"""Lines, at least, from which two stripes' distance shows where they cross."""
 
-_CORNER_LINES = 30
-"""The same lines, at most, for a corner: some show another stripe."""
-
-_BESIDE, _AS_BRIGHT, _LONGEST_CROSSING = 4.0, 0.5, 24
-"""Distance, in jumps' lengths, within which stripes may run into each other; share of the brightness from which the
-other one matters; and most lines of a crossing."""
+_BESIDE, _AS_BRIGHT = 4.0, 0.5
+"""Distance, in jumps' lengths, within which stripes may run into each other, and share of the brightness from which the
+other one matters."""
 
 _GRAIN, _FEWEST_BESIDE, _STRAIGHT_PX, _STEEPEST = 3, 4, 2.5, 6.0
-"""A stripe shows within `_GAP` lines on so many others, at least, those next to it aside, over which a grain of speckle
+"""A stripe shows within `GAP` lines on so many others, at least, those next to it aside, over which a grain of speckle
 may reach too, within so many px of a straight line of no more than so many px per line."""
 
 _TAKEN, _OPEN, _REFUSED = 1, 0, -1
@@ -118,24 +82,24 @@ def direct_stripes(images: Iterable[SeenStripes], *, farther: int) -> Iterator[S
     for image in images:
         path = None
         if image.rivals is not None:
-            path = _Paths.of(image.stripe, image.rivals, least=image.least, jump_px=image.jump_px)
-            path.decide(farther, np.zeros(len(path.line)))
+            path = _Paths.of(image.stripe, image.rivals, farther=farther, least=image.least, jump_px=image.jump_px)
+            path.decide(np.zeros(len(path.line)))
         if last is not None:
-            yield _chosen(*last, beside=(before, path), farther=farther)
+            yield _chosen(*last, beside=(before, path))
             before = last[1]
         last = image, path
     if last is not None:
-        yield _chosen(*last, beside=(before,), farther=farther)
+        yield _chosen(*last, beside=(before,))
 
 
-def _chosen(image: SeenStripes, path: _Paths | None, *, beside: Sequence[_Paths | None], farther: int) -> Stripe:
+def _chosen(image: SeenStripes, path: _Paths | None, *, beside: Sequence[_Paths | None]) -> Stripe:
     """The direct stripe of an image: decided once more where the images beside it, which show nearly the same, vote."""
     stripe = image.stripe
     if path is not None:
         vote = sum((path.vote(other) for other in beside if other is not None), np.zeros(len(path.line)))
         if vote.any():
             path = replace(path, state=path.state.copy())
-            path.decide(farther, vote)
+            path.decide(vote)
         stripe = path.stripe(stripe)
     return leave_ends_out(stripe, lines=image.end_lines, jump_px=image.jump_px)
 
@@ -144,8 +108,8 @@ def _chosen(image: SeenStripes, path: _Paths | None, *, beside: Sequence[_Paths 
 class _Paths:
     """Candidates (M,) of an image on all of its lines.
 
-    ``number`` is that of the stripe of each (`_number_stripes`), ``alone`` which are alone on their lines, ``state``
-    what is decided.
+    ``number`` is that of the stripe of each (`_number_stripes`), ``alone`` which are alone on their lines, ``cost``
+    what each costs by the others, ``state`` what is decided.
     """
 
     line: np.ndarray
@@ -154,12 +118,13 @@ class _Paths:
     width_px: np.ndarray
     number: np.ndarray
     alone: np.ndarray
+    cost: np.ndarray
     state: np.ndarray
     least: float
     jump_px: float
 
     @classmethod
-    def of(cls, stripe: Stripe, rivals: StripeCandidates, *, least: float, jump_px: float) -> _Paths:
+    def of(cls, stripe: Stripe, rivals: StripeCandidates, *, farther: int, least: float, jump_px: float) -> _Paths:
         """The candidates of an image."""
         alone = np.setdiff1d(stripe.lines, rivals.line)
         line = np.concatenate([alone, rivals.line])
@@ -176,20 +141,13 @@ class _Paths:
         single = np.bincount(line)[line] == 1
         number, state = np.empty(len(line), np.intp), np.full(len(line), _OPEN, np.int8)
         _number_stripes(line, centre, jump_px, number)
-        return cls(line, centre, amplitude, width, number, single, state, least, jump_px)
+        cost = own_cost(line, centre, amplitude, number, farther)
+        return cls(line, centre, amplitude, width, number, single, cost, state, least, jump_px)
 
-    def decide(self, farther: int, vote: np.ndarray) -> None:
+    def decide(self, vote: np.ndarray) -> None:
         """Take the candidates that the best path goes through, if it is clearly the best."""
-        margin = path_margins(
-            self.line,
-            self.centre_px,
-            self.amplitude,
-            self.number,
-            farther=farther,
-            jump_px=self.jump_px,
-            least=self.least,
-            vote=vote,
-        )
+        candidates = self.line, self.centre_px, self.amplitude, self.number, vote + self.cost
+        margin = path_margins(*candidates, jump_px=self.jump_px, least=self.least)
         _take(self.line, margin, self.alone, self.state)
         _refuse_alone(self.line, self.number, self.alone, self.state)
         _refuse_crossings(self.line, self.centre_px, self.amplitude, self.state, self.jump_px)
@@ -221,96 +179,6 @@ def farther(sensor: Sensor) -> int:
     return 1 if far > near else -1
 
 
-def path_margins(
-    line: np.ndarray,
-    centre_px: np.ndarray,
-    amplitude: np.ndarray,
-    stripe: np.ndarray,
-    *,
-    farther: int,
-    jump_px: float,
-    least: float,
-    vote: np.ndarray,
-) -> np.ndarray:
-    """Cost (M,), in jumps beyond the best path, of the best path through each candidate (M,) of an image.
-
-    ``line`` (M,) grows; ``stripe`` (M,) numbers the stripes that they belong to; ``farther`` is as of `farther`, 0
-    where unknown. Neighbours more than ``jump_px`` apart are a jump. ``vote`` (M,) is added to the cost of each
-    candidate.
-    """
-    mean = np.empty(len(line))
-    _average(line, amplitude, stripe, mean)
-    height = np.minimum(amplitude, mean) / least
-    clear = np.clip((height - _FAINT) / (_CLEAR - _FAINT), 0.0, 1.0)
-    skipped = _LOST + (_SKIPPED - _LOST) * clear
-    cost = vote + _own_cost(line, centre_px, amplitude, stripe, farther)
-    before, after = np.empty((2, len(line)))
-    _slopes(line, centre_px, stripe, before, after)
-    enter, leave = _cuts(stripe)
-    through, backwards = np.empty((2, len(line)))
-    _least_cost(line, centre_px, before, after, cost, skipped, enter, leave, jump_px, through)
-    turned = [
-        values[::-1].copy() for values in (line.max() - line, centre_px, -after, -before, cost, skipped, leave, enter)
-    ]
-    _least_cost(*turned, jump_px=jump_px, result=backwards)
-    through += backwards[::-1] - cost
-    return through - through.min()
-
-
-def _own_cost(
-    line: np.ndarray, centre_px: np.ndarray, amplitude: np.ndarray, stripe: np.ndarray, farther: int
-) -> np.ndarray:
-    """Cost (M,) of candidates by the others on their lines; that of a stripe does not grow with its length."""
-    _, group, count = np.unique(line, return_inverse=True, return_counts=True)
-    brightest = np.zeros(len(count))
-    np.maximum.at(brightest, group, amplitude)
-    dimmer = np.clip(np.log2(brightest[group] / np.maximum(amplitude, 1e-6)), 0.0, _OCTAVES)
-    rivals = np.bincount(stripe, count[group] > 1, minlength=len(line))
-    cost = _DIMMER * dimmer / np.maximum(rivals[stripe], _SOME_LINES)
-    if farther:
-        order = np.lexsort((farther * centre_px, line))
-        behind = order[1:][np.diff(line[order]) == 0]
-        before = order[:-1][np.diff(line[order]) == 0]
-        apart = np.abs(centre_px[behind] - centre_px[before])
-        pairs = stripe[behind] * (len(line) + 1) + stripe[before]
-        for pair in np.unique(pairs):
-            own = behind[pairs == pair]
-            corner = _corner(line[own], apart[pairs == pair])
-            alone = line[(stripe == stripe[own[0]]) & (count[group] == 1)]
-            beyond = np.count_nonzero(alone > line[own[-1]] if corner < 0 else alone < line[own[0]])
-            whole = _BEHIND_CORNER if corner and beyond <= 2 * len(own) else _BEHIND
-            cost[own] += whole / max(len(own), _SOME_LINES)
-    return cost
-
-
-def _cuts(stripe: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What it costs (M,) to jump to each candidate, and from it, beyond the jump, by the rest of its stripe."""
-    order = np.argsort(stripe, kind="stable")
-    before = np.empty(len(stripe))
-    before[order] = np.arange(len(stripe)) - np.searchsorted(stripe[order], stripe[order])
-    after = np.bincount(stripe)[stripe] - 1 - before
-    enter, leave = (_CUT * np.minimum(rest / _SOME_LINES, 1.0) for rest in (before, after))
-    return enter, leave
-
-
-def _corner(line: np.ndarray, apart_px: np.ndarray) -> int:
-    """Where distances (K,) of a stripe from the one before it shrink to nothing: -1 before the first line, 1 behind the
-    last one, 0 nowhere.
-
-    By the median slope (Theil and Sen), as the one before it may be lost on lines where still another one is seen.
-    """
-    if len(line) < _CROSSING_LINES:
-        return 0
-    for end, inwards in ((slice(None, _CORNER_LINES), 1), (slice(-_CORNER_LINES, None), -1)):
-        lines, apart = line[end], apart_px[end]
-        away = inwards * (lines - lines[0 if inwards > 0 else -1])
-        one, other = np.triu_indices(len(lines), 1)
-        growth = float(np.median((apart[other] - apart[one]) / (away[other] - away[one])))
-        if growth > _OPENING and np.median(apart - growth * away) <= _LONGEST_CROSSING * growth:
-            return -inwards
-    return 0
-
-
 @compiled_with_arrays
 def _number_stripes(line: np.ndarray, centre: np.ndarray, jump_px: float, stripe: np.ndarray) -> None:
     """Number (M,) of the stripe of each candidate: that of the one before it that it goes on from most straight.
@@ -319,7 +187,7 @@ def _number_stripes(line: np.ndarray, centre: np.ndarray, jump_px: float, stripe
     """
     first, goes_on, slope = 0, np.zeros(line.size, np.bool_), np.zeros(line.size)
     for k in range(line.size):
-        while line[k] - line[first] > _GAP:
+        while line[k] - line[first] > GAP:
             first += 1
         before, nearest, j = -1, np.inf, k - 1
         while j >= first and (before < 0 or line[j] == line[before]):
@@ -334,80 +202,6 @@ def _number_stripes(line: np.ndarray, centre: np.ndarray, jump_px: float, stripe
             slope[k] = slope[before] + _TURN * (step - slope[before])
 
 
-@compiled_with_arrays
-def _least_cost(
-    line: np.ndarray,
-    centre: np.ndarray,
-    before: np.ndarray,
-    after: np.ndarray,
-    cost: np.ndarray,
-    skipped: np.ndarray,
-    enter: np.ndarray,
-    leave: np.ndarray,
-    jump_px: float,
-    result: np.ndarray,
-) -> None:
-    """Cost (M,) of the best path that ends in each candidate, its own included.
-
-    ``before`` and ``after`` are the slopes of its stripe on either side of each, ``enter`` and ``leave`` what a jump to
-    it and from it costs more.
-    """
-    count = line.size
-    # What it costs to pass by, from the first line on: the number of lines with candidates before each one.
-    lines_before = np.zeros(count)
-    for k in range(1, count):
-        lines_before[k] = lines_before[k - 1] + (1.0 if line[k] != line[k - 1] else 0.0)
-    elsewhere, best_of_line, first = 0.0, np.inf, 0
-    for k in range(count):
-        if k > 0 and line[k] != line[k - 1]:
-            elsewhere = min(elsewhere + _SKIPPED, best_of_line)
-            best_of_line = np.inf
-        while line[k] - line[first] > _LONG_GAP:
-            first += 1
-        best = elsewhere + enter[k]
-        for j in range(first, k):
-            apart = line[k] - line[j]
-            if apart == 0:
-                break
-            moved, allowed = centre[k] - centre[j], jump_px + _SLACK_PX * (apart - 1)
-            straight = min(abs(moved - before[j] * apart), abs(moved - after[k] * apart))
-            off = min(abs(moved), straight)
-            if off <= allowed if apart <= _GAP else straight <= jump_px:
-                way = result[j] + min(skipped[j], skipped[k]) * (lines_before[k] - lines_before[j] - 1.0)
-                way += min(max(off - _SMOOTH_PX, 0.0) * _ROUGH, _ROUGHEST)
-                best = min(best, way)
-        result[k] = best + cost[k]
-        best_of_line = min(best_of_line, result[k] + 1.0 + leave[k])
-
-
-@compiled
-def _slopes(line: np.ndarray, centre: np.ndarray, stripe: np.ndarray, before: np.ndarray, after: np.ndarray) -> None:
-    """Slopes (M,) of the stripe of each candidate on the lines before and after it, by least squares; 0 at its ends."""
-    for side, result in ((-1, before), (1, after)):
-        for k in range(line.size):
-            products, squares, j = 0.0, 0.0, k + side
-            while 0 <= j < line.size and abs(line[j] - line[k]) <= _GAP:
-                if stripe[j] == stripe[k]:
-                    away = float(line[j] - line[k])
-                    products, squares = products + away * (centre[j] - centre[k]), squares + away * away
-                j += side
-            result[k] = products / squares if squares > 0.0 else 0.0
-
-
-@compiled
-def _average(line: np.ndarray, amplitude: np.ndarray, stripe: np.ndarray, mean: np.ndarray) -> None:
-    """Mean height (M,) of each candidate and those of its stripe on the lines beside it."""
-    for k in range(line.size):
-        total, count = amplitude[k] * 1.0, 1
-        for side in (-1, 1):
-            j = k + side
-            while 0 <= j < line.size and abs(line[j] - line[k]) <= _GAP:
-                if stripe[j] == stripe[k]:
-                    total, count = total + amplitude[j], count + 1
-                j += side
-        mean[k] = total / count
-
-
 @compiled
 def _keep_stripes(line: np.ndarray, centre: np.ndarray, amplitude: np.ndarray, kept: np.ndarray) -> None:
     """Mark candidates that go on straight over neighbouring lines, and the brightest ones of lines without any such."""
@@ -417,7 +211,7 @@ def _keep_stripes(line: np.ndarray, centre: np.ndarray, amplitude: np.ndarray, k
             slope, beside = _STEEPEST * (2.0 * number / (slopes - 1) - 1.0), 0
             for side in (-1, 1):
                 j, last = k + side, line[k]
-                while 0 <= j < line.size and abs(line[j] - line[k]) <= _GAP:
+                while 0 <= j < line.size and abs(line[j] - line[k]) <= GAP:
                     away = line[j] - line[k]
                     if (
                         abs(away) > _GRAIN
@@ -497,7 +291,7 @@ def _refuse_alone(line: np.ndarray, stripe: np.ndarray, alone: np.ndarray, state
             if first >= 0 and state[first] == _TAKEN:
                 refused = -count
         lines = line[end] - line[k] + 1
-        state_of_run = _REFUSED if refused > lines or (known == 2 and refused > 0 and lines <= 2 * _GAP) else _TAKEN
+        state_of_run = _REFUSED if refused > lines or (known == 2 and refused > 0 and lines <= 2 * GAP) else _TAKEN
         j = k
         while j >= 0 and alone[j]:
             state[j] = state_of_run
@@ -507,7 +301,7 @@ def _refuse_alone(line: np.ndarray, stripe: np.ndarray, alone: np.ndarray, state
 @compiled_part
 def _linked(line: np.ndarray, centre: np.ndarray, one: int, other: int, jump_px: float) -> bool:
     """Whether two candidates may be of the same stripe."""
-    return abs(centre[one] - centre[other]) <= jump_px + _SLACK_PX * max(abs(line[one] - line[other]) - 1, 0)
+    return abs(centre[one] - centre[other]) <= jump_px + SLACK_PX * max(abs(line[one] - line[other]) - 1, 0)
 
 
 @compiled_with_arrays
@@ -529,7 +323,7 @@ def _refuse_crossings(
                 continue
             # How the distance grows from here on.
             seen, at, apart = 1, i, away
-            while seen < _CROSSING_LINES:
+            while seen < CROSSING_LINES:
                 j = _pair_beside(line, centre, state, at, side, away, _REFUSED_BESIDE + 1, jump_px)
                 if j < 0:
                     break
@@ -537,8 +331,8 @@ def _refuse_crossings(
             if seen < _FEWEST_LINES:
                 continue
             growth = (abs(apart) - abs(away)) / abs(line[at] - line[i])
-            if growth > _OPENING:
-                reach = min(abs(away) / growth, _LONGEST_CROSSING) + 2.0
+            if growth > OPENING:
+                reach = min(abs(away) / growth, LONGEST_CROSSING) + 2.0
                 j = i - side
                 while 0 <= j < count and abs(line[j] - line[i]) <= reach:
                     hidden[j] |= line[j] != line[i]
