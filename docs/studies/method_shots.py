@@ -100,7 +100,8 @@ class Rendered:
 @cache
 def render(place: Place) -> Rendered:
     """The place's light: the stripe with many samples, the light around it with all effects of the place."""
-    from twin.recording.studio import Studio, true_stripe
+    from twin.recording.frame_truth import true_stripe
+    from twin.recording.studio import Studio
 
     scene, sensor = place.scene(), place.sensor()
     still = place.effects.without("noise", "speckle")

@@ -42,7 +42,8 @@ CASES = {
 
 
 def rows() -> Iterator[str]:
-    from twin.recording.studio import Studio, true_stripe
+    from twin.recording.frame_truth import true_stripe
+    from twin.recording.studio import Studio
 
     yield "| scene | surface | image | lines found % | bias px | std px |"
     yield "| --- | --- | --- | --- | --- | --- |"

@@ -139,7 +139,8 @@ class Spread:
 def measure(case: Case) -> Frames:
     """Render the case's frames, find the stripe in them, and compare with the truth."""
     # Mitsuba looks for its variant when it is imported.
-    from twin.recording.studio import Studio, true_stripe
+    from twin.recording.frame_truth import true_stripe
+    from twin.recording.studio import Studio
 
     sensor, scene = case.sensor(), case.scene()
     studio = Studio(sensor, scene, Options(spp=case.spp, effects=case.effects))
@@ -197,7 +198,8 @@ def step_per_px(case: Case, z_mm: np.ndarray) -> np.ndarray:
 @cache
 def _scale(medium: str) -> tuple[np.ndarray, np.ndarray]:
     """Polynomials (degree + 1, L) in Z of every line's row and Y, from the truth of plates all over the volume."""
-    from twin.recording.studio import Studio, true_stripe
+    from twin.recording.frame_truth import true_stripe
+    from twin.recording.studio import Studio
 
     studio = Studio(load_sensor("thesis"), Case(medium=medium).scene(), Options(effects=NONE))
     rows, places = [], []

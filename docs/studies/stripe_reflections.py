@@ -191,7 +191,8 @@ class _Capture(SimpleNamespace):
 
 
 def rendered(of: Scene) -> Rendered:
-    from twin.recording.studio import Studio, crossings
+    from twin.recording.frame_truth import crossings
+    from twin.recording.studio import Studio
 
     studio, images, lit = Studio(load_sensor("thesis"), of, Options()), [], []
     for number, shot in enumerate(of.motion.shots()):

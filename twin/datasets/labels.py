@@ -52,7 +52,7 @@ NO_OBJECT = 255
 
 def labelled(studio: Studio, shot: Shot, taken: Exposed, wanted: tuple[Label, ...]) -> dict[str, np.ndarray]:
     """The wanted arrays of a shot that was taken by a studio, by their names."""
-    from twin.recording.studio import seen_surfaces
+    from twin.recording.frame_truth import seen_surfaces
 
     arrays: dict[str, np.ndarray] = {}
     noise = noise_std_e(taken, studio.sensor.detector)
@@ -81,7 +81,7 @@ def labelled(studio: Studio, shot: Shot, taken: Exposed, wanted: tuple[Label, ..
 
 def _line_labels(studio: Studio, shot: Shot, taken: Exposed, noise: np.ndarray) -> dict[str, np.ndarray]:
     """All labels of the profile lines of a shot."""
-    from twin.recording.studio import brightest, crossings, lit_dimmest_first, no_stripe
+    from twin.recording.frame_truth import brightest, crossings, lit_dimmest_first, no_stripe
 
     camera, detector = studio.sensor.camera, studio.sensor.detector
     count, truth, number = camera.lines(), no_stripe(camera.lines()), np.full(camera.lines(), -1, np.int16)
@@ -105,7 +105,7 @@ def _line_labels(studio: Studio, shot: Shot, taken: Exposed, noise: np.ndarray) 
 
 def _target_points(studio: Studio, shot: Shot) -> np.ndarray:
     """Image points (N, 2), float32, of the points of the scene's first calibration target."""
-    from twin.recording.studio import image_points
+    from twin.recording.frame_truth import image_points
 
     things = zip(studio.scene.objects, studio.scene.object_poses(), strict=True)
     plate, pose = next((thing, pose) for thing, pose in things if isinstance(thing, Printed))

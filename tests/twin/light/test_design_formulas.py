@@ -11,7 +11,7 @@ import pytest
 
 from tests.virtual_sensors import altered, plate, scene_of, sensor_at
 from twin.light.renderer import Renderer
-from twin.recording.studio import true_stripe
+from twin.recording.frame_truth import true_stripe
 from uwlts.optics.design import (
     depth_mm,
     depth_per_pixel_mm,

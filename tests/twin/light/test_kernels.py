@@ -13,7 +13,8 @@ from twin.datasets.draws import draw_scene
 from twin.datasets.labels import labelled
 from twin.light.pose import SensorPose
 from twin.light.renderer import Renderer
-from twin.recording.studio import Studio, true_stripe
+from twin.recording.frame_truth import true_stripe
+from twin.recording.studio import Studio
 from twin.scene.description import load_scene
 from uwlts.model.sensor import Medium, Sensor
 

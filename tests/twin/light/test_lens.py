@@ -9,7 +9,7 @@ import pytest
 from tests.virtual_sensors import altered, camera_axes, clear, cropped, plate, scene_of, sensor_at
 from twin.light.renderer import Renderer
 from twin.options import NONE
-from twin.recording.studio import true_stripe
+from twin.recording.frame_truth import true_stripe
 from uwlts.model.sensor import Medium, Sensor
 
 SPP = 1024

@@ -10,7 +10,7 @@ from tests.virtual_sensors import block, clear, image_of, plate, scene_of, senso
 from twin.light.pose import Travel
 from twin.light.renderer import Renderer
 from twin.options import NONE
-from twin.recording.studio import true_stripe
+from twin.recording.frame_truth import true_stripe
 from twin.scene.description import Scene
 from uwlts.model.sensor import Sensor
 from uwlts.storage.truth import TruthStatus

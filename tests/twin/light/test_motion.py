@@ -10,7 +10,8 @@ from tests.virtual_sensors import altered, clear, cropped, plate, scene_of, sens
 from twin.light.pose import Travel
 from twin.light.renderer import Renderer
 from twin.options import NONE, Options
-from twin.recording.studio import Studio, true_stripe
+from twin.recording.frame_truth import true_stripe
+from twin.recording.studio import Studio
 from uwlts.model.errors import DesignError
 
 ALONG_X = np.array([1.0, 0.0, 0.0])

@@ -10,7 +10,7 @@ import pytest
 from tests.virtual_sensors import clear, oracle_paths, scene_of, sensor_at
 from twin.backend.arrays import to_jit, to_numpy
 from twin.light.renderer import Renderer
-from twin.recording.studio import true_stripe
+from twin.recording.frame_truth import true_stripe
 from twin.scene.forms.head import head_depth
 from twin.scene.forms.weld import Weld, weld_height
 from twin.scene.objects import Objects, build_objects

@@ -22,7 +22,7 @@ from tests.virtual_sensors import (
 )
 from twin.light.renderer import Renderer
 from twin.options import NONE
-from twin.recording.studio import FrameTruth, crossings, depth_map, image_points, seen_surfaces, true_stripe
+from twin.recording.frame_truth import FrameTruth, crossings, depth_map, image_points, seen_surfaces, true_stripe
 from uwlts.model.sensor import Sensor
 from uwlts.storage.truth import TruthStatus
 
