@@ -24,7 +24,7 @@ _REWEIGHTED = 10
 _FAR = 4.0
 """Standard uncertainties within which points of a ring's wall are sought; poses with as many misfits are left out."""
 _CLEAR = 6.0
-"""Times the width within which its points are sought: a smaller circle is not told from others."""
+"""Least radius over the width within which a circle's points are sought: a smaller one cannot be distinguished."""
 _CIRCLES, _JUDGED = 3000, 1500
 """Circles tried, and points by which each is judged: where a fifth of the points are on the wall, 24 circles are."""
 _ROUGH = Scatter(point_mm=0.1, pose_mm=0.3, turn_rad=3e-3)

@@ -369,14 +369,13 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
             by_noise = float(np.hypot(random[k], fixed[k]))
             values.append(plain_value(FeatureKind.WELD, name, float(value), by_noise, shared, least=0))
         else:
-            # The interval of the largest holds the noise; what remains widens it on both sides.
-            other = float(np.hypot(fixed[k], shared or 0.0))
-            values.append(_widened(name, float(value), top, float(fixed[k]), shared, other))
+            values.append(_widened(name, float(value), top, float(fixed[k]), shared))
     return tuple(values), np.array([bead.length_mm, float(plain[2]), float(plain[1])])
 
 
-def _widened(name: str, value: float, top: Largest, fixed: float, shared: float | None, other: float) -> FeatureValue:
-    """A largest value with its interval and what other standard uncertainties make of that."""
+def _widened(name: str, value: float, top: Largest, fixed: float, shared: float | None) -> FeatureValue:
+    """A largest value with its interval, which holds the noise and is widened on both sides by what remains."""
+    other = np.hypot(fixed, shared or 0.0)
     ends = [
         np.hypot(top.value - top.low, COVERAGE_FACTOR * other),
         np.hypot(top.high - top.value, COVERAGE_FACTOR * other),

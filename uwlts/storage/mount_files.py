@@ -42,7 +42,7 @@ _OFTEN_MEANT += ("euler-ZYZ-deg", "rotvec-deg", "rotvec-rad", "euler-ZYX-rad", "
 
 Artefact = Literal["sphere", "plane", "step", "ring"]
 _SIZES: dict[Artefact, str] = {"sphere": "radius", "step": "height", "ring": "radius"}
-"""What is known of an artefact's size."""
+"""Name of the size of an artefact, for those that have one."""
 SensorAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 SENSOR_AXES: dict[SensorAxis, np.ndarray] = {
     sign + name: (-1.0 if sign else 1.0) * direction  # pyright: ignore[reportAssignmentType]
