@@ -42,6 +42,8 @@ places along the stripe at each."""
 _EDGE_STEPS = 5
 _MANY = 200
 """Designs from which the time to compile the formulas for them comes back."""
+_BLOCK = 1000
+"""Designs that compiled formulas take at once."""
 _NEAREST_MM, _FARTHEST_MM = 1.0, 1e6
 """Largest distances at which the sheet leaves the image: from the window's outer face, and from the pupil."""
 _BRIGHT_LINES = 2.05
@@ -407,7 +409,11 @@ def _over_volume(
 def _compiled_over_volume(
     xp: ModuleType, p: SensorArrays, follow: tuple[Follow, ...], reflectance: float
 ) -> tuple[dict[str, Array], Array, Array, dict[str, Array]]:
-    """The same by Dr.Jit in a fifth of the time, for two designs or more, in one thread: sweeps have one per core."""
+    """The same by Dr.Jit in a fifth of the time, for two designs or more, in one thread: sweeps have one per core.
+
+    What Dr.Jit records holds for one number of designs and none else, so that they go in blocks of one size, the last
+    one filled up with the last design.
+    """
     prepare_llvm()
     import drjit as dr
     from drjit.llvm import TensorXf64
@@ -415,15 +421,24 @@ def _compiled_over_volume(
     def converted(values: Array) -> Array:
         return tuple(map(converted, values)) if isinstance(values, tuple) else TensorXf64(_aligned(values))
 
-    given = {name: converted(values) for name, values in vars(p).items()}
+    designs = p.baseline_mm.size
+    over_volume, at = _frozen(follow, reflectance), (converted(_SHARES), converted(_PLACES))
+    blocks: list[tuple[dict[str, Array], ...]] = []
     threads = dr.thread_count()
     dr.set_thread_count(1)
     try:
-        followers, near, far, field = _frozen(follow, reflectance)(given, converted(_SHARES), converted(_PLACES))
-        tables = [{name: array.numpy() for name, array in table.items()} for table in (followers, field)]
-        return tables[0], near.numpy(), far.numpy(), tables[1]
+        for first in range(0, designs, _BLOCK):
+            block = p.at(np.minimum(np.arange(first, first + _BLOCK), designs - 1))
+            followers, near, far, field = over_volume({n: converted(values) for n, values in vars(block).items()}, *at)
+            tables = followers, {"near": near, "far": far}, field
+            blocks.append(tuple({name: array.numpy() for name, array in table.items()} for table in tables))
     finally:
         dr.set_thread_count(threads)
+    followers, ends, field = (
+        {name: np.concatenate([table[name] for table in parts])[:designs] for name in parts[0]}
+        for parts in zip(*blocks, strict=True)
+    )
+    return followers, ends["near"], ends["far"], field
 
 
 def _aligned(values: np.ndarray) -> np.ndarray:
