@@ -106,7 +106,10 @@ class _PartLowering(NativeLowering):
     _name = "part_lowering"
 
     def run_pass(self, state: Any) -> bool:
-        state.library, state.flags.no_compile = _PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname), True
+        state.library, state.flags.no_compile = (
+            _PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname),
+            True,
+        )
         super().run_pass(state)
         # Callers find it by its entry point, which has no code.
         lowered = state["cr"]
