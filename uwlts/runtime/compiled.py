@@ -7,10 +7,10 @@ import inspect
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Literal, ParamSpec, TypeVar
 
 import numpy as np
-from numba import _dynfunc, njit
+from numba import _dynfunc, njit  # pyright: ignore[reportAttributeAccessIssue]
 from numba.core import event
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
@@ -105,7 +105,7 @@ class _PartLibrary(JITCodeLibrary):
 class _PartLowering(NativeLowering):
     _name = "part_lowering"
 
-    def run_pass(self, state: Any) -> bool:
+    def run_pass(self, state: Any) -> Literal[True]:
         state.library, state.flags.no_compile = (
             _PartLibrary(state.targetctx.codegen(), state.func_id.func_qualname),
             True,

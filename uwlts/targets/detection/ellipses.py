@@ -71,7 +71,8 @@ def _level_planes(grey, centres, shapes, reaches):
     slope with the edge's tail, which reaches further on one side where the plate is inclined.
     """
     planes = np.zeros((len(centres), 2, 3))
-    _mean_levels(grey, centres, shapes, np.linalg.inv(shapes), *reaches, DIRECTIONS, planes)
+    inner, outer = reaches
+    _mean_levels(grey, centres, shapes, np.linalg.inv(shapes), inner, outer, DIRECTIONS, planes)
     if len(centres) > 1:
         near = KDTree(centres).query(centres, k=min(NEIGHBOURS + 1, len(centres)))[1]
         _fit_slopes(centres, np.asarray(near), planes)
