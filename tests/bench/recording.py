@@ -31,7 +31,9 @@ SERVED = 300
 
 @dataclass(frozen=True)
 class Recorded:
-    """Frames per second that reached the disk, from the first to the last, and how many were lost.
+    """Frames per second that reached the disk, by a straight line through their moments, and how many were lost.
+
+    From the first to the last alone, a first frame that is stored 10 ms late would raise 60 frames per second by 0.1.
 
     ``followed`` of them were read from the growing file, their stripe found and turned into points, by a second
     process, at ``followed_hz`` from the first to the last; it was done ``behind_s`` after the recording.
@@ -110,7 +112,7 @@ def _record(camera: CameraDevice, sensor: Sensor, out: Path, count: int) -> Reco
             writer.append(Frame(frame.image, float(k), True, 1.0, frame.time_s))
             stored_s[k] = time.perf_counter()
         counts = camera.counts
-    return Recorded((count - 1) / float(stored_s[-1] - stored_s[0]), counts.dropped + counts.short)
+    return Recorded(float(1.0 / np.polyfit(np.arange(count), stored_s, 1)[0]), counts.dropped + counts.short)
 
 
 def _followed(out: Path, record: Callable[[], Recorded]) -> Recorded:
