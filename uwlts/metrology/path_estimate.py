@@ -123,7 +123,7 @@ class PathSpline:
 class Piece:
     """A part of the path: patches of its surface, their times (P,), the platform's places (P, 3) then, and its points.
 
-    ``held_out`` (P,) are patches that judge the gain, ``points_mm`` (N, 3) averages of the points, and ``patch_of`` (N,)
+    ``held_out`` (P,) are patches that judge the gain, ``points_mm`` (N, 3) averages of the points and ``patch_of`` (N,)
     the patch nearest to each. Places are those by the path as it was.
     """
 
