@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -51,7 +52,7 @@ def close_crossings(
     doubtful: list[Pair] = []
     count = len(estimate.pieces)
     for number in range(count):
-        waiting += _hypotheses(estimate, number)
+        waiting += [each for each in _hypotheses(estimate, number) if not _beside(each.pair, doubtful)]
         while waiting and (number - min(each.pair[1] for each in waiting) >= _AHEAD or number == count - 1):
             best = max(waiting, key=lambda each: each.patches)
             waiting.remove(best)
@@ -59,16 +60,17 @@ def close_crossings(
             if not _closed(estimate, best):
                 continue
             closed = estimate.state()
-            if rival := _rival(estimate, best, waiting, before):
+            if _has_rival(estimate, best, waiting, before):
                 doubtful.append(best.pair)
-                waiting.remove(rival)
+                waiting = [each for each in waiting if not _beside(each.pair, doubtful)]
                 estimate.restore(before)
                 continue
             estimate.restore(closed)
             complete(estimate, number + 1)
             waiting = [each for each in waiting if each.pair not in estimate.pairs and _likely(estimate, each)]
         progress(number + 1, count)
-    return doubtful
+    complete(estimate, count)
+    return [pair for pair in doubtful if pair not in estimate.pairs]
 
 
 def complete(estimate: PathEstimate, count: int) -> None:
@@ -105,11 +107,17 @@ def _reach(estimate: PathEstimate, pair: Pair) -> np.ndarray | None:
     """How far (3,) the later piece may lie from where it is now; None where it reaches the earlier nowhere."""
     other, own = (estimate.moved(number).places_mm for number in pair)
     low, high = own.min(axis=0), own.max(axis=0)
-    by = estimate.by_relative_movement(pair, (low + high) / 2)
-    std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", by, estimate.covariance, by, optimize=True), 0.0))
+    std = np.sqrt(np.diag(_relative_covariance(estimate, pair, (low + high) / 2)))
     reach = SIGMAS * (std[:3] + float(np.linalg.norm(high - low)) / 2 * std[3:].max())
     apart = np.maximum(low - reach - other.max(axis=0), other.min(axis=0) - high - reach)
     return None if (apart > 0).any() else reach
+
+
+def _relative_covariance(estimate: PathEstimate, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
+    """Covariance (6, 6) of shift and turn of the later piece against the earlier, at a place (3,)."""
+    by = estimate.by_relative_movement(pair, at_mm)
+    used = np.flatnonzero(by.any(axis=0))
+    return by[:, used] @ estimate.covariance[np.ix_(used, used)] @ by[:, used].T
 
 
 def _poses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> list[Hypothesis]:
@@ -164,8 +172,7 @@ def _likely(estimate: PathEstimate, hypothesis: Hypothesis) -> bool:
     places = estimate.moved(hypothesis.pair[1]).places_mm
     middle = places.mean(axis=0)
     size = float(np.sqrt(np.mean(np.sum((places - middle) ** 2, axis=1))))
-    by = estimate.by_relative_movement(hypothesis.pair, middle)
-    covariance = by @ estimate.covariance @ by.T
+    covariance = _relative_covariance(estimate, hypothesis.pair, middle)
     # The pose is as good as two bent pieces tell, and a search within a patch's radius.
     bent = max(_bent(estimate), estimate.reach_mm / 2)
     covariance += bent**2 * np.diag(np.repeat([1.0, 1 / size**2], 3))
@@ -187,13 +194,20 @@ def _closed(estimate: PathEstimate, hypothesis: Hypothesis) -> bool:
     return False
 
 
-def _rival(
-    estimate: PathEstimate, best: Hypothesis, waiting: list[Hypothesis], before: tuple[object, ...]
-) -> Hypothesis | None:
-    """Another hypothesis that contradicts the closed one and holds as well, from the estimate before."""
-    rivals = [each for each in waiting if each.patches >= _RIVAL * best.patches and not _likely(estimate, each)]
+def _has_rival(estimate: PathEstimate, best: Hypothesis, waiting: list[Hypothesis], before: tuple[Any, ...]) -> bool:
+    """Whether another hypothesis contradicts the closed one and holds as well, from the estimate before."""
+    rivals = [
+        each
+        for each in waiting
+        if _beside(each.pair, [best.pair]) and each.patches >= _RIVAL * best.patches and not _likely(estimate, each)
+    ]
     for rival in rivals:
         estimate.restore(before)
         if _closed(estimate, rival):
-            return rival
-    return None
+            return True
+    return False
+
+
+def _beside(pair: Pair, others: list[Pair]) -> bool:
+    """Whether a pair belongs to the crossing of one of the others."""
+    return any(max(abs(pair[0] - earlier), abs(pair[1] - later)) <= _AHEAD for earlier, later in others)

@@ -140,9 +140,13 @@ def align_trajectory(
     times = on_clock(cloud.time_s, offset_s=clock_offset_s, drift_ppm=clock_drift_ppm)
     path = PathSpline.of(trajectory, _drift(trajectory, drift_mm, drift_deg), times)
     left_out: tuple[tuple[float, float], ...] = ()
-    for shares in (_SMOOTH, _ROUGH):
+    for turn, shares in enumerate((_SMOOTH, _ROUGH)):
         estimate = PathEstimate(cloud, times, path, shares)
-        doubtful = close_crossings(estimate, progress)
+
+        def searched(done: int, total: int, turn: int = turn) -> None:
+            progress(turn * total + done, (turn + 1) * total)
+
+        doubtful = close_crossings(estimate, searched)
         if estimate.pairs:
             estimate.settle()
             complete(estimate, len(estimate.pieces))

@@ -16,6 +16,9 @@ SEED = 5
 LOOP_MM = np.array([[0, 0], [1100, 0], [1100, 700], [450, 700], [450, -500]], float)
 """Of 4 m, with one crossing at (450, 0)."""
 
+RACE_MM = np.array([[-200, 0], [700, 0], [700, 600], [-200, 600], [-200, 0], [500, 0]], float)
+"""Ends where it began, in the same direction."""
+
 
 def position_errors(found: Trajectory, true: Trajectory) -> float:
     """Root mean square distance of the positions from the true ones."""
@@ -64,6 +67,32 @@ def test_a_loop_is_closed(loop):
     # The start is the frame's, and what a crossing tells lowers the uncertainty of what came before it.
     std = np.sqrt(np.einsum("nii->ni", found.trajectory.covariance))
     assert std[0, :3].max() < 0.1 and (std[:, :3] < 60).all()
+
+
+def test_a_surface_that_fits_in_many_places_is_refused():
+    # Equal stones each 60 mm; the navigation is off by about 40 mm where the path crosses itself.
+    def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 8 * np.cos(2 * np.pi * x / 60) * np.cos(2 * np.pi * y / 60)
+
+    drift = {"drift_mm": 60.0, "drift_deg": 0.3}
+    cloud, reported, _ = ride(np.random.default_rng(SEED), LOOP_MM, ground=ground, **drift)
+    with pytest.raises(uwlts.Error, match="fits in several places"):
+        uwlts.align_trajectory(cloud, reported, **drift)
+
+
+def test_along_a_ridge_the_navigation_is_all_that_is_known():
+    def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 60 * np.exp(-(y**2) / (2 * 60**2)) + 0 * x
+
+    drift = {"drift_mm": 4.0, "drift_deg": 0.05}
+    cloud, reported, true = ride(np.random.default_rng(SEED), RACE_MM, ground=ground, **drift)
+    found = uwlts.align_trajectory(cloud, reported, **drift).trajectory
+    std = np.sqrt(np.einsum("ii->i", found.covariance[-1]))
+    # Over the start again: along the ridge the navigation's 4 mm stay, less what the kind of drift tells.
+    assert std[0] > 3.0 and (std[1:3] < 0.5).all()
+    error = (found.poses - true.poses)[-1, :3, 3]
+    assert (np.abs(error) < 5 * std[:3]).all()
+    assert np.abs((reported.poses - true.poses)[-1, :3, 3]).min() > 1.0
 
 
 def test_the_corrected_cloud_is_that_of_the_corrected_trajectory(loop):
