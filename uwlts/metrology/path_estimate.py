@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline
-from scipy.linalg import eigh
+from scipy.linalg import eigh, solve_triangular
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from uwlts.metrology.patches import (
@@ -42,12 +43,17 @@ _INTERVALS = 100
 """Of the spline: between two knots a random walk goes a tenth of the drift of the whole path."""
 _SHARES = [
     (wander, walk)
-    for wander in (0.003, 0.01, 0.03, 0.1, 0.3, 0.6)
+    for wander in (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0, 2.0, 4.0)
     for walk in (1e-5, 1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6)
-    if wander + walk <= 0.9
 ]
+"""Variances at the end of a rate that wanders and of a random walk over that of the drift as it is stated, of which the
+steady rate has the rest: a rate may wander by more than what it comes to in the end."""
+_LAID, _LITTLE = 8, 0.1
+"""Times that patches are laid anew at most, and by how much of a standard deviation the path may still move then."""
 _LEARNED = 4
 """Times the shares are estimated: matches and weights follow them."""
+_BESIDE = 13
+"""Patches from which it is taken how times grow: two rings around one."""
 FEWEST = 30
 """Patches of a piece, and of a crossing."""
 _ROUNDS = 15
@@ -98,10 +104,15 @@ class PathSpline:
         inside = np.clip(times_s, self.first_s, self.last_s)
         return BSpline.design_matrix(inside, self.knots, 3).toarray()
 
+    def corrections(self, coefficients: np.ndarray, times_s: np.ndarray, *, rates: bool = False) -> np.ndarray:
+        """Shift and turn (N, 6) at times (N,) by coefficients (6 C,), or their rates per second."""
+        spline = BSpline(self.knots, coefficients.reshape(-1, 6), 3)
+        return (spline.derivative() if rates else spline)(np.clip(times_s, self.first_s, self.last_s))
+
     def information(self, shares: tuple[float, float]) -> np.ndarray:
         """Inverse covariance (6 C, 6 C) of the coefficients, ordered coefficient by coefficient.
 
-        ``shares`` of the variance at the end are those of a wandering rate and of a random walk.
+        ``shares`` of the stated variance at the end are those of a wandering rate and of a random walk.
         """
         # A coefficient stands for the correction at the mean of its knots (Greville).
         at = np.array([self.knots[k + 1 : k + 4].mean() for k in range(self.count)])
@@ -109,7 +120,7 @@ class PathSpline:
         first, second = np.minimum(t[:, None], t), np.maximum(t[:, None], t)
         # A rate that walks at random, from zero: the integral of a random walk.
         wandering = first**2 * (3 * second - first) / 2
-        shape = (1 - sum(shares)) * np.outer(t, t) + shares[0] * wandering + shares[1] * first
+        shape = max(1 - sum(shares), 0.0) * np.outer(t, t) + shares[0] * wandering + shares[1] * first
         parts = []
         for size, exact in zip(self.drift, (EXACT_MM, EXACT_RAD), strict=True):
             parts += [np.linalg.inv(size**2 * shape + (exact**2 + 1e-10 * size**2) * np.eye(len(t)))] * 3
@@ -121,15 +132,33 @@ class PathSpline:
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """A part of the path: patches of its surface, their times (P,), the platform's places (P, 3) then, and its points.
+    """A part of the path, and P patches of its surface.
 
-    ``held_out`` (P,) are patches that judge the gain, ``points_mm`` (N, 3) averages of the points and ``patch_of`` (N,)
-    the patch nearest to each. Places are those by the path as it was.
+    Attributes
+    ----------
+    patches : Patches
+        By the path when they were laid.
+    back : (P, 3, 3)
+        From the surface around each patch then to that by the path as it was; see `_around`.
+    places_mm : (P, 3)
+        Of the patches, by the path as it was.
+    times_s, slopes : (P,) and (P, 3)
+        Times of the patches, and how they grow over the surface, s/mm.
+    platform_mm, speed : (P, 3)
+        The platform's places at these times, and its velocity, mm/s.
+    held_out : (P,) bool
+        Patches that judge the gain.
+    points_mm, patch_of : (N, 3) and (N,)
+        Averages of the points by the path as it was, and the patch nearest to each.
     """
 
     patches: Patches
+    back: np.ndarray
+    places_mm: np.ndarray
     times_s: np.ndarray
+    slopes: np.ndarray
     platform_mm: np.ndarray
+    speed: np.ndarray
     held_out: np.ndarray
     points_mm: np.ndarray
     patch_of: np.ndarray
@@ -147,6 +176,7 @@ class PathEstimate:
         self.cloud, self.path, self.shares = cloud, path, shares
         moments, self._image = np.unique(times_s, return_inverse=True)
         self._moments, self._platform = moments, path.trajectory.poses_at(moments)[:, :3, 3]
+        self._speed = path.trajectory.rates_at(moments)[:, :3]
         self.prior = path.information(shares)
         self.coefficients = np.zeros(6 * path.count)
         self.covariance = np.linalg.inv(self.prior)
@@ -161,24 +191,40 @@ class PathEstimate:
         """Within which patches are matched."""
         return 2 * self._radius
 
-    def corrections(self, basis: np.ndarray) -> np.ndarray:
-        """Shift and turn (N, 6) by weights (N, C)."""
-        return basis @ self.coefficients.reshape(-1, 6)
+    def corrections(self, times_s: np.ndarray) -> np.ndarray:
+        """Shift and turn (N, 6) at times (N,)."""
+        return self.path.corrections(self.coefficients, times_s)
 
     def moved(self, number: int) -> Patches:
         """Patches of a piece along the path as it is now."""
         piece = self.pieces[number]
-        correction = self.corrections(self.path.basis(piece.times_s))
-        places = _moved(correction, piece.platform_mm, piece.patches.places_mm)
-        matrices = Rotation.from_rotvec(correction[:, 3:]).as_matrix()
-        axes = np.einsum("pij,pkj->pki", matrices, piece.patches.axes)
+        places = _moved(self.corrections(piece.times_s), piece.platform_mm, piece.places_mm)
+        # Images move one by one: what lies along the path is not turned with them, but sheared by how they drift apart.
+        tangents = np.einsum("pij,pkj->pki", self._around(piece) @ piece.back, piece.patches.axes[:, :2])
+        first = tangents[:, 0] / np.linalg.norm(tangents[:, 0], axis=1, keepdims=True)
+        normal = np.cross(first, tangents[:, 1])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        axes = np.stack([first, np.cross(normal, first), normal], axis=1)
         return replace(piece.patches, places_mm=places, axes=axes, one_sided=False)
 
     def moved_points(self, number: int) -> np.ndarray:
         """Points (N, 3) of a piece along the path as it is now."""
         piece = self.pieces[number]
-        correction = self.corrections(self.path.basis(piece.times_s))[piece.patch_of]
+        correction = self.corrections(piece.times_s)[piece.patch_of]
         return _moved(correction, piece.platform_mm[piece.patch_of], piece.points_mm)
+
+    def _around(self, piece: Piece) -> np.ndarray:
+        """Derivatives (P, 3, 3) of the surface around patches, along the path as it is now, by it as it was.
+
+        Of p' = R(t) (p - X(t)) + X(t) + s(t) by p, with the time t that grows over the surface, the turn R, the shift
+        s, and the platform's place X.
+        """
+        correction = self.corrections(piece.times_s)
+        rates = self.path.corrections(self.coefficients, piece.times_s, rates=True)
+        turn = Rotation.from_rotvec(correction[:, 3:])
+        drifting = np.cross(rates[:, 3:], turn.apply(piece.places_mm - piece.platform_mm)) + rates[:, :3]
+        drifting += piece.speed - turn.apply(piece.speed)
+        return turn.as_matrix() + drifting[:, :, None] * piece.slopes[:, None]
 
     def by_relative_movement(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
         """Derivatives (6, 6 C) of shift and turn of the later piece against the earlier, at a place (3,)."""
@@ -187,7 +233,7 @@ class PathEstimate:
             piece = self.pieces[number]
             basis = self.path.basis(np.array([piece.middle_s]))
             platform = piece.platform_mm[np.argmin(np.abs(piece.times_s - piece.middle_s))]
-            lever = at_mm - platform - self.corrections(basis)[0, :3]
+            lever = at_mm - platform - self.corrections(np.array([piece.middle_s]))[0, :3]
             twist = np.eye(6)
             twist[:3, 3:] = np.cross(np.eye(3), lever).T
             result += sign * np.einsum("c,ij->icj", basis[0], twist).reshape(6, -1)
@@ -219,16 +265,23 @@ class PathEstimate:
     def settle(self) -> None:
         """Estimate the path and the shares of its drift by turns; pairs that do not agree then are given up."""
         for _ in range(_LEARNED):
-            self.estimate({})
-            self.lay_anew(range(len(self.pieces)))
-            self.estimate({})
+            self.converge()
             if (shares := self._likeliest()) == self.shares:
                 break
             self.shares, self.prior = shares, self.path.information(shares)
-        self.estimate({})
         if len(agreeing := [pair for pair in self.pairs if self.agrees(pair)]) < len(self.pairs):
             self.pairs = agreeing
+        self.converge()
+
+    def converge(self) -> None:
+        """Estimate and lay the patches anew by turns, until the path moves by little of its uncertainty."""
+        for _ in range(_LAID):
             self.estimate({})
+            before = self.coefficients
+            self.lay_anew({number for pair in self.pairs for number in pair})
+            self.estimate({})
+            if np.max(np.abs(self.coefficients - before) / np.sqrt(np.diag(self.covariance))) < _LITTLE:
+                break
 
     def agrees(self, pair: Pair) -> bool:
         """Whether the surfaces of a pair agree, also where they were held out, and tell more than they determine."""
@@ -254,9 +307,7 @@ class PathEstimate:
     def _laid(self, own: np.ndarray) -> Piece | None:
         """Patches of points by their numbers, along the path as it is now; None where they lie on no surface."""
         image = self._image[own]
-        first = int(image.min())
-        basis = self.path.basis(self._moments[first : int(image.max()) + 1])
-        correction, platform = self.corrections(basis)[image - first], self._platform[image]
+        correction, platform = self.corrections(self._moments)[image], self._platform[image]
         known = None if self.cloud.uncertainty is None else self.cloud.uncertainty[own]
         # What all points share does not tell one pass from another along a path.
         known = None if known is None else replace(known, patterns_mm=known.patterns_mm[:0], poses_mm=None)
@@ -265,16 +316,28 @@ class PathEstimate:
             patches = surface_patches(points, known, radius_mm=self._radius)
         except EvaluationError:
             return None
-        correction, platform = correction[patches.numbers], platform[patches.numbers]
+        at = image[patches.numbers]
+        correction, platform, times = correction[patches.numbers], self._platform[at], self._moments[at]
         back = Rotation.from_rotvec(-correction[:, 3:])
         places = back.apply(patches.places_mm - platform - correction[:, :3]) + platform
-        axes = np.einsum("pij,pkj->pki", back.as_matrix(), patches.axes)
-        patches = replace(patches, places_mm=places, axes=axes)
         cubes = np.floor(places / (4 * self._radius)).astype(np.int64)
         held_out = (cubes @ np.array([1, 2, 3])) % _HELD_OUT == 0
         averages = averaged_points(self.cloud.points_mm[own], self._radius * _VOXEL)
-        near: Any = patches.tree.query(averages)
-        return Piece(patches, self._moments[image[patches.numbers]], platform, held_out, averages, near[1])
+        tree = KDTree(places)
+        near: Any = tree.query(averages)
+        piece = Piece(
+            patches,
+            np.empty(0),
+            places,
+            times,
+            _slopes(tree, times),
+            platform,
+            self._speed[at],
+            held_out,
+            averages,
+            near[1],
+        )
+        return replace(piece, back=np.linalg.inv(self._around(piece)))
 
     def _round(self, seed: dict[Pair, np.ndarray]) -> float:
         """One step of least squares; returns the largest shift of a coefficient."""
@@ -293,9 +356,9 @@ class PathEstimate:
         def likelihood(shares: tuple[float, float]) -> float:
             """Twice the logarithm, but for what all shares have in common: the path is integrated out."""
             prior = self.path.information(shares)
-            together = normal + prior
-            sizes = [np.linalg.slogdet(each)[1] for each in (prior, together)]
-            return float(at @ np.linalg.solve(together, at) + sizes[0] - sizes[1])
+            roots = [np.linalg.cholesky(each) for each in (prior, normal + prior)]
+            sizes = [2 * np.sum(np.log(np.diag(root))) for root in roots]
+            return float(np.sum(solve_triangular(roots[1], at, lower=True) ** 2) + sizes[0] - sizes[1])
 
         return max(_SHARES, key=likelihood)
 
@@ -342,11 +405,16 @@ class PathEstimate:
             derivatives = np.zeros((len(weight), 6 * self.path.count))
             for number, rows, sign in ((source, found.source[used], 1.0), (target, found.target[used], -1.0)):
                 piece = self.pieces[number]
-                basis = self.path.basis(piece.times_s[rows])
+                # Beside the middle of a patch the surface was seen a little earlier or later.
+                off = now[number] - patches[number].places_mm[rows]
+                later = np.einsum("qi,qi->q", piece.slopes[rows], off)
+                times = piece.times_s[rows] + later
+                basis = self.path.basis(times)
                 at = middle + now[number] - places
                 by = np.hstack([normals, np.cross(places - middle, normals)]) @ told
                 # Turns are about the platform where the present correction has it.
-                platform = piece.platform_mm[rows] + self.corrections(basis)[:, :3]
+                platform = piece.platform_mm[rows] + later[:, None] * piece.speed[rows]
+                platform += self.corrections(times)[:, :3]
                 by[:, 3:] += np.cross(at - platform, by[:, :3])
                 derivatives += sign * np.einsum("qc,qi->qci", basis, by).reshape(len(rows), -1)
             normal += derivatives.T @ (weight[:, None] * derivatives)
@@ -357,6 +425,16 @@ class PathEstimate:
 def _moved(correction: np.ndarray, platform: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Places (N, 3) after corrections (N, 6) about the platform's places (N, 3)."""
     return Rotation.from_rotvec(correction[:, 3:]).apply(places - platform) + platform + correction[:, :3]
+
+
+def _slopes(tree: KDTree, times: np.ndarray) -> np.ndarray:
+    """How times (P,) grow over the places of a tree (P, 3), s/mm."""
+    near: Any = tree.query(tree.data, k=min(_BESIDE, tree.n))[1]
+    about, later = np.asarray(tree.data)[near] - np.asarray(tree.data)[:, None], times[near] - times[:, None]
+    normal = np.einsum("pki,pkj->pij", about, about)
+    # Across a plane surface times do not grow: the ridge is a millionth of what tells along it.
+    normal += 1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    return np.linalg.solve(normal, np.einsum("pki,pk->pi", about, later)[:, :, None])[:, :, 0]
 
 
 def _told(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middle: np.ndarray) -> np.ndarray:

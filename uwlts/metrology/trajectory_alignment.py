@@ -180,7 +180,7 @@ def _result(
 ) -> AlignedTrajectory:
     cloud = estimate.cloud
     basis = estimate.path.basis(trajectory.times_s)
-    correction = estimate.corrections(basis)
+    correction = estimate.corrections(trajectory.times_s)
     poses = trajectory.poses.copy()
     poses[:, :3, :3] = Rotation.from_rotvec(correction[:, 3:]).as_matrix() @ poses[:, :3, :3]
     poses[:, :3, 3] += correction[:, :3]
@@ -189,7 +189,7 @@ def _result(
     covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
     moments, image = np.unique(times, return_inverse=True)
     at_image = estimate.path.basis(moments)
-    by_point = estimate.corrections(at_image)[image]
+    by_point = estimate.corrections(moments)[image]
     platform = trajectory.poses_at(moments)[image, :3, 3]
     levers = Rotation.from_rotvec(by_point[:, 3:]).apply(cloud.points_mm - platform)
     known = cloud.uncertainty
@@ -210,7 +210,7 @@ def _crossing(estimate: PathEstimate, pair: Pair) -> Crossing:
     # The same patches, as they lay by the path as it was.
     shift = np.zeros_like(now.places_mm)
     for number, rows, sign in zip(pair, (now.target, now.source), (-1.0, 1.0), strict=True):
-        shift += sign * (estimate.moved(number).places_mm - estimate.pieces[number].patches.places_mm)[rows]
+        shift += sign * (estimate.moved(number).places_mm - estimate.pieces[number].places_mm)[rows]
     before = now.distance_mm - np.einsum("qi,qi->q", shift, now.normals)
     inside = np.abs(now.distance_mm) < 5 * now.std_mm * scatter(now.distance_mm / now.std_mm)
 
