@@ -76,8 +76,11 @@ def close_crossings(
 def complete(estimate: PathEstimate, count: int) -> None:
     """Add all pairs of the first pieces that must lie on each other, by the path as it is known now."""
     closed = list(estimate.pairs)
+    places = [estimate.moved(number).places_mm for number in range(count)]
+    low, high = (np.array([of(each, axis=0) for each in places]) for of in (np.min, np.max))
     for later in range(count):
-        for earlier in range(later - 2):
+        near = np.all((low[later] < high + estimate.reach_mm) & (low < high[later] + estimate.reach_mm), axis=1)
+        for earlier in np.flatnonzero(near[: max(later - 2, 0)]).tolist():
             pair = earlier, later
             reach = None if pair in closed else _reach(estimate, pair)
             if reach is not None and reach.max() < estimate.reach_mm:

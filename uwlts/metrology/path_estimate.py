@@ -72,6 +72,8 @@ _PER_PARAMETER = 3.0
 fits anywhere if the path may bend as much as it takes."""
 _NOISE = 5.0
 """Times the information that the noise of normals alone would give: a movement with less is open."""
+_TELLING = 1e-4
+"""Of the information that the drift is known with beforehand: less does not tell one kind of drift from another."""
 _ROUNDING = 1e-9
 """Of the information on the best determined movement: less is rounding."""
 
@@ -109,8 +111,8 @@ class PathSpline:
         spline = BSpline(self.knots, coefficients.reshape(-1, 6), 3)
         return (spline.derivative() if rates else spline)(np.clip(times_s, self.first_s, self.last_s))
 
-    def information(self, shares: tuple[float, float]) -> np.ndarray:
-        """Inverse covariance (6 C, 6 C) of the coefficients, ordered coefficient by coefficient.
+    def shape(self, shares: tuple[float, float]) -> np.ndarray:
+        """Covariance (C, C) of the coefficients of one component, over the variance that is stated for the end.
 
         ``shares`` of the stated variance at the end are those of a wandering rate and of a random walk.
         """
@@ -120,14 +122,21 @@ class PathSpline:
         first, second = np.minimum(t[:, None], t), np.maximum(t[:, None], t)
         # A rate that walks at random, from zero: the integral of a random walk.
         wandering = first**2 * (3 * second - first) / 2
-        shape = max(1 - sum(shares), 0.0) * np.outer(t, t) + shares[0] * wandering + shares[1] * first
-        parts = []
-        for size, exact in zip(self.drift, (EXACT_MM, EXACT_RAD), strict=True):
-            parts += [np.linalg.inv(size**2 * shape + (exact**2 + 1e-10 * size**2) * np.eye(len(t)))] * 3
-        result = np.zeros((6 * len(t),) * 2)
-        for component, part in enumerate(parts):
-            result[component::6, component::6] = part
+        steady = max(1 - sum(shares), 0.0) * np.outer(t, t)
+        return steady + shares[0] * wandering + shares[1] * first + 1e-10 * np.eye(len(t))
+
+    def information(self, shares: tuple[float, float]) -> np.ndarray:
+        """Inverse covariance (6 C, 6 C) of the coefficients, ordered coefficient by coefficient; see `shape`."""
+        shape = self.shape(shares)
+        result = np.zeros((6 * self.count,) * 2)
+        for component, (size, exact) in enumerate(zip(self.sizes, (EXACT_MM,) * 3 + (EXACT_RAD,) * 3, strict=True)):
+            result[component::6, component::6] = np.linalg.inv(size**2 * shape + exact**2 * np.eye(self.count))
         return result
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Drift (6,) of each component at the end, mm and rad."""
+        return np.repeat(self.drift, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,22 +352,28 @@ class PathEstimate:
         """One step of least squares; returns the largest shift of a coefficient."""
         normal, gradient = self._evidence(seed)
         normal, gradient = normal + self.prior, gradient + self.prior @ self.coefficients
-        step = -np.linalg.solve(normal, gradient)
-        self.coefficients = self.coefficients + step
         self.covariance = np.linalg.inv(normal)
+        step = -self.covariance @ gradient
+        self.coefficients = self.coefficients + step
         return float(np.abs(step.reshape(-1, 6)[:, :3]).max())
 
     def _likeliest(self) -> tuple[float, float]:
         """Shares of the drift with which the matches as they are now are likeliest."""
         normal, gradient = self._evidence({})
-        at = normal @ self.coefficients - gradient
+        # In units of the drift the evidence is that of as many independent numbers as it tells of.
+        units = np.tile(self.path.sizes, self.path.count)
+        values, vectors = np.linalg.eigh(normal * np.outer(units, units))
+        telling = values > _TELLING
+        roots = np.sqrt(values[telling])
+        at = vectors[:, telling].T @ (units * (normal @ self.coefficients - gradient)) / roots
+        ways = (vectors[:, telling] * roots).reshape(self.path.count, -1)
 
         def likelihood(shares: tuple[float, float]) -> float:
             """Twice the logarithm, but for what all shares have in common: the path is integrated out."""
-            prior = self.path.information(shares)
-            roots = [np.linalg.cholesky(each) for each in (prior, normal + prior)]
-            sizes = [2 * np.sum(np.log(np.diag(root))) for root in roots]
-            return float(np.sum(solve_triangular(roots[1], at, lower=True) ** 2) + sizes[0] - sizes[1])
+            moved = (self.path.shape(shares) @ ways).reshape(len(units), -1)
+            root = np.linalg.cholesky(np.eye(len(roots)) + ways.reshape(moved.shape).T @ moved)
+            off = solve_triangular(root, at, lower=True)
+            return float(at @ at - off @ off - 2 * np.sum(np.log(np.diag(root))))
 
         return max(_SHARES, key=likelihood)
 
@@ -402,23 +417,26 @@ class PathEstimate:
             # Matched by another pose than the present one: where the later piece's surface lies now.
             now = {pair[0]: places, pair[1]: places @ back[:3, :3].T + back[:3, 3]}
             gap = np.einsum("qi,qi->q", now[source] - now[target], normals)
-            derivatives = np.zeros((len(weight), 6 * self.path.count))
+            parts = []
             for number, rows, sign in ((source, found.source[used], 1.0), (target, found.target[used], -1.0)):
                 piece = self.pieces[number]
                 # Beside the middle of a patch the surface was seen a little earlier or later.
                 off = now[number] - patches[number].places_mm[rows]
                 later = np.einsum("qi,qi->q", piece.slopes[rows], off)
                 times = piece.times_s[rows] + later
-                basis = self.path.basis(times)
-                at = middle + now[number] - places
                 by = np.hstack([normals, np.cross(places - middle, normals)]) @ told
                 # Turns are about the platform where the present correction has it.
                 platform = piece.platform_mm[rows] + later[:, None] * piece.speed[rows]
                 platform += self.corrections(times)[:, :3]
-                by[:, 3:] += np.cross(at - platform, by[:, :3])
-                derivatives += sign * np.einsum("qc,qi->qci", basis, by).reshape(len(rows), -1)
-            normal += derivatives.T @ (weight[:, None] * derivatives)
-            gradient += derivatives.T @ (weight * (found.distance_mm[used] + gap))
+                by[:, 3:] += np.cross(middle + now[number] - places - platform, by[:, :3])
+                parts.append((sign * self.path.basis(times), by))
+            # Of all coefficients those around both passes.
+            near = np.flatnonzero(np.any([basis.any(axis=0) for basis, _ in parts], axis=0))
+            derivatives = sum(np.einsum("qc,qi->qci", basis[:, near], by) for basis, by in parts)
+            derivatives = np.reshape(derivatives, (len(weight), -1))
+            columns = (6 * near[:, None] + np.arange(6)).ravel()
+            normal[np.ix_(columns, columns)] += derivatives.T @ (weight[:, None] * derivatives)
+            gradient[columns] += derivatives.T @ (weight * (found.distance_mm[used] + gap))
         return normal, gradient
 
 
