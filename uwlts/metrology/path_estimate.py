@@ -301,7 +301,7 @@ class PathEstimate:
         if np.count_nonzero(held) >= _FEWEST_HELD_OUT and np.mean(fits[held]) < _AGREEING:
             return False
         determined = float(np.sum(self._of_pair(pair, None)[0] * self.covariance))
-        return np.count_nonzero(fits) / self.pieces[pair[1]].patches.shared > _PER_PARAMETER * determined
+        return bool(np.count_nonzero(fits) / self.pieces[pair[1]].patches.shared > _PER_PARAMETER * determined)
 
     def matched(self, pair: Pair) -> tuple[PatchDistances, np.ndarray]:
         """Distances (Q,) of the later piece from the earlier, and which of them agree with zero."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -99,7 +99,7 @@ def write_e57(
         raise OutputError(f"cannot write {name}.e57: {' '.join(str(error).split())[:200]}") from error
 
 
-def _limits(named: list[tuple[str, np.ndarray]], kind: type[int] | type[float]) -> dict[str, int | float]:
+def _limits(named: Sequence[tuple[str, np.ndarray]], kind: type[int] | type[float]) -> dict[str, int | float]:
     """``xMinimum``, ``xMaximum`` and so on of columns (N,) by their names."""
     return {f"{label}{end}": kind(of(values)) for label, values in named for end, of in _LIMITS}
 
