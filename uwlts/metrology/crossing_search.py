@@ -206,7 +206,12 @@ def _has_rival(estimate: PathEstimate, best: Hypothesis, waiting: list[Hypothesi
     ]
     for rival in rivals:
         estimate.restore(before)
-        if _closed(estimate, rival):
+        if not _closed(estimate, rival):
+            continue
+        # A pose that was found badly may lead to the same place.
+        estimate.pairs.append(best.pair)
+        estimate.estimate({})
+        if not estimate.agrees(best.pair):
             return True
     return False
 

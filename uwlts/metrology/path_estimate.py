@@ -2,10 +2,11 @@
 
 Unknown is a correction of every pose, a shift (mm) and a turn (rad) in the base frame about the platform, as a cubic
 B-spline in time. Known beforehand is by how much a navigation drifts from an exact start: by a steady rate (a bias of
-velocity or gyroscope), by a rate that wanders (its instability), and by a random walk (noise of the velocity). Which
-shares of the variance these have is what makes the evidence likeliest (empirical Bayes: MacKay, Neural Computation 4,
-1992). Residuals are distances between patches of the surface where the path crosses itself. Movements that the surface
-leaves open there, as along a plain pipe, stay with what is known beforehand.
+velocity or gyroscope), by a rate that changes smoothly (temperature), by one that wanders (instability of the bias),
+and by a random walk (noise of the velocity); these are the integrated Wiener processes of orders two, one and none.
+Which shares of the variance these have is what makes the evidence likeliest (empirical Bayes: MacKay, Neural
+Computation 4, 1992). Residuals are distances between patches of the surface where the path crosses itself. Movements
+that the surface leaves open there, as along a plain pipe, stay with what is known beforehand.
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ from uwlts.model.errors import EvaluationError
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.cloud import PointCloud
 
+Shares = tuple[float, float, float]
+"""Variances at the end of a rate that changes smoothly, of one that wanders and of a random walk over that of the drift
+as it is stated, of which a steady rate has the rest: a rate may vary by more than what it comes to in the end."""
 Pair = tuple[int, int]
 """Numbers of two pieces that show the same surface, the earlier first."""
 
@@ -42,12 +46,11 @@ _VOXEL = 0.4
 _INTERVALS = 100
 """Of the spline: between two knots a random walk goes a tenth of the drift of the whole path."""
 _SHARES = [
-    (wander, walk)
-    for wander in (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0, 2.0, 4.0)
+    (smooth, wander, walk)
+    for smooth in (0.0, 0.1, 0.3, 1.0, 3.0, 10.0)
+    for wander in (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
     for walk in (1e-5, 1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6)
 ]
-"""Variances at the end of a rate that wanders and of a random walk over that of the drift as it is stated, of which the
-steady rate has the rest: a rate may wander by more than what it comes to in the end."""
 _LAID, _LITTLE = 8, 0.1
 """Times that patches are laid anew at most, and by how much of a standard deviation the path may still move then."""
 _LEARNED = 4
@@ -111,21 +114,20 @@ class PathSpline:
         spline = BSpline(self.knots, coefficients.reshape(-1, 6), 3)
         return (spline.derivative() if rates else spline)(np.clip(times_s, self.first_s, self.last_s))
 
-    def shape(self, shares: tuple[float, float]) -> np.ndarray:
-        """Covariance (C, C) of the coefficients of one component, over the variance that is stated for the end.
-
-        ``shares`` of the stated variance at the end are those of a wandering rate and of a random walk.
-        """
+    def shape(self, shares: Shares) -> np.ndarray:
+        """Covariance (C, C) of the coefficients of one component, over the variance that is stated for the end."""
         # A coefficient stands for the correction at the mean of its knots (Greville).
         at = np.array([self.knots[k + 1 : k + 4].mean() for k in range(self.count)])
         t = (at - self.first_s) / (self.last_s - self.first_s)
         first, second = np.minimum(t[:, None], t), np.maximum(t[:, None], t)
-        # A rate that walks at random, from zero: the integral of a random walk.
+        # Integrals of a random walk from zero, twice and once; each is one at the end.
+        smooth = first**3 * (10 * second**2 - 5 * first * second + first**2) / 6
         wandering = first**2 * (3 * second - first) / 2
-        steady = max(1 - sum(shares), 0.0) * np.outer(t, t)
-        return steady + shares[0] * wandering + shares[1] * first + 1e-10 * np.eye(len(t))
+        kinds = np.outer(t, t), smooth, wandering, first
+        parts = max(1 - sum(shares), 0.0), *shares
+        return sum((part * kind for part, kind in zip(parts, kinds, strict=True)), 1e-10 * np.eye(len(t)))
 
-    def information(self, shares: tuple[float, float]) -> np.ndarray:
+    def information(self, shares: Shares) -> np.ndarray:
         """Inverse covariance (6 C, 6 C) of the coefficients, ordered coefficient by coefficient; see `shape`."""
         shape = self.shape(shares)
         result = np.zeros((6 * self.count,) * 2)
@@ -181,7 +183,7 @@ class Piece:
 class PathEstimate:
     """Coefficients of the correction, round by round, and the pairs of pieces that cross."""
 
-    def __init__(self, cloud: PointCloud, times_s: np.ndarray, path: PathSpline, shares: tuple[float, float]) -> None:
+    def __init__(self, cloud: PointCloud, times_s: np.ndarray, path: PathSpline, shares: Shares) -> None:
         self.cloud, self.path, self.shares = cloud, path, shares
         moments, self._image = np.unique(times_s, return_inverse=True)
         self._moments, self._platform = moments, path.trajectory.poses_at(moments)[:, :3, 3]
@@ -357,7 +359,7 @@ class PathEstimate:
         self.coefficients = self.coefficients + step
         return float(np.abs(step.reshape(-1, 6)[:, :3]).max())
 
-    def _likeliest(self) -> tuple[float, float]:
+    def _likeliest(self) -> Shares:
         """Shares of the drift with which the matches as they are now are likeliest."""
         normal, gradient = self._evidence({})
         # In units of the drift the evidence is that of as many independent numbers as it tells of.
@@ -368,7 +370,7 @@ class PathEstimate:
         at = vectors[:, telling].T @ (units * (normal @ self.coefficients - gradient)) / roots
         ways = (vectors[:, telling] * roots).reshape(self.path.count, -1)
 
-        def likelihood(shares: tuple[float, float]) -> float:
+        def likelihood(shares: Shares) -> float:
             """Twice the logarithm, but for what all shares have in common: the path is integrated out."""
             moved = (self.path.shape(shares) @ ways).reshape(len(units), -1)
             root = np.linalg.cholesky(np.eye(len(roots)) + ways.reshape(moved.shape).T @ moved)

@@ -69,6 +69,11 @@ def test_a_loop_is_closed(loop, closed):
     after = crossing_errors(found.trajectory, true, best.times_s, places)
     assert before.min() > 10 and after.max() < 1.0
     assert position_errors(found.trajectory, true) < position_errors(reported, true) / 3
+    for time in best.times_s:
+        # Five standard deviations: a component of a pass fails once in two million rides.
+        k = int(np.argmin(np.abs(true.times_s - time)))
+        error = (found.trajectory.poses - true.poses)[k, :3, 3]
+        assert (np.abs(error) < 5 * np.sqrt(np.diag(found.trajectory.covariance[k])[:3])).all()
     # The start is the frame's, and what a crossing tells lowers the uncertainty of what came before it.
     std = np.sqrt(np.einsum("nii->ni", found.trajectory.covariance))
     assert std[0, :3].max() < 0.1 and (std[:, :3] < 60).all()
