@@ -51,10 +51,8 @@ _SHARES = [
     for wander in (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
     for walk in (1e-5, 1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6)
 ]
-_LAID, _LITTLE = 8, 0.1
+_TURNS, _LITTLE = 8, 0.2
 """Times that patches are laid anew at most, and by how much of a standard deviation the path may still move then."""
-_LEARNED = 4
-"""Times the shares are estimated: matches and weights follow them."""
 _BESIDE = 13
 """Patches from which it is taken how times grow: two rings around one."""
 FEWEST = 30
@@ -275,24 +273,22 @@ class PathEstimate:
 
     def settle(self) -> None:
         """Estimate the path and the shares of its drift by turns; pairs that do not agree then are given up."""
-        for _ in range(_LEARNED):
-            self.converge()
-            if (shares := self._likeliest()) == self.shares:
-                break
-            self.shares, self.prior = shares, self.path.information(shares)
+        self._settled()
         if len(agreeing := [pair for pair in self.pairs if self.agrees(pair)]) < len(self.pairs):
             self.pairs = agreeing
-        self.converge()
+            self._settled()
 
-    def converge(self) -> None:
-        """Estimate and lay the patches anew by turns, until the path moves by little of its uncertainty."""
-        for _ in range(_LAID):
-            self.estimate({})
+    def _settled(self) -> None:
+        """Lay the patches and estimate anew until the path moves by little and its drift is of the likeliest kind."""
+        self.estimate({})
+        for _ in range(_TURNS):
             before = self.coefficients
             self.lay_anew({number for pair in self.pairs for number in pair})
             self.estimate({})
-            if np.max(np.abs(self.coefficients - before) / np.sqrt(np.diag(self.covariance))) < _LITTLE:
+            still = np.max(np.abs(self.coefficients - before) / np.sqrt(np.diag(self.covariance))) < _LITTLE
+            if (shares := self._likeliest()) == self.shares and still:
                 break
+            self.shares, self.prior = shares, self.path.information(shares)
 
     def agrees(self, pair: Pair) -> bool:
         """Whether the surfaces of a pair agree, also where they were held out, and tell more than they determine."""
