@@ -49,6 +49,7 @@ def main() -> None:
         drift = {"drift_mm": given.drift_mm, "drift_deg": given.drift_deg}
         cloud, reported, true = ride(np.random.default_rng(seed), PASS_MM, walk=given.walk, **drift)
         found = uwlts.align_trajectory(cloud, reported, **drift)
+        assert found.trajectory.covariance is not None
         known = np.einsum("nii->n", found.trajectory.covariance[:, :3, :3])
         last = max(each.times_s[1] for each in found.crossings)
         words = []

@@ -4,7 +4,7 @@ Unknown is a correction of every pose, a shift (mm) and a turn (rad) in the base
 B-spline in time. Known beforehand is by how much a navigation drifts from an exact start: by a steady rate (a bias of
 velocity or gyroscope), by a rate that changes smoothly (temperature), by one that wanders (instability of the bias),
 and by a random walk (noise of the velocity); these are the integrated Wiener processes of orders two, one and none.
-Which shares of the variance these have is what makes the evidence likeliest (empirical Bayes: MacKay, Neural
+How large the others are beside the steady rate is what makes the evidence likeliest (empirical Bayes: MacKay, Neural
 Computation 4, 1992). Residuals are distances between patches of the surface where the path crosses itself. Movements
 that the surface leaves open there, as along a plain pipe, stay with what is known beforehand.
 """
@@ -35,8 +35,8 @@ from uwlts.model.trajectory import Trajectory
 from uwlts.storage.cloud import PointCloud
 
 Shares = tuple[float, float, float]
-"""Variances at the end of a rate that changes smoothly, of one that wanders and of a random walk over that of the drift
-as it is stated, of which a steady rate has the rest: a rate may vary by more than what it comes to in the end."""
+"""Variances at the end of a rate that changes smoothly, of one that wanders, and of a random walk, over that of a steady
+rate, which alone would come to the drift as it is stated."""
 Pair = tuple[int, int]
 """Numbers of two pieces that show the same surface, the earlier first."""
 
@@ -122,8 +122,8 @@ class PathSpline:
         smooth = first**3 * (10 * second**2 - 5 * first * second + first**2) / 6
         wandering = first**2 * (3 * second - first) / 2
         kinds = np.outer(t, t), smooth, wandering, first
-        parts = max(1 - sum(shares), 0.0), *shares
-        return sum((part * kind for part, kind in zip(parts, kinds, strict=True)), 1e-10 * np.eye(len(t)))
+        parts = zip((1.0, *shares), kinds, strict=True)
+        return sum((part * kind for part, kind in parts), 1e-10 * np.eye(len(t)))
 
     def information(self, shares: Shares) -> np.ndarray:
         """Inverse covariance (6 C, 6 C) of the coefficients, ordered coefficient by coefficient; see `shape`."""
