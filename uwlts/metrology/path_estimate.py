@@ -35,8 +35,8 @@ from uwlts.model.trajectory import Trajectory
 from uwlts.storage.cloud import PointCloud
 
 Shares = tuple[float, float, float]
-"""Variances at the end of a rate that changes smoothly, of one that wanders, and of a random walk, over that of a steady
-rate, which alone would come to the drift as it is stated."""
+"""Variances at the end of a rate that changes smoothly, of one that wanders, and of a random walk, over that of a
+steady rate, which alone would come to the drift as it is stated."""
 Pair = tuple[int, int]
 """Numbers of two pieces that show the same surface, the earlier first."""
 
