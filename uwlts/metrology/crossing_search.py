@@ -198,7 +198,8 @@ def _closed(estimate: PathEstimate, hypothesis: Hypothesis) -> bool:
 
 
 def _has_rival(estimate: PathEstimate, best: Hypothesis, waiting: list[Hypothesis], before: tuple[Any, ...]) -> bool:
-    """Whether another hypothesis contradicts the closed one and holds as well, from the estimate before."""
+    """Whether another hypothesis contradicts the closed one, and holds as well from the estimate before."""
+    closed = estimate.coefficients
     rivals = [
         each
         for each in waiting
@@ -206,13 +207,12 @@ def _has_rival(estimate: PathEstimate, best: Hypothesis, waiting: list[Hypothesi
     ]
     for rival in rivals:
         estimate.restore(before)
-        if not _closed(estimate, rival):
-            continue
-        # A pose that was found badly may lead to the same place.
-        estimate.pairs.append(best.pair)
-        estimate.estimate({})
-        if not estimate.agrees(best.pair):
-            return True
+        if _closed(estimate, rival):
+            # A pose that was found badly may lead to the same place.
+            middle = estimate.moved(best.pair[1]).places_mm.mean(axis=0)
+            apart = estimate.by_relative_movement(best.pair, middle) @ (estimate.coefficients - closed)
+            if np.linalg.norm(apart[:3]) > estimate.reach_mm:
+                return True
     return False
 
 
