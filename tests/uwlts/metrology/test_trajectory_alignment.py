@@ -79,6 +79,7 @@ def test_a_loop_is_closed(loop, closed):
     assert std[0, :3].max() < 0.1 and (std[:, :3] < 60).all()
 
 
+@pytest.mark.slow
 def test_a_surface_that_fits_in_many_places_is_refused():
     # Equal stones each 60 mm; the navigation is off by about 40 mm where the path crosses itself.
     def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -90,6 +91,7 @@ def test_a_surface_that_fits_in_many_places_is_refused():
         uwlts.align_trajectory(cloud, reported, **drift)
 
 
+@pytest.mark.slow
 def test_along_a_ridge_the_navigation_is_all_that_is_known():
     def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return 60 * np.exp(-(y**2) / (2 * 60**2)) + 0 * x
