@@ -48,7 +48,11 @@ def main() -> None:
     for seed in given.seeds:
         drift = {"drift_mm": given.drift_mm, "drift_deg": given.drift_deg}
         cloud, reported, true = ride(np.random.default_rng(seed), PASS_MM, walk=given.walk, **drift)
-        found = uwlts.align_trajectory(cloud, reported, **drift)
+        try:
+            found = uwlts.align_trajectory(cloud, reported, **drift)
+        except uwlts.Error as error:
+            print(f"seed {seed}: {error}", flush=True)
+            continue
         assert found.trajectory.covariance is not None
         known = np.einsum("nii->n", found.trajectory.covariance[:, :3, :3])
         last = max(each.times_s[1] for each in found.crossings)
