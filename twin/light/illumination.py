@@ -62,6 +62,7 @@ class Light:
             direction=self._pose.moving_direction(direction, after_s),
             normal=self._pose.moving_direction(normal, after_s),
             irradiance=dr.select(meets, light.irradiance * self._share, 0.0),
+            in_middle=dr.select(meets, light.in_middle * self._share, 0.0),
         )
 
     def _unfolded(self, p: Point3f) -> SheetLight:
@@ -71,10 +72,14 @@ class Light:
         light = self.sheet.at(self._to_own @ mi.Point3f(p))
         return replace(light, direction=self._from_own @ light.direction, normal=self._from_own @ light.normal)
 
-    def may_reach(self, p: Point3f, light: SheetLight) -> Bool:
-        """Region the sheet may light: everywhere, but by way of a mirror only where that sends it."""
-        everywhere = dr.full(mi.Bool, True, dr.width(p))
-        return everywhere if self._mirror is None else self._on_mirror(p, -light.direction)[1]
+    @property
+    def mirrored(self) -> bool:
+        """Whether the light comes by way of a mirror."""
+        return self._mirror is not None
+
+    def may_reach(self, p: Point3f, light: SheetLight) -> Bool | None:
+        """Where a mirror may send the sheet's light; None for a direct one, which is sent everywhere."""
+        return None if self._mirror is None else self._on_mirror(p, -light.direction)[1]
 
     def reaches(self, objects: mi.Scene, p: Point3f, light: SheetLight, after_s: Float | None, active: Bool):
         """Whether nothing stands between points of the sensor's OCS and the laser's window."""
@@ -118,7 +123,8 @@ class Light:
         t -= light.distance_mm / dr.dot(direction, light.normal)
         light = self.sheet.at(mi.Point3f(origin + direction * t))
         if self._mirror is not None:
-            light = replace(light, irradiance=light.irradiance * self._share)
+            share = self._share
+            light = replace(light, irradiance=light.irradiance * share, in_middle=light.in_middle * share)
         return t, light
 
     def _middle_of(self, origin: Point3f, direction: Vector3f, length: Float) -> tuple[Float, SheetLight, Float, Float]:

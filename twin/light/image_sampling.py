@@ -81,6 +81,13 @@ def places(marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return row, column
 
 
+def repeated(cells: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Values of the coarse grid's cells, float32 or bool, given to their pixels (H, W)."""
+    size = cells.shape[1] * NODE_SPACING_PX, cells.shape[0] * NODE_SPACING_PX
+    full = cv2.resize(cells.view(np.uint8) if cells.dtype == bool else cells, size, interpolation=cv2.INTER_NEAREST)
+    return np.ascontiguousarray(full[:height, :width]).view(cells.dtype)
+
+
 def near_sheet(across: np.ndarray, reached: np.ndarray | bool = True) -> np.ndarray:
     """Cells with a corner within `LIT_SIGMAS` of the sheet's middle, or between whose corners it passes.
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from twin.backend.arrays import Bool, Float, to_jit
 from twin.light.camera import CameraView
-from twin.light.image_sampling import NODE_SPACING_PX, places
+from twin.light.image_sampling import NODE_SPACING_PX, places, repeated
 from twin.light.smoothing import FoundLight, blurred, estimated, interpolated
 from twin.light.walk import Walker
 
@@ -104,7 +104,7 @@ def light_on_longer_ways(view: CameraView, walker: Walker, sources: Sources, *, 
     image = cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
     in_cells = np.zeros(sources.lit.shape, np.float32)
     in_cells[sources.lit] = inside
-    return np.where(_repeated(sources.lit, height, width), _repeated(in_cells, height, width), image)
+    return np.where(repeated(sources.lit, height, width), repeated(in_cells, height, width), image)
 
 
 def walked(
@@ -169,8 +169,3 @@ def _in_cells(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
 def _in_large_cells(small: np.ndarray) -> np.ndarray:
     """Rows or columns of the middle of small cells, counted in large cells from the middle of the first one."""
     return ((small + 0.5) * (NODE_SPACING_PX / WALK_CELL_PX) - 0.5).astype(np.float32)
-
-
-def _repeated(cells: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Values of small cells given to their pixels, (H, W)."""
-    return cells.repeat(NODE_SPACING_PX, axis=0).repeat(NODE_SPACING_PX, axis=1)[:height, :width]

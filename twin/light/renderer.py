@@ -18,16 +18,26 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Float, Point3f, opaque, to_jit
+from twin.backend.arrays import Float, Point3f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, ray_segments
+from twin.light.haze import Crossing, crossing, haze
 from twin.light.illumination import Light, lights
-from twin.light.image_sampling import NODE_SPACING_PX, lattice, near_sheet, over_corners, places, pupil_shifts, widened
+from twin.light.image_sampling import (
+    NODE_SPACING_PX,
+    lattice,
+    near_sheet,
+    over_corners,
+    places,
+    pupil_shifts,
+    repeated,
+    widened,
+)
 from twin.light.longer_ways import Sources, falling_off, light_on_longer_ways
 from twin.light.particles import Body, spots
 from twin.light.pose import Rays, SensorPose, Travel
-from twin.light.sheet import Sheet
+from twin.light.sheet import Sheet, SheetLight
 from twin.light.walk import Walker
-from twin.light.water import Scattering, single_scattering
+from twin.light.water import Scattering
 from twin.options import ALL, Effects
 from twin.scene.description import Scene
 from twin.scene.motion import Light as LightName
@@ -122,6 +132,7 @@ class Renderer:
         self.scattering = Scattering(medium, wavelength)
         self.sheet = Sheet(sensor, medium)
         self._sheets = [self.sheet, *(Sheet(sensor, medium, laser) for laser in sensor.more_lasers)]
+        self._crossings: dict[Sheet, Crossing] = {}
         self._mirrors = self.objects.mirrors if effects.secondary_light else ()
         # Through the water to the stand-off and back, light is scattered so many times.
         scatterings = 2 * self.scattering.coefficient * self.design.standoff_mm
@@ -151,6 +162,7 @@ class Renderer:
         self, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
     ) -> LaserFrame:
         """The light of the laser on the image sensor; see `irradiance`."""
+        begin_kernels()
         pose = SensorPose(scene_from_object, travel)
         direct, mirrored = lights(self._sheets, pose, self._mirrors)
         lit, haze, surfaces = self._laser_nodes(pose, direct, mirrored)
@@ -196,13 +208,12 @@ class Renderer:
         if self._own_stripe is None or not pose.equals(self._own_stripe[0]):
             bundle, shape = self.view.grid(NODE_SPACING_PX)
             direct, _ = lights(self._sheets[:1], pose)
-            near = [
-                near_sheet(self._sigmas(light, next(self._segments(moment, bundle, None))).numpy().reshape(shape))
-                for moment, (light, *_) in self._moments(pose, direct)
-            ]
-            self._own_stripe = pose, np.any(near, axis=0)
-        rows, columns = places(self._repeated(self._own_stripe[1]))
-        return rows, columns
+            own = np.zeros((shape[0] - 1, shape[1] - 1), bool)
+            for moment, (light, *_) in self._moments(pose, direct):
+                segment = next(self._segments(moment, bundle, None))
+                own |= near_sheet(_sigmas(light.at(segment.end()), segment).numpy().reshape(shape))
+            self._own_stripe = pose, own
+        return places(self._repeated(self._own_stripe[1]))
 
     def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> tuple[Float, RaySegment]:
         """Irradiance of the first laser's light per ray in W/mm2, of the surface seen straight alone, and the rays."""
@@ -215,11 +226,6 @@ class Renderer:
     def _segments(self, pose: SensorPose, bundle: Rays, after_s: Float | None) -> Iterator[RaySegment]:
         mirrors = _MIRRORS if self._mirrors else 0
         return ray_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=mirrors)
-
-    def _sigmas(self, light: Light, segment: RaySegment) -> Float:
-        """The light's distance across at segments' ends in standard deviations; infinity where there is no surface."""
-        here = light.at(segment.end())
-        return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
 
     def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None) -> Float:
         """Radiance in W/mm2/sr that lit surfaces send back along segments, as it arrives at their beginning."""
@@ -243,19 +249,21 @@ class Renderer:
         image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
         surfaces: list[Float] = []
         for moment, sources in self._moments(pose, direct + mirrored):
-            haze = mi.Float(0.0)
+            scattered = mi.Float(0.0)
             for index, segment in enumerate(self._segments(moment, bundle, None)):
-                across = [self._sigmas(light, segment) for light in sources]
+                ends = [light.at(segment.end()) for light in sources]
+                across = [_sigmas(here, segment) for here in ends]
                 straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
                 depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
                 if index == 0 and moment is pose and self._scatters:
-                    surfaces = self._surfaces(pose, segment, sources)
-                    for light, sigmas in zip(sources, across, strict=True):
-                        haze += bundle.weight * self._haze(light, segment, sigmas)
-                reached = [light.may_reach(segment.end(), light.at(segment.end())) for light in sources]
-                dr.eval(depth, haze, surfaces, *across, *reached)
+                    surfaces = self._surfaces(pose, segment, ends)
+                    for light, here in zip(sources, ends, strict=True):
+                        crossed = self._crossing(light, bundle)
+                        scattered += haze(crossed, light, self.objects.scene, segment, here)
+                reached = [light.may_reach(segment.end(), here) for light, here in zip(sources, ends, strict=True)]
+                dr.eval(depth, scattered, surfaces, *across, *reached)
                 stripes = [
-                    near_sheet(sigmas.numpy().reshape(shape), there.numpy().reshape(shape))
+                    near_sheet(sigmas.numpy().reshape(shape), True if there is None else there.numpy().reshape(shape))
                     for sigmas, there in zip(across, reached, strict=True)
                 ]
                 near = np.any(stripes, axis=0)
@@ -265,8 +273,8 @@ class Renderer:
                     blur = self.view.blur_radius_px(depth.numpy().reshape(shape))
                     reach[near] = np.fmax(reach, over_corners(np.fmax, blur))[near]
                 lit |= near
-            if moment is pose and dr.width(haze) > 1:
-                image = self._repeated(0.25 * over_corners(np.add, haze.numpy().reshape(shape)))
+            if moment is pose and dr.width(scattered) > 1:
+                image = self._repeated(0.25 * over_corners(np.add, scattered.numpy().reshape(shape)))
         self._own_stripe = pose, own
         over_cells = [0.25 * over_corners(np.add, each.numpy().reshape(shape)) for each in surfaces]
         return widened(lit, reach), image, np.array(over_cells).reshape(-1, *lit.shape)
@@ -282,34 +290,26 @@ class Renderer:
                 direct, mirrored = lights(self._sheets, moved, self._mirrors)
                 yield moved, direct + mirrored
 
-    def _haze(self, light: Light, segment: RaySegment, sigmas: Float) -> Float:
-        """Radiance scattered once by the water where rays cross the sheet, in W/mm2/sr.
+    def _crossing(self, light: Light, bundle: Rays) -> Crossing:
+        """Where the nodes' rays cross a sheet, kept from frame to frame unless a mirror shows it."""
+        if light.mirrored:
+            return crossing(light, self.scattering, bundle)
+        if light.sheet not in self._crossings:
+            found = crossing(light, self.scattering, bundle)
+            dr.eval(vars(found))
+            self._crossings[light.sheet] = found
+        return self._crossings[light.sheet]
 
-        ``sigmas`` is the sheet's distance where the rays end on a surface, in standard deviations.
-        """
-        origin, direction = light.in_own_frame(segment.origin, segment.direction)
-        t, here = light.crossing(origin, direction)
-        end = dr.select(segment.valid, sigmas * dr.sign(dr.dot(direction, here.normal)), dr.inf)
-        scattered = single_scattering(self.scattering, here, direction=direction, surface_sigmas=end)
-        # A surface just before the sheet's middle cuts the sheet's light, but does not shadow what lies before it.
-        place = mi.Point3f(
-            segment.origin + segment.direction * dr.minimum(t, dr.select(segment.valid, segment.si.t, dr.inf))
-        )
-        reached = light.reaches(self.objects.scene, place, light.at(place), None, (t > 0) & (scattered > 0))
-        return dr.select(reached, scattered * dr.exp(-self.scattering.c * t), 0.0)
-
-    def _surfaces(self, pose: SensorPose, segment: RaySegment, sources: list[Light]) -> list[Float]:
-        """Irradiance per ray of surfaces lit from where the laser is, as `Sources` has it."""
-        end, bsdf = segment.end(), segment.si.bsdf()
+    def _surfaces(self, pose: SensorPose, segment: RaySegment, ends: list[SheetLight]) -> list[Float]:
+        """Irradiance per ray of surfaces lit from where the laser is, as `Sources` has it; ``ends`` are the lights."""
+        bsdf = segment.si.bsdf()
         seen = segment.weight * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
         parts = []
-        for light in sources:
-            here = light.at(end)
-            within = light.at(mi.Point3f(end - here.normal * here.distance_mm))
-            active = segment.valid & (within.irradiance > 0)
+        for here in ends:
+            active = segment.valid & (here.in_middle > 0)
             towards = segment.si.to_local(pose.direction(-here.direction))
             sent = bsdf.eval(mi.BSDFContext(), segment.si, towards, active)[0]
-            sent *= seen * within.irradiance * within.sigma_mm
+            sent *= seen * here.in_middle * here.sigma_mm
             parts.append(falling_off(sent, here.distance_mm, active))
         return [sum(each, mi.Float(0.0)) for each in zip(*parts, strict=True)]
 
@@ -317,6 +317,7 @@ class Renderer:
 
     def _lamp_frame(self, pose: SensorPose, *, spp: int, ambient: bool = False) -> np.ndarray:
         """Light (H, W) of the lamp or the day in W/mm2; only the pixels in which it changes are rendered finely."""
+        begin_kernels()
         bundle, shape = self.view.grid(1)
         segment = next(self._segments(pose, bundle, None))
         value = self._evenly_lit(segment, ambient)
@@ -468,9 +469,12 @@ class Renderer:
 
     def _repeated(self, cells: np.ndarray) -> np.ndarray:
         """Values of grid cells given to their pixels, (H, W)."""
-        camera = self.sensor.camera
-        full = cells.repeat(NODE_SPACING_PX, axis=0).repeat(NODE_SPACING_PX, axis=1)
-        return np.ascontiguousarray(full[: camera.height_px, : camera.width_px])
+        return repeated(cells, self.sensor.camera.height_px, self.sensor.camera.width_px)
+
+
+def _sigmas(here: SheetLight, segment: RaySegment) -> Float:
+    """A sheet's distance across at segments' ends in standard deviations; infinity where there is no surface."""
+    return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
 
 
 def _parts(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

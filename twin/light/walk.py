@@ -152,13 +152,21 @@ class Walker:
             return walks, mi.Point2f(found + more), alive, seed + 1, left - 1
 
         width = dr.width(walks.cell)
-        walks, found, alive, _, _ = dr.while_loop(
-            (walks, dr.zeros(mi.Point2f, width), dr.full(mi.Bool, True, width), seed, dr.opaque(mi.UInt32, stretches)),
-            lambda walks, found, alive, seed, left: alive & (left > 0),
-            following,
-            mode="symbolic",
-            label="walks",
-        )
+        # Without a second writing of the loop, which would find next to nothing that does not change in it.
+        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+            walks, found, alive, _, _ = dr.while_loop(
+                (
+                    walks,
+                    dr.zeros(mi.Point2f, width),
+                    dr.full(mi.Bool, True, width),
+                    seed,
+                    dr.opaque(mi.UInt32, stretches),
+                ),
+                lambda walks, found, alive, seed, left: alive & (left > 0),
+                following,
+                mode="symbolic",
+                label="walks",
+            )
         return walks, found, alive
 
     def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Point2f, Bool]:
