@@ -82,10 +82,13 @@ def places(marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def repeated(cells: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Values of the coarse grid's cells, float32 or bool, given to their pixels (H, W)."""
-    size = cells.shape[1] * NODE_SPACING_PX, cells.shape[0] * NODE_SPACING_PX
-    full = cv2.resize(cells.view(np.uint8) if cells.dtype == bool else cells, size, interpolation=cv2.INTER_NEAREST)
-    return np.ascontiguousarray(full[:height, :width]).view(cells.dtype)
+    """Values of the coarse grid's cells given to their pixels (H, W), faster than by `numpy.repeat`."""
+    side = NODE_SPACING_PX
+    full = np.empty((cells.shape[0], side, cells.shape[1], side), cells.dtype)
+    for k in range(side):
+        full[:, 0, :, k] = cells
+    full[:, 1:] = full[:, :1]
+    return np.ascontiguousarray(full.reshape(side * cells.shape[0], -1)[:height, :width])
 
 
 def near_sheet(across: np.ndarray, reached: np.ndarray | bool = True) -> np.ndarray:

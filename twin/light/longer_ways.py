@@ -18,7 +18,7 @@ import numpy as np
 
 from twin.backend.arrays import Bool, Float, to_jit
 from twin.light.camera import CameraView
-from twin.light.image_sampling import NODE_SPACING_PX, places, repeated
+from twin.light.image_sampling import NODE_SPACING_PX, places
 from twin.light.smoothing import FoundLight, blurred, estimated, interpolated
 from twin.light.walk import Walker
 
@@ -80,11 +80,12 @@ def light_on_longer_ways(view: CameraView, walker: Walker, sources: Sources, *, 
         seed=seed,
         walks=walks,
     ):
-        is_large = cell < len(large)
-        of_large, of_small = large[cell[is_large]], small[cell[~is_large] - len(large)]
         for (in_large, in_small), light in zip(kinds, parts, strict=True):
-            in_large.add(of_large, light[is_large])
-            in_small.add(of_small, light[~is_large])
+            found = np.flatnonzero(light > 0)
+            where, light = cell[found], light[found]
+            is_large = where < len(large)
+            in_large.add(large[where[is_large]], light[is_large])
+            in_small.add(small[where[~is_large] - len(large)], light[~is_large])
     cells, inside = np.zeros((rows, columns)), np.zeros(len(row_in_stripe))
     if walker.scatters:
         features = _features(sources, rows, columns)
@@ -102,9 +103,11 @@ def light_on_longer_ways(view: CameraView, walker: Walker, sources: Sources, *, 
             inside += in_small.total()[0] / (walks * times_in_stripe)
     size = columns * WALK_CELL_PX, rows * WALK_CELL_PX
     image = cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
-    in_cells = np.zeros(sources.lit.shape, np.float32)
-    in_cells[sources.lit] = inside
-    return np.where(repeated(sources.lit, height, width), repeated(in_cells, height, width), image)
+    for down, right in np.ndindex(NODE_SPACING_PX, NODE_SPACING_PX):
+        row, column = row_in_stripe * NODE_SPACING_PX + down, column_in_stripe * NODE_SPACING_PX + right
+        there = (row < height) & (column < width)
+        image[row[there], column[there]] = inside[there]
+    return image
 
 
 def walked(
