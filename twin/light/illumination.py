@@ -127,12 +127,8 @@ class Light:
             light = replace(light, irradiance=light.irradiance * share, in_middle=light.in_middle * share)
         return t, light
 
-    def _middle_of(self, origin: Point3f, direction: Vector3f, length: Float) -> tuple[Float, SheetLight, Float, Float]:
-        """Where rays of the sensor's OCS, up to ``length``, pass the sheet's middle.
-
-        The part of ``length`` before the window, the light near the middle, the slope of its distance along the ray,
-        and the middle's place on it, which may lie outside.
-        """
+    def passage(self, origin: Point3f, direction: Vector3f, length: Float) -> Passage:
+        """Where rays of the sensor's OCS, up to ``length``, pass the sheet's middle."""
         o, d = self.in_own_frame(origin, direction)
         back = (self.sheet.begins_at_z_mm - o.z) / d.z
         length = dr.select((d.z < 0) & (back > 0), dr.minimum(length, back), length)
@@ -144,25 +140,36 @@ class Light:
             return light, slope, t - light.distance_mm / slope
 
         _, _, middle = step(-o.x / _away_from_zero(d.x))
-        return length, *step(middle)
+        light, slope, middle = step(middle)
+        return Passage(length, middle, light.sigma_mm / dr.abs(slope))
 
-    def near_crossing(self, origin: Point3f, direction: Vector3f, length: Float) -> tuple[Float, Float]:
-        """Where rays of the sensor's OCS, up to ``length``, come nearest to the sheet, and how near, in mm along them.
+
+@dataclass(frozen=True)
+class Passage:
+    """Where rays pass the middle of a sheet: at ``middle_mm``, which may lie outside of 0 to ``length_mm``.
+
+    The part of the rays before the laser's window counts. ``sigma_mm`` is the sheet's standard deviation along them.
+    """
+
+    length_mm: Float
+    middle_mm: Float
+    sigma_mm: Float
+
+    def nearest(self) -> tuple[Float, Float]:
+        """Where the rays come nearest to the sheet, and how near, in mm along them.
 
         Within the sheet, its standard deviation counts as the distance.
         """
-        length, light, slope, middle = self._middle_of(origin, direction, length)
-        t = dr.clip(middle, 0.0, length)
-        return t, dr.abs(middle - t) + light.sigma_mm / dr.abs(slope)
+        t = dr.clip(self.middle_mm, 0.0, self.length_mm)
+        return t, dr.abs(self.middle_mm - t) + self.sigma_mm
 
-    def pick_in_sheet(self, origin: Point3f, direction: Vector3f, length: Float, u: Float) -> tuple[Float, Float]:
-        """A place on rays of the sensor's OCS, drawn like the sheet's Gaussian across them, and its density in 1/mm.
+    def pick(self, u: Float) -> tuple[Float, Float]:
+        """A place on the rays, drawn like the sheet's Gaussian across them, and its density in 1/mm.
 
-        The density is 0 where a ray up to ``length`` keeps clear of the sheet. It only steers samples: whoever uses it
-        evaluates the true light there.
+        The density is 0 where a ray keeps clear of the sheet. It only steers samples: whoever uses it evaluates the
+        true light there.
         """
-        length, light, slope, middle = self._middle_of(origin, direction, length)
-        spread = 1.1 * math.sqrt(2) * light.sigma_mm / dr.abs(slope)
+        spread, length, middle = 1.1 * math.sqrt(2) * self.sigma_mm, self.length_mm, self.middle_mm
         low, high = dr.erf(-middle / spread), dr.erf((length - middle) / spread)
         x = dr.clip((middle + spread * dr.erfinv(dr.lerp(low, high, u))), 0.0, length)
         share = 0.5 * (high - low)

@@ -61,53 +61,72 @@ def falling_off(reflected: Float, distance_mm: Float, active: Bool) -> list[Floa
     return [dr.select(active, reflected * dr.exp(-dr.abs(distance_mm) / spread), 0.0) for spread in SPREAD_MM]
 
 
-def light_on_longer_ways(view: CameraView, walker: Walker, sources: Sources, *, seed: int, walks: int) -> np.ndarray:
-    """Irradiance (H, W) in W/mm2 of multiply scattered and secondary light; ``walks`` begin in most large cells."""
-    height, width = sources.stripe.shape
-    rows, columns = -(-height // WALK_CELL_PX), -(-width // WALK_CELL_PX)
-    times = np.where(_beside_stripe(sources.lit, rows, columns), _WALKS_BESIDE_STRIPE, 1)
-    times_in_stripe = 1 if walker.scatters else _WALKS_IN_STRIPE
-    row_in_stripe, column_in_stripe = places(sources.lit)
-    large = np.repeat(np.arange(rows * columns), times.ravel())
-    small = np.repeat(np.arange(len(row_in_stripe)), times_in_stripe)
-    kinds = [(FoundLight(rows, columns), FoundLight(1, len(row_in_stripe))) for _ in NOISE_SHARES]
-    for cell, *parts in walked(
-        view,
-        walker,
-        np.concatenate([large // columns * WALK_CELL_PX, row_in_stripe[small] * NODE_SPACING_PX]),
-        np.concatenate([large % columns * WALK_CELL_PX, column_in_stripe[small] * NODE_SPACING_PX]),
-        np.repeat([WALK_CELL_PX, NODE_SPACING_PX], [len(large), len(small)]),
-        seed=seed,
-        walks=walks,
-    ):
-        for (in_large, in_small), light in zip(kinds, parts, strict=True):
-            found = np.flatnonzero(light > 0)
-            where, light = cell[found], light[found]
-            is_large = where < len(large)
-            in_large.add(large[where[is_large]], light[is_large])
-            in_small.add(small[where[~is_large] - len(large)], light[~is_large])
-    cells, inside = np.zeros((rows, columns)), np.zeros(len(row_in_stripe))
-    if walker.scatters:
+class LongerWays:
+    """Multiply scattered and secondary light, as far as random walks found it; ``walks`` begin in most large cells.
+
+    The walks are followed at once. `image` makes smooth light of what they found, without anything of the renderer.
+    """
+
+    def __init__(self, view: CameraView, walker: Walker, sources: Sources, *, seed: int, walks: int):
+        self._sources, self._walks, self._scatters = sources, walks, walker.scatters
+        height, width = sources.stripe.shape
+        rows, columns = self._shape = -(-height // WALK_CELL_PX), -(-width // WALK_CELL_PX)
+        self._times = np.where(_beside_stripe(sources.lit, rows, columns), _WALKS_BESIDE_STRIPE, 1)
+        self._times_in_stripe = 1 if walker.scatters else _WALKS_IN_STRIPE
+        self._in_stripe = row_in_stripe, column_in_stripe = places(sources.lit)
+        large = np.repeat(np.arange(rows * columns), self._times.ravel())
+        small = np.repeat(np.arange(len(row_in_stripe)), self._times_in_stripe)
+        self._found = [(FoundLight(rows, columns), FoundLight(1, len(row_in_stripe))) for _ in NOISE_SHARES]
+        for cell, *parts in walked(
+            view,
+            walker,
+            np.concatenate([large // columns * WALK_CELL_PX, row_in_stripe[small] * NODE_SPACING_PX]),
+            np.concatenate([large % columns * WALK_CELL_PX, column_in_stripe[small] * NODE_SPACING_PX]),
+            np.repeat([WALK_CELL_PX, NODE_SPACING_PX], [len(large), len(small)]),
+            seed=seed,
+            walks=walks,
+        ):
+            for (in_large, in_small), light in zip(self._found, parts, strict=True):
+                found = np.flatnonzero(light > 0)
+                where, light = cell[found], light[found]
+                is_large = where < len(large)
+                in_large.add(large[where[is_large]], light[is_large])
+                in_small.add(small[where[~is_large] - len(large)], light[~is_large])
+
+    def image(self) -> np.ndarray:
+        """Irradiance (H, W) in W/mm2."""
+        height, width = self._sources.stripe.shape
+        cells, inside = self._smooth() if self._scatters else self._means()
+        size = self._shape[1] * WALK_CELL_PX, self._shape[0] * WALK_CELL_PX
+        image = cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
+        for down, right in np.ndindex(NODE_SPACING_PX, NODE_SPACING_PX):
+            row, column = (
+                NODE_SPACING_PX * each + part for each, part in zip(self._in_stripe, (down, right), strict=True)
+            )
+            there = (row < height) & (column < width)
+            image[row[there], column[there]] = inside[there]
+        return image
+
+    def _smooth(self) -> tuple[np.ndarray, np.ndarray]:
+        """Light in large cells (rows, columns) and in the small ones of the stripe (P,), without most of its noise."""
+        sources, (rows, columns) = self._sources, self._shape
         features = _features(sources, rows, columns)
-        place_row, place_column = _in_large_cells(row_in_stripe), _in_large_cells(column_in_stripe)
-        fine = _features_in_stripe(sources, features, place_row, place_column)
+        row, column = map(_in_large_cells, self._in_stripe)
+        fine = _features_in_stripe(sources, features, row, column)
         tolerance = TOLERANCE * float(sources.stripe.max(initial=0.0))
-        for (in_large, in_small), noise_share in zip(kinds, NOISE_SHARES, strict=True):
-            estimate = estimated(in_large, walks * times, features, tolerance=tolerance, noise_share=noise_share)
+        cells, inside = np.zeros(self._shape), np.zeros(len(row))
+        for (in_large, in_small), noise_share in zip(self._found, NOISE_SHARES, strict=True):
+            walks = self._walks * self._times
+            estimate = estimated(in_large, walks, features, tolerance=tolerance, noise_share=noise_share)
             cells += estimate.cells
-            inside += estimate.at(place_row, place_column, fine, in_small, walks * times_in_stripe)
-    else:
-        # Without rare bright samples, light from surface to surface is left as steep as it may be.
-        for in_large, in_small in kinds:
-            cells += in_large.total() / (walks * times)
-            inside += in_small.total()[0] / (walks * times_in_stripe)
-    size = columns * WALK_CELL_PX, rows * WALK_CELL_PX
-    image = cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
-    for down, right in np.ndindex(NODE_SPACING_PX, NODE_SPACING_PX):
-        row, column = row_in_stripe * NODE_SPACING_PX + down, column_in_stripe * NODE_SPACING_PX + right
-        there = (row < height) & (column < width)
-        image[row[there], column[there]] = inside[there]
-    return image
+            inside += estimate.at(row, column, fine, in_small, self._walks * self._times_in_stripe)
+        return cells, inside
+
+    def _means(self) -> tuple[np.ndarray, np.ndarray]:
+        """The same as the walks found it: without rare bright samples, light may be as steep as it is."""
+        cells = sum(in_large.total() for in_large, _ in self._found) / (self._walks * self._times)
+        inside = sum(in_small.total()[0] for _, in_small in self._found) / (self._walks * self._times_in_stripe)
+        return cells, inside
 
 
 def walked(

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import drjit as dr
@@ -32,7 +33,7 @@ from twin.light.image_sampling import (
     repeated,
     widened,
 )
-from twin.light.longer_ways import Sources, falling_off, light_on_longer_ways
+from twin.light.longer_ways import LongerWays, Sources, falling_off
 from twin.light.particles import Body, spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet, SheetLight
@@ -74,13 +75,13 @@ _REACH_SHARE = 1.5
 class LaserFrame:
     """Irradiance on the image sensor in W/mm2: (H, W) of the scattered light, and the stripe's pixels on their own.
 
-    ``scattered`` is all light on longer ways, ``haze`` (H, W) the part of it that the water scattered once out of the
-    sheet into the camera's rays, ``particles`` (H, W) that of grains and bubbles in the sheet, which is not among it.
+    ``haze`` (H, W) is what the water scattered once out of the sheet into the camera's rays, ``particles`` (H, W) the
+    light of grains and bubbles in the sheet, which is not among it, ``longer`` what random walks found, if any did.
     ``rows`` and ``columns`` (P,) name the stripe's pixels, ``stripe`` (P,) is the light
     that came straight from the lit surface; ``polarisation`` and ``roughness_um`` (P,) are that surface's, for speckle.
     """
 
-    scattered: np.ndarray
+    longer: LongerWays | None
     haze: np.ndarray
     particles: np.ndarray
     rows: np.ndarray
@@ -88,6 +89,11 @@ class LaserFrame:
     stripe: np.ndarray
     polarisation: np.ndarray
     roughness_um: np.ndarray
+
+    @cached_property
+    def scattered(self) -> np.ndarray:
+        """All light on longer ways (H, W), the haze among it; what the walks found is made smooth when first needed."""
+        return self.haze if self.longer is None else self.longer.image() + self.haze
 
     def irradiance(self, factors: np.ndarray | float = 1.0) -> np.ndarray:
         """All light (H, W), the stripe's multiplied by ``factors`` (P,)."""
@@ -97,7 +103,7 @@ class LaserFrame:
 
     def direct(self) -> np.ndarray:
         """The stripe's light alone (H, W), without speckle."""
-        image = np.zeros_like(self.scattered)
+        image = np.zeros_like(self.haze)
         image[self.rows, self.columns] = self.stripe
         return image
 
@@ -169,16 +175,16 @@ class Renderer:
         rows, columns = places(self._repeated(lit))
         stripe, polarised, rough = self._stripe(pose, rows, columns, direct + mirrored, spp=spp)
         walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm)
-        image = np.zeros_like(haze)
+        longer = None
         if walker.finds_light:
+            image = np.zeros_like(haze)
             image[rows, columns] = stripe
             sources, walks = Sources(image, haze, lit, surfaces), math.ceil(spp * self._walks_per_sample)
-            image = light_on_longer_ways(self.view, walker, sources, seed=seed, walks=walks)
+            longer = LongerWays(self.view, walker, sources, seed=seed, walks=walks)
         haze = haze if self.effects.haze else np.zeros_like(haze)
-        image += haze
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
         particles, polarisation = self._particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
-        return LaserFrame(image, haze, particles, rows, columns, stripe, polarisation, rough / bright)
+        return LaserFrame(longer, haze, particles, rows, columns, stripe, polarisation, rough / bright)
 
     def _particles(self, direct: list[Light], pose: SensorPose, *, seed: int) -> np.ndarray:
         """Irradiance (H, W) in W/mm2 of grains and bubbles in the sheets."""
@@ -269,9 +275,8 @@ class Renderer:
                 near = np.any(stripes, axis=0)
                 if index == 0:
                     own |= stripes[0]
-                if self.effects.defocus and near.any():
-                    blur = self.view.blur_radius_px(depth.numpy().reshape(shape))
-                    reach[near] = np.fmax(reach, over_corners(np.fmax, blur))[near]
+                if self.effects.defocus:
+                    reach = np.fmax(reach, self._blur_px(near, depth.numpy().reshape(shape)))
                 lit |= near
             if moment is pose and dr.width(scattered) > 1:
                 image = self._repeated(0.25 * over_corners(np.add, scattered.numpy().reshape(shape)))
@@ -327,8 +332,7 @@ class Renderer:
         low, high = over_corners(np.minimum, nodes), over_corners(np.maximum, nodes)
         changes = high - low > CHANGE_SHARE * nodes.max()
         if self.effects.defocus:
-            blur = self.view.blur_radius_px(depth.numpy().reshape(shape))
-            changes = widened(changes, np.fmax(over_corners(np.fmax, blur), 0), cell_px=1)
+            changes = widened(changes, self._blur_px(changes, depth.numpy().reshape(shape)), cell_px=1)
         if pose.travel is not None:
             changes[:] = True  # what moves by may change any pixel
         image = 0.25 * over_corners(np.add, nodes)
@@ -445,27 +449,38 @@ class Renderer:
 
         ``shifted`` takes other places on the pupil in neighbouring pixels, so that a blurred edge shows no steps.
         """
-        x, y = to_jit(mi.Float, columns), to_jit(mi.Float, rows)
         index = dr.arange(mi.UInt32, len(rows) * spp)
         per_pixel = dr.opaque(mi.UInt32, spp)
         pixel = index // per_pixel
         sample = index - pixel * per_pixel
-        axes = 2 + 2 * self.effects.defocus + (pose.travel is not None)
-        places = [dr.gather(mi.Float, to_jit(mi.Float, axis), sample) for axis in lattice(spp, axes)]
-        row = dr.gather(mi.Float, y, pixel)
+        # Values that lie side by side are read together, which takes a fraction of the time.
+        axes = lattice(spp, 2 + 2 * self.effects.defocus + (pose.travel is not None))
+        places = np.zeros((spp, 4))
+        places[:, : 2 + 2 * self.effects.defocus] = axes[: 2 + 2 * self.effects.defocus].T
+        across, down, u, v = dr.gather(mi.Vector4f, to_jit(mi.Float, places), sample)
+        x, y = dr.gather(mi.Point2f, to_jit(mi.Float, np.stack([columns, rows], axis=1)), pixel)
         pupil = None
         if self.effects.defocus:
-            u, v = places[2:4]
             if shifted:
-                shift_u, shift_v = (to_jit(mi.Float, axis) for axis in pupil_shifts(rows, columns))
-                u, v = u + dr.gather(mi.Float, shift_u, pixel), v + dr.gather(mi.Float, shift_v, pixel)
+                shift_u, shift_v = dr.gather(mi.Point2f, to_jit(mi.Float, pupil_shifts(rows, columns).T), pixel)
+                u, v = u + shift_u, v + shift_v
                 u, v = u - dr.floor(u), v - dr.floor(v)
             pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
-        after_s = None if pose.travel is None else pose.travel.at(row, places[-1])
-        bundle = self.view.bundle(dr.gather(mi.Float, x, pixel) + places[0] - 0.5, row + places[1] - 0.5, pupil)
+        after_s = None
+        if pose.travel is not None:
+            after_s = pose.travel.at(y, dr.gather(mi.Float, to_jit(mi.Float, axes[-1]), sample))
+        bundle = self.view.bundle(x + across - 0.5, y + down - 0.5, pupil)
         values = light(pose, bundle, after_s, *rest)
         dr.eval(values)  # together: each sum on its own would trace the rays anew
         return np.stack([dr.block_sum(value, spp).numpy() / spp for value in values])
+
+    def _blur_px(self, marked: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
+        """Largest blur in px of what is seen at the corners of marked cells, 0 elsewhere, of depths at all nodes."""
+        row, column = places(marked)
+        corners = np.stack([depth_mm[row + down, column + right] for down, right in np.ndindex(2, 2)])
+        blur = np.zeros(marked.shape, np.float32)
+        blur[row, column] = np.fmax(np.fmax.reduce(self.view.blur_radius_px(corners)), 0)
+        return blur
 
     def _repeated(self, cells: np.ndarray) -> np.ndarray:
         """Values of grid cells given to their pixels, (H, W)."""

@@ -90,7 +90,8 @@ class FoundLight:
 
     def light(self, kinds: range) -> np.ndarray:
         """Light (rows, columns) of the walks of some classes."""
-        return self._light[self._among(kinds)].sum(axis=0).reshape(self.shape)
+        found = self._light[self._among(kinds)]
+        return (found[0] if len(found) == 1 else found.sum(axis=0)).reshape(self.shape)
 
     def squares(self, kinds: range) -> float:
         """Sum of the squares of what each of these walks found."""
@@ -152,8 +153,11 @@ def estimated(
     total = findings.total()
     faint = _FAINT_SHARE * max(tolerance * mean_walks, noise_share * float(total.mean()))
     classes = [kinds for kinds in findings.classes(faint) if findings.squares(kinds) > 0]
-    light = np.array([findings.light(kinds) / mean_walks for kinds in classes], np.float32).reshape(-1, *total.shape)
-    portions = np.array([findings.squares(kinds) / findings.light(kinds).sum() for kinds in classes])
+    each_found = [findings.light(kinds) for kinds in classes]
+    light = np.array([found / mean_walks for found in each_found], np.float32).reshape(-1, *total.shape)
+    portions = np.array(
+        [findings.squares(kinds) / found.sum() for kinds, found in zip(classes, each_found, strict=True)]
+    )
     weights = _weights(light, features, exposure)
     each_described = (weights @ features.reshape(len(features), -1)).reshape(light.shape)
     described = each_described.sum(axis=0)
