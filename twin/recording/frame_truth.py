@@ -136,12 +136,14 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
         high, above = dr.select(same_side, high, centre), dr.select(same_side, above, found)
         return low, high, below, above, at, left - 1
 
-    low, high, below, above, at, _ = dr.while_loop(
-        (low, high, below, above, at, dr.full(mi.UInt32, _FALSE_POSITIONS, len(line))),
-        lambda low, high, below, above, at, left: left > 0,
-        narrowed,
-        mode="symbolic",
-    )
+    # Written down once, as in `Walker`.
+    with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+        low, high, below, above, at, _ = dr.while_loop(
+            (low, high, below, above, at, dr.full(mi.UInt32, _FALSE_POSITIONS, len(line))),
+            lambda low, high, below, above, at, left: left > 0,
+            narrowed,
+            mode="symbolic",
+        )
     centre = low + (high - low) * below / (below - above)
     dr.eval(centre)
     bundle = renderer.view.bundle(*position(centre, at))
