@@ -141,7 +141,9 @@ class WindowFaces:
         weight, valid = dr.full(mi.Float, 1.0, width), dr.full(mi.Bool, True, width)
         if not self.mounted:
             return Rays(origin, direction, weight)
-        p, d, normal = mi.Point3f(origin), mi.Vector3f(direction), self._normal
+        p: Point3f = mi.Point3f(origin)
+        d: Vector3f = mi.Vector3f(direction)
+        normal = self._normal
         for number, (centre, ratio) in enumerate(self._faces):
             cosine = dr.dot(d, normal)
             t = dr.dot(mi.Vector3f(centre - p), normal) / cosine

@@ -18,7 +18,7 @@ import numpy as np
 
 from twin.backend.arrays import Bool, Float, to_jit
 from twin.light.camera import CameraView
-from twin.light.image_sampling import NODE_SPACING_PX, places
+from twin.light.image_sampling import NODE_SPACING_PX, over_corners, places
 from twin.light.smoothing import FoundLight, blurred, estimated, interpolated
 from twin.light.walk import Walker
 
@@ -45,15 +45,14 @@ _WALKS_IN_STRIPE = 4
 class Sources:
     """What sends light on longer ways: images (H, W) in W/mm2 of the stripe and the haze, and the lit surfaces.
 
-    ``lit`` (rows, columns) marks the small cells of the stripe's pixels, ``surfaces`` (S, rows, columns) is what
-    surfaces would send to the camera of light that comes from the laser and falls off with the distance from the sheet
-    over each of `SPREAD_MM`.
+    ``surfaces`` are images (rows + 1, columns + 1) at the corners of the small cells, of what surfaces would send to
+    the camera of light that comes from the laser and falls off with the distance from the sheet over each of
+    `SPREAD_MM`.
     """
 
     stripe: np.ndarray
     haze: np.ndarray
-    lit: np.ndarray
-    surfaces: np.ndarray
+    surfaces: list[np.ndarray]
 
 
 def falling_off(reflected: Float, distance_mm: Float, active: Bool) -> list[Float]:
@@ -64,16 +63,17 @@ def falling_off(reflected: Float, distance_mm: Float, active: Bool) -> list[Floa
 class LongerWays:
     """Multiply scattered and secondary light, as far as random walks found it; ``walks`` begin in most large cells.
 
-    The walks are followed at once. `image` makes smooth light of what they found, without anything of the renderer.
+    ``lit`` (rows, columns) marks the small cells of the stripe's pixels. The walks are followed at once. `image` makes
+    smooth light of what they found, without anything of the renderer.
     """
 
-    def __init__(self, view: CameraView, walker: Walker, sources: Sources, *, seed: int, walks: int):
-        self._sources, self._walks, self._scatters = sources, walks, walker.scatters
-        height, width = sources.stripe.shape
+    def __init__(self, view: CameraView, walker: Walker, lit: np.ndarray, *, seed: int, walks: int):
+        self._lit, self._walks, self._scatters = lit, walks, walker.scatters
+        height, width = view.camera.height_px, view.camera.width_px
         rows, columns = self._shape = -(-height // WALK_CELL_PX), -(-width // WALK_CELL_PX)
-        self._times = np.where(_beside_stripe(sources.lit, rows, columns), _WALKS_BESIDE_STRIPE, 1)
+        self._times = np.where(_beside_stripe(lit, rows, columns), _WALKS_BESIDE_STRIPE, 1)
         self._times_in_stripe = 1 if walker.scatters else _WALKS_IN_STRIPE
-        self._in_stripe = row_in_stripe, column_in_stripe = places(sources.lit)
+        self._in_stripe = row_in_stripe, column_in_stripe = places(lit)
         large = np.repeat(np.arange(rows * columns), self._times.ravel())
         small = np.repeat(np.arange(len(row_in_stripe)), self._times_in_stripe)
         self._found = [(FoundLight(rows, columns), FoundLight(1, len(row_in_stripe))) for _ in NOISE_SHARES]
@@ -93,10 +93,10 @@ class LongerWays:
                 in_large.add(large[where[is_large]], light[is_large])
                 in_small.add(small[where[~is_large] - len(large)], light[~is_large])
 
-    def image(self) -> np.ndarray:
+    def image(self, sources: Sources) -> np.ndarray:
         """Irradiance (H, W) in W/mm2."""
-        height, width = self._sources.stripe.shape
-        cells, inside = self._smooth() if self._scatters else self._means()
+        height, width = sources.stripe.shape
+        cells, inside = self._smooth(sources) if self._scatters else self._means()
         size = self._shape[1] * WALK_CELL_PX, self._shape[0] * WALK_CELL_PX
         image = cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
         for down, right in np.ndindex(NODE_SPACING_PX, NODE_SPACING_PX):
@@ -107,12 +107,10 @@ class LongerWays:
             image[row[there], column[there]] = inside[there]
         return image
 
-    def _smooth(self) -> tuple[np.ndarray, np.ndarray]:
+    def _smooth(self, sources: Sources) -> tuple[np.ndarray, np.ndarray]:
         """Light in large cells (rows, columns) and in the small ones of the stripe (P,), without most of its noise."""
-        sources, (rows, columns) = self._sources, self._shape
-        features = _features(sources, rows, columns)
         row, column = map(_in_large_cells, self._in_stripe)
-        fine = _features_in_stripe(sources, features, row, column)
+        features, fine = _features(sources, self._lit, *self._shape, row, column)
         tolerance = TOLERANCE * float(sources.stripe.max(initial=0.0))
         cells, inside = np.zeros(self._shape), np.zeros(len(row))
         for (in_large, in_small), noise_share in zip(self._found, NOISE_SHARES, strict=True):
@@ -124,9 +122,9 @@ class LongerWays:
 
     def _means(self) -> tuple[np.ndarray, np.ndarray]:
         """The same as the walks found it: without rare bright samples, light may be as steep as it is."""
-        cells = sum(in_large.total() for in_large, _ in self._found) / (self._walks * self._times)
-        inside = sum(in_small.total()[0] for _, in_small in self._found) / (self._walks * self._times_in_stripe)
-        return cells, inside
+        cells = np.sum([in_large.total() for in_large, _ in self._found], axis=0) / (self._walks * self._times)
+        inside = np.sum([in_small.total()[0] for _, in_small in self._found], axis=0)
+        return cells, inside / (self._walks * self._times_in_stripe)
 
 
 def walked(
@@ -159,24 +157,25 @@ def _beside_stripe(lit: np.ndarray, rows: int, columns: int) -> np.ndarray:
     return cv2.dilate(on_stripe, np.ones((across, across), np.uint8)) > 0
 
 
-def _features(sources: Sources, rows: int, columns: int) -> np.ndarray:
-    """What light on longer ways may look like (J, rows, columns): nothing in particular, the haze, surfaces, blurs."""
+def _features(
+    sources: Sources, lit: np.ndarray, rows: int, columns: int, place_rows: np.ndarray, place_columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What light on longer ways may look like (J, rows, columns): nothing in particular, the haze, surfaces, blurs.
+
+    And the same (J, P) in the small cells of the stripe, at ``place_rows`` and ``place_columns`` (P,) of the others.
+    """
     stripe, haze = (_in_cells(image, rows, columns) for image in (sources.stripe, sources.haze))
-    surfaces = [_in_cells(image, rows, columns) for image in sources.surfaces]
+    surfaces = [0.25 * over_corners(np.add, nodes) for nodes in sources.surfaces]
     widths = [_NARROWEST_CELLS]
     while widths[-1] < 0.2 * max(rows, columns):
         widths.append(3 * widths[-1])
     blurs = [blurred(source, width) for source in (stripe, haze) for width in widths]
-    return np.stack([np.ones_like(haze), haze, *surfaces, *blurs])
-
-
-def _features_in_stripe(
-    sources: Sources, features: np.ndarray, place_rows: np.ndarray, place_columns: np.ndarray
-) -> np.ndarray:
-    """The same (J, P) in the small cells of the stripe, at ``place_rows`` and ``place_columns`` (P,) of the others."""
-    haze = sources.haze[::NODE_SPACING_PX, ::NODE_SPACING_PX][sources.lit]
-    blurs = [interpolated(feature, place_rows, place_columns) for feature in features[2 + len(sources.surfaces) :]]
-    return np.stack([np.ones_like(haze), haze, *(image[sources.lit] for image in sources.surfaces), *blurs])
+    fine_haze = sources.haze[::NODE_SPACING_PX, ::NODE_SPACING_PX][lit]
+    fine_blurs = [interpolated(blur, place_rows, place_columns) for blur in blurs]
+    return (
+        np.stack([np.ones_like(haze), haze, *(_in_cells(image, rows, columns) for image in surfaces), *blurs]),
+        np.stack([np.ones_like(fine_haze), fine_haze, *(image[lit] for image in surfaces), *fine_blurs]),
+    )
 
 
 def _in_cells(image: np.ndarray, rows: int, columns: int) -> np.ndarray:

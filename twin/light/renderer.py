@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import cv2
 import drjit as dr
@@ -76,12 +76,12 @@ class LaserFrame:
     """Irradiance on the image sensor in W/mm2: (H, W) of the scattered light, and the stripe's pixels on their own.
 
     ``haze`` (H, W) is what the water scattered once out of the sheet into the camera's rays, ``particles`` (H, W) the
-    light of grains and bubbles in the sheet, which is not among it, ``longer`` what random walks found, if any did.
-    ``rows`` and ``columns`` (P,) name the stripe's pixels, ``stripe`` (P,) is the light
-    that came straight from the lit surface; ``polarisation`` and ``roughness_um`` (P,) are that surface's, for speckle.
+    light of grains and bubbles in the sheet, which is not among it; ``longer`` makes the image (H, W) of what random
+    walks found. ``rows`` and ``columns`` (P,) name the stripe's pixels, ``stripe`` (P,) is the light that came straight
+    from the lit surface; ``polarisation`` and ``roughness_um`` (P,) are that surface's, for speckle.
     """
 
-    longer: LongerWays | None
+    longer: Callable[[], np.ndarray] | None
     haze: np.ndarray
     particles: np.ndarray
     rows: np.ndarray
@@ -93,7 +93,7 @@ class LaserFrame:
     @cached_property
     def scattered(self) -> np.ndarray:
         """All light on longer ways (H, W), the haze among it; what the walks found is made smooth when first needed."""
-        return self.haze if self.longer is None else self.longer.image() + self.haze
+        return self.haze if self.longer is None else self.longer() + self.haze
 
     def irradiance(self, factors: np.ndarray | float = 1.0) -> np.ndarray:
         """All light (H, W), the stripe's multiplied by ``factors`` (P,)."""
@@ -173,14 +173,17 @@ class Renderer:
         direct, mirrored = lights(self._sheets, pose, self._mirrors)
         lit, haze, surfaces = self._laser_nodes(pose, direct, mirrored)
         rows, columns = places(self._repeated(lit))
-        stripe, polarised, rough = self._stripe(pose, rows, columns, direct + mirrored, spp=spp)
-        walker = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm)
-        longer = None
+        stripe_means = self._stripe(pose, rows, columns, direct + mirrored, spp=spp)
+        walker, walked = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm), None
         if walker.finds_light:
+            walks = math.ceil(spp * self._walks_per_sample)
+            walked = LongerWays(self.view, walker, lit, seed=seed, walks=walks)
+        stripe, polarised, rough = stripe_means()
+        longer = None
+        if walked is not None:
             image = np.zeros_like(haze)
             image[rows, columns] = stripe
-            sources, walks = Sources(image, haze, lit, surfaces), math.ceil(spp * self._walks_per_sample)
-            longer = LongerWays(self.view, walker, sources, seed=seed, walks=walks)
+            longer = partial(walked.image, Sources(image, haze, surfaces))
         haze = haze if self.effects.haze else np.zeros_like(haze)
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
         particles, polarisation = self._particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
@@ -247,7 +250,7 @@ class Renderer:
 
     def _laser_nodes(
         self, pose: SensorPose, direct: list[Light], mirrored: list[Light]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
         """Cells (rows, columns) close to the lit stripe, the haze (H, W) in W/mm2, and the surfaces of `Sources`."""
         bundle, shape = self.view.grid(NODE_SPACING_PX)
         lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
@@ -281,8 +284,7 @@ class Renderer:
             if moment is pose and dr.width(scattered) > 1:
                 image = self._repeated(0.25 * over_corners(np.add, scattered.numpy().reshape(shape)))
         self._own_stripe = pose, own
-        over_cells = [0.25 * over_corners(np.add, each.numpy().reshape(shape)) for each in surfaces]
-        return widened(lit, reach), image, np.array(over_cells).reshape(-1, *lit.shape)
+        return widened(lit, reach), image, [each.numpy().reshape(shape) for each in surfaces]
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
         """The pose, and more of them over the exposure if the sensor travels, with the lights there."""
@@ -341,7 +343,7 @@ class Renderer:
             return (self._evenly_lit(next(self._segments(pose, bundle, after_s)), ambient),)
 
         for rows, columns in _parts(*places(changes), spp=spp):
-            image[rows, columns] = self._fine(evenly_lit, pose, rows, columns, spp=spp, shifted=True)[0]
+            image[rows, columns] = self._fine(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
         return image
 
     def _evenly_lit(self, segment: RaySegment, ambient: bool) -> Float:
@@ -401,18 +403,24 @@ class Renderer:
 
     def _stripe(
         self, pose: SensorPose, rows: np.ndarray, columns: np.ndarray, sources: list[Light], *, spp: int
-    ) -> np.ndarray:
-        """Means (3, P) of `_stripe_sums` over pixels, of few samples where the light of a wide stripe is smooth."""
+    ) -> Callable[[], np.ndarray]:
+        """Means (3, P) of `_stripe_sums` over pixels, of few samples where the light of a wide stripe is smooth.
 
-        def means(where: np.ndarray, spp: int) -> np.ndarray:
-            parts = _parts(rows[where], columns[where], spp=spp)
-            found = [self._fine(self._stripe_sums, pose, *part, sources, spp=spp) for part in parts]
-            return np.concatenate([np.zeros((3, 0), np.float32), *found], axis=1)
+        They are fetched by the function returned: most are still being rendered.
+        """
+
+        def begun(where: np.ndarray, spp: int) -> Callable[[], np.ndarray]:
+            found: list[Callable[[], np.ndarray]] = []
+            for part in _parts(rows[where], columns[where], spp=spp):
+                if found:
+                    dr.sync_thread()  # the samples of one part at a time take memory
+                found.append(self._fine(self._stripe_sums, pose, *part, sources, spp=spp))
+            return lambda: np.concatenate([np.zeros((3, 0), np.float32), *(means() for means in found)], axis=1)
 
         everywhere, lines = np.arange(len(rows)), self.sensor.camera.lines()
         if len(rows) < _WIDE_PX * lines or spp < _LEAST_SPP * _FEWER_SAMPLES:
-            return means(everywhere, spp)
-        sums = means(everywhere, spp // _FEWER_SAMPLES)
+            return begun(everywhere, spp)
+        sums = begun(everywhere, spp // _FEWER_SAMPLES)()
         image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
         image[rows, columns] = sums[0]
         bends = np.zeros(image.shape, np.uint8)
@@ -420,8 +428,8 @@ class Renderer:
             second = cv2.Sobel(image, cv2.CV_32F, along_x, along_y, ksize=1)
             bends |= (np.abs(second) > BEND_SHARE * sums[0].max(initial=0.0)).view(np.uint8)
         again = np.flatnonzero(cv2.dilate(bends, np.ones((3, 3), np.uint8))[rows, columns])
-        sums[:, again] = means(again, spp)
-        return sums
+        sums[:, again] = begun(again, spp)()
+        return lambda: sums
 
     def _stripe_sums(
         self, pose: SensorPose, bundle: Rays, after_s: Float | None, sources: list[Light]
@@ -444,10 +452,11 @@ class Renderer:
         *rest: object,
         spp: int,
         shifted: bool = False,
-    ) -> np.ndarray:
+    ) -> Callable[[], np.ndarray]:
         """Means (K, P) over the area of pixels, the pupil and the exposure of what ``light`` finds along each ray.
 
-        ``shifted`` takes other places on the pupil in neighbouring pixels, so that a blurred edge shows no steps.
+        They are fetched by the function returned, and rendered meanwhile. ``shifted`` takes other places on the pupil
+        in neighbouring pixels, so that a blurred edge shows no steps.
         """
         index = dr.arange(mi.UInt32, len(rows) * spp)
         per_pixel = dr.opaque(mi.UInt32, spp)
@@ -472,7 +481,9 @@ class Renderer:
         bundle = self.view.bundle(x + across - 0.5, y + down - 0.5, pupil)
         values = light(pose, bundle, after_s, *rest)
         dr.eval(values)  # together: each sum on its own would trace the rays anew
-        return np.stack([dr.block_sum(value, spp).numpy() / spp for value in values])
+        sums = [dr.block_sum(value, spp) for value in values]
+        dr.eval(sums)
+        return lambda: np.stack([each.numpy() / spp for each in sums])
 
     def _blur_px(self, marked: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
         """Largest blur in px of what is seen at the corners of marked cells, 0 elsewhere, of depths at all nodes."""

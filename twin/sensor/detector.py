@@ -95,7 +95,8 @@ def _collected(
         mean = electrons + dark
     else:
         mean = np.empty_like(electrons, order="C")
-        _mean_electrons(*map(np.ravel, (electrons, pattern.gain, pattern.hot_e_per_s)), exposure_s, dark, mean.ravel())
+        light, gain, hot = (values.ravel() for values in (electrons, pattern.gain, pattern.hot_e_per_s))
+        _mean_electrons(light, gain, hot, exposure_s, float(dark), mean.ravel())
     return mean if rng is None else poisson_numbers(mean, rng)
 
 
