@@ -37,7 +37,7 @@ from twin.scene.objects import Objects
 
 _STEPS = 64
 """No walk is longer; in the most turbid waters fewer than one in 10^4 would be."""
-_FEW = 2**15
+_FEW = 2**16
 """So many walks or fewer are followed to their end in one kernel, which costs less than a launch for every stretch."""
 _TOWARDS_LASER = 0.15
 """Share of directions drawn about the direction to the laser."""
