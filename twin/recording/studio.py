@@ -1,13 +1,16 @@
 """A sensor before a scene: its images with exposures and noise, and their recording into a capture with the truth."""
 
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -389,6 +392,25 @@ def lit_level(peaks: np.ndarray) -> float:
     return float(np.quantile(lit, BRIGHT_SHARE)) if len(lit) else 0.0
 
 
+@contextmanager
+def _threads_kept() -> Iterator[int]:
+    """The number of Dr.Jit's threads, as it is again afterwards."""
+    threads = dr.thread_count()
+    try:
+        yield threads
+    finally:
+        dr.set_thread_count(threads)
+
+
+def _threads_for(shot: Shot, threads: int) -> int:
+    """How many of Dr.Jit's threads render a shot while another thread exposes and writes the one before.
+
+    Between the many small kernels of a laser image they would keep that one from its processor; a lamp image has few
+    large kernels.
+    """
+    return threads if shot.light == "lamp" else min(threads, max(1, (os.cpu_count() or 1) - 1))
+
+
 def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], shots: Sequence[Shot]) -> Truth:
     """The truths of a recording's frames as one, with the depth map of the first of its ``shots``."""
     stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
@@ -459,6 +481,7 @@ def record_scene(
     with (
         CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer,
         ThreadPoolExecutor(1) as camera,
+        _threads_kept() as threads,
     ):
         done = len(writer)
 
@@ -474,6 +497,7 @@ def record_scene(
         # An image is exposed and written while the light of the next one is rendered.
         before: Future[None] | None = None
         for index, shot in enumerate(shots):
+            dr.set_thread_count(_threads_for(shot, threads))
             # The light first: the truth goes on from where it found the stripe.
             light = studio.light(shot, index) if index >= done else None
             truths.append(studio.truth(shot))
