@@ -1,13 +1,20 @@
 """Demonstration of all commands: record a virtual campaign, calibrate, reconstruct, evaluate, report."""
 
+import io
 import json
+import runpy
 import shlex
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator
+from contextlib import redirect_stderr, redirect_stdout
 from itertools import groupby
 from pathlib import Path
+
+from uwlts.model.errors import SetupError
+from uwlts.runtime.console import INTERRUPTED
+from uwlts.runtime.workers import Lost, open_workers
 
 STAGES = ("render", "calibrate", "reconstruct", "evaluate", "report")
 AT_ONCE = 2
@@ -37,7 +44,7 @@ def commands(out: Path) -> list[tuple[str, str]]:
             rows.append(("reconstruct", f"uwlts reconstruct {made}"))
             judged = f"--out {cloud}.evaluation.json --coloured {cloud}-coloured.ply --overwrite"
             rows.append(("evaluate", f"uwlts evaluate {cloud}.ply --truth {capture}.truth.h5 {judged}"))
-    rows.append(("report", f"uwlts report {folder} --reference thesis --overwrite"))
+    rows.append(("report", f"uwlts report {folder} --reference thesis --workers {AT_ONCE} --overwrite"))
     return rows
 
 
@@ -57,38 +64,54 @@ def demo(out: str | Path = "runs/demo") -> Path:
     ------
     subprocess.CalledProcessError
         A command failed; what it printed says why.
+    SetupError
+        A working process has ended unexpectedly.
     """
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     seconds: dict[str, float] = {}
     begun = time.perf_counter()
     in_order = sorted(commands(folder), key=lambda row: STAGES.index(row[0]))
-    for stage, rows in groupby(in_order, key=lambda row: row[0]):
-        if stage == "report":
-            (folder / "seconds.json").write_text(json.dumps(seconds, indent=2) + "\n", encoding="utf-8")
-        start = time.perf_counter()
-        lines = [line for _, line in rows]
-        # Commands of one stage need nothing of each other.
-        with ThreadPoolExecutor(AT_ONCE) as pool:
-            codes = list(pool.map(_run, lines))
-        for line, code in zip(lines, codes, strict=True):
-            if code:
-                raise subprocess.CalledProcessError(code, line)
-        seconds[stage] = round(time.perf_counter() - start, 2)
+    with open_workers(workers=AT_ONCE) as workers:
+        for stage, rows in groupby(in_order, key=lambda row: row[0]):
+            if stage == "report":
+                (folder / "seconds.json").write_text(json.dumps(seconds, indent=2) + "\n", encoding="utf-8")
+            start = time.perf_counter()
+            # Commands of one stage need nothing of each other.
+            for line, ended in workers.completed(_run, _announced([line for _, line in rows])):
+                if isinstance(ended, Lost):
+                    raise SetupError(f"{line}: {ended.reason}")
+                code, output, complaints = ended
+                print(output, end="", flush=True)
+                print(complaints, end="", file=sys.stderr, flush=True)
+                if code:
+                    raise subprocess.CalledProcessError(code, line)
+            seconds[stage] = round(time.perf_counter() - start, 2)
     total = ", ".join(f"{stage} {value:.1f} s" for stage, value in seconds.items())
     report = folder / "report.html"
     print(f"done in {time.perf_counter() - begun:.1f} s ({total}); open {report}")
     return report
 
 
-def _run(line: str) -> int:
-    """Run a command and print what it says once it has ended; its exit code."""
-    sys.stdout.write(f"$ {line}\n")  # at once: print would write the line's end on its own, among other lines
-    sys.stdout.flush()
+def _announced(lines: Iterable[str]) -> Iterator[str]:
+    """The commands, each printed as it begins."""
+    for line in lines:
+        print(f"$ {line}", flush=True)
+        yield line
+
+
+def _run(line: str) -> tuple[int, str, str]:
+    """Exit code of a command and what it prints, as ``python -m`` runs it, in this process: commands share what they
+    import, which takes most of them longer than their work."""
     program, *arguments = shlex.split(line)
-    done = subprocess.run(
-        [sys.executable, "-m", f"{program}.cli", *arguments], check=False, capture_output=True, text=True
-    )
-    print(done.stdout, end="", flush=True)
-    print(done.stderr, end="", file=sys.stderr, flush=True)
-    return done.returncode
+    output, complaints = io.StringIO(), io.StringIO()
+    sys.argv = [program, *arguments]
+    code = 0
+    with redirect_stdout(output), redirect_stderr(complaints):
+        try:
+            runpy.run_module(f"{program}.cli", run_name="__main__", alter_sys=True)
+        except SystemExit as end:
+            code = int(end.code or 0)
+    if code == INTERRUPTED:
+        raise KeyboardInterrupt
+    return code, output.getvalue(), complaints.getvalue()

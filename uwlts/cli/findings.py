@@ -248,6 +248,7 @@ def report(
     reference: str | None = None,
     out: Path | None = None,
     pictures: Path | None = None,
+    workers: int = 1,
     overwrite: Flag = False,
 ) -> None:
     """Gather a campaign's files into one page with pictures, a summary and a table on the terminal.
@@ -262,11 +263,14 @@ def report(
         reference: Published values to set beside the measured ones: name (thesis) or path of a TOML file.
         out: Page to write; FOLDER/report.html unless given. The summary goes beside it, to summary.json.
         pictures: Also write every measurement's stripe and cloud as PNG files into this folder.
+        workers: Number of processes that draw.
         overwrite: Replace an existing report, summary and pictures.
     """
     from uwlts.report.tables import print_table
 
-    written = uwlts.write_report(folder, reference=reference, out=out, pictures=pictures, overwrite=overwrite)
+    written = uwlts.write_report(
+        folder, reference=reference, out=out, pictures=pictures, workers=workers, overwrite=overwrite
+    )
     print_table(written.rows())
     print(f"wrote {written.page} and {written.summary}")
 

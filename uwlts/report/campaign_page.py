@@ -2,19 +2,16 @@
 
 import json
 import platform
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup
-from matplotlib.axes import Axes
-
 import uwlts
 from uwlts.measurement.evaluation import TruthComparisons
 from uwlts.model.command_files import keeps_inputs
-from uwlts.model.errors import OutputError
+from uwlts.model.errors import OutputError, RangeError
 from uwlts.report import plot
 from uwlts.report.gather import (
     GatheredCampaign,
@@ -35,7 +32,7 @@ from uwlts.report.page_toolkit import (
     svg_of,
     write_page,
 )
-from uwlts.report.pictures import MeasurementPictures, draw_pictures, write_pictures
+from uwlts.report.pictures import MeasurementPictures, draw_pictures, svg_if_any, write_pictures
 from uwlts.report.summary_file import KEY_FIGURES, summary, write_summary
 from uwlts.report.tables import Row, parameter_table, residual_table, summary_table
 from uwlts.storage.files import refuse_unsuitable
@@ -71,6 +68,7 @@ def write_report(
     reference: str | Path | None = None,
     out: str | Path | None = None,
     pictures: str | Path | None = None,
+    workers: int = 1,
     overwrite: bool = False,
 ) -> Report:
     """Write the report of a campaign: one page with pictures, and a summary in numbers beside it.
@@ -86,6 +84,8 @@ def write_report(
         Page to write; FOLDER/report.html unless given. The summary goes beside it, to summary.json.
     pictures : str or Path, optional
         Folder for the stripe and the cloud of every measurement as PNG files; not written unless given.
+    workers : int
+        Number of processes that draw; with more than one, a script needs Python's ``if __name__ == "__main__"``.
     overwrite : bool
         Replace an existing report, summary and pictures.
 
@@ -97,14 +97,18 @@ def write_report(
         A file of the campaign is damaged.
     DescriptionError
         The published values cannot be read.
+    RangeError
+        ``workers`` is less than 1.
     """
+    if workers < 1:
+        raise RangeError(f"workers is {workers}; it must be at least 1")
     campaign = gather_campaign(folder)
     published = load_reference(reference) if reference else None
     page = Path(out or campaign.folder / "report.html")
     refuse_unsuitable(page, overwrite=overwrite)
     report = Report(page, page.with_name("summary.json"), campaign, published)
     write_summary(report.summary, campaign, published, overwrite=overwrite)
-    drawn = draw_pictures(campaign)
+    drawn = draw_pictures(campaign, workers=workers)
     write_page(page, report_page(campaign, published, pictures=drawn), overwrite=overwrite)
     if pictures:
         try:
@@ -143,14 +147,6 @@ def report_page(
     )
 
 
-def _drawn(draw: Callable[..., Axes], shown: object, **options: Any) -> Markup | None:
-    """A plot as SVG; None if there is nothing to draw."""
-    try:
-        return svg_of(draw(shown, **options))
-    except plot.NothingToDrawError:
-        return None
-
-
 def _measurement(
     measurement: GatheredMeasurement, pictures: MeasurementPictures, collected: FigureCollector
 ) -> dict[str, Any]:
@@ -176,8 +172,8 @@ def _measurement(
         "stripe": None if pictures.stripe is None else png_data_uri(pictures.stripe),
         "no_stripe": no_stripe,
         "cloud": shown,
-        "histogram": None if cloud is None else _drawn(plot.deviation_histogram, cloud),
-        "along": None if cloud is None else _drawn(plot.along_stripe, cloud),
+        "histogram": pictures.histogram,
+        "along": pictures.along,
         "deviation_from": "the artefact's fitted surface" if evaluation else "the true surface",
         "figures": figures,
         "truth": None if truth is None else _truth_table(truth),
@@ -253,7 +249,7 @@ def _calibrations(campaign: GatheredCampaign) -> dict[str, Any]:
         "parameters": parameter_table(campaign),
         "residuals": residual_table(campaign.calibrations),
         "warnings": warnings,
-        "curve": _drawn(plot.window_curves, by_name, true_mm=campaign.true_window_mm),
+        "curve": svg_if_any(plot.window_curves, by_name, true_mm=campaign.true_window_mm),
         "groups": groups,
     }
 

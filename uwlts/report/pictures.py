@@ -1,16 +1,20 @@
-"""Pictures of a campaign's measurements as PNG: the stripe in one image, and the cloud."""
+"""Pictures of a campaign's measurements: the stripe in one image and the cloud as PNG, the deviations as SVG."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from uwlts.report import plot
-from uwlts.report.gather import GatheredCampaign
-from uwlts.report.page_toolkit import new_figure, png_of
+from uwlts.report.gather import GatheredCampaign, GatheredMeasurement
+from uwlts.report.page_toolkit import new_figure, png_of, svg_of
+from uwlts.runtime.workers import Send, work_through
 from uwlts.storage.capture import Capture, picture_of
 from uwlts.storage.files import written_aside
 from uwlts.stripe import Stripe, stripe_in
@@ -65,27 +69,42 @@ def stripe_picture(view: StripeView) -> Figure:
 
 @dataclass(frozen=True)
 class MeasurementPictures:
-    """A measurement's stripe and cloud as PNG; None without a capture that shows a stripe, or without a cloud."""
+    """A measurement's stripe and cloud as PNG, and its deviations as SVG, their histogram and along the stripe; None
+    without a capture that shows a stripe, without a cloud, or where the cloud has no deviations."""
 
     name: str
     stripe: bytes | None
     cloud: bytes | None
+    histogram: Markup | None
+    along: Markup | None
 
 
-def draw_pictures(campaign: GatheredCampaign) -> list[MeasurementPictures]:
-    """Pictures of a campaign's measurements, in order; CaptureError where an image of a capture is damaged."""
-    drawn = []
-    for measurement in campaign.measurements:
-        view = stripe = cloud = None
-        if measurement.capture is not None:
-            with Capture(measurement.capture.path) as capture:
-                view = stripe_view(capture)
-        if view is not None:
-            stripe = png_of(stripe_picture(view))
-        if measurement.cloud is not None:
-            cloud = png_of(plot.cloud(measurement.cloud), few_colours=True)
-        drawn.append(MeasurementPictures(measurement.name, stripe, cloud))
-    return drawn
+def draw_pictures(campaign: GatheredCampaign, *, workers: int = 1) -> list[MeasurementPictures]:
+    """Pictures of a campaign's measurements, in order, drawn in so many processes; CaptureError where an image of a
+    capture is damaged."""
+    return work_through(_drawn, campaign.measurements, workers=workers)
+
+
+def _drawn(measurement: GatheredMeasurement, send: Send) -> MeasurementPictures:
+    view, cloud = None, measurement.cloud
+    if measurement.capture is not None:
+        with Capture(measurement.capture.path) as capture:
+            view = stripe_view(capture)
+    return MeasurementPictures(
+        measurement.name,
+        None if view is None else png_of(stripe_picture(view)),
+        None if cloud is None else png_of(plot.cloud(cloud), few_colours=True),
+        None if cloud is None else svg_if_any(plot.deviation_histogram, cloud),
+        None if cloud is None else svg_if_any(plot.along_stripe, cloud),
+    )
+
+
+def svg_if_any(draw: Callable[..., Axes], shown: object, **options: Any) -> Markup | None:
+    """A plot as SVG; None if there is nothing to draw."""
+    try:
+        return svg_of(draw(shown, **options))
+    except plot.NothingToDrawError:
+        return None
 
 
 def write_pictures(

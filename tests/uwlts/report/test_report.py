@@ -581,8 +581,11 @@ def test_pictures_are_written_for_what_there_is(campaign, tmp_path):
     for path in written:
         picture = cv2.imread(str(path))
         assert picture.shape[1] == 1120 and picture.std() > 5
+    # Two processes draw what one draws.
+    again = draw_pictures(campaign, workers=2)
+    assert again == draw_pictures(campaign)
     with pytest.raises(OutputError, match="exists already"):
-        write_pictures(tmp_path, draw_pictures(campaign))
+        write_pictures(tmp_path, again)
 
 
 def test_centres_are_drawn_where_the_light_is():
