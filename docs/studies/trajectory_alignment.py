@@ -48,17 +48,32 @@ def main() -> None:
     for seed in given.seeds:
         drift = {"drift_mm": given.drift_mm, "drift_deg": given.drift_deg}
         cloud, reported, true = ride(np.random.default_rng(seed), PASS_MM, walk=given.walk, **drift)
-        found = uwlts.align_trajectory(cloud, reported, **drift)
-        before, after = (
-            np.sqrt(np.mean(np.sum((each.poses[:, :3, 3] - true.poses[:, :3, 3]) ** 2, axis=1)))
-            for each in (reported, found.trajectory)
-        )
-        lengths = [_apart(found.trajectory, true, each.times_s) for each in found.crossings if each.patches > 100]
+        try:
+            found = uwlts.align_trajectory(cloud, reported, **drift)
+        except uwlts.Error as error:
+            print(f"seed {seed}: {error}", flush=True)
+            continue
+        assert found.trajectory.covariance is not None
         known = np.einsum("nii->n", found.trajectory.covariance[:, :3, :3])
+        last = max(each.times_s[1] for each in found.crossings)
+        words = []
+        for name, part in (
+            ("path", slice(None)),
+            ("to the last crossing", reported.times_s <= last),
+            ("behind it", reported.times_s > last),
+        ):
+            before, after = (
+                np.sqrt(np.mean(np.sum((each.poses[part, :3, 3] - true.poses[part, :3, 3]) ** 2, axis=1)))
+                for each in (reported, found.trajectory)
+            )
+            words.append(
+                f"{name} {before:.1f} -> {after:.1f} mm (rms), {before / after:.1f} times, "
+                f"{np.sqrt(known[part].mean()):.1f} mm stated"
+            )
+        lengths = [_apart(found.trajectory, true, each.times_s) for each in found.crossings if each.patches > 100]
         print(
-            f"seed {seed}: path {before:.1f} -> {after:.1f} mm (rms), {before / after:.1f} times better; "
-            f"{np.sqrt(known.mean()):.1f} mm stated; {len(lengths)} overlaps, lengths between both passes wrong by "
-            f"{_rms(lengths):.3f} mm (rms)",
+            f"seed {seed}: {'; '.join(words)}; {len(lengths)} overlaps, lengths between both passes wrong by "
+            f"{_rms(lengths):.3f} mm (rms), {len(found.doubtful_s)} crossings left out",
             flush=True,
         )
 

@@ -128,7 +128,7 @@ def campaign() -> list[Row]:
         target, *steps, in_water = (folder / f"{number}.h5" for number in range(5))
         calibration, finding, estimating = joint_calibration([target, in_water], steps)
         cv2.setNumThreads(1)
-        rate = measuring_rate(folder / "13.h5", calibration)
+        rate = measuring_rate([folder / "13.h5", folder / "14.h5"], calibration)
     return [
         at_most(f"campaign of {frames} frames", seconds, "s", 60),
         at_most("campaign, peak memory", peak, "GiB", 3),

@@ -19,6 +19,7 @@ class _InMemory:
     """A capture whose images were read beforehand."""
 
     def __init__(self, capture: Capture):
+        self.capture = capture
         self.path, self.header, self.laser_on, self.pose = capture.path, capture.header, capture.laser_on, capture.pose
         self.stage_mm, self.exposure_ms = capture.stage_mm, capture.exposure_ms
         self.has_image = capture.has_image
@@ -46,14 +47,14 @@ def joint_calibration(targets: list[Path], steps: list[Path]) -> tuple[Calibrati
         return calibration, found - start, time.perf_counter() - found
 
 
-def measuring_rate(scan: Path, calibration: Calibration) -> float:
-    """Frames per second from images in memory to points with their covariance."""
-    with Capture(scan) as capture:
-        images = _InMemory(capture)
+def measuring_rate(scans: list[Path], calibration: Calibration) -> float:
+    """Frames per second from images in memory to points with their covariance, of scans that follow a first one."""
+    with ExitStack() as stack:
+        recordings = [_InMemory(stack.enter_context(Capture(path))) for path in scans]
         seconds = []
-        for _ in range(4):
+        for images in recordings * 4:
             start = time.perf_counter()
-            cloud = reconstruct_stripes(capture, find_stripes(images), calibration, with_uncertainty=True)
+            cloud = reconstruct_stripes(images.capture, find_stripes(images), calibration, with_uncertainty=True)
             assert cloud.uncertainty is not None and cloud.uncertainty.covariance_mm2().shape == (len(cloud), 3, 3)
-            seconds.append(time.perf_counter() - start)
-        return np.count_nonzero(images.laser_on) / float(np.median(seconds[1:]))
+            seconds.append((time.perf_counter() - start) / np.count_nonzero(images.laser_on))
+        return 1.0 / float(np.median(seconds[1:]))

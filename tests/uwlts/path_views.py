@@ -3,6 +3,7 @@
 The navigation drifts smoothly; what it reports is all that the code under test gets besides the points.
 """
 
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -46,13 +47,20 @@ def route(corners: np.ndarray, *, radius_mm: float = 250.0) -> np.ndarray:
 
 
 def ride(
-    rng: np.random.Generator, corners: np.ndarray, *, drift_mm: float, drift_deg: float, walk: float = 0.0
+    rng: np.random.Generator,
+    corners: np.ndarray,
+    *,
+    drift_mm: float,
+    drift_deg: float,
+    walk: float = 0.0,
+    ground: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
 ) -> tuple[PointCloud, Trajectory, Trajectory]:
     """Cloud by the reported path, the reported path, and the true one.
 
     The drift at the end is of the stated size along each axis: a steady rate with a slow wave of a fifth, and besides a
-    random walk of ``walk`` times that.
+    random walk of ``walk`` times that. The height over x and y is that of `bed` unless ``ground`` gives it.
     """
+    height = bed().ev if ground is None else ground
     places = route(corners)
     heading = np.unwrap(np.arctan2(*np.gradient(places, axis=0).T[::-1]))
     times = np.arange(len(places)) * STEP_MM / SPEED_MM_S
@@ -69,7 +77,7 @@ def ride(
     origin, length = true[frame, :3, 3], np.full(len(frame), ALTITUDE_MM)
     for _ in range(25):
         point = origin + length[:, None] * ray
-        gap = point[:, 2] - bed().ev(point[:, 0], point[:, 1])
+        gap = point[:, 2] - height(point[:, 0], point[:, 1])
         length = length - 0.9 * gap / ray[:, 2]
     local = (length + NOISE_MM * rng.standard_normal(len(frame)))[:, None] * rays[line]
     t = times / times[-1]

@@ -124,7 +124,9 @@ def point_uncertainty(
         np.zeros((6, root.shape[1])) if mount_by is None else _in_sensor(mount_by, header) @ root[: mount_by.shape[1]]
     )
     exact = partial(_derivatives, known, root, rigid)
-    table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE_MM)
+    of_estimate = tuple(array.tobytes() for array in (known.values, root, rigid))
+    key = None if digest is None else ("uncertainty", digest, known.view, *of_estimate)
+    table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE_MM, key=key)
     beside = np.zeros((len(line), 3)) if beside_mm is None else beside_std(header.sensor.uncertainty) * beside_mm
     blur = np.zeros(len(line)) if blur_px is None else BLUR_STD * blur_px
 

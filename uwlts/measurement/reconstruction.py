@@ -175,7 +175,8 @@ def reconstruct_stripes(
         blurred = len(stripes.line) - len(sharp)
         lines = lines | {"ok": lines.get("ok", 0) - blurred, "blurred": blurred}
         stripes = stripes[sharp]
-    sheet = _lit_sheet(capture, calibration, stripes, index)
+    digest = calibration_digest(calibration)
+    sheet = _lit_sheet(capture, calibration, stripes, index, digest)
     found = _points(capture, calibration, stripes, index, sheet)
     beside, points = np.zeros((len(sharp), 3)), found.points_mm
     if exact is not None and sheet is not None:
@@ -184,7 +185,7 @@ def reconstruct_stripes(
     points = _posed(points, capture, stripes.frame)
     there = found.status == RayStatus.OK
     good = slice(None) if there.all() else np.flatnonzero(there)
-    kept, known, digest = stripes[good], None, calibration_digest(calibration)
+    kept, known = stripes[good], None
     if with_uncertainty:
         if exact is None:
             raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (--water or --joint)")
@@ -215,13 +216,13 @@ def reconstruct_stripes(
 
 
 def _lit_sheet(
-    capture: Capture | FrameTable, calibration: AnyCalibration, stripes: FoundStripes, index: float
+    capture: Capture | FrameTable, calibration: AnyCalibration, stripes: FoundStripes, index: float, digest: str
 ) -> LitSheet | None:
     """What stripe centres see of the sheet; none with poses, or by polynomials."""
     if isinstance(calibration, PolynomialCalibration) or np.isfinite(capture.pose).any():
         return None
     sensor = capture.header.sensor
-    return LitSheet.of(calibration, sensor, stripes.line, stripes.centre_px, medium_index=index)
+    return LitSheet.of(calibration, sensor, stripes.line, stripes.centre_px, medium_index=index, digest=digest)
 
 
 def _points(

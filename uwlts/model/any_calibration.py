@@ -1,6 +1,7 @@
 """Calibrations of any kind: reading, digest, and whether one fits a recording."""
 
 import hashlib
+import weakref
 
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
@@ -19,7 +20,15 @@ _OTHER_LENS = 1.1  # focal lengths of lenses of one kind differ by less
 
 def calibration_digest(calibration: AnyCalibration) -> str:
     """Short digest that identifies a calibration, as the clouds made with it name it."""
-    return hashlib.sha256(calibration.model_dump_json().encode()).hexdigest()[:16]
+    if (digest := _digests.get(id(calibration))) is None:
+        digest = hashlib.sha256(calibration.model_dump_json().encode()).hexdigest()[:16]
+        _digests[id(calibration)] = digest
+        weakref.finalize(calibration, _digests.pop, id(calibration), None).atexit = False
+    return digest
+
+
+_digests: dict[int, str] = {}
+"""Digests of calibrations in use, by their identity."""
 
 
 def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: str) -> list[str]:

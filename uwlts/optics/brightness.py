@@ -84,18 +84,31 @@ class LitSheet:
 
     @classmethod
     def of(
-        cls, calibration: Calibration, sensor: Sensor, line: np.ndarray, centre_px: np.ndarray, *, medium_index: float
+        cls,
+        calibration: Calibration,
+        sensor: Sensor,
+        line: np.ndarray,
+        centre_px: np.ndarray,
+        *,
+        medium_index: float,
+        digest: str | None = None,
     ) -> LitSheet:
-        """The sheet as described of a sensor by a calibration, without a window where the sensor has none."""
+        """The sheet as described of a sensor by a calibration, without a window where the sensor has none.
+
+        With the calibration's ``digest`` tables are kept for the next scan.
+        """
         if not sensor.camera.window.mounted:
             calibration = calibration.model_copy(update={"window": None})
-        known = _on_sheet(calibration, sensor, medium_index=medium_index)
+        origin_mm = laser_pose(sensor).origin_mm
+        known = _on_sheet(calibration, sensor.laser, origin_mm, medium_index=medium_index)
+        laser = sensor.laser.model_dump_json(), origin_mm.tobytes()
+        key = None if digest is None else ("sheet", digest, sensor.camera.window.mounted, *laser, medium_index)
         status = np.full(len(line), RayStatus.OK, dtype=np.uint8)
 
         def exact(line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
             return known(line, place_px)[0]
 
-        table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE)
+        table = LineTable.about(exact, line, centre_px, tolerance=_TABLE_TOLERANCE, key=key)
         if table is None:
             values, status = known(line, centre_px)
         else:
@@ -143,11 +156,10 @@ class LitSheet:
 
 
 def _on_sheet(
-    calibration: Calibration, sensor: Sensor, *, medium_index: float
+    calibration: Calibration, laser: Laser, origin_mm: np.ndarray, *, medium_index: float
 ) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Values (N, 8) for lines and places (N,), points, and ``of_slope`` to ``per_sigma_px``; and status (N,)."""
     frame = calibration.object_transform()
-    origin_mm = laser_pose(sensor).origin_mm
 
     def exact(line: np.ndarray, place_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         count = len(line)
@@ -155,7 +167,7 @@ def _on_sheet(
         pixels = pixels_of(np.concatenate([line, line]), places, stripe_along=calibration.stripe_along)
         found, ray, slope = rays_on_sheet(calibration, pixels, medium_index=medium_index)
         in_camera = found.points_mm[:count]
-        sigma = sheet_sigma_mm(sensor.laser, np.linalg.norm(in_camera - origin_mm, axis=1), medium_index=medium_index)
+        sigma = sheet_sigma_mm(laser, np.linalg.norm(in_camera - origin_mm, axis=1), medium_index=medium_index)
         # A sheet that moves by 1 mm moves the point along its ray by so much over the slope.
         per_mm = ray[:count] @ frame[:3, :3] / slope[:count, None]
         per_px = (found.points_mm[count:, :] - in_camera) @ frame[:3, 2] / _MOVED_PX

@@ -7,7 +7,8 @@ holds it to rounding. One is kept for every profile line.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,6 +18,10 @@ from uwlts.runtime.compiled import compiled, compiled_part
 
 _NODES = (12, 8), (24, 24)
 """Numbers of nodes along lines and places that are tried, one after another."""
+
+_KEPT, _WIDER = 16, 64
+"""Tables that are kept, of the functions asked for last, and to what multiple of lines and pixels these are widened, so
+that the next scan by the same calibration lies within them."""
 
 _WORTH = 5000
 """Places from which a table is worth making: it costs as much as some thousand of them."""
@@ -82,11 +87,28 @@ class LineTable:
         *,
         tolerance: float | np.ndarray,
         share: float = 0.0,
+        key: Hashable = None,
     ) -> LineTable | None:
-        """Table for all of the places (N,) on lines (N,) int; None also where they are too few to be worth one."""
+        """Table for all of the places (N,) on lines (N,) int; None also where they are too few to be worth one.
+
+        Of what says all about the function, as a ``key``, tables are kept. They are for some places more, so that a
+        table depends on nothing but these and the key.
+        """
         if len(line) < _WORTH or line.dtype.kind not in "iu" or not np.isfinite(place_px).all():
             return None
         lines, places_px = (int(line.min()), int(line.max())), (float(place_px.min()), float(place_px.max()))
+        if key is not None:
+            wide, wide_px = (
+                (_WIDER * math.floor(low / _WIDER), _WIDER * math.ceil(high / _WIDER))
+                for low, high in (lines, places_px)
+            )
+            known = key, wide, wide_px
+            if known not in _tables:
+                _tables[known] = cls.of(exact, wide, wide_px, tolerance=tolerance, share=share)
+                for oldest in [*_tables][:-_KEPT]:
+                    _tables.pop(oldest, None)
+            if (table := _tables.get(known)) is not None:
+                return table
         return cls.of(exact, lines, places_px, tolerance=tolerance, share=share)
 
     def combined(self, weights: np.ndarray) -> LineTable:
@@ -114,6 +136,9 @@ class LineTable:
         result = np.empty((len(line), self.terms.shape[2]))
         sum_series(*self.series(line, place_px), result)
         return result
+
+
+_tables: dict[Hashable, LineTable | None] = {}
 
 
 def _into_series(count: int) -> np.ndarray:

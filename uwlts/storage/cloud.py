@@ -103,22 +103,22 @@ class PointUncertainty:
 
     def systematic_mm2(self) -> np.ndarray:
         """Covariance (N, 6) of each point by calibration and stage."""
-        return np.stack([np.sum(self.patterns_mm[:, :, i] * self.patterns_mm[:, :, j], axis=0) for i, j in PAIRS], 1)
+        return _pairs_of(self.patterns_mm)
 
     def covariance_mm2(self) -> np.ndarray:
         """Covariance (N, 3, 3) of the coordinates of each point, of all kinds together."""
-        pairs = self.random_mm2 + self.systematic_mm2()
-        by_image = self.by_image_mm()
-        covariance = np.einsum("kni,knj->nij", by_image, by_image)
-        for column, (i, j) in enumerate(PAIRS):
-            covariance[:, i, j] += pairs[:, column]
-            if i != j:
-                covariance[:, j, i] += pairs[:, column]
-        return covariance
+        pairs = _pairs_of(self.by_image_mm()) + (self.random_mm2 + self.systematic_mm2())
+        return pairs[:, [PAIRS.index((min(i, j), max(i, j))) for i in range(3) for j in range(3)]].reshape(-1, 3, 3)
 
     def std_mm(self) -> np.ndarray:
         """Standard uncertainty (N, 3) of each coordinate, of all kinds together."""
         return np.sqrt(np.einsum("nii->ni", self.covariance_mm2()))
+
+
+def _pairs_of(parts_mm: np.ndarray) -> np.ndarray:
+    """Covariance (N, 6) of points that independent parts (M, N, 3) move; see `PAIRS`."""
+    axes = np.ascontiguousarray(parts_mm.transpose(2, 0, 1))
+    return np.stack([np.einsum("mn,mn->n", axes[i], axes[j]) for i, j in PAIRS], axis=1)
 
 
 def images_along(known: PointUncertainty, normals: np.ndarray) -> np.ndarray:

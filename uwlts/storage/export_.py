@@ -26,10 +26,11 @@ from uwlts.storage.cloud import (
     write_cloud,
 )
 from uwlts.storage.copc_file import is_copc, write_copc
+from uwlts.storage.e57_file import write_e57
 from uwlts.storage.files import refuse_unsuitable, require_possible_name, written_aside
 from uwlts.storage.import_.description import NAME
 from uwlts.storage.import_.matching import POSE_COLUMNS
-from uwlts.storage.las_file import laz_content, library
+from uwlts.storage.las_file import laz_content
 from uwlts.storage.mcap_clouds import covariance_columns, mcap_of
 from uwlts.stripe import Stripe
 
@@ -170,8 +171,9 @@ def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> N
       ``frame``, ``line``, ``deviation_mm`` and the covariance ``cov_xx_mm2`` to ``cov_zz_mm2`` the rest.
     - ``.copc.laz``: the same without times and covariances as COPC, in an octree with levels of detail.
     - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate; the
-      image as column, the line as row where both are known and below 65536. The library writes neither times nor
-      covariances.
+      image as column, the line as row where both are known and below 65536; ``timeStamp`` in 64 bits since
+      ``acquisitionStart`` where times are known; the covariance as extension, ``uwlts:cov_xx_mm2`` to
+      ``uwlts:cov_zz_mm2``.
     - ``.mcap``: messages sensor_msgs/msg/PointCloud2 of ROS 2, and where the name ends with ``.foxglove.mcap``
       foxglove.PointCloud; one for each image where the points' times are known (`uwlts.storage.mcap_clouds`).
 
@@ -210,23 +212,14 @@ def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> N
 
 
 def _write_e57(cloud: PointCloud, aside: Path, path: Path) -> None:
-    pye57 = library("pye57", "E57")
     unknown = np.isnan(cloud.intensity)
     if unknown.any() and not unknown.all():
         raise OutputError(
             f"{np.count_nonzero(unknown)} of {len(cloud)} points have no intensity, which E57 as written here cannot "
             "mark: write PLY, XYZ or LAZ"
         )
-    # Rounded before, so that the bounds in the file hold for the numbers in the file.
-    columns = (1e-3 * cloud.points_mm).astype(np.float32).astype(np.float64).T
-    data: dict[str, np.ndarray] = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), columns, strict=True))
-    if not unknown.any():
-        data["intensity"] = cloud.intensity
+    columns = {} if unknown.any() else {"intensity": cloud.intensity}
     if all(numbers.min() >= 0 and numbers.max() < 2**16 for numbers in (cloud.frame, cloud.line)):
-        data |= {"columnIndex": cloud.frame.astype(np.uint16), "rowIndex": cloud.line.astype(np.uint16)}
-    try:
-        file = pye57.E57(str(aside), mode="w")
-        file.write_scan_raw(data, name=path.stem)
-        file.close()
-    except pye57.libe57.E57Exception as error:
-        raise OutputError(f"cannot write {path}: {' '.join(str(error).split())[:200]}") from error
+        columns |= {"columnIndex": cloud.frame.astype(np.uint16), "rowIndex": cloud.line.astype(np.uint16)}
+    further = covariance_columns(cloud)
+    write_e57(aside, cloud.points_mm, columns, name=path.stem, time_s=cloud.time_s, further=further)

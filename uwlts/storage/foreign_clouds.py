@@ -11,6 +11,7 @@ import numpy as np
 
 from uwlts.model.errors import CaptureError, DescriptionError
 from uwlts.model.input_file import opened
+from uwlts.storage.e57_file import read_e57
 from uwlts.storage.las_file import library
 from uwlts.storage.pose_files import read_columns
 
@@ -44,7 +45,10 @@ def read_foreign(path: Path) -> ForeignPoints:
     suffix = path.suffix.lower()
     if suffix in TEXT_FORMATS:
         return _read_text(path)
-    return _read_las(path, start) if suffix == ".las" else _read_e57(path)
+    if suffix == ".las":
+        return _read_las(path, start)
+    found = read_e57(path)
+    return ForeignPoints(found.points_mm, found.intensity, time_s=found.time_s)
 
 
 def _read_text(path: Path) -> ForeignPoints:
@@ -91,7 +95,7 @@ def _read_las(path: Path, start: bytes) -> ForeignPoints:
         struct.error,
         laspy.errors.LaspyException,
     ) as error:
-        raise CaptureError(f"{path} is not a complete LAS file: {_brief(error)}") from error
+        raise CaptureError(f"{path} is not a complete LAS file: {' '.join(str(error).split())[:200]}") from error
     times = column.get("gps_time")
     return ForeignPoints(
         points,
@@ -102,26 +106,3 @@ def _read_las(path: Path, start: bytes) -> ForeignPoints:
         # Programs leave it 0 where they know no times.
         None if times is None or not times.any() else times,
     )
-
-
-def _read_e57(path: Path) -> ForeignPoints:
-    pye57 = library("pye57", "E57")
-    try:
-        file = pye57.E57(str(path))
-        try:
-            scans = [
-                file.read_scan(number, intensity=True, ignore_missing_fields=True) for number in range(file.scan_count)
-            ]
-        finally:
-            file.close()
-    except (pye57.libe57.E57Exception, OSError, RuntimeError, ValueError, KeyError, MemoryError) as error:
-        raise CaptureError(f"{path} is not a complete E57 file: {_brief(error)}") from error
-    if not scans:
-        raise CaptureError(f"{path} is an E57 file without scans")
-    points = 1e3 * np.concatenate([np.column_stack([scan[f"cartesian{axis}"] for axis in "XYZ"]) for scan in scans])
-    lit = all("intensity" in scan for scan in scans)
-    return ForeignPoints(points, np.concatenate([scan["intensity"] for scan in scans]) if lit else None)
-
-
-def _brief(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]

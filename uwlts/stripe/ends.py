@@ -55,11 +55,12 @@ def _half_lit(good: np.ndarray, centre: np.ndarray, *, lines: int, jump_px: floa
     place = centre[found]
     # Breaks stand before these of the lines found, and after all of them.
     apart = (found[1:] - found[:-1] > _SHORT_GAP + 1) | (np.abs(place[1:] - place[:-1]) > jump_px)
-    breaks = 1 + np.flatnonzero(apart)
+    breaks = (1 + np.flatnonzero(apart)).tolist()
     if found[0] > _SHORT_GAP:
-        breaks = np.append(breaks, 0)
+        breaks.append(0)
     if len(good) - 1 - found[-1] > _SHORT_GAP:
-        breaks = np.append(breaks, len(found))
+        breaks.append(len(found))
     beside = np.zeros(len(found) + 2 * lines, np.bool_)
-    beside[np.add.outer(breaks, np.arange(2 * lines))] = True
+    for each in breaks:
+        beside[each : each + 2 * lines] = True
     return found[beside[lines : lines + len(found)]]

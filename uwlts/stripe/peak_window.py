@@ -117,8 +117,12 @@ class PeakWindow(NamedTuple):
 def cut(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> None:
     """Pixels of one of the profiles (N, L) from `start` on, the border pixel repeated beyond the border."""
     last = profiles.shape[0] - 1
-    for k in range(out.size):
-        out[k] = profiles[min(max(start + k, 0), last), line]
+    if start >= 0 and start + out.size - 1 <= last:
+        for k in range(out.size):
+            out[k] = profiles[start + k, line]
+    else:
+        for k in range(out.size):
+            out[k] = profiles[min(max(start + k, 0), last), line]
 
 
 @compiled_part

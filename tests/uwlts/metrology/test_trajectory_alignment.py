@@ -16,6 +16,9 @@ SEED = 5
 LOOP_MM = np.array([[0, 0], [1100, 0], [1100, 700], [450, 700], [450, -500]], float)
 """Of 4 m, with one crossing at (450, 0)."""
 
+RACE_MM = np.array([[-200, 0], [700, 0], [700, 600], [-200, 600], [-200, 0], [500, 0]], float)
+"""Ends where it began, in the same direction."""
+
 
 def position_errors(found: Trajectory, true: Trajectory) -> float:
     """Root mean square distance of the positions from the true ones."""
@@ -37,6 +40,12 @@ def loop():
     return ride(np.random.default_rng(SEED), LOOP_MM, drift_mm=60.0, drift_deg=0.3)
 
 
+@pytest.fixture(scope="module")
+def closed(loop):
+    cloud, reported, _ = loop
+    return uwlts.align_trajectory(cloud, reported, drift_mm=60.0, drift_deg=0.3)
+
+
 def test_shifts_are_found_in_heights_with_gaps():
     rng = np.random.default_rng(SEED)
     x, y = rng.uniform(0, 300, (2, 40_000))
@@ -47,9 +56,8 @@ def test_shifts_are_found_in_heights_with_gaps():
     np.testing.assert_allclose(found[0], [37.0, -52.0, 11.0], atol=4.0)
 
 
-def test_a_loop_is_closed(loop):
-    cloud, reported, true = loop
-    found = uwlts.align_trajectory(cloud, reported, drift_mm=60.0, drift_deg=0.3)
+def test_a_loop_is_closed(loop, closed):
+    (_, reported, true), found = loop, closed
     assert found.crossings
     for each in found.crossings:
         assert each.held_out_after_mm < 0.02 * each.held_out_before_mm
@@ -61,14 +69,46 @@ def test_a_loop_is_closed(loop):
     after = crossing_errors(found.trajectory, true, best.times_s, places)
     assert before.min() > 10 and after.max() < 1.0
     assert position_errors(found.trajectory, true) < position_errors(reported, true) / 3
+    for time in best.times_s:
+        # Five standard deviations: a component of a pass fails once in two million rides.
+        k = int(np.argmin(np.abs(true.times_s - time)))
+        error = (found.trajectory.poses - true.poses)[k, :3, 3]
+        assert (np.abs(error) < 5 * np.sqrt(np.diag(found.trajectory.covariance[k])[:3])).all()
     # The start is the frame's, and what a crossing tells lowers the uncertainty of what came before it.
     std = np.sqrt(np.einsum("nii->ni", found.trajectory.covariance))
     assert std[0, :3].max() < 0.1 and (std[:, :3] < 60).all()
 
 
-def test_the_corrected_cloud_is_that_of_the_corrected_trajectory(loop):
-    cloud, reported, _ = loop
-    found = uwlts.align_trajectory(cloud, reported, drift_mm=60.0, drift_deg=0.3)
+@pytest.mark.slow
+def test_a_surface_that_fits_in_many_places_is_refused():
+    # Equal stones each 60 mm; the navigation is off by about 40 mm where the path crosses itself.
+    def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 8 * np.cos(2 * np.pi * x / 60) * np.cos(2 * np.pi * y / 60)
+
+    drift = {"drift_mm": 60.0, "drift_deg": 0.3}
+    cloud, reported, _ = ride(np.random.default_rng(SEED), LOOP_MM, ground=ground, **drift)
+    with pytest.raises(uwlts.Error, match="fits in several places"):
+        uwlts.align_trajectory(cloud, reported, **drift)
+
+
+@pytest.mark.slow
+def test_along_a_ridge_the_navigation_is_all_that_is_known():
+    def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 60 * np.exp(-(y**2) / (2 * 60**2)) + 0 * x
+
+    drift = {"drift_mm": 4.0, "drift_deg": 0.05}
+    cloud, reported, true = ride(np.random.default_rng(SEED), RACE_MM, ground=ground, **drift)
+    found = uwlts.align_trajectory(cloud, reported, **drift).trajectory
+    std = np.sqrt(np.einsum("ii->i", found.covariance[-1]))
+    # Over the start again: along the ridge the navigation's 4 mm stay, less what the kind of drift tells.
+    assert std[0] > 3.0 and (std[1:3] < 0.5).all()
+    error = (found.poses - true.poses)[-1, :3, 3]
+    assert (np.abs(error) < 5 * std[:3]).all()
+    assert np.abs((reported.poses - true.poses)[-1, :3, 3]).min() > 1.0
+
+
+def test_the_corrected_cloud_is_that_of_the_corrected_trajectory(loop, closed):
+    (cloud, reported, _), found = loop, closed
     local = np.einsum(
         "nij,nj->ni", np.linalg.inv(reported.poses_at(cloud.time_s)), np.c_[cloud.points_mm, np.ones(len(cloud))]
     )

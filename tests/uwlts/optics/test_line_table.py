@@ -49,6 +49,46 @@ def test_terms_are_left_out_up_to_an_error():
     assert 1e-6 < off.max() <= 2e-4
 
 
+def test_a_table_is_kept_for_the_next_places_of_the_same_function():
+    """Those that lie within the same multiples of 64, whichever came first; another function has another one."""
+    calls = []
+
+    def counted(line, place):
+        calls.append(len(line))
+        return waves(line, place)
+
+    def table(seed, key, *, places=(70.0, 500.0)):
+        rng = np.random.default_rng(seed)
+        line, place = rng.integers(5, 1200, 6000), rng.uniform(*places, 6000)
+        found = LineTable.about(counted, line, place, tolerance=1e-10, key=key)
+        assert found is not None
+        np.testing.assert_allclose(found.values(line, place), waves(line, place), rtol=0, atol=1e-9)
+        return found
+
+    first = table(1, "waves")
+    count = len(calls)
+    assert table(2, "waves") is first and len(calls) == count
+    assert table(1, "other waves") is not first and table(1, None) is not first
+    wider = table(3, "waves", places=(70.0, 600.0))
+    assert wider is not first and table(4, "waves") is first
+    # The oldest are forgotten.
+    for number in range(20):
+        table(5, number)
+    assert table(1, "waves") is not first
+
+
+def test_where_the_wider_table_would_reach_too_far_it_is_for_the_places_alone():
+    def up_to_500(line, place):
+        return np.where(place[:, None] <= 500.0, waves(line, place), np.nan)
+
+    rng = np.random.default_rng(8)
+    line, place = rng.integers(0, 1280, 6000), rng.uniform(70.0, 500.0, 6000)
+    for _ in range(2):
+        table = LineTable.about(up_to_500, line, place, tolerance=1e-10, key="up to 500")
+        assert table is not None and table.high_px <= 500.0
+        np.testing.assert_allclose(table.values(line, place), waves(line, place), rtol=0, atol=1e-9)
+
+
 def test_the_error_is_a_share_of_each_value_where_that_is_more():
     def large(line, place):
         return waves(line, place) * [1e8, 1.0]

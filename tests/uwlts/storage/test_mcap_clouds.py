@@ -1,5 +1,7 @@
 """Time, image and covariance of each point in exchange formats, read back by the formats' own libraries."""
 
+from dataclasses import replace
+
 import laspy
 import numpy as np
 import pye57
@@ -11,6 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import uwlts
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.e57_file import write_e57
 from uwlts.storage.export_ import export_cloud
 
 FIELDS = ("x", "y", "z", "intensity", "frame", "line", "time")
@@ -119,13 +122,43 @@ def test_laz_has_time_image_and_covariance(cloud, tmp_path):
     assert_same(cloud, table | {a: (1e-3 * cloud.points_mm)[:, k] for k, a in enumerate("xyz")})
 
 
-def test_e57_has_image_and_line(cloud, tmp_path):
+def test_e57_has_time_image_and_covariance(cloud, tmp_path):
     export_cloud(cloud, tmp_path / "a.e57")
-    file = pye57.E57(str(tmp_path / "a.e57"))
-    found = file.read_scan_raw(0)
-    file.close()
-    np.testing.assert_array_equal(found["columnIndex"], cloud.frame)
-    np.testing.assert_array_equal(found["rowIndex"], cloud.line)
+    names = {"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ", "intensity": "intensity"}
+    names |= {"frame": "columnIndex", "line": "rowIndex", "time": "timeStamp"}
+    names |= {name: f"uwlts:{name}" for name in (f"cov_{'xyz'[i]}{'xyz'[j]}_mm2" for i, j in PAIRS)}
+    table = {name: np.zeros(len(cloud), np.float64) for name in names}
+    with pye57.E57(str(tmp_path / "a.e57")) as file:
+        header, buffers = file.get_header(0), pye57.libe57.VectorSourceDestBuffer()
+        for name, field in names.items():
+            buffers.append(pye57.libe57.SourceDestBuffer(file.image_file, field, table[name], len(cloud), True, True))
+        assert header.points.reader(buffers).read() == len(cloud)
+        start = file.data3d[0]["acquisitionStart"]["dateTimeValue"].value()
+        assert file.image_file.extensionsPrefix(1) == "uwlts"
+    assert table["time"].min() >= 0
+    assert_same(cloud, table | {"time": start + table["time"]})
+
+
+def test_e57_gives_its_times_back(cloud, tmp_path):
+    for number, times in enumerate((cloud.time_s, cloud.time_s - 1.7e9 - 0.3, None)):
+        path = tmp_path / f"{number}.e57"
+        export_cloud(replace(cloud, time_s=times), path)
+        again = uwlts.read_cloud(path)
+        np.testing.assert_allclose(again.points_mm, cloud.points_mm, atol=2e-5)
+        assert (again.time_s is None) == (times is None)
+        if times is not None:
+            # Whole seconds and a fraction as doubles: the difference and the sum round by 2e-16 of a few seconds.
+            np.testing.assert_allclose(again.time_s, times, rtol=0, atol=1e-14)
+
+
+def test_e57_times_that_are_marked_invalid_are_not_known(cloud, tmp_path):
+    columns = {"isTimeStampInvalid": (np.arange(len(cloud)) % 7 == 0).astype(np.uint8)}
+    write_e57(tmp_path / "a.e57", cloud.points_mm, columns, name="a", time_s=cloud.time_s)
+    assert uwlts.read_cloud(tmp_path / "a.e57").time_s is None
+    columns = {"cartesianInvalidState": columns["isTimeStampInvalid"]}
+    write_e57(tmp_path / "b.e57", cloud.points_mm, columns, name="b", time_s=cloud.time_s)
+    placed = np.arange(len(cloud)) % 7 > 0
+    np.testing.assert_array_equal(uwlts.read_cloud(tmp_path / "b.e57").time_s, cloud.time_s[placed])
 
 
 def test_ply_has_time_image_and_covariance(cloud, tmp_path):

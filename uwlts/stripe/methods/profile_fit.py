@@ -7,6 +7,7 @@ flanks then locate a stripe better than its bright middle, where the profile is 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -77,13 +78,23 @@ def centres(peak: PeakWindow) -> np.ndarray:
     noise = max(_LEAST_NOISE, math.sqrt(0.5 * (low + high) / _MEDIAN_MEAN_SQUARE))
     groups, most = -(-peak.start.size // _LANES), int(peak.reach.max())
     # Flat rows, of which the compiler knows that their parts do not overlap.
-    signal = np.empty((groups, (2 * most + 1) * _LANES), np.float32)
-    known, sums = np.empty((groups, _KNOWN * _LANES), np.float32), np.empty(14 * _LANES, np.float32)
+    signal, known, sums = _aligned((groups, 2 * most + 1), (groups, _KNOWN), (1, 14))
     centre, flat = np.empty(peak.start.size, np.float32), np.empty(peak.start.size, np.bool_)
-    _fit(peak, noise, sampled, signal, known, sums, centre, flat)
+    _fit(peak, noise, sampled, signal, known, sums[0], centre, flat)
     if flat.any():
         centre[flat] = quadratic.centres(peak.keep(flat))
     return centre
+
+
+def _aligned(*shapes: tuple[int, int]) -> Iterator[np.ndarray]:
+    """Arrays (G, K lanes) for shapes (G, K) that begin where vector units read fastest: elsewhere a fit takes a third
+    longer."""
+    sizes = [groups * count * _LANES for groups, count in shapes]
+    room = np.empty(sum(sizes) + _LANES, np.float32)
+    first = -(room.__array_interface__["data"][0] // room.itemsize) % _LANES
+    for (groups, count), size in zip(shapes, sizes, strict=True):
+        yield room[first : first + size].reshape(groups, count * _LANES)
+        first += size
 
 
 @compiled

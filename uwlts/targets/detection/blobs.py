@@ -1,6 +1,5 @@
 """Closed bright or dark blobs of an unevenly lit image, as candidates for the images of circles."""
 
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -40,7 +39,7 @@ class Blobs:
 
 
 def checked_grey(image):
-    """Return `image` unchanged if it is an (H, W) array of uint8 or uint16, else raise `ImageError`."""
+    """The image as a read-only array (H, W), `ImageError` if it is not of uint8 or uint16."""
     if not isinstance(image, np.ndarray):
         raise ImageError(f"the image is a {type(image).__name__}; expected a NumPy array (H, W) of uint8 or uint16")
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16) or min(image.shape) < 16:
@@ -49,7 +48,10 @@ def checked_grey(image):
             f"the image has {size} pixels, {image.ndim} dimensions and the type {image.dtype}; expected one grey "
             "channel (H, W) of uint8 or uint16, at least 16 x 16: convert colour images first"
         )
-    return image
+    # Compiled code is made once for arrays that can be written and once more for others.
+    grey = np.ascontiguousarray(image).view()
+    grey.flags.writeable = False
+    return grey
 
 
 def noise_level(image):
@@ -58,13 +60,24 @@ def noise_level(image):
     The mask of Immerkaer (Fast noise variance estimation, CVIU 64, 1996, eq. 2) cancels linear shading and has norm 6.
     Its lower fifth is used instead of its mean because a fine pattern puts an edge into most neighbourhoods.
     """
-    # One row in four is enough for a quantile.
-    rows = image[: 4 * ((len(image) - 2) // 4) + 3].astype(np.int32)
-    rows = rows[0:-2:4] - 2 * rows[1:-1:4] + rows[2::4]
-    response = np.abs(rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:])
-    lower_fifth = np.searchsorted(np.cumsum(np.bincount(response.ravel())), 0.2 * response.size)
+    counts = np.zeros(8 * np.iinfo(image.dtype).max + 1, np.int64)
+    _count_responses(image, counts)
+    lower_fifth = np.searchsorted(np.cumsum(counts), 0.2 * counts.sum())
     lower_fifth_of_unit_normal = 0.2533
     return float(lower_fifth) / (6 * lower_fifth_of_unit_normal)
+
+
+@compiled
+def _count_responses(image, counts):
+    """Count how often the mask's response has each size; one row in four is enough for a quantile."""
+    for v in range(0, image.shape[0] - 2, 4):
+        above, middle, below = image[v], image[v + 1], image[v + 2]
+        before = np.int64(above[0]) - 2 * np.int64(middle[0]) + np.int64(below[0])
+        here = np.int64(above[1]) - 2 * np.int64(middle[1]) + np.int64(below[1])
+        for u in range(2, image.shape[1]):
+            after = np.int64(above[u]) - 2 * np.int64(middle[u]) + np.int64(below[u])
+            counts[abs(before - 2 * here + after)] += 1
+            before, here = here, after
 
 
 def find_blobs(image, noise):
@@ -82,16 +95,16 @@ def find_blobs(image, noise):
     floor = max(CONTRAST_OVER_NOISE * noise, CONTRAST_OVER_RANGE * (high - low))
     smooth = cv2.medianBlur(image, 3)
     # All pixels are above -1.
-    _, mean = _above(smooth, np.full(_blocks(smooth), -1, np.float32))
+    _, mean = _above(smooth, np.full([-(-size // BLOCK_PX) for size in smooth.shape], -1, np.float32))
     best, best_score = Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), True), (0, 0.0)
+    sides, wide = np.empty((2, *smooth.shape), np.uint8), np.empty((2, 2, BLOCK_PX * mean.shape[1]), np.float32)
     for window in WINDOWS_PX:
         if window > WINDOWS_PX[0] and window > max(image.shape):
             break
-        sides = np.empty((2, *smooth.shape), np.uint8)
-        threshold, contrast = map(_widened, _local_levels(smooth, mean, window))
-        _set_sides(smooth, threshold, contrast, np.float32(floor), sides[0], sides[1])
+        threshold, contrast = _local_levels(smooth, mean, window)
+        _set_sides(smooth, threshold, contrast, np.float32(floor), wide, sides[0], sides[1])
         for bright, side in zip((True, False), sides, strict=True):
-            blobs = _ellipse_like(side, bright=bright)
+            blobs = _ellipse_like(side, bright=bright, fewest=best_score[0])
             radii = np.sqrt(np.linalg.det(blobs.shapes))
             score = _largest_family(radii), -float(np.median(radii)) if len(radii) else 0.0
             if score > best_score:
@@ -121,32 +134,37 @@ def _local_mean(blocks, window):
 def _above(smooth, threshold):
     """Of each block the share of pixels above the threshold, interpolated between blocks, and their sum over all."""
     share, above = np.empty_like(threshold), np.empty_like(threshold)
-    wide = _widened(threshold)
-    _sum_above(smooth, wide, np.empty((2, wide.shape[1]), np.float32), share, above)
+    wide, sums = np.empty((2, 2, BLOCK_PX * threshold.shape[1]), np.float32)
+    _sum_above(smooth, threshold, wide, sums, share, above)
     return share, above
 
 
-def _blocks(image):
-    """Numbers of blocks along both sides of an image; the last ones may be smaller."""
-    return tuple(-(-size // BLOCK_PX) for size in image.shape)
+@compiled_part
+def _between(blocks, v, wide):
+    """Rows of blocks on either side of a row of pixels, interpolated for each column, and the share of the second one.
 
-
-def _widened(blocks):
-    """Values of blocks interpolated along their rows, for each column of pixels."""
-    rows, columns = blocks.shape
-    return cv2.resize(blocks, (BLOCK_PX * columns, rows), interpolation=cv2.INTER_LINEAR)
+    To be called for all rows of pixels in turn; ``wide`` keeps both rows of blocks.
+    """
+    top = (v + BLOCK_PX // 2) // BLOCK_PX - 1
+    if v == 0:
+        _widen(blocks[0], wide[top & 1])
+    if v == 0 or v % BLOCK_PX == BLOCK_PX // 2:
+        _widen(blocks[min(top + 1, blocks.shape[0] - 1)], wide[(top + 1) & 1])
+    return wide[top & 1], wide[(top + 1) & 1], np.float32((v + 0.5) / BLOCK_PX - 0.5 - top)
 
 
 @compiled_part
-def _between(count, v):
-    """Rows of blocks, of so many, on either side of a row of pixels, and the share of the second one."""
-    at = (v + 0.5) / BLOCK_PX - 0.5
-    top = math.floor(at)
-    return max(top, 0), min(top + 1, count - 1), np.float32(at - top)
+def _widen(blocks, wide):
+    """Values of a row of blocks, those at its ends repeated beyond them, interpolated for each column of pixels."""
+    far, near, last = np.float32(0.375), np.float32(0.125), blocks.size - 1
+    for c in range(last + 1):
+        before, after = blocks[max(c - 1, 0)] - blocks[c], blocks[min(c + 1, last)] - blocks[c]
+        wide[4 * c], wide[4 * c + 1] = blocks[c] + far * before, blocks[c] + near * before
+        wide[4 * c + 2], wide[4 * c + 3] = blocks[c] + near * after, blocks[c] + far * after
 
 
 @compiled
-def _sum_above(smooth, threshold, sums, share, above):
+def _sum_above(smooth, threshold, wide, sums, share, above):
     height, width = smooth.shape
     number, total = sums[0], sums[1]
     for block in range(share.shape[0]):
@@ -154,8 +172,8 @@ def _sum_above(smooth, threshold, sums, share, above):
         for u in range(width):
             number[u], total[u] = np.float32(0.0), np.float32(0.0)
         for v in range(first, last):
-            top, bottom, part = _between(share.shape[0], v)
-            pixels, upper, lower = smooth[v], threshold[top], threshold[bottom]
+            upper, lower, part = _between(threshold, v, wide)
+            pixels = smooth[v]
             for u in range(width):
                 grey = np.float32(pixels[u])
                 is_above = np.float32(grey > upper[u] + part * (lower[u] - upper[u]))
@@ -170,12 +188,12 @@ def _sum_above(smooth, threshold, sums, share, above):
 
 
 @compiled
-def _set_sides(smooth, threshold, contrast, floor, bright, dark):
+def _set_sides(smooth, threshold, contrast, floor, wide, bright, dark):
     """Masks (H, W) of what is brighter and of what is darker than the threshold, where there is contrast."""
     for v in range(smooth.shape[0]):
-        top, bottom, part = _between(threshold.shape[0], v)
+        upper, lower, part = _between(threshold, v, wide[0])
+        above, below, part = _between(contrast, v, wide[1])
         pixels, is_bright, is_dark = smooth[v], bright[v], dark[v]
-        upper, lower, above, below = threshold[top], threshold[bottom], contrast[top], contrast[bottom]
         for u in range(pixels.size):
             level = upper[u] + part * (lower[u] - upper[u])
             clear = above[u] + part * (below[u] - above[u]) > floor
@@ -183,14 +201,18 @@ def _set_sides(smooth, threshold, contrast, floor, bright, dark):
             is_dark[u] = clear & (np.float32(pixels[u]) < level)
 
 
-def _ellipse_like(mask, *, bright):
-    """Blobs of a 0/1 mask whose outline encloses the area of the ellipse with the same moments."""
+def _ellipse_like(mask, *, bright, fewest=0):
+    """Blobs of a 0/1 mask whose outline encloses the area of the ellipse with the same moments.
+
+    None where there would be less than the ``fewest``.
+    """
     height, width = mask.shape
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     lengths = np.fromiter(map(len, contours), int, len(contours))
     # The outline of the largest circle that fits into the image has less than four times its shorter side.
     chosen = np.flatnonzero((lengths >= 8) & (lengths <= 4 * min(height, width)))
     chosen = chosen[hierarchy[0, chosen, 3] < 0] if len(contours) else chosen
+    chosen = chosen[: len(chosen) if len(chosen) >= fewest else 0]
     found = np.empty((len(chosen), 7))
     if len(chosen):
         ends = np.cumsum(lengths[chosen])

@@ -17,6 +17,7 @@ MAX_REACH_PX = 8.0
 MIN_RELATIVE_CONTRAST = 0.25
 NEIGHBOURS = 12  # their levels show the shading
 MAX_LEVEL_DEPARTURE = 0.25  # a neighbour that differs by more differs by its print, or is no circle
+_ON_A_LINE = 1e-3  # ratio of squares across and along a line, below which places lie on it
 MAX_SHIFT_PX = 0.5  # a centroid further from the ellipse's centre has something other than a circle in its band
 PROFILES = 48  # around a blob
 SAMPLES = 11  # on each profile
@@ -35,7 +36,7 @@ def area_centroids(grey, ellipses):
     has no influence.
 
     Returns centres (N, 2) in px and whether (N,) the centroid is next to the centre of the ellipse fitted to the edge;
-    where not, the ellipse's centre is given. ``grey`` is float32 (H, W).
+    where not, the ellipse's centre is given. ``grey`` is the image (H, W).
     """
     centres, agree = ellipses.centres, np.ones(len(ellipses), bool)
     reaches = _reaches(grey.shape, ellipses)
@@ -69,27 +70,62 @@ def _level_planes(grey, centres, shapes, reaches):
     The slopes are those of the levels of neighbouring blobs: levels read around a single one, close to a blurred edge,
     slope with the edge's tail, which reaches further on one side where the plate is inclined.
     """
-    rim, normals = _rims(shapes)
     planes = np.zeros((len(centres), 2, 3))
-    near = KDTree(centres).query(centres, k=min(NEIGHBOURS + 1, len(centres)))[1] if len(centres) > 1 else None
-    for side, reach in enumerate((-reaches[0], reaches[1])):
-        offsets = rim + normals * reach[:, None, None]
-        planes[:, side, 0] = sample(grey, centres[:, None] + offsets).mean(1)
-        if near is not None:
-            planes[:, side, 1:] = _slopes(centres, planes[:, side, 0], near)
+    inner, outer = reaches
+    _mean_levels(grey, centres, shapes, np.linalg.inv(shapes), inner, outer, DIRECTIONS, planes)
+    if len(centres) > 1:
+        near = KDTree(centres).query(centres, k=min(NEIGHBOURS + 1, len(centres)))[1]
+        _fit_slopes(centres, np.asarray(near), planes)
     return planes
 
 
-def _slopes(places, values, near):
-    """Slopes (N, 2) of planes through values (N,) at each of the places (N, 2) and at those ``near`` it (N, K)."""
-    alike = np.abs(values[near] - values[:, None]) <= MAX_LEVEL_DEPARTURE * np.abs(values[:, None])
-    weights = alike / alike.sum(1, keepdims=True)
-    at, level = places[near], values[near]
-    at = at - np.einsum("nk,nki->ni", weights, at)[:, None]
-    level = level - np.einsum("nk,nk->n", weights, level)[:, None]
-    spread = np.einsum("nk,nki,nkj->nij", weights, at, at)
-    # Of places on one line the slope along it is all that they tell.
-    return np.einsum("nij,nj->ni", np.linalg.pinv(spread, rcond=1e-3), np.einsum("nk,nki,nk->ni", weights, at, level))
+@compiled
+def _mean_levels(grey, centres, shapes, inverses, inner, outer, directions, planes):
+    """Set the levels (N, 2) along the rims of ellipses, so far inwards and outwards from them."""
+    around = directions.shape[0]
+    for n in range(len(centres)):
+        shape, inverse, inside, outside = shapes[n], inverses[n], 0.0, 0.0
+        for p in range(around):
+            e_u, e_v = directions[p, 0], directions[p, 1]
+            at_u = centres[n, 0] + shape[0, 0] * e_u + shape[0, 1] * e_v
+            at_v = centres[n, 1] + shape[0, 1] * e_u + shape[1, 1] * e_v
+            n_u, n_v = inverse[0, 0] * e_u + inverse[0, 1] * e_v, inverse[0, 1] * e_u + inverse[1, 1] * e_v
+            length = math.sqrt(n_u * n_u + n_v * n_v)
+            n_u, n_v = n_u / length, n_v / length
+            inside += _bilinear(grey, at_u - inner[n] * n_u, at_v - inner[n] * n_v)
+            outside += _bilinear(grey, at_u + outer[n] * n_u, at_v + outer[n] * n_v)
+        planes[n, 0, 0], planes[n, 1, 0] = inside / around, outside / around
+
+
+@compiled
+def _fit_slopes(places, near, planes):
+    """Fill the slopes of planes through the values at each of the places (N, 2) and at those ``near`` it (N, K).
+
+    Of places on one line the slope along it is all that they tell.
+    """
+    for n in range(len(places)):
+        for side in range(2):
+            value = planes[n, side, 0]
+            count, su, sv, sz, uu, uv, vv, uz, vz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for k in near[n]:
+                z = planes[k, side, 0] - value
+                if abs(z) <= MAX_LEVEL_DEPARTURE * abs(value):
+                    u, v = places[k, 0] - places[n, 0], places[k, 1] - places[n, 1]
+                    count, su, sv, sz = count + 1.0, su + u, sv + v, sz + z
+                    uu, uv, vv, uz, vz = uu + u * u, uv + u * v, vv + v * v, uz + u * z, vz + v * z
+            uu, uv, vv = uu - su * su / count, uv - su * sv / count, vv - sv * sv / count
+            uz, vz = uz - su * sz / count, vz - sv * sz / count
+            determinant, middle = uu * vv - uv * uv, 0.5 * (uu + vv)
+            largest = middle + math.sqrt(max(middle * middle - determinant, 0.0))
+            if determinant > _ON_A_LINE * largest * largest:
+                slope_u, slope_v = (vv * uz - uv * vz) / determinant, (uu * vz - uv * uz) / determinant
+            else:
+                # By the direction along which the places lie, whose squares add up to the largest.
+                least = 2.0 * middle - largest
+                scale = 1.0 / (largest * max(largest - least, 1e-300)) if largest > 0.0 else 0.0
+                slope_u = scale * ((uu - least) * uz + uv * vz)
+                slope_v = scale * (uv * uz + (vv - least) * vz)
+            planes[n, side, 1], planes[n, side, 2] = slope_u, slope_v
 
 
 def _centroids(grey, centres, shapes, reaches, planes):
@@ -108,6 +144,7 @@ def _sum_shares(grey, centres, inner, outer, planes, result):
         q, (centre_u, centre_v) = outer[n], centres[n]
         (inside, inside_u, inside_v), (outside, outside_u, outside_v) = planes[n]
         area, sum_u, sum_v = 0.0, 0.0, 0.0
+        sign, least = math.copysign(1.0, inside - outside), MIN_RELATIVE_CONTRAST * abs(inside - outside)
         half_height = math.sqrt(q[0, 0] / (q[0, 0] * q[1, 1] - q[0, 1] * q[0, 1]))
         top, bottom = math.ceil(centre_v - half_height), math.floor(centre_v + half_height)
         for v in range(max(top, 0), min(bottom + 1, height)):
@@ -125,10 +162,10 @@ def _sum_shares(grey, centres, inner, outer, planes, result):
                 u = band if band < whole_from else band + whole
                 du = u - centre_u
                 dark = outside + outside_u * du + outside_v * dv
-                relative = (inside + inside_u * du + inside_v * dv - dark) / (inside - outside)
+                contrast = sign * (inside + inside_u * du + inside_v * dv - dark)
                 # Planes that meet within the band belong to no circle; their share stays finite, and the centre shows
                 # it.
-                share = (grey[v, u] - dark) / (max(relative, MIN_RELATIVE_CONTRAST) * (inside - outside))
+                share = sign * (grey[v, u] - dark) / max(contrast, least)
                 area, sum_u, sum_v = area + share, sum_u + share * du, sum_v + share * dv
         result[n, 0], result[n, 1] = centre_u + sum_u / area, centre_v + sum_v / area
 
@@ -199,7 +236,7 @@ def fit_ellipses(grey, blobs, noise):
     an uneven contrast and are left out; nothing is downweighted. Where the image is out of focus, the edge is sampled
     over a longer distance.
 
-    ``grey`` is the image (H, W) in float32, ``noise`` that of a pixel; possibly no ellipse is accepted.
+    ``grey`` is the image (H, W), ``noise`` that of a pixel; possibly no ellipse is accepted.
     """
     best = _fitted(grey, blobs, REACHES_PX[0], noise)
     for reach in REACHES_PX[1:]:
@@ -210,7 +247,7 @@ def fit_ellipses(grey, blobs, noise):
 
 
 def _fitted(grey, blobs, reach, noise):
-    """Ellipses of a float32 image (H, W) with edges sampled over one reach in px."""
+    """Ellipses of an image (H, W) with edges sampled over one reach in px."""
     found = Ellipses(blobs.centres, blobs.shapes, blobs.bright, *np.zeros((3, len(blobs))))
     found = found[_inside(grey.shape, found, reach)]
     for _ in range(PASSES):
@@ -231,12 +268,6 @@ def _inside(shape, ellipses, reach):
     half_width = np.sqrt((ellipses.shapes**2).sum(2)) + reach
     limit = np.array([shape[1], shape[0]]) - 1.001
     return (ellipses.centres - half_width >= 0).all(1) & (ellipses.centres + half_width <= limit).all(1)
-
-
-def _rims(shapes):
-    """Points of the rims of ellipses about their centres, and the normals there, both (N, PROFILES, 2)."""
-    normals = DIRECTIONS @ np.linalg.inv(shapes)
-    return DIRECTIONS @ shapes, normals / np.linalg.norm(normals, axis=2, keepdims=True)
 
 
 def _moved(grey, ellipses, longest, noise):
@@ -352,10 +383,10 @@ def find_circles(image):
     The image is (H, W) of uint8 or uint16, ImageError for others. Centres are centroids of the covered area, in px
     (u, v); possibly none are found.
     """
-    grey = checked_grey(image).astype(np.float32)
+    grey = checked_grey(image)
     # Half a grey level covers an image without noise, whose only disturbance is its rounding.
-    noise = max(noise_level(image), 0.5)
-    ellipses = fit_ellipses(grey, find_blobs(image, noise), noise)
+    noise = max(noise_level(grey), 0.5)
+    ellipses = fit_ellipses(grey, find_blobs(grey, noise), noise)
     centres, agree = area_centroids(grey, ellipses)
     return replace(ellipses, centres=centres)[agree]
 
@@ -366,7 +397,7 @@ def mark_strength(image, circles, *, mark_over_circle):
     (ring - dot) / contrast: about 0 without a dot, towards 1 with a sharp one. ``mark_over_circle`` is the diameter of
     the dot over that of the circle.
     """
-    grey = image.astype(np.float32)
+    grey = checked_grey(image)
     rim = DIRECTIONS @ circles.shapes
     dot = np.mean(
         [sample(grey, circles.centres[:, None] + share * mark_over_circle * rim) for share in (0.0, 0.25, 0.5)], (0, 2)

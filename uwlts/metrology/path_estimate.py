@@ -1,0 +1,492 @@
+"""Least squares for a smooth correction of a path, by the surfaces that it shows more than once.
+
+Unknown is a correction of every pose, a shift (mm) and a turn (rad) in the base frame about the platform, as a cubic
+B-spline in time. Known beforehand is by how much a navigation drifts from an exact start: by a steady rate (a bias of
+velocity or gyroscope), by a rate that changes smoothly (temperature), by one that wanders (instability of the bias),
+and by a random walk (noise of the velocity); these are the integrated Wiener processes of orders two, one and none.
+How large the others are beside the steady rate is what makes the evidence likeliest (empirical Bayes: MacKay, Neural
+Computation 4, 1992). Residuals are distances between patches of the surface where the path crosses itself. Movements
+that the surface leaves open there, as along a plain pipe, stay with what is known beforehand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import eigh, solve_triangular
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from uwlts.metrology.patches import (
+    PatchDistances,
+    Patches,
+    averaged_points,
+    disc_radius,
+    distances_between,
+    scatter,
+    surface_patches,
+)
+from uwlts.model.errors import EvaluationError
+from uwlts.model.trajectory import Trajectory
+from uwlts.storage.cloud import PointCloud
+
+Shares = tuple[float, float, float]
+"""Variances at the end of a rate that changes smoothly, of one that wanders, and of a random walk, over that of a
+steady rate, which alone would come to the drift as it is stated."""
+Pair = tuple[int, int]
+"""Numbers of two pieces that show the same surface, the earlier first."""
+
+_TUKEY = 4.685
+_VOXEL = 0.4
+"""Of the radius of patches: points for a search by heights."""
+_INTERVALS = 100
+"""Of the spline: between two knots a random walk goes a tenth of the drift of the whole path."""
+_SHARES = [
+    (smooth, wander, walk)
+    for smooth in (0.0, 0.1, 0.3, 1.0, 3.0, 10.0)
+    for wander in (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
+    for walk in (1e-5, 1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6)
+]
+_TURNS, _LITTLE = 8, 0.2
+"""Times that patches are laid anew at most, and by how much of a standard deviation the path may still move then."""
+_BESIDE = 13
+"""Patches from which it is taken how times grow: two rings around one."""
+FEWEST = 30
+"""Patches of a piece, and of a crossing."""
+_ROUNDS = 15
+_STILL_MM = 1e-3
+EXACT_MM, EXACT_RAD = 1e-3, 1e-7
+"""Standard uncertainty of the start of the path, which is the frame's: as good as exact."""
+_HELD_OUT = 5
+"""Every fifth cube of a crossing, of four radii, is held out and judges the gain."""
+_AGREEING = 0.9
+"""Of the patches of a crossing within four radii, those that agree within five of their standard deviations; the same
+of those held out. Wrong places reach 0.8 where the path bends to them."""
+_FEWEST_HELD_OUT = 10
+"""Held-out patches whose share is judged."""
+_PER_PARAMETER = 3.0
+"""Independent distances of a crossing for each parameter of the path that it determines: a surface without features
+fits anywhere if the path may bend as much as it takes."""
+_NOISE = 5.0
+"""Times the information that the noise of normals alone would give: a movement with less is open."""
+_TELLING = 1e-4
+"""Of the information that the drift is known with beforehand: less does not tell one kind of drift from another."""
+_ROUNDING = 1e-9
+"""Of the information on the best determined movement: less is rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class PathSpline:
+    """A trajectory, the knots of the spline over the time of the points, and the drift at its end, mm and rad."""
+
+    trajectory: Trajectory
+    knots: np.ndarray
+    drift: tuple[float, float]
+    first_s: float
+    last_s: float
+
+    @classmethod
+    def of(cls, trajectory: Trajectory, drift: tuple[float, float], times_s: np.ndarray) -> PathSpline:
+        """The spline over the times (N,) of the points."""
+        first, last = float(times_s.min()), float(times_s.max())
+        inner = np.linspace(first, last, _INTERVALS + 1)
+        knots = np.concatenate([np.repeat(first, 3), inner, np.repeat(last, 3)])
+        return cls(trajectory, knots, drift, first, last)
+
+    @property
+    def count(self) -> int:
+        """Number C of coefficients, each of six numbers."""
+        return len(self.knots) - 4
+
+    def basis(self, times_s: np.ndarray) -> np.ndarray:
+        """Weights (N, C) of the coefficients at times (N,)."""
+        inside = np.clip(times_s, self.first_s, self.last_s)
+        return BSpline.design_matrix(inside, self.knots, 3).toarray()
+
+    def corrections(self, coefficients: np.ndarray, times_s: np.ndarray, *, rates: bool = False) -> np.ndarray:
+        """Shift and turn (N, 6) at times (N,) by coefficients (6 C,), or their rates per second."""
+        spline = BSpline(self.knots, coefficients.reshape(-1, 6), 3)
+        return (spline.derivative() if rates else spline)(np.clip(times_s, self.first_s, self.last_s))
+
+    def shape(self, shares: Shares) -> np.ndarray:
+        """Covariance (C, C) of the coefficients of one component, over the variance that is stated for the end."""
+        # A coefficient stands for the correction at the mean of its knots (Greville).
+        at = np.array([self.knots[k + 1 : k + 4].mean() for k in range(self.count)])
+        t = (at - self.first_s) / (self.last_s - self.first_s)
+        first, second = np.minimum(t[:, None], t), np.maximum(t[:, None], t)
+        # Integrals of a random walk from zero, twice and once; each is one at the end.
+        smooth = first**3 * (10 * second**2 - 5 * first * second + first**2) / 6
+        wandering = first**2 * (3 * second - first) / 2
+        kinds = np.outer(t, t), smooth, wandering, first
+        parts = zip((1.0, *shares), kinds, strict=True)
+        return sum((part * kind for part, kind in parts), 1e-10 * np.eye(len(t)))
+
+    def information(self, shares: Shares) -> np.ndarray:
+        """Inverse covariance (6 C, 6 C) of the coefficients, ordered coefficient by coefficient; see `shape`."""
+        shape = self.shape(shares)
+        result = np.zeros((6 * self.count,) * 2)
+        for component, (size, exact) in enumerate(zip(self.sizes, (EXACT_MM,) * 3 + (EXACT_RAD,) * 3, strict=True)):
+            result[component::6, component::6] = np.linalg.inv(size**2 * shape + exact**2 * np.eye(self.count))
+        return result
+
+    @property
+    def sizes(self) -> np.ndarray:
+        """Drift (6,) of each component at the end, mm and rad."""
+        return np.repeat(self.drift, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A part of the path, and P patches of its surface.
+
+    Attributes
+    ----------
+    patches : Patches
+        By the path when they were laid.
+    back : (P, 3, 3)
+        From the surface around each patch then to that by the path as it was; see `_around`.
+    places_mm : (P, 3)
+        Of the patches, by the path as it was.
+    times_s, slopes : (P,) and (P, 3)
+        Times of the patches, and how they grow over the surface, s/mm.
+    platform_mm, speed : (P, 3)
+        The platform's places at these times, and its velocity, mm/s.
+    held_out : (P,) bool
+        Patches that judge the gain.
+    points_mm, patch_of : (N, 3) and (N,)
+        Averages of the points by the path as it was, and the patch nearest to each.
+    """
+
+    patches: Patches
+    back: np.ndarray
+    places_mm: np.ndarray
+    times_s: np.ndarray
+    slopes: np.ndarray
+    platform_mm: np.ndarray
+    speed: np.ndarray
+    held_out: np.ndarray
+    points_mm: np.ndarray
+    patch_of: np.ndarray
+
+    @property
+    def middle_s(self) -> float:
+        """Time in the middle of the piece."""
+        return float(np.median(self.times_s))
+
+
+class PathEstimate:
+    """Coefficients of the correction, round by round, and the pairs of pieces that cross."""
+
+    def __init__(self, cloud: PointCloud, times_s: np.ndarray, path: PathSpline, shares: Shares) -> None:
+        self.cloud, self.path, self.shares = cloud, path, shares
+        moments, self._image = np.unique(times_s, return_inverse=True)
+        self._moments, self._platform = moments, path.trajectory.poses_at(moments)[:, :3, 3]
+        self._speed = path.trajectory.rates_at(moments)[:, :3]
+        self.prior = path.information(shares)
+        self.coefficients = np.zeros(6 * path.count)
+        self.covariance = np.linalg.inv(self.prior)
+        self.pairs: list[Pair] = []
+        self._own, self._radius = _divided(cloud, times_s)
+        laid = [(own, self._laid(own)) for own in self._own]
+        self._own = [own for own, piece in laid if piece is not None]
+        self.pieces = [piece for _, piece in laid if piece is not None]
+
+    @property
+    def reach_mm(self) -> float:
+        """Within which patches are matched."""
+        return 2 * self._radius
+
+    def corrections(self, times_s: np.ndarray) -> np.ndarray:
+        """Shift and turn (N, 6) at times (N,)."""
+        return self.path.corrections(self.coefficients, times_s)
+
+    def moved(self, number: int) -> Patches:
+        """Patches of a piece along the path as it is now."""
+        piece = self.pieces[number]
+        places = _moved(self.corrections(piece.times_s), piece.platform_mm, piece.places_mm)
+        # Images move one by one: what lies along the path is not turned with them, but sheared by how they drift apart.
+        tangents = np.einsum("pij,pkj->pki", self._around(piece) @ piece.back, piece.patches.axes[:, :2])
+        first = tangents[:, 0] / np.linalg.norm(tangents[:, 0], axis=1, keepdims=True)
+        normal = np.cross(first, tangents[:, 1])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        axes = np.stack([first, np.cross(normal, first), normal], axis=1)
+        return replace(piece.patches, places_mm=places, axes=axes, one_sided=False)
+
+    def moved_points(self, number: int) -> np.ndarray:
+        """Points (N, 3) of a piece along the path as it is now."""
+        piece = self.pieces[number]
+        correction = self.corrections(piece.times_s)[piece.patch_of]
+        return _moved(correction, piece.platform_mm[piece.patch_of], piece.points_mm)
+
+    def _around(self, piece: Piece) -> np.ndarray:
+        """Derivatives (P, 3, 3) of the surface around patches, along the path as it is now, by it as it was.
+
+        Of p' = R(t) (p - X(t)) + X(t) + s(t) by p, with the time t that grows over the surface, the turn R, the shift
+        s, and the platform's place X.
+        """
+        correction = self.corrections(piece.times_s)
+        rates = self.path.corrections(self.coefficients, piece.times_s, rates=True)
+        turn = Rotation.from_rotvec(correction[:, 3:])
+        drifting = np.cross(rates[:, 3:], turn.apply(piece.places_mm - piece.platform_mm)) + rates[:, :3]
+        drifting += piece.speed - turn.apply(piece.speed)
+        return turn.as_matrix() + drifting[:, :, None] * piece.slopes[:, None]
+
+    def by_relative_movement(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
+        """Derivatives (6, 6 C) of shift and turn of the later piece against the earlier, at a place (3,)."""
+        result = np.zeros((6, 6 * self.path.count))
+        for number, sign in zip(pair, (-1.0, 1.0), strict=True):
+            piece = self.pieces[number]
+            basis = self.path.basis(np.array([piece.middle_s]))
+            platform = piece.platform_mm[np.argmin(np.abs(piece.times_s - piece.middle_s))]
+            lever = at_mm - platform - self.corrections(np.array([piece.middle_s]))[0, :3]
+            twist = np.eye(6)
+            twist[:3, 3:] = np.cross(np.eye(3), lever).T
+            result += sign * np.einsum("c,ij->icj", basis[0], twist).reshape(6, -1)
+        return result
+
+    def state(self) -> tuple[Any, ...]:
+        """What `restore` needs to return to the present estimate."""
+        return self.coefficients, self.covariance, tuple(self.pairs), tuple(self.pieces)
+
+    def restore(self, state: tuple[Any, ...]) -> None:
+        """Return to an earlier estimate."""
+        self.coefficients, self.covariance = state[:2]
+        self.pairs, self.pieces = list(state[2]), list(state[3])
+
+    def lay_anew(self, numbers: Iterable[int]) -> None:
+        """Fit the patches of pieces to the points along the path as it is now.
+
+        A patch moves as a whole: a drift within it, of the path as it was, has tilted it.
+        """
+        for number in numbers:
+            self.pieces[number] = self._laid(self._own[number]) or self.pieces[number]
+
+    def estimate(self, seed: dict[Pair, np.ndarray]) -> None:
+        """Estimate until nothing moves any more; poses (4, 4) of pairs give their first matches."""
+        for done in range(_ROUNDS):
+            if self._round(seed if done == 0 else {}) < _STILL_MM and (done > 1 or not seed):
+                break
+
+    def settle(self) -> None:
+        """Estimate the path and the shares of its drift by turns; pairs that do not agree then are given up."""
+        self._settled()
+        if len(agreeing := [pair for pair in self.pairs if self.agrees(pair)]) < len(self.pairs):
+            self.pairs = agreeing
+            self._settled()
+
+    def _settled(self) -> None:
+        """Lay the patches and estimate anew until the path moves by little and its drift is of the likeliest kind."""
+        self.estimate({})
+        for _ in range(_TURNS):
+            before = self.coefficients
+            self.lay_anew({number for pair in self.pairs for number in pair})
+            self.estimate({})
+            still = np.max(np.abs(self.coefficients - before) / np.sqrt(np.diag(self.covariance))) < _LITTLE
+            if (shares := self._likeliest()) == self.shares and still:
+                break
+            self.shares, self.prior = shares, self.path.information(shares)
+
+    def agrees(self, pair: Pair) -> bool:
+        """Whether the surfaces of a pair agree, also where they were held out, and tell more than they determine."""
+        found, fits = self.matched(pair)
+        if np.count_nonzero(fits) < FEWEST or np.mean(fits) < _AGREEING:
+            return False
+        held = self.held_out(pair, found)
+        if np.count_nonzero(held) >= _FEWEST_HELD_OUT and np.mean(fits[held]) < _AGREEING:
+            return False
+        determined = float(np.sum(self._of_pair(pair, None)[0] * self.covariance))
+        return bool(np.count_nonzero(fits) / self.pieces[pair[1]].patches.shared > _PER_PARAMETER * determined)
+
+    def matched(self, pair: Pair) -> tuple[PatchDistances, np.ndarray]:
+        """Distances (Q,) of the later piece from the earlier, and which of them agree with zero."""
+        earlier, later = (self.moved(number) for number in pair)
+        found = distances_between(later, np.eye(4), earlier, np.eye(4), reach_mm=2 * self.reach_mm)
+        return found, np.abs(found.distance_mm) < 5 * found.std_mm
+
+    def held_out(self, pair: Pair, found: PatchDistances) -> np.ndarray:
+        """Which distances (Q,) from the later piece to the earlier the estimate has not used."""
+        return self.pieces[pair[1]].held_out[found.source] | self.pieces[pair[0]].held_out[found.target]
+
+    def _laid(self, own: np.ndarray) -> Piece | None:
+        """Patches of points by their numbers, along the path as it is now; None where they lie on no surface."""
+        image = self._image[own]
+        correction, platform = self.corrections(self._moments)[image], self._platform[image]
+        known = None if self.cloud.uncertainty is None else self.cloud.uncertainty[own]
+        # What all points share does not tell one pass from another along a path.
+        known = None if known is None else replace(known, patterns_mm=known.patterns_mm[:0], poses_mm=None)
+        points = _moved(correction, platform, self.cloud.points_mm[own])
+        try:
+            patches = surface_patches(points, known, radius_mm=self._radius)
+        except EvaluationError:
+            return None
+        at = image[patches.numbers]
+        correction, platform, times = correction[patches.numbers], self._platform[at], self._moments[at]
+        back = Rotation.from_rotvec(-correction[:, 3:])
+        places = back.apply(patches.places_mm - platform - correction[:, :3]) + platform
+        cubes = np.floor(places / (4 * self._radius)).astype(np.int64)
+        held_out = (cubes @ np.array([1, 2, 3])) % _HELD_OUT == 0
+        averages = averaged_points(self.cloud.points_mm[own], self._radius * _VOXEL)
+        tree = KDTree(places)
+        near: Any = tree.query(averages)
+        piece = Piece(
+            patches,
+            np.empty(0),
+            places,
+            times,
+            _slopes(tree, times),
+            platform,
+            self._speed[at],
+            held_out,
+            averages,
+            near[1],
+        )
+        return replace(piece, back=np.linalg.inv(self._around(piece)))
+
+    def _round(self, seed: dict[Pair, np.ndarray]) -> float:
+        """One step of least squares; returns the largest shift of a coefficient."""
+        normal, gradient = self._evidence(seed)
+        normal, gradient = normal + self.prior, gradient + self.prior @ self.coefficients
+        self.covariance = np.linalg.inv(normal)
+        step = -self.covariance @ gradient
+        self.coefficients = self.coefficients + step
+        return float(np.abs(step.reshape(-1, 6)[:, :3]).max())
+
+    def _likeliest(self) -> Shares:
+        """Shares of the drift with which the matches as they are now are likeliest."""
+        normal, gradient = self._evidence({})
+        # In units of the drift the evidence is that of as many independent numbers as it tells of.
+        units = np.tile(self.path.sizes, self.path.count)
+        values, vectors = np.linalg.eigh(normal * np.outer(units, units))
+        telling = values > _TELLING
+        roots = np.sqrt(values[telling])
+        at = vectors[:, telling].T @ (units * (normal @ self.coefficients - gradient)) / roots
+        ways = (vectors[:, telling] * roots).reshape(self.path.count, -1)
+
+        def likelihood(shares: Shares) -> float:
+            """Twice the logarithm, but for what all shares have in common: the path is integrated out."""
+            moved = (self.path.shape(shares) @ ways).reshape(len(units), -1)
+            root = np.linalg.cholesky(np.eye(len(roots)) + ways.reshape(moved.shape).T @ moved)
+            off = solve_triangular(root, at, lower=True)
+            return float(at @ at - off @ off - 2 * np.sum(np.log(np.diag(root))))
+
+        return max(_SHARES, key=likelihood)
+
+    def _evidence(self, seed: dict[Pair, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Normal matrix and gradient of the distances between all pairs, without what is known beforehand."""
+        normal, gradient = np.zeros_like(self.prior), np.zeros_like(self.coefficients)
+        for pair in self.pairs:
+            own = self._of_pair(pair, seed.get(pair))
+            normal += own[0]
+            gradient += own[1]
+        return normal, gradient
+
+    def _of_pair(self, pair: Pair, seed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """Normal matrix and gradient of one pair; by its pose (4, 4) where that differs from the present one."""
+        normal, gradient = np.zeros_like(self.prior), np.zeros_like(self.coefficients)
+        patches = {number: self.moved(number) for number in pair}
+        poses = {pair[0]: np.eye(4), pair[1]: np.eye(4) if seed is None else seed}
+        ways = []
+        for source, target in (pair[::-1], pair):
+            found = distances_between(
+                patches[source], poses[source], patches[target], poses[target], reach_mm=self.reach_mm
+            )
+            used = ~(self.pieces[source].held_out[found.source] | self.pieces[target].held_out[found.target])
+            if np.count_nonzero(used) < FEWEST // 2:
+                continue
+            std = found.std_mm[used]
+            if seed is None:
+                std = std * scatter(found.distance_mm[used] / std)
+                u = np.clip(found.distance_mm[used] / (std * _TUKEY), -1, 1)
+            else:
+                u = np.zeros(len(std))
+            # Both directions count by half.
+            ways.append((source, target, found, used, (1 - u * u) ** 2 / std**2 / (2 * patches[source].shared)))
+        if not ways:
+            return normal, gradient
+        middle = np.vstack([found.places_mm[used] for _, _, found, used, _ in ways]).mean(axis=0)
+        told = np.eye(6) if seed is not None else _told([each[2:] for each in ways], middle)
+        back = np.eye(4) if seed is None else np.linalg.inv(seed)
+        for source, target, found, used, weight in ways:
+            normals, places = found.normals[used], found.places_mm[used]
+            # Matched by another pose than the present one: where the later piece's surface lies now.
+            now = {pair[0]: places, pair[1]: places @ back[:3, :3].T + back[:3, 3]}
+            gap = np.einsum("qi,qi->q", now[source] - now[target], normals)
+            parts = []
+            for number, rows, sign in ((source, found.source[used], 1.0), (target, found.target[used], -1.0)):
+                piece = self.pieces[number]
+                # Beside the middle of a patch the surface was seen a little earlier or later.
+                off = now[number] - patches[number].places_mm[rows]
+                later = np.einsum("qi,qi->q", piece.slopes[rows], off)
+                times = piece.times_s[rows] + later
+                by = np.hstack([normals, np.cross(places - middle, normals)]) @ told
+                # Turns are about the platform where the present correction has it.
+                platform = piece.platform_mm[rows] + later[:, None] * piece.speed[rows]
+                platform += self.corrections(times)[:, :3]
+                by[:, 3:] += np.cross(middle + now[number] - places - platform, by[:, :3])
+                parts.append((sign * self.path.basis(times), by))
+            # Of all coefficients those around both passes.
+            near = np.flatnonzero(np.any([basis.any(axis=0) for basis, _ in parts], axis=0))
+            derivatives = sum(np.einsum("qc,qi->qci", basis[:, near], by) for basis, by in parts)
+            derivatives = np.reshape(derivatives, (len(weight), -1))
+            columns = (6 * near[:, None] + np.arange(6)).ravel()
+            normal[np.ix_(columns, columns)] += derivatives.T @ (weight[:, None] * derivatives)
+            gradient[columns] += derivatives.T @ (weight * (found.distance_mm[used] + gap))
+        return normal, gradient
+
+
+def _moved(correction: np.ndarray, platform: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Places (N, 3) after corrections (N, 6) about the platform's places (N, 3)."""
+    return Rotation.from_rotvec(correction[:, 3:]).apply(places - platform) + platform + correction[:, :3]
+
+
+def _slopes(tree: KDTree, times: np.ndarray) -> np.ndarray:
+    """How times (P,) grow over the places of a tree (P, 3), s/mm."""
+    near: Any = tree.query(tree.data, k=min(_BESIDE, tree.n))[1]
+    about, later = np.asarray(tree.data)[near] - np.asarray(tree.data)[:, None], times[near] - times[:, None]
+    normal = np.einsum("pki,pkj->pij", about, about)
+    # Across a plane surface times do not grow: the ridge is a millionth of what tells along it.
+    normal += 1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    return np.linalg.solve(normal, np.einsum("pki,pk->pi", about, later)[:, :, None])[:, :, 0]
+
+
+def _told(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middle: np.ndarray) -> np.ndarray:
+    """Projection (6, 6) of shift and turn about a middle to the part that distances tell more of than noise would."""
+    normal, spurious = np.zeros((6, 6)), np.zeros((6, 6))
+    places = np.vstack([found.places_mm[used] for found, used, _ in ways]) - middle
+    scale = np.repeat([1.0, 1 / float(np.sqrt(np.mean(np.sum(places**2, axis=1))))], 3)
+    for found, used, weight in ways:
+        normals, levers = found.normals[used], found.places_mm[used] - middle
+        by = np.hstack([normals, np.cross(levers, normals)]) * scale
+        normal += by.T @ (weight[:, None] * by)
+        across = np.cross(normals, np.eye(3)[np.argmin(np.abs(normals), axis=1)])
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        for direction in (across, np.cross(normals, across)):
+            by = np.hstack([direction, np.cross(levers, direction)]) * scale
+            spurious += by.T @ ((weight * found.slope_variance[used])[:, None] * by)
+    metric = spurious + _ROUNDING / _NOISE * float(np.linalg.eigvalsh(normal)[-1]) * np.eye(6)
+    values, ways_of_moving = eigh(normal, metric)
+    open_ = ways_of_moving[:, values <= _NOISE]
+    return scale[:, None] * (np.eye(6) - open_ @ open_.T @ metric) / scale
+
+
+def _divided(cloud: PointCloud, times: np.ndarray) -> tuple[list[np.ndarray], float]:
+    """Numbers of the points of parts of the path about as long as the stripe is wide, and the radius of patches."""
+    frames = np.unique(times)
+    order = np.argsort(times, kind="stable")
+    sorted_times = times[order]
+    starts = np.searchsorted(sorted_times, frames)
+    ends = np.append(starts[1:], len(times))
+    widths = [np.linalg.norm(np.ptp(cloud.points_mm[order[a:b]], axis=0)) for a, b in zip(starts, ends, strict=True)]
+    swath = float(np.median(widths))
+    middles = np.array([cloud.points_mm[order[a:b]].mean(axis=0) for a, b in zip(starts, ends, strict=True)])
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(middles, axis=0), axis=1)))
+    count = max(2, round(way[-1] / swath))
+    number = np.minimum((way / way[-1] * count).astype(int), count - 1)
+    of_piece = number[np.searchsorted(frames, sorted_times)]
+    radius = disc_radius(cloud.points_mm[order[of_piece == count // 2]])
+    parts = [order[of_piece == k] for k in range(count)]
+    return [part for part in parts if len(part) >= 200], radius

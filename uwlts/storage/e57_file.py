@@ -1,0 +1,152 @@
+"""E57 (ASTM E2807): points in m with intensity, image, line and time, and further fields as an extension."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from uwlts.model.errors import CaptureError, OutputError
+from uwlts.storage.las_file import library
+
+PREFIX, EXTENSION = "uwlts", "urn:uwlts:point-fields"
+"""Of the fields that the standard does not have: an extension is a prefix of their names, and its own name as a URI."""
+
+_LIMITS: tuple[tuple[str, Callable[[np.ndarray], Any]], ...] = (("Minimum", np.min), ("Maximum", np.max))
+_PLACES = ("cartesianInvalidState", "sphericalInvalidState")
+"""Fields of points that have no place."""
+
+
+class E57Points(NamedTuple):
+    """Points (N, 3) in mm, and columns (N,), None where a scan of the file has no such field."""
+
+    points_mm: np.ndarray
+    intensity: np.ndarray | None
+    time_s: np.ndarray | None
+
+
+def write_e57(
+    path: Path,
+    points_mm: np.ndarray,
+    columns: dict[str, np.ndarray],
+    *,
+    name: str,
+    time_s: np.ndarray | None = None,
+    further: dict[str, np.ndarray] | None = None,
+) -> None:
+    """Write points (N, 3), columns (N,) by their names in the standard, times (N,) and further fields as one scan.
+
+    Coordinates and real numbers are of 32 bits, times of 64. A time is ``acquisitionStart``, the last whole second
+    before all of them, and ``timeStamp`` from there on, which the standard wants positive; further fields are
+    ``uwlts:NAME``. OutputError where storage fails; SetupError where pye57 is not installed.
+    """
+    pye57 = library("pye57", "E57")
+    lib = pye57.libe57
+    # Rounded before, so that the bounds in the file hold for the numbers in the file.
+    coordinates = (1e-3 * points_mm).astype(np.float32).astype(np.float64).T
+    fields = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), coordinates, strict=True)) | columns
+    fields |= {f"{PREFIX}:{label}": values for label, values in (further or {}).items()}
+    start = 0.0 if time_s is None else float(np.floor(time_s.min()))
+    if time_s is not None:
+        fields["timeStamp"] = time_s - start
+    fields = {label: np.ascontiguousarray(values) for label, values in fields.items()}
+    try:
+        # The library's own writer of scans has neither times nor extensions.
+        with pye57.E57(str(path), mode="w") as file:
+            image = file.image_file
+            if further:
+                image.extensionsAdd(PREFIX, EXTENSION)
+
+            def structure(values: dict[str, Any]) -> Any:
+                node = lib.StructureNode(image)
+                for label, value in values.items():
+                    kind = lib.IntegerNode if isinstance(value, int) else lib.FloatNode
+                    node.set(label, kind(image, value))
+                return node
+
+            scan, prototype, buffers = lib.StructureNode(image), lib.StructureNode(image), lib.VectorSourceDestBuffer()
+            scan.set("guid", lib.StringNode(image, f"{{{uuid.uuid4()}}}"))
+            scan.set("name", lib.StringNode(image, name))
+            named = list(zip(("x", "y", "z"), coordinates, strict=True))
+            scan.set("cartesianBounds", structure(_limits(named, float)))
+            if "intensity" in fields:
+                scan.set("intensityLimits", structure(_limits([("intensity", fields["intensity"])], float)))
+            if "rowIndex" in fields:
+                named = [(each, fields[f"{each}Index"]) for each in ("row", "column")]
+                scan.set("indexBounds", structure(_limits(named, int)))
+            if time_s is not None:
+                scan.set("acquisitionStart", structure({"dateTimeValue": start, "isAtomicClockReferenced": 0}))
+            for label, values in fields.items():
+                low, high = values.min(), values.max()
+                if values.dtype.kind in "iu":
+                    node = lib.IntegerNode(image, int(low), int(low), int(high))
+                elif label == "timeStamp":
+                    node = lib.FloatNode(image, float(low), lib.E57_DOUBLE, float(low), float(high))
+                else:
+                    node = lib.FloatNode(image, float(low), lib.E57_SINGLE, float(low), float(high))
+                prototype.set(label, node)
+                buffers.append(lib.SourceDestBuffer(image, label, values, len(values), True, True))
+            points = lib.CompressedVectorNode(image, prototype, lib.VectorNode(image, True))
+            scan.set("points", points)
+            file.data3d.append(scan)
+            writer = points.writer(buffers)
+            writer.write(len(points_mm))
+            writer.close()
+    except lib.E57Exception as error:
+        raise OutputError(f"cannot write {name}.e57: {' '.join(str(error).split())[:200]}") from error
+
+
+def _limits(named: Sequence[tuple[str, np.ndarray]], kind: type[int] | type[float]) -> dict[str, int | float]:
+    """``xMinimum``, ``xMaximum`` and so on of columns (N,) by their names."""
+    return {f"{label}{end}": kind(of(values)) for label, values in named for end, of in _LIMITS}
+
+
+def read_e57(path: Path) -> E57Points:
+    """All points of a file, each scan at its pose; times by the scanner's clock.
+
+    CaptureError where the file is damaged or has no scans; SetupError where pye57 is not installed.
+    """
+    pye57 = library("pye57", "E57")
+    try:
+        with pye57.E57(str(path)) as file:
+            scans = [
+                file.read_scan(number, intensity=True, ignore_missing_fields=True)
+                | {"time_s": _times(pye57, file, number)}
+                for number in range(file.scan_count)
+            ]
+    except (pye57.libe57.E57Exception, OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
+        raise CaptureError(f"{path} is not a complete E57 file: {' '.join(str(error).split())[:200]}") from error
+    if not scans:
+        raise CaptureError(f"{path} is an E57 file without scans")
+    points = 1e3 * np.concatenate([np.column_stack([scan[f"cartesian{axis}"] for axis in "XYZ"]) for scan in scans])
+    lit = all("intensity" in scan for scan in scans)
+    timed = all(scan["time_s"] is not None for scan in scans)
+    return E57Points(
+        points,
+        np.concatenate([scan["intensity"] for scan in scans]) if lit else None,
+        np.concatenate([scan["time_s"] for scan in scans]) if timed else None,
+    )
+
+
+def _times(pye57: Any, file: Any, number: int) -> np.ndarray | None:
+    """Times (N,) of the points of a scan that are valid, s; None where some are not known."""
+    header = file.get_header(number)
+    if "timeStamp" not in header.point_fields:
+        return None
+    labels = [each for each in ("timeStamp", "isTimeStampInvalid", *_PLACES) if each in header.point_fields]
+    columns = {label: np.zeros(header.point_count) for label in labels}
+    buffers = pye57.libe57.VectorSourceDestBuffer()
+    for label, values in columns.items():
+        buffers.append(pye57.libe57.SourceDestBuffer(file.image_file, label, values, len(values), True, True))
+    header.points.reader(buffers).read()
+    if columns.get("isTimeStampInvalid", np.zeros(1)).any():
+        return None
+    placed = np.ones(header.point_count, bool)
+    for label in _PLACES:
+        placed &= columns.get(label, 0) == 0
+    scan = file.data3d[number]
+    start = scan["acquisitionStart"]["dateTimeValue"].value() if scan.isDefined("acquisitionStart") else 0.0
+    return start + columns["timeStamp"][placed]
