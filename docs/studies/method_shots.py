@@ -120,7 +120,7 @@ def render(place: Place) -> Rendered:
     return Rendered(
         sensor=sensor,
         index=whole.medium.refractive_index(sensor.laser.wavelength_nm),
-        frame=replace(frame, scattered=around),
+        frame=replace(frame, longer=None, haze=around),
         truth_px=np.where(used, truth.centre_px, np.nan),
         mm_per_px=(step * truth.normal).sum(axis=-1),
         exposure_ms=whole.exposure_ms["laser"],

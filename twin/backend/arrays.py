@@ -68,3 +68,12 @@ def opaque_transform(matrix: np.ndarray) -> mi.Transform4f:
     opaque = mi.Matrix4f(matrix)
     dr.make_opaque(opaque)
     return mi.Transform4f(opaque)
+
+
+def begin_kernels() -> None:
+    """Begin to write down kernels that are the same in every frame, whatever arrays are still in use from before.
+
+    Dr.Jit shares a plain number among all arrays of one basic block that need it, and orders kernels by where each
+    number came up first: those of a block of their own never meet older ones.
+    """
+    dr.detail.new_scope(dr.backend_v(mi.Float))

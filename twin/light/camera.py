@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -20,8 +19,8 @@ from twin.backend.arrays import (
     SurfaceInteraction3f,
     Vector3f,
     opaque,
+    opaque_point,
     opaque_transform,
-    scalar_transform,
     to_jit,
     to_numpy,
 )
@@ -31,8 +30,6 @@ from uwlts.model.errors import DesignError
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
 
-_STEP_MM = 1e-3
-"""Offset of a refracted ray's start along its direction; far above the spacing of 32-bit floats at 1 m (6e-5 mm)."""
 _NEWTON_STEPS = 6
 """Lead to the rounding of 32 bits for the distortion of real lenses."""
 _FIELD = 0.96
@@ -112,7 +109,7 @@ def frame_about(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
 class WindowFaces:
     """Both faces of a window, which lets rays pass unchanged if it is not mounted.
 
-    Rays meet the faces in a known order, so each is intersected alone, without a scene. ``origin_mm`` (3,) and
+    Rays meet the faces in a known order, so each is intersected alone, as a disc of a plane. ``origin_mm`` (3,) and
     ``rotation`` (3, 3) are the module's frame in the camera frame; the third column is the module's axis.
     """
 
@@ -130,16 +127,9 @@ class WindowFaces:
         normal = rotation @ window.normal()
         inner = origin_mm + window.distance_mm * rotation[:, 2]
         outer = inner + window.thickness_mm * normal
-        self._faces: list[tuple[Any, Float]] = []
-        for centre, ratio in ((inner, glass), (outer, index / glass)):
-            to_world = np.eye(4)
-            to_world[:3, :3] = frame_about(-normal, rotation[:, 0]) * (
-                window.aperture_diameter_mm / 2,
-                window.aperture_diameter_mm / 2,
-                1,
-            )
-            to_world[:3, 3] = centre
-            self._faces.append((mi.load_dict({"type": "disk", "to_world": scalar_transform(to_world)}), opaque(ratio)))
+        self._normal = mi.Vector3f(opaque_point(normal))
+        self._radius = opaque(window.aperture_diameter_mm / 2)
+        self._faces = [(opaque_point(inner), opaque(glass)), (opaque_point(outer), opaque(index / glass))]
 
     def through(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> Rays:
         """Send rays from the module's side through both faces; the weight of those that do not pass is 0.
@@ -151,20 +141,23 @@ class WindowFaces:
         weight, valid = dr.full(mi.Float, 1.0, width), dr.full(mi.Bool, True, width)
         if not self.mounted:
             return Rays(origin, direction, weight)
-        ray = mi.Ray3f(origin, direction)
-        for number, (face, ratio) in enumerate(self._faces):
-            si = face.ray_intersect(ray, active=valid)
-            cosine = mi.Frame3f.cos_theta(si.wi)
-            valid &= si.is_valid() & (cosine > 0)
+        p: Point3f = mi.Point3f(origin)
+        d: Vector3f = mi.Vector3f(direction)
+        normal = self._normal
+        for number, (centre, ratio) in enumerate(self._faces):
+            cosine = dr.dot(d, normal)
+            t = dr.dot(mi.Vector3f(centre - p), normal) / cosine
+            p = mi.Point3f(p + d * t)
+            valid &= (cosine > 0) & (t > 0) & (dr.norm(p - centre) <= self._radius)
             reflected, refracted_cosine, _, inverse = mi.fresnel(cosine, ratio)
             weight *= dr.select(valid, 1 - reflected, 0.0)
             if mode == mi.TransportMode.Radiance:
                 weight *= dr.square(inverse)
             if number == 1:
-                weight *= dr.exp(-self._absorption * (si.t + _STEP_MM))
-            onward = si.to_world(mi.refract(si.wi, refracted_cosine, inverse))
-            ray = mi.Ray3f(si.p + onward * _STEP_MM, onward)
-        return Rays(ray.o, ray.d, dr.select(valid & (weight > 0), weight, 0.0))
+                weight *= dr.exp(-self._absorption * t)
+            # Snell's law: the part along the face is stretched by the ratio of the indices.
+            d = mi.Vector3f((d - normal * cosine) * inverse - normal * refracted_cosine)
+        return Rays(p, d, dr.select(valid & (weight > 0), weight, 0.0))
 
 
 class CameraView:

@@ -62,6 +62,7 @@ class Light:
             direction=self._pose.moving_direction(direction, after_s),
             normal=self._pose.moving_direction(normal, after_s),
             irradiance=dr.select(meets, light.irradiance * self._share, 0.0),
+            in_middle=dr.select(meets, light.in_middle * self._share, 0.0),
         )
 
     def _unfolded(self, p: Point3f) -> SheetLight:
@@ -71,10 +72,14 @@ class Light:
         light = self.sheet.at(self._to_own @ mi.Point3f(p))
         return replace(light, direction=self._from_own @ light.direction, normal=self._from_own @ light.normal)
 
-    def may_reach(self, p: Point3f, light: SheetLight) -> Bool:
-        """Region the sheet may light: everywhere, but by way of a mirror only where that sends it."""
-        everywhere = dr.full(mi.Bool, True, dr.width(p))
-        return everywhere if self._mirror is None else self._on_mirror(p, -light.direction)[1]
+    @property
+    def mirrored(self) -> bool:
+        """Whether the light comes by way of a mirror."""
+        return self._mirror is not None
+
+    def may_reach(self, p: Point3f, light: SheetLight) -> Bool | None:
+        """Where a mirror may send the sheet's light; None for a direct one, which is sent everywhere."""
+        return None if self._mirror is None else self._on_mirror(p, -light.direction)[1]
 
     def reaches(self, objects: mi.Scene, p: Point3f, light: SheetLight, after_s: Float | None, active: Bool):
         """Whether nothing stands between points of the sensor's OCS and the laser's window."""
@@ -118,15 +123,12 @@ class Light:
         t -= light.distance_mm / dr.dot(direction, light.normal)
         light = self.sheet.at(mi.Point3f(origin + direction * t))
         if self._mirror is not None:
-            light = replace(light, irradiance=light.irradiance * self._share)
+            share = self._share
+            light = replace(light, irradiance=light.irradiance * share, in_middle=light.in_middle * share)
         return t, light
 
-    def _middle_of(self, origin: Point3f, direction: Vector3f, length: Float) -> tuple[Float, SheetLight, Float, Float]:
-        """Where rays of the sensor's OCS, up to ``length``, pass the sheet's middle.
-
-        The part of ``length`` before the window, the light near the middle, the slope of its distance along the ray,
-        and the middle's place on it, which may lie outside.
-        """
+    def passage(self, origin: Point3f, direction: Vector3f, length: Float) -> Passage:
+        """Where rays of the sensor's OCS, up to ``length``, pass the sheet's middle."""
         o, d = self.in_own_frame(origin, direction)
         back = (self.sheet.begins_at_z_mm - o.z) / d.z
         length = dr.select((d.z < 0) & (back > 0), dr.minimum(length, back), length)
@@ -138,25 +140,36 @@ class Light:
             return light, slope, t - light.distance_mm / slope
 
         _, _, middle = step(-o.x / _away_from_zero(d.x))
-        return length, *step(middle)
+        light, slope, middle = step(middle)
+        return Passage(length, middle, light.sigma_mm / dr.abs(slope))
 
-    def near_crossing(self, origin: Point3f, direction: Vector3f, length: Float) -> tuple[Float, Float]:
-        """Where rays of the sensor's OCS, up to ``length``, come nearest to the sheet, and how near, in mm along them.
+
+@dataclass(frozen=True)
+class Passage:
+    """Where rays pass the middle of a sheet: at ``middle_mm``, which may lie outside of 0 to ``length_mm``.
+
+    The part of the rays before the laser's window counts. ``sigma_mm`` is the sheet's standard deviation along them.
+    """
+
+    length_mm: Float
+    middle_mm: Float
+    sigma_mm: Float
+
+    def nearest(self) -> tuple[Float, Float]:
+        """Where the rays come nearest to the sheet, and how near, in mm along them.
 
         Within the sheet, its standard deviation counts as the distance.
         """
-        length, light, slope, middle = self._middle_of(origin, direction, length)
-        t = dr.clip(middle, 0.0, length)
-        return t, dr.abs(middle - t) + light.sigma_mm / dr.abs(slope)
+        t = dr.clip(self.middle_mm, 0.0, self.length_mm)
+        return t, dr.abs(self.middle_mm - t) + self.sigma_mm
 
-    def pick_in_sheet(self, origin: Point3f, direction: Vector3f, length: Float, u: Float) -> tuple[Float, Float]:
-        """A place on rays of the sensor's OCS, drawn like the sheet's Gaussian across them, and its density in 1/mm.
+    def pick(self, u: Float) -> tuple[Float, Float]:
+        """A place on the rays, drawn like the sheet's Gaussian across them, and its density in 1/mm.
 
-        The density is 0 where a ray up to ``length`` keeps clear of the sheet. It only steers samples: whoever uses it
-        evaluates the true light there.
+        The density is 0 where a ray keeps clear of the sheet. It only steers samples: whoever uses it evaluates the
+        true light there.
         """
-        length, light, slope, middle = self._middle_of(origin, direction, length)
-        spread = 1.1 * math.sqrt(2) * light.sigma_mm / dr.abs(slope)
+        spread, length, middle = 1.1 * math.sqrt(2) * self.sigma_mm, self.length_mm, self.middle_mm
         low, high = dr.erf(-middle / spread), dr.erf((length - middle) / spread)
         x = dr.clip((middle + spread * dr.erfinv(dr.lerp(low, high, u))), 0.0, length)
         share = 0.5 * (high - low)

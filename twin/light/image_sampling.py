@@ -60,8 +60,14 @@ def pupil_shifts(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     do too. The 16 pixels of a block 4 px square take 8 evenly spread shifts (the R2 sequence, Roberts 2018) and their
     negatives, whose points are mirrored about the pupil's middle: the block as a whole does not shift what it sees.
     """
-    order = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])[rows % 4, columns % 4]
-    shift = (order % 8 + 0.5) * np.array([0.7548776662466927, 0.5698402909980532])[:, None] % 1
+    return _block_shifts()[:, rows & 3, columns & 3]
+
+
+@cache
+def _block_shifts() -> np.ndarray:
+    """Shifts (2, 4, 4) of a block's pixels."""
+    order = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
+    shift = (order % 8 + 0.5) * np.array([0.7548776662466927, 0.5698402909980532])[:, None, None] % 1
     return np.where(order < 8, shift, 1 - shift)
 
 
@@ -79,6 +85,16 @@ def places(marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of what is marked in an image (H, W), faster than by `numpy.nonzero` where little is."""
     row, column = np.divmod(np.flatnonzero(marked), marked.shape[1])
     return row, column
+
+
+def repeated(cells: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Values of the coarse grid's cells given to their pixels (H, W), faster than by `numpy.repeat`."""
+    side = NODE_SPACING_PX
+    full = np.empty((cells.shape[0], side, cells.shape[1], side), cells.dtype)
+    for k in range(side):
+        full[:, 0, :, k] = cells
+    full[:, 1:] = full[:, :1]
+    return np.ascontiguousarray(full.reshape(side * cells.shape[0], -1)[:height, :width])
 
 
 def near_sheet(across: np.ndarray, reached: np.ndarray | bool = True) -> np.ndarray:

@@ -18,7 +18,7 @@ import numpy as np
 
 from twin.backend.arrays import Bool, Float, to_jit
 from twin.light.camera import CameraView
-from twin.light.image_sampling import NODE_SPACING_PX, places
+from twin.light.image_sampling import NODE_SPACING_PX, over_corners, places
 from twin.light.smoothing import FoundLight, blurred, estimated, interpolated
 from twin.light.walk import Walker
 
@@ -45,15 +45,14 @@ _WALKS_IN_STRIPE = 4
 class Sources:
     """What sends light on longer ways: images (H, W) in W/mm2 of the stripe and the haze, and the lit surfaces.
 
-    ``lit`` (rows, columns) marks the small cells of the stripe's pixels, ``surfaces`` (S, rows, columns) is what
-    surfaces would send to the camera of light that comes from the laser and falls off with the distance from the sheet
-    over each of `SPREAD_MM`.
+    ``surfaces`` are images (rows + 1, columns + 1) at the corners of the small cells, of what surfaces would send to
+    the camera of light that comes from the laser and falls off with the distance from the sheet over each of
+    `SPREAD_MM`.
     """
 
     stripe: np.ndarray
     haze: np.ndarray
-    lit: np.ndarray
-    surfaces: np.ndarray
+    surfaces: list[np.ndarray]
 
 
 def falling_off(reflected: Float, distance_mm: Float, active: Bool) -> list[Float]:
@@ -61,50 +60,71 @@ def falling_off(reflected: Float, distance_mm: Float, active: Bool) -> list[Floa
     return [dr.select(active, reflected * dr.exp(-dr.abs(distance_mm) / spread), 0.0) for spread in SPREAD_MM]
 
 
-def light_on_longer_ways(view: CameraView, walker: Walker, sources: Sources, *, seed: int, walks: int) -> np.ndarray:
-    """Irradiance (H, W) in W/mm2 of multiply scattered and secondary light; ``walks`` begin in most large cells."""
-    height, width = sources.stripe.shape
-    rows, columns = -(-height // WALK_CELL_PX), -(-width // WALK_CELL_PX)
-    times = np.where(_beside_stripe(sources.lit, rows, columns), _WALKS_BESIDE_STRIPE, 1)
-    times_in_stripe = 1 if walker.scatters else _WALKS_IN_STRIPE
-    row_in_stripe, column_in_stripe = places(sources.lit)
-    large = np.repeat(np.arange(rows * columns), times.ravel())
-    small = np.repeat(np.arange(len(row_in_stripe)), times_in_stripe)
-    kinds = [(FoundLight(rows, columns), FoundLight(1, len(row_in_stripe))) for _ in NOISE_SHARES]
-    for cell, *parts in walked(
-        view,
-        walker,
-        np.concatenate([large // columns * WALK_CELL_PX, row_in_stripe[small] * NODE_SPACING_PX]),
-        np.concatenate([large % columns * WALK_CELL_PX, column_in_stripe[small] * NODE_SPACING_PX]),
-        np.repeat([WALK_CELL_PX, NODE_SPACING_PX], [len(large), len(small)]),
-        seed=seed,
-        walks=walks,
-    ):
-        is_large = cell < len(large)
-        of_large, of_small = large[cell[is_large]], small[cell[~is_large] - len(large)]
-        for (in_large, in_small), light in zip(kinds, parts, strict=True):
-            in_large.add(of_large, light[is_large])
-            in_small.add(of_small, light[~is_large])
-    cells, inside = np.zeros((rows, columns)), np.zeros(len(row_in_stripe))
-    if walker.scatters:
-        features = _features(sources, rows, columns)
-        place_row, place_column = _in_large_cells(row_in_stripe), _in_large_cells(column_in_stripe)
-        fine = _features_in_stripe(sources, features, place_row, place_column)
+class LongerWays:
+    """Multiply scattered and secondary light, as far as random walks found it; ``walks`` begin in most large cells.
+
+    ``lit`` (rows, columns) marks the small cells of the stripe's pixels. The walks are followed at once. `image` makes
+    smooth light of what they found, without anything of the renderer.
+    """
+
+    def __init__(self, view: CameraView, walker: Walker, lit: np.ndarray, *, seed: int, walks: int):
+        self._lit, self._walks, self._scatters = lit, walks, walker.scatters
+        height, width = view.camera.height_px, view.camera.width_px
+        rows, columns = self._shape = -(-height // WALK_CELL_PX), -(-width // WALK_CELL_PX)
+        self._times = np.where(_beside_stripe(lit, rows, columns), _WALKS_BESIDE_STRIPE, 1)
+        self._times_in_stripe = 1 if walker.scatters else _WALKS_IN_STRIPE
+        self._in_stripe = row_in_stripe, column_in_stripe = places(lit)
+        large = np.repeat(np.arange(rows * columns), self._times.ravel())
+        small = np.repeat(np.arange(len(row_in_stripe)), self._times_in_stripe)
+        self._found = [(FoundLight(rows, columns), FoundLight(1, len(row_in_stripe))) for _ in NOISE_SHARES]
+        for cell, *parts in walked(
+            view,
+            walker,
+            np.concatenate([large // columns * WALK_CELL_PX, row_in_stripe[small] * NODE_SPACING_PX]),
+            np.concatenate([large % columns * WALK_CELL_PX, column_in_stripe[small] * NODE_SPACING_PX]),
+            np.repeat([WALK_CELL_PX, NODE_SPACING_PX], [len(large), len(small)]),
+            seed=seed,
+            walks=walks,
+        ):
+            for (in_large, in_small), light in zip(self._found, parts, strict=True):
+                found = np.flatnonzero(light > 0)
+                where, light = cell[found], light[found]
+                is_large = where < len(large)
+                in_large.add(large[where[is_large]], light[is_large])
+                in_small.add(small[where[~is_large] - len(large)], light[~is_large])
+
+    def image(self, sources: Sources) -> np.ndarray:
+        """Irradiance (H, W) in W/mm2."""
+        height, width = sources.stripe.shape
+        cells, inside = self._smooth(sources) if self._scatters else self._means()
+        size = self._shape[1] * WALK_CELL_PX, self._shape[0] * WALK_CELL_PX
+        image = cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
+        for down, right in np.ndindex(NODE_SPACING_PX, NODE_SPACING_PX):
+            row, column = (
+                NODE_SPACING_PX * each + part for each, part in zip(self._in_stripe, (down, right), strict=True)
+            )
+            there = (row < height) & (column < width)
+            image[row[there], column[there]] = inside[there]
+        return image
+
+    def _smooth(self, sources: Sources) -> tuple[np.ndarray, np.ndarray]:
+        """Light in large cells (rows, columns) and in the small ones of the stripe (P,), without most of its noise."""
+        row, column = map(_in_large_cells, self._in_stripe)
+        features, fine = _features(sources, self._lit, *self._shape, row, column)
         tolerance = TOLERANCE * float(sources.stripe.max(initial=0.0))
-        for (in_large, in_small), noise_share in zip(kinds, NOISE_SHARES, strict=True):
-            estimate = estimated(in_large, walks * times, features, tolerance=tolerance, noise_share=noise_share)
+        cells, inside = np.zeros(self._shape), np.zeros(len(row))
+        for (in_large, in_small), noise_share in zip(self._found, NOISE_SHARES, strict=True):
+            walks = self._walks * self._times
+            estimate = estimated(in_large, walks, features, tolerance=tolerance, noise_share=noise_share)
             cells += estimate.cells
-            inside += estimate.at(place_row, place_column, fine, in_small, walks * times_in_stripe)
-    else:
-        # Without rare bright samples, light from surface to surface is left as steep as it may be.
-        for in_large, in_small in kinds:
-            cells += in_large.total() / (walks * times)
-            inside += in_small.total()[0] / (walks * times_in_stripe)
-    size = columns * WALK_CELL_PX, rows * WALK_CELL_PX
-    image = cv2.resize(cells.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)[:height, :width]
-    in_cells = np.zeros(sources.lit.shape, np.float32)
-    in_cells[sources.lit] = inside
-    return np.where(_repeated(sources.lit, height, width), _repeated(in_cells, height, width), image)
+            inside += estimate.at(row, column, fine, in_small, self._walks * self._times_in_stripe)
+        return cells, inside
+
+    def _means(self) -> tuple[np.ndarray, np.ndarray]:
+        """The same as the walks found it: without rare bright samples, light may be as steep as it is."""
+        cells = np.sum([in_large.total() for in_large, _ in self._found], axis=0) / (self._walks * self._times)
+        inside = np.sum([in_small.total()[0] for _, in_small in self._found], axis=0)
+        return cells, inside / (self._walks * self._times_in_stripe)
 
 
 def walked(
@@ -137,24 +157,25 @@ def _beside_stripe(lit: np.ndarray, rows: int, columns: int) -> np.ndarray:
     return cv2.dilate(on_stripe, np.ones((across, across), np.uint8)) > 0
 
 
-def _features(sources: Sources, rows: int, columns: int) -> np.ndarray:
-    """What light on longer ways may look like (J, rows, columns): nothing in particular, the haze, surfaces, blurs."""
+def _features(
+    sources: Sources, lit: np.ndarray, rows: int, columns: int, place_rows: np.ndarray, place_columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What light on longer ways may look like (J, rows, columns): nothing in particular, the haze, surfaces, blurs.
+
+    And the same (J, P) in the small cells of the stripe, at ``place_rows`` and ``place_columns`` (P,) of the others.
+    """
     stripe, haze = (_in_cells(image, rows, columns) for image in (sources.stripe, sources.haze))
-    surfaces = [_in_cells(image, rows, columns) for image in sources.surfaces]
+    surfaces = [0.25 * over_corners(np.add, nodes) for nodes in sources.surfaces]
     widths = [_NARROWEST_CELLS]
     while widths[-1] < 0.2 * max(rows, columns):
         widths.append(3 * widths[-1])
     blurs = [blurred(source, width) for source in (stripe, haze) for width in widths]
-    return np.stack([np.ones_like(haze), haze, *surfaces, *blurs])
-
-
-def _features_in_stripe(
-    sources: Sources, features: np.ndarray, place_rows: np.ndarray, place_columns: np.ndarray
-) -> np.ndarray:
-    """The same (J, P) in the small cells of the stripe, at ``place_rows`` and ``place_columns`` (P,) of the others."""
-    haze = sources.haze[::NODE_SPACING_PX, ::NODE_SPACING_PX][sources.lit]
-    blurs = [interpolated(feature, place_rows, place_columns) for feature in features[2 + len(sources.surfaces) :]]
-    return np.stack([np.ones_like(haze), haze, *(image[sources.lit] for image in sources.surfaces), *blurs])
+    fine_haze = sources.haze[::NODE_SPACING_PX, ::NODE_SPACING_PX][lit]
+    fine_blurs = [interpolated(blur, place_rows, place_columns) for blur in blurs]
+    return (
+        np.stack([np.ones_like(haze), haze, *(_in_cells(image, rows, columns) for image in surfaces), *blurs]),
+        np.stack([np.ones_like(fine_haze), fine_haze, *(image[lit] for image in surfaces), *fine_blurs]),
+    )
 
 
 def _in_cells(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
@@ -169,8 +190,3 @@ def _in_cells(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
 def _in_large_cells(small: np.ndarray) -> np.ndarray:
     """Rows or columns of the middle of small cells, counted in large cells from the middle of the first one."""
     return ((small + 0.5) * (NODE_SPACING_PX / WALK_CELL_PX) - 0.5).astype(np.float32)
-
-
-def _repeated(cells: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Values of small cells given to their pixels, (H, W)."""
-    return cells.repeat(NODE_SPACING_PX, axis=0).repeat(NODE_SPACING_PX, axis=1)[:height, :width]

@@ -31,8 +31,8 @@ _RAYS = 1025
 """Fan rays traced through the window; many more than the series have terms."""
 _NODES = 4097
 """Nodes of the power along the fan: finer than the traced rays."""
-_NEWTON_STEPS = 3
-"""Lead to the rounding of 32 bits, as the start is the ray of a fan without a window."""
+_NEWTON_STEPS = 2
+"""Lead to the rounding of 32 bits, as the start is the ray of a fan that meets in one point behind the window."""
 _LARGEST_DEGREE = 27
 """Degree of the series before their ends are cut; enough for fans that fill their window."""
 _LARGEST_MISS_MM = 1e-3
@@ -49,12 +49,14 @@ class SheetLight:
     """The sheet's light at points: signed distance across, width, irradiance in W/mm2 across the ray, its direction.
 
     ``distance_mm`` and ``sigma_mm`` are measured along ``normal``, the unit normal of the lit surface on the side of X;
-    ``exit_mm`` is the way back to the laser's window.
+    ``in_middle`` is the irradiance beside the point in the sheet's middle; ``exit_mm`` is the way back to the laser's
+    window.
     """
 
     distance_mm: Float
     sigma_mm: Float
     irradiance: Float
+    in_middle: Float
     direction: Vector3f
     normal: Vector3f
     exit_mm: Float
@@ -92,6 +94,8 @@ class Sheet:
         self._y0, self._x0, self._tilt, self._exit_z = map(_Series, (y0, x0, k, exit_z))
         self._dy0, self._dx0, self._dtilt = (_Series(each.deriv()) for each in (y0, x0, k))
         (low, high), (offset, scale) = y0.domain, y0.mapparms()
+        straight = y0.cutdeg(1)
+        self._start_y0, self._start_dy0 = opaque(float(straight(0.0))), opaque(float(straight.deriv()(0.0)))
         self._least, self._most = opaque(low - 0.05 * (high - low)), opaque(high + 0.05 * (high - low))
         self._offset, self._scale = opaque(offset), opaque(scale)
         self._power, self.power_w = _power_along(laser, slope, angle, fan.weight)
@@ -108,7 +112,7 @@ class Sheet:
         P'(m) dm; across it spreads as a Gaussian of standard deviation w / 2 with w^2 = w0^2 (1 + ((s - s0) / zR)^2)
         (Siegman, Lasers, Eqs. 17.5, and 17.6 for zR, with M2), s being the distance from the laser.
         """
-        m = p.y / (p.z - self._origin.z)
+        m = (p.y - self._start_y0) / (self._start_dy0 + p.z)
         for _ in range(_NEWTON_STEPS):
             t = self._normalised(m)
             m -= (self._y0(t) + m * p.z - p.y) / (self._dy0(t) + p.z)
@@ -120,12 +124,13 @@ class Sheet:
         exit_mm = (p.z - self._exit_z(t)) * stretch
         away = dr.norm(p - self._origin) - self._waist_at
         sigma = 0.5 * self._waist * dr.sqrt(1 + dr.square(away / self._rayleigh))
-        gauss = dr.exp(-0.5 * dr.square(distance / sigma)) / (sigma * math.sqrt(2 * math.pi))
         # A plane Z = const is crossed by P'(m) dm / dY per length along Y, spread along X as the Gaussian is cut there.
         density = self._power.at(m) / (self._dy0(t) + p.z) * normal.x
-        irradiance = density * gauss * stretch * dr.exp(-self._extinction * exit_mm)
+        in_middle = density / (sigma * math.sqrt(2 * math.pi)) * stretch * dr.exp(-self._extinction * exit_mm)
+        in_middle = dr.select(exit_mm > 0, in_middle, 0.0)
+        irradiance = in_middle * dr.exp(-0.5 * dr.square(distance / sigma))
         direction = mi.Vector3f(tilt, m, 1.0) / stretch
-        return SheetLight(distance, sigma, dr.select(exit_mm > 0, irradiance, 0.0), direction, normal, exit_mm)
+        return SheetLight(distance, sigma, irradiance, in_middle, direction, normal, exit_mm)
 
     def sample(self, u: Point3f) -> Rays:
         """Rays behind the window, of weight 1 and drawn in proportion to power with three numbers from 0 to 1 each.

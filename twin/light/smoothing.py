@@ -23,6 +23,8 @@ import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
+from uwlts.runtime.compiled import compiled
+
 _AT_ONCE = 2**22
 """So many findings are kept before they are sorted; they take some 50 MB."""
 _CLASS_BITS = 2
@@ -39,6 +41,7 @@ _WIDTHS = (0.7, 1.4, 2.8, 5.6)
 """Standard deviations in cells of the local corrections."""
 _STEPS = 40
 """Further steps of the likelihood change the light by less than its noise."""
+_TINY = np.finfo(np.float32).tiny
 
 
 class FoundLight:
@@ -46,13 +49,13 @@ class FoundLight:
 
     def __init__(self, rows: int, columns: int):
         self.shape = rows, columns
-        self._light: dict[int, np.ndarray] = {}
-        self._squares: dict[int, float] = {}
+        self._first = 0
+        self._light, self._squares = np.zeros((0, rows * columns)), np.zeros(0)
         self._new: list[tuple[np.ndarray, np.ndarray]] = []
 
     def add(self, cell: np.ndarray, light: np.ndarray) -> None:
-        """Add the light (N,) of walks of flat cells (N,)."""
-        self._new.append((cell[light > 0], light[light > 0]))
+        """Add the light (N,), above 0, of walks of flat cells (N,)."""
+        self._new.append((cell, light))
         if sum(len(light) for _, light in self._new) > _AT_ONCE:
             self._sort()
 
@@ -63,20 +66,23 @@ class FoundLight:
         cell, light = (np.concatenate(each) for each in zip(*self._new, strict=True))
         self._new = []
         kind = np.frexp(light)[1] // _CLASS_BITS
-        first, size = int(kind.min()), math.prod(self.shape)
-        count = int(kind.max()) - first + 1
-        sums = np.bincount((kind - first) * size + cell, light, count * size).reshape(count, *self.shape)
+        first, end = int(kind.min()), int(kind.max()) + 1
+        if len(self._squares):
+            first, end = min(first, self._first), max(end, self._first + len(self._squares))
+        size, count = math.prod(self.shape), end - first
+        sums = np.bincount((kind - first) * size + cell, light, count * size).reshape(count, size)
         squares = np.bincount(kind - first, np.square(light, dtype=float), count)
-        for each in np.flatnonzero(squares).tolist():
-            self._light[first + each] = self._light.get(first + each, 0.0) + sums[each]
-            self._squares[first + each] = self._squares.get(first + each, 0.0) + float(squares[each])
+        known = slice(self._first - first, self._first - first + len(self._squares))
+        sums[known] += self._light
+        squares[known] += self._squares
+        self._first, self._light, self._squares = first, sums, squares
 
     def classes(self, faint: float = 0.0) -> list[range]:
         """Classes without gaps, from the faintest on; all those of walks that found less than ``faint`` are one."""
         self._sort()
-        if not self._light:
+        if not len(self._squares):
             return []
-        first, last = min(self._light), max(self._light)
+        first, last = self._first, self._first + len(self._squares) - 1
         joined = first
         while joined < last and 2.0 ** (_CLASS_BITS * (joined + 1)) <= faint:
             joined += 1
@@ -84,18 +90,22 @@ class FoundLight:
 
     def light(self, kinds: range) -> np.ndarray:
         """Light (rows, columns) of the walks of some classes."""
-        self._sort()
-        return sum((self._light[kind] for kind in kinds if kind in self._light), np.zeros(self.shape))
+        found = self._light[self._among(kinds)]
+        return (found[0] if len(found) == 1 else found.sum(axis=0)).reshape(self.shape)
 
     def squares(self, kinds: range) -> float:
         """Sum of the squares of what each of these walks found."""
-        self._sort()
-        return sum(self._squares.get(kind, 0.0) for kind in kinds)
+        return float(self._squares[self._among(kinds)].sum())
 
     def total(self) -> np.ndarray:
         """Light (rows, columns) of all walks."""
         self._sort()
-        return sum(self._light.values(), np.zeros(self.shape))
+        return self._light.sum(axis=0).reshape(self.shape)
+
+    def _among(self, kinds: range) -> slice:
+        """Places of classes without gaps among those that were found."""
+        self._sort()
+        return slice(max(kinds.start - self._first, 0), max(kinds.stop - self._first, 0))
 
 
 @dataclass(frozen=True)
@@ -143,8 +153,11 @@ def estimated(
     total = findings.total()
     faint = _FAINT_SHARE * max(tolerance * mean_walks, noise_share * float(total.mean()))
     classes = [kinds for kinds in findings.classes(faint) if findings.squares(kinds) > 0]
-    light = np.array([findings.light(kinds) / mean_walks for kinds in classes], np.float32).reshape(-1, *total.shape)
-    portions = np.array([findings.squares(kinds) / findings.light(kinds).sum() for kinds in classes])
+    each_found = [findings.light(kinds) for kinds in classes]
+    light = np.array([found / mean_walks for found in each_found], np.float32).reshape(-1, *total.shape)
+    portions = np.array(
+        [findings.squares(kinds) / found.sum() for kinds, found in zip(classes, each_found, strict=True)]
+    )
     weights = _weights(light, features, exposure)
     each_described = (weights @ features.reshape(len(features), -1)).reshape(light.shape)
     described = each_described.sum(axis=0)
@@ -153,7 +166,7 @@ def estimated(
     for found, expected, portion in zip(light, each_described, portions / mean_walks, strict=True):
         cells += _corrected(found, expected, exposure, portion, allowed)
     # Over all walks, nothing is added or lost.
-    cells *= light.sum(dtype=float) / max((exposure * cells).sum(dtype=float), float(np.finfo(np.float32).tiny))
+    cells *= light.sum(dtype=float) / max((exposure * cells).sum(dtype=float), float(_TINY))
     return SmoothLight(cells, described, classes, weights, portions, tolerance, noise_share)
 
 
@@ -169,7 +182,7 @@ def _corrected(
     for width in _WIDTHS:
         if accepted.all():
             break
-        nearby = np.maximum(_under_gaussian(exposure * expected, width), np.finfo(np.float32).tiny)
+        nearby = np.maximum(_under_gaussian(exposure * expected, width), _TINY)
         share = expected / nearby
         suffices = ~accepted & _quiet(expected, portion * share / (4 * math.pi * width**2), allowed)
         if suffices.any():
@@ -195,12 +208,47 @@ def _weights(light: np.ndarray, features: np.ndarray, exposure: np.ndarray) -> n
     counts, seen = _in_blocks(light), _in_blocks(features * exposure)
     norm = seen.sum(axis=1)
     per_norm = np.divide(1, norm, out=np.zeros_like(norm), where=norm > 0)
-    back = (seen * per_norm[:, None]).T.copy()
     weights = counts.sum(axis=1)[:, None] * per_norm / np.count_nonzero(norm)
-    for _ in range(_STEPS):
-        weights *= (counts / np.maximum(weights @ seen, np.finfo(np.float32).tiny)) @ back
-        weights[weights < _NO_WEIGHT * per_norm] = 0  # numbers that small are slow
+    seen = np.ascontiguousarray(seen.T)
+    scratch = np.empty_like(per_norm), np.empty(len(seen), np.int64)
+    for each, found in zip(weights, counts, strict=True):
+        _maximise(each, found, seen, seen * per_norm, _NO_WEIGHT * per_norm, *scratch)
     return weights
+
+
+@compiled
+def _maximise(
+    weights: np.ndarray,
+    counts: np.ndarray,
+    seen: np.ndarray,
+    back: np.ndarray,
+    least: np.ndarray,
+    gain: np.ndarray,
+    found: np.ndarray,
+) -> None:
+    """Improve the weights (J,) by `_STEPS` steps, so that they make the counts of blocks (B,) more likely.
+
+    ``seen`` (B, J) is what the features send to each block, ``back`` each feature's share of itself there. Blocks
+    without counts change nothing. Weights below ``least`` (J,), numbers so small that they are slow, become 0. ``gain``
+    (J,) and ``found`` (B,) are overwritten.
+    """
+    some = 0
+    for block in range(len(counts)):
+        if counts[block] > 0:
+            found[some] = block
+            some += 1
+    for _ in range(_STEPS):
+        gain[:] = 0
+        for k in range(some):
+            block = found[k]
+            expected = np.float32(0)
+            for j in range(len(weights)):
+                expected += weights[j] * seen[block, j]
+            ratio = counts[block] / max(expected, _TINY)
+            for j in range(len(weights)):
+                gain[j] += ratio * back[block, j]
+        for j in range(len(weights)):
+            weights[j] = weights[j] * gain[j] if weights[j] * gain[j] >= least[j] else np.float32(0)
 
 
 def _in_blocks(cells: np.ndarray) -> np.ndarray:

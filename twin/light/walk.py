@@ -28,7 +28,7 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import PCG32, Bool, BSDFPtr, Float, Point2f, Point3f, SurfaceInteraction3f, UInt32, Vector3f
-from twin.light.illumination import Light, SheetLobe
+from twin.light.illumination import Light, Passage, SheetLobe
 from twin.light.pose import Rays, SensorPose
 from twin.light.sheet import SheetLight
 from twin.light.water import Scattering, one_minus_cosine, turned
@@ -37,7 +37,7 @@ from twin.scene.objects import Objects
 
 _STEPS = 64
 """No walk is longer; in the most turbid waters fewer than one in 10^4 would be."""
-_FEW = 2**15
+_FEW = 2**16
 """So many walks or fewer are followed to their end in one kernel, which costs less than a launch for every stretch."""
 _TOWARDS_LASER = 0.15
 """Share of directions drawn about the direction to the laser."""
@@ -152,13 +152,21 @@ class Walker:
             return walks, mi.Point2f(found + more), alive, seed + 1, left - 1
 
         width = dr.width(walks.cell)
-        walks, found, alive, _, _ = dr.while_loop(
-            (walks, dr.zeros(mi.Point2f, width), dr.full(mi.Bool, True, width), seed, dr.opaque(mi.UInt32, stretches)),
-            lambda walks, found, alive, seed, left: alive & (left > 0),
-            following,
-            mode="symbolic",
-            label="walks",
-        )
+        # Without a second writing of the loop, which would find next to nothing that does not change in it.
+        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+            walks, found, alive, _, _ = dr.while_loop(
+                (
+                    walks,
+                    dr.zeros(mi.Point2f, width),
+                    dr.full(mi.Bool, True, width),
+                    seed,
+                    dr.opaque(mi.UInt32, stretches),
+                ),
+                lambda walks, found, alive, seed, left: alive & (left > 0),
+                following,
+                mode="symbolic",
+                label="walks",
+            )
         return walks, found, alive
 
     def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Point2f, Bool]:
@@ -176,13 +184,14 @@ class Walker:
         mirror = dr.select(hit, self.objects.mirror_share(si), 0.0)
 
         from_sheet, from_surfaces = mi.Float(0.0), mi.Float(0.0)
+        passages = [light.passage(o, d, length) for light in self.lights if self.scatters]
+        for light, passage in zip(self.lights, passages, strict=False):
+            from_sheet += self._scattered_by_sheet(light, passage, o, d, walks.away, rng.next_float32())
         for light in self.lights:
-            if self.scatters:
-                from_sheet += self._scattered_by_sheet(light, o, d, length, walks.away, rng.next_float32())
             from_surfaces += dr.exp(-c * length) * self._lit_end(light, walks, si, bsdf, end, hit)
 
         # The walk is scattered on its way or ends on the surface, and goes on if it still promises enough.
-        in_water, distance, passed = self._free_path(o, d, length, hit, rng)
+        in_water, distance, passed = self._free_path(passages, length, hit, rng)
         vertex = mi.Point3f(o + d * distance)
         reflected, scattered_now = cast(Bool, walks.reflected | ~in_water), cast(Bool, walks.scattered | in_water)
         here = [light.at(vertex) for light in self.lights]
@@ -268,10 +277,10 @@ class Walker:
         return following, mi.Point2f(walks.weight * by_water, walks.weight * between_surfaces), alive
 
     def _scattered_by_sheet(
-        self, light: Light, o: Point3f, d: Vector3f, length: Float, active: Bool, u: Float
+        self, light: Light, passage: Passage, o: Point3f, d: Vector3f, active: Bool, u: Float
     ) -> Float:
         """Radiance that the sheet scatters once into rays, from one place on each."""
-        t, density = light.pick_in_sheet(o, d, length, u)
+        t, density = passage.pick(u)
         p = mi.Point3f(o + d * t)
         here = light.at(p)
         active = active & (density > 0) & (here.irradiance > 0)
@@ -325,7 +334,7 @@ class Walker:
         light_there = light.power_w * sent * dr.exp(-self.scattering.c * way) / dr.square(distance)
         return dr.select(active & (by_light > 0), value * light_there * by_light / (by_light + by_walk), 0.0)
 
-    def _free_path(self, o: Point3f, d: Vector3f, length: Float, hit: Bool, rng: PCG32) -> tuple[Bool, Float, Float]:
+    def _free_path(self, passages: list[Passage], length: Float, hit: Bool, rng: PCG32) -> tuple[Bool, Float, Float]:
         """Whether walks are scattered before the surface, how far along they then are, and the share of light left.
 
         Scattering is drawn as often as it promises light compared with the surface, whatever the water's clarity;
@@ -343,8 +352,8 @@ class Walker:
         likely = dr.select(hit, dr.clip(promised / (promised + 0.5 * through), 0.3, 0.7), 1.0)
         in_water = choice < likely
         distance = -dr.log(1 - u * share) / fall
-        each = _NEAR_SHEET / len(self.lights)
-        crossings = [light.near_crossing(o, d, length) for light in self.lights]
+        each = _NEAR_SHEET / len(passages)
+        crossings = [passage.nearest() for passage in passages]
         spans = [(dr.log(1 + t / apart), dr.log(1 + (length - t) / apart)) for t, apart in crossings]
         for k, ((t, apart), (before, after)) in enumerate(zip(crossings, spans, strict=True)):
             place = u * (before + after) - before

@@ -1,4 +1,4 @@
-"""Scattering in the water: its phase function, evaluated and sampled, and the sheet's light scattered once.
+"""Scattering in the water: its phase function, evaluated and sampled.
 
 All phase functions have one table form, computed in float64 by NumPy. With the scattering angle t and
 h = sin^2(t / 2), 1 - cos t is 2 h; the table runs over x = log(h / (1 - h)) = 2 log tan(t / 2) in even steps, which
@@ -16,7 +16,6 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import Bool, Float, Point2f, UInt32, Vector3f, opaque, to_jit
-from twin.light.sheet import SheetLight
 from uwlts.model.phase_functions import Molecular, PhaseFunction, Scatterer
 from uwlts.model.sensor import Medium
 
@@ -222,21 +221,3 @@ def turned(axis: Vector3f, heights: tuple[Float, Float], u: Float) -> Vector3f:
 def one_minus_cosine(a: Vector3f, b: Vector3f) -> Float:
     """1 - cos of the angle between unit vectors, exact for small angles too."""
     return 0.5 * dr.squared_norm(a - b)
-
-
-def single_scattering(
-    scattering: Scattering, light: SheetLight, *, direction: Vector3f, surface_sigmas: Float
-) -> Float:
-    """Radiance that the sheet scatters once into a camera ray where the ray crosses it, in W/mm2/sr.
-
-    ``light`` is the sheet at the crossing, where the distance across is about zero; ``surface_sigmas`` the distance
-    across, in standard deviations and along the ray, of its end on a surface, which cuts the Gaussian off.
-    The line integral of a Gaussian along a straight ray is b p(angle) E sigma sqrt(2 pi) / |cos| times the share of the
-    Gaussian that the ray has passed.
-    """
-    cosine = dr.maximum(dr.abs(dr.dot(direction, light.normal)), 1e-3)
-    peak = light.irradiance * light.sigma_mm * math.sqrt(2 * math.pi)
-    share = 0.5 * (1 + dr.erf(surface_sigmas / math.sqrt(2.0)))
-    # The light leaves against the camera ray, so that the difference of both directions is a sum here.
-    phase = scattering.phase(0.5 * dr.squared_norm(light.direction + direction))
-    return scattering.b * phase * peak / cosine * share

@@ -115,9 +115,10 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
         return dr.select(hit.is_valid() & (bundle.weight > 0), light.distance_mm, dr.nan)
 
     # Neighbours across the stripe share an edge.
-    edges = np.zeros((camera.lines(), (camera.height_px if along_width else camera.width_px) + 1), np.float32)
-    edges[line, cell] = edges[line, cell + 1] = 1
-    edge_line, edge = places(edges)
+    marked = np.zeros((camera.lines(), (camera.height_px if along_width else camera.width_px) + 1), bool)
+    marked[line, cell] = marked[line, cell + 1] = True
+    edge_line, edge = places(marked)
+    edges = np.empty(marked.shape, np.float32)
     edges[edge_line, edge] = distance(to_jit(mi.Float, edge - 0.5), to_jit(mi.Float, edge_line)).numpy()
     below, above = edges[line, cell], edges[line, cell + 1]
     bracketed = (below <= 0) != (above <= 0)
@@ -136,12 +137,14 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
         high, above = dr.select(same_side, high, centre), dr.select(same_side, above, found)
         return low, high, below, above, at, left - 1
 
-    low, high, below, above, at, _ = dr.while_loop(
-        (low, high, below, above, at, dr.full(mi.UInt32, _FALSE_POSITIONS, len(line))),
-        lambda low, high, below, above, at, left: left > 0,
-        narrowed,
-        mode="symbolic",
-    )
+    # Written down once, as in `Walker`.
+    with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+        low, high, below, above, at, _ = dr.while_loop(
+            (low, high, below, above, at, dr.full(mi.UInt32, _FALSE_POSITIONS, len(line))),
+            lambda low, high, below, above, at, left: left > 0,
+            narrowed,
+            mode="symbolic",
+        )
     centre = low + (high - low) * below / (below - above)
     dr.eval(centre)
     bundle = renderer.view.bundle(*position(centre, at))

@@ -1,13 +1,16 @@
 """A sensor before a scene: its images with exposures and noise, and their recording into a capture with the truth."""
 
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -139,10 +142,12 @@ class Studio:
         check_scene(self.renderer, scene)
         camera, laser = self.sensor.camera, self.sensor.laser
         self._speckle = Speckle(camera, wavelength_nm=laser.wavelength_nm, seed=options.seed)
-        self._vignette = vignette(camera, flaws.vignetting) if flaws.vignetting else 1.0
+        # None where everything passes: each pass over an image takes a millisecond.
+        self._passed = vignette(camera, flaws.vignetting) if flaws.vignetting else None
         if flaws.dirt and mounted:
-            self._vignette = self._vignette * dirt(camera, flaws.dirt, seed=options.seed)
-        self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else 1.0
+            clean = dirt(camera, flaws.dirt, seed=options.seed)
+            self._passed = clean if self._passed is None else self._passed * clean
+        self._laser_shares = laser_shares(camera.height_px, camera.width_px) if flaws.colour_filter else None
         self.peak_finder = None
         if flaws.camera_3d:
             self.peak_finder = PeakFinder(camera, self.sensor.detector.full_scale_dn(), flaws.camera_3d)
@@ -233,9 +238,8 @@ class Studio:
         """Mean photo-electrons per ms (H, W) of what `_light` returns, with ``speckle`` if that is rendered."""
         light = self._through_lens(even)
         if laser is not None:
-            light += self._laser_shares * self._through_lens(
-                self._speckled(laser, shot) if speckle else laser.irradiance()
-            )
+            seen = self._through_lens(self._speckled(laser, shot) if speckle else laser.irradiance())
+            light = light + (seen if self._laser_shares is None else self._laser_shares * seen)
         return self._to_electrons(light)
 
     def _to_electrons(self, irradiance: np.ndarray) -> np.ndarray:
@@ -248,7 +252,7 @@ class Studio:
 
     def _through_lens(self, irradiance: np.ndarray) -> np.ndarray:
         """Irradiance (H, W) behind a lens with vignetting and glare."""
-        passed, glare = irradiance * self._vignette, self.options.flaws.glare
+        passed, glare = irradiance if self._passed is None else irradiance * self._passed, self.options.flaws.glare
         return veiled(passed, glare) if glare else passed
 
     def _speckled(self, frame: LaserFrame, shot: Shot) -> np.ndarray:
@@ -322,7 +326,8 @@ class Studio:
         parts = [nothing] * 4
         if laser is not None:
             parts = [laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles]
-        parts = [self._laser_shares * self._through_lens(part) if part.any() else nothing for part in parts]
+        shares = 1.0 if self._laser_shares is None else self._laser_shares
+        parts = [shares * self._through_lens(part) if part.any() else nothing for part in parts]
         parts = [exposure_ms * self._to_electrons(part) for part in (*parts, self._through_lens(even))]
         image = self._taken(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)
         return Exposed(image, exposure_ms, *(np.maximum(part, 0, dtype=np.float32) for part in parts))
@@ -385,6 +390,25 @@ def lit_level(peaks: np.ndarray) -> float:
     reference = np.sort(peaks)[-1 - min(STRAY_LINES, len(peaks) - 1)]
     lit = peaks[peaks > LIT_SHARE * reference]
     return float(np.quantile(lit, BRIGHT_SHARE)) if len(lit) else 0.0
+
+
+@contextmanager
+def _threads_kept() -> Iterator[int]:
+    """The number of Dr.Jit's threads, as it is again afterwards."""
+    threads = dr.thread_count()
+    try:
+        yield threads
+    finally:
+        dr.set_thread_count(threads)
+
+
+def _threads_for(shot: Shot, threads: int) -> int:
+    """How many of Dr.Jit's threads render a shot while another thread exposes and writes the one before.
+
+    Between the many small kernels of a laser image they would keep that one from its processor; a lamp image has few
+    large kernels.
+    """
+    return threads if shot.light == "lamp" else min(threads, max(1, (os.cpu_count() or 1) - 1))
 
 
 def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], shots: Sequence[Shot]) -> Truth:
@@ -457,6 +481,7 @@ def record_scene(
     with (
         CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer,
         ThreadPoolExecutor(1) as camera,
+        _threads_kept() as threads,
     ):
         done = len(writer)
 
@@ -472,6 +497,7 @@ def record_scene(
         # An image is exposed and written while the light of the next one is rendered.
         before: Future[None] | None = None
         for index, shot in enumerate(shots):
+            dr.set_thread_count(_threads_for(shot, threads))
             # The light first: the truth goes on from where it found the stripe.
             light = studio.light(shot, index) if index >= done else None
             truths.append(studio.truth(shot))

@@ -48,12 +48,14 @@ class Objects:
 
     ``scene`` holds what scatters light; ``mirrors`` are the faces that reflect beside that. Tables give a fact of each
     shape at its number in Dr.Jit's registry, which counts through all scenes of the process. With ``coherent``, rays
-    that lie side by side are faster followed together: among facets, not among spheres and cylinders.
+    that lie side by side are faster followed together: among facets, not among spheres and cylinders. ``glossy`` says
+    whether any object's albedo depends on the direction.
     """
 
     scene: mi.Scene
     mirrors: tuple[MirrorFace, ...]
     coherent: Bool
+    glossy: bool
     _facts: dict[str, Float]
 
     def mirror_share(self, si: SurfaceInteraction3f) -> Float:
@@ -81,6 +83,8 @@ class Objects:
         """
         active = active & si.is_valid() & ((si.wi.z > 0) | (self._fact("two_sided", si) > 0))
         reflectance = si.bsdf().eval_diffuse_reflectance(square_on(si), active)[0]
+        if not self.glossy:
+            return dr.select(active, reflectance, 0.0)
         last = len(_ALBEDO_COSINES) - 1
         place = dr.minimum(dr.abs(si.wi.z), 1.0) * last
         below = mi.UInt32(dr.minimum(dr.floor(place), last - 1))
@@ -111,9 +115,10 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
     placed = list(zip(things, scene.object_poses(), strict=True))
     shapes = [_shape(thing, pose, finish_bsdf(thing, gloss=gloss, **optics)) for thing, pose in placed]
     flat = np.zeros_like(_ALBEDO_COSINES), np.ones_like(_ALBEDO_COSINES)
+    glossy = [gloss and thing.finish != "diffuse" for thing in things]
     parts = [
-        albedo_parts(thing, _ALBEDO_COSINES, **optics) if gloss and thing.finish != "diffuse" else flat
-        for thing in things
+        albedo_parts(thing, _ALBEDO_COSINES, **optics) if shines else flat
+        for thing, shines in zip(things, glossy, strict=True)
     ]
     facts = {
         "mirror": [thing.mirror_share() if gloss else 0.0 for thing in things],
@@ -131,6 +136,7 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
     return Objects(
         scene=whole,
         coherent=mi.Bool(any(shape.is_mesh() for shape in shapes)),
+        glossy=any(glossy),
         mirrors=tuple(face for thing, pose in placed if gloss for face in _mirror_faces(thing, pose)),
         _facts={key: _by_registry(shapes, np.array(values, float)) for key, values in facts.items()},
     )

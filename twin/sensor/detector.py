@@ -1,21 +1,21 @@
 """From light to grey values, after EMVA 1288: photons, electrons, noise, full well, gain, quantisation.
 
 A camera's pixels differ from each other, the same way in every image (`fixed_pattern`); charge that a full pixel cannot
-hold spills along its column (`spilled`); shot noise comes from `poisson_numbers`.
+hold spills along its column (`spilled`); shot and read noise come from `twin.sensor.random_numbers`.
 """
 
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
 from typing import cast
 
 import numpy as np
-from scipy import special
 
+from twin.sensor.random_numbers import add_normal_numbers, poisson_numbers
 from uwlts.model.errors import ImageError
 from uwlts.model.sensor import Camera, Detector
+from uwlts.runtime.compiled import compiled
 
 PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0
 """h c in J m (SI, exact)."""
@@ -27,18 +27,6 @@ _BANDS = 8
 """Bands of rows with random numbers of their own: at most so many are made at a time."""
 _STREAM = 1288
 """Keeps the pattern's random numbers apart from those of the images, whatever their seeds."""
-
-POISSON_STEP = 0.125
-"""Step of the means for which `poisson_numbers` has a table; smaller ones make a larger table and fewer events."""
-LARGEST_MEAN = 32.0
-"""Means from here on are left to NumPy."""
-_LEVELS = int(LARGEST_MEAN / POISSON_STEP)
-_CELLS = 4096
-"""Cells of the unit interval in a table: twelve bits of a random number choose one."""
-_COUNTS = 120
-"""Counts with a probability above 1e-17 for every mean in the table."""
-_SEVERAL = 255
-"""Marks a cell that does not belong to a single count."""
 
 
 def electrons_per_ms(irradiance: np.ndarray, camera: Camera, detector: Detector, *, wavelength_nm: float) -> np.ndarray:
@@ -101,30 +89,48 @@ def _collected(
     rng: np.random.Generator | None,
 ) -> np.ndarray:
     """Electrons of light and dark current that an exposure collects, before any are lost."""
-    dark = np.float32(1e-3 * exposure_ms * detector.dark_current_e_per_s * detector.dark_current_growth())
-    mean = electrons if pattern is None else electrons * pattern.gain
-    if pattern is not None:
-        mean += pattern.hot_e_per_s * np.float32(1e-3 * exposure_ms)
-    mean = mean + dark
+    exposure_s = 1e-3 * exposure_ms
+    dark = np.float32(exposure_s * detector.dark_current_e_per_s * detector.dark_current_growth())
+    if pattern is None:
+        mean = electrons + dark
+    else:
+        mean = np.empty_like(electrons, order="C")
+        light, gain, hot = (values.ravel() for values in (electrons, pattern.gain, pattern.hot_e_per_s))
+        _mean_electrons(light, gain, hot, exposure_s, float(dark), mean.ravel())
     return mean if rng is None else poisson_numbers(mean, rng)
+
+
+@compiled
+def _mean_electrons(
+    light: np.ndarray, gain: np.ndarray, hot_e_per_s: np.ndarray, exposure_s: float, dark: float, mean: np.ndarray
+) -> None:
+    """Mean electrons (N,) of pixels with a gain and a dark current (N,) of their own beyond that of all."""
+    seconds, everywhere = np.float32(exposure_s), np.float32(dark)
+    for i in range(len(light)):
+        mean[i] = light[i] * gain[i] + hot_e_per_s[i] * seconds + everywhere
 
 
 def _digitised(
     charge: np.ndarray, detector: Detector, pattern: FixedPattern | None, rng: np.random.Generator | None
 ) -> np.ndarray:
-    """Grey values of collected electrons."""
-    signal = np.minimum(charge, np.float32(detector.full_well_e))
+    """Grey values of collected electrons, which are overwritten."""
+    signal = np.minimum(charge, np.float32(detector.full_well_e), out=charge)
     if pattern is not None:
         signal += pattern.offset_e
     if rng is not None:
-        noise = rng.standard_normal(signal.shape, dtype=np.float32)
-        noise *= np.float32(detector.read_noise_e)
-        signal += noise
-    signal *= np.float32(detector.gain_dn_per_e())
-    signal += np.float32(detector.black_level_dn)
-    np.rint(signal, out=signal)
-    np.clip(signal, 0, detector.full_scale_dn(), out=signal)
-    return signal.astype(np.uint8 if detector.bits == 8 else np.uint16)
+        add_normal_numbers(signal, detector.read_noise_e, rng)
+    image = np.empty(signal.shape, np.uint8 if detector.bits == 8 else np.uint16)
+    scale, offset = np.float32(detector.gain_dn_per_e()), np.float32(detector.black_level_dn)
+    _rounded(signal.ravel(), scale, offset, np.float32(detector.full_scale_dn()), image.ravel())
+    return image
+
+
+@compiled
+def _rounded(signal: np.ndarray, scale: np.float32, offset: np.float32, most: np.float32, image: np.ndarray) -> None:
+    """Signals (N,), float32, scaled, with an offset, rounded to integers from 0 to ``most`` into the image (N,)."""
+    nothing = np.float32(0)
+    for i in range(len(signal)):
+        image[i] = min(max(np.rint(signal[i] * scale + offset), nothing), most)
 
 
 @dataclass(frozen=True)
@@ -197,55 +203,3 @@ def _swept(charge: np.ndarray, full_well_e: float, share: float) -> np.ndarray:
             kept[row] = np.minimum(held, full_well_e)
             arriving = share * (held - kept[row]) + spilt_each_way[row]
     return kept
-
-
-def poisson_numbers(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Poisson random numbers, float32, of the shape of their means (float32, finite, not negative).
-
-    Most pixels of a laser image are nearly dark, for which this is several times faster than NumPy. A mean is split,
-    m = m_j + r, with m_j on a grid of steps h and 0 <= r < h. The part of m_j is found by inversion in a table: one of
-    4096 equal cells of the unit interval holds the uniform number, and nearly all cells belong to a single count; the
-    others, and with them the tail, are settled by a further uniform number and the distribution function. The part of r
-    is a Poisson process of density h over all pixels of which each event is kept with probability r / h (L. Devroye,
-    Non-Uniform Random Variate Generation, 1986, sections III.2.4 and VI.1.3). Sums of Poisson numbers are Poisson's, so
-    the result is exact to the resolution of a double.
-    """
-    flat = mean.ravel()
-    large = np.flatnonzero(flat >= LARGEST_MEAN)
-    if large.size == flat.size:
-        return rng.poisson(mean).astype(np.float32)
-    if large.size:
-        flat = flat.copy()
-        flat[large] = 0.0
-    numbers = _small_poisson_numbers(flat, rng)
-    numbers[large] = rng.poisson(mean.ravel()[large])
-    return numbers.reshape(mean.shape)
-
-
-def _small_poisson_numbers(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Poisson random numbers (N,), float32, of means (N,) below LARGEST_MEAN."""
-    count_of_cell, distribution = _poisson_tables()
-    share = mean * np.float32(1 / POISSON_STEP)
-    entry = share.astype(np.intp)
-    share -= entry
-    entry *= _CELLS
-    # Sixteen bits at a time come fastest; the upper twelve choose the cell.
-    entry += rng.integers(0, 2**16, mean.size, dtype=np.uint16) >> 4
-    numbers = count_of_cell[entry]
-    open_ = np.flatnonzero(numbers == _SEVERAL)
-    level, cell = np.divmod(entry[open_], _CELLS)
-    uniform = (cell + rng.random(open_.size)) / _CELLS
-    numbers[open_] = np.count_nonzero(distribution[level] <= uniform[:, None], axis=1)
-    events = rng.integers(0, mean.size, rng.poisson(POISSON_STEP * mean.size))
-    np.add.at(numbers, events[rng.random(events.size) < share[events]], np.uint8(1))
-    return numbers.astype(np.float32)
-
-
-@cache
-def _poisson_tables() -> tuple[np.ndarray, np.ndarray]:
-    """The count of every cell of every level (levels * cells,), and the distribution functions (levels, counts)."""
-    distribution = special.pdtr(np.arange(_COUNTS), POISSON_STEP * np.arange(_LEVELS)[:, None])
-    edges = np.arange(_CELLS + 1) / _CELLS
-    lowest = np.array([np.searchsorted(row, edges[:-1], side="right") for row in distribution])
-    highest = np.array([np.searchsorted(row, edges[1:], side="left") for row in distribution])
-    return np.where(lowest == highest, lowest, _SEVERAL).astype(np.uint8).ravel(), distribution

@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from scipy import fft, ndimage, special
 from scipy.special import j1
 
+from twin.sensor.random_numbers import add_normal_numbers
 from uwlts.model.errors import DesignError, ImageError, RangeError
 from uwlts.model.sensor import Camera
 
@@ -317,8 +318,8 @@ def _draw(size: int, seed: int, group: int, node: int) -> np.ndarray:
     """Circular complex Gaussian numbers (size,) of mean square 1 that belong to a lattice node of either sign."""
     key = (group, 2 * node if node >= 0 else -2 * node - 1)
     rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=key)))
-    parts = rng.standard_normal(2 * size, dtype=np.float32)
-    parts *= np.float32(math.sqrt(0.5))
+    parts = np.zeros(2 * size, np.float32)
+    add_normal_numbers(parts, math.sqrt(0.5), rng)
     return parts.view(np.complex64)
 
 

@@ -1,0 +1,68 @@
+"""Haze: the light that the water scatters once out of a sheet into the camera's rays, where they cross it.
+
+The windows and the sheets stand still before the camera, so that everything but what surfaces cut off and shade is the
+same in all frames.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from twin.backend.arrays import Float, Vector3f
+from twin.light.camera import RaySegment
+from twin.light.illumination import Light
+from twin.light.pose import Rays
+from twin.light.sheet import SheetLight
+from twin.light.water import Scattering
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """Crossings of camera rays with the middle of a sheet, at ``distance_mm`` along them.
+
+    ``sense`` is 1 where a ray goes on to the side of the sheet's normal, else -1; ``irradiance`` on the image sensor in
+    W/mm2 is that of the water's scattering where nothing is in the way; ``direction`` and ``exit_mm`` are the light's.
+    """
+
+    distance_mm: Float
+    sense: Float
+    irradiance: Float
+    direction: Vector3f
+    exit_mm: Float
+
+
+def crossing(light: Light, scattering: Scattering, rays: Rays) -> Crossing:
+    """Where camera rays cross a sheet; of a direct light it is the same at all poses.
+
+    The line integral of a Gaussian along a straight ray is b p(angle) E sigma sqrt(2 pi) / |cos|, p being the phase
+    function and E the irradiance in the sheet's middle.
+    """
+    origin, direction = light.in_own_frame(rays.origin, rays.direction)
+    t, middle = light.crossing(origin, direction)
+    towards = dr.dot(direction, middle.normal)
+    peak = middle.irradiance * middle.sigma_mm * math.sqrt(2 * math.pi)
+    # The light leaves against the camera ray, so that the difference of both directions is a sum here.
+    phase = scattering.phase(0.5 * dr.squared_norm(middle.direction + direction))
+    radiance = scattering.b * phase * peak / dr.maximum(dr.abs(towards), 1e-3) * dr.exp(-scattering.c * t)
+    here = light.at(mi.Point3f(rays.origin + rays.direction * t))
+    return Crossing(t, dr.sign(towards), rays.weight * dr.select(t > 0, radiance, 0.0), here.direction, here.exit_mm)
+
+
+def haze(crossed: Crossing, light: Light, scene: mi.Scene, segment: RaySegment, at_end: SheetLight) -> Float:
+    """Irradiance on the image sensor in W/mm2 of rays that end on surfaces, where ``at_end`` is the sheet's light.
+
+    A surface cuts off what of the Gaussian lies behind it. One just before the sheet's middle does so, but does not
+    shadow what lies before it: there, shadows are those of the surface itself.
+    """
+    end_sigmas = dr.select(segment.valid, crossed.sense * at_end.distance_mm / at_end.sigma_mm, dr.inf)
+    scattered = crossed.irradiance * (0.5 * (1 + dr.erf(end_sigmas / math.sqrt(2.0))))
+    before = ~segment.valid | (crossed.distance_mm < segment.si.t)
+    place = segment.origin + segment.direction * dr.select(before, crossed.distance_mm, segment.si.t)
+    direction = dr.select(before, crossed.direction, at_end.direction)
+    exit_mm = dr.select(before, crossed.exit_mm, at_end.exit_mm)
+    here = replace(at_end, direction=direction, exit_mm=exit_mm)
+    return dr.select(light.reaches(scene, mi.Point3f(place), here, None, scattered > 0), scattered, 0.0)
