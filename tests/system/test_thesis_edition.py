@@ -29,9 +29,9 @@ pytestmark = pytest.mark.slow
 
 SPHERES, PLANE = ("spheres", "standoff"), ("plane", "standoff")
 GATES_MM = {
-    (*SPHERES, "two refractions", "ours", "SSE"): (0.0264, 0.0464),
+    (*SPHERES, "two refractions", "ours", "SSE"): (-0.0001, 0.0199),
     (*SPHERES, "two refractions", "ours", "STD"): (0.015, 0.025),
-    (*SPHERES, "proposed", "ours", "SSE"): (0.0168, 0.0568),
+    (*SPHERES, "proposed", "ours", "SSE"): (-0.0086, 0.0314),
     (*SPHERES, "polynomials", "ours", "SSE"): (-0.02, 0.02),
     (*SPHERES, "single viewpoint", "ours", "SSE"): (-0.02, 0.02),
     (*SPHERES, "proposed", "thesis", "STD"): (0.08, 0.10),
@@ -40,7 +40,7 @@ GATES_MM = {
 }
 """Least and greatest value of a figure with its sign, about what was measured with the noise of this seed.
 
-Nine poses leave a spacing error by refractions of +0.013 to +0.047 mm in six other draws of the noise.
+Nine poses leave a spacing error by refractions of +0.008 to +0.047 mm in eleven other draws of the noise.
 """
 POSES = {"direction": (0.0, 0.0, 1.0), "lights": ("lamp", "laser"), "count": 9}
 RECORDINGS = (

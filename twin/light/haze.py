@@ -21,7 +21,7 @@ from twin.light.water import Scattering
 
 
 @dataclass(frozen=True)
-class Crossing:
+class SheetCrossing:
     """Crossings of camera rays with the middle of a sheet, at ``distance_mm`` along them.
 
     ``sense`` is 1 where a ray goes on to the side of the sheet's normal, else -1; ``irradiance`` on the image sensor in
@@ -35,7 +35,7 @@ class Crossing:
     exit_mm: Float
 
 
-def crossing(light: Light, scattering: Scattering, rays: Rays) -> Crossing:
+def crossing(light: Light, scattering: Scattering, rays: Rays) -> SheetCrossing:
     """Where camera rays cross a sheet; of a direct light it is the same at all poses.
 
     The line integral of a Gaussian along a straight ray is b p(angle) E sigma sqrt(2 pi) / |cos|, p being the phase
@@ -49,10 +49,12 @@ def crossing(light: Light, scattering: Scattering, rays: Rays) -> Crossing:
     phase = scattering.phase(0.5 * dr.squared_norm(middle.direction + direction))
     radiance = scattering.b * phase * peak / dr.maximum(dr.abs(towards), 1e-3) * dr.exp(-scattering.c * t)
     here = light.at(mi.Point3f(rays.origin + rays.direction * t))
-    return Crossing(t, dr.sign(towards), rays.weight * dr.select(t > 0, radiance, 0.0), here.direction, here.exit_mm)
+    return SheetCrossing(
+        t, dr.sign(towards), rays.weight * dr.select(t > 0, radiance, 0.0), here.direction, here.exit_mm
+    )
 
 
-def haze(crossed: Crossing, light: Light, scene: mi.Scene, segment: RaySegment, at_end: SheetLight) -> Float:
+def haze(crossed: SheetCrossing, light: Light, scene: mi.Scene, segment: RaySegment, at_end: SheetLight) -> Float:
     """Irradiance on the image sensor in W/mm2 of rays that end on surfaces, where ``at_end`` is the sheet's light.
 
     A surface cuts off what of the Gaussian lies behind it. One just before the sheet's middle does so, but does not

@@ -21,7 +21,7 @@ import numpy as np
 
 from twin.backend.arrays import Float, Point3f, begin_kernels, opaque, to_jit
 from twin.light.camera import CameraView, RaySegment, ray_segments
-from twin.light.haze import Crossing, crossing, haze
+from twin.light.haze import SheetCrossing, crossing, haze
 from twin.light.illumination import Light, lights
 from twin.light.image_sampling import (
     NODE_SPACING_PX,
@@ -138,7 +138,7 @@ class Renderer:
         self.scattering = Scattering(medium, wavelength)
         self.sheet = Sheet(sensor, medium)
         self._sheets = [self.sheet, *(Sheet(sensor, medium, laser) for laser in sensor.more_lasers)]
-        self._crossings: dict[Sheet, Crossing] = {}
+        self._crossings: dict[Sheet, SheetCrossing] = {}
         self._mirrors = self.objects.mirrors if effects.secondary_light else ()
         # Through the water to the stand-off and back, light is scattered so many times.
         scatterings = 2 * self.scattering.coefficient * self.design.standoff_mm
@@ -297,7 +297,7 @@ class Renderer:
                 direct, mirrored = lights(self._sheets, moved, self._mirrors)
                 yield moved, direct + mirrored
 
-    def _crossing(self, light: Light, bundle: Rays) -> Crossing:
+    def _crossing(self, light: Light, bundle: Rays) -> SheetCrossing:
         """Where the nodes' rays cross a sheet, kept from frame to frame unless a mirror shows it."""
         if light.mirrored:
             return crossing(light, self.scattering, bundle)

@@ -68,7 +68,13 @@ def _start(rng: np.random.Generator) -> np.uint64:
 @compiled_part
 def _next(state: np.uint64) -> np.uint64:
     """The next state; its bits are made random by `_mixed` (SplitMix64: Steele, Lea and Flood 2014, Fig. 17)."""
-    return state + np.uint64(0x9E3779B97F4A7C15)
+    return _later(state, 1)
+
+
+@compiled_part
+def _later(state: np.uint64, steps: int) -> np.uint64:
+    """The state after so many steps."""
+    return state + np.uint64(steps) * np.uint64(0x9E3779B97F4A7C15)
 
 
 @compiled_part
@@ -94,23 +100,26 @@ def _small_poisson_numbers(
     events: int,
     numbers: np.ndarray,
 ) -> None:
-    """Poisson random numbers (N,) of means (N,) below LARGEST_MEAN; others are left 0. ``events`` are drawn in all."""
+    """Poisson random numbers (N,) of means (N,) below LARGEST_MEAN; others are left 0. ``events`` are drawn in all.
+
+    Each number has states of its own, so that rounding of one mean, as on another processor, changes no other number.
+    """
     step = np.float32(POISSON_STEP)
     for i in range(len(mean)):
         if mean[i] >= LARGEST_MEAN:
             numbers[i] = 0
             continue
         level = np.int64(mean[i] / step)
-        state = _next(state)
-        cell = np.int64(_mixed(state) >> np.uint64(52))
+        own = _later(state, 2 * i)
+        cell = np.int64(_mixed(own) >> np.uint64(52))
         count = np.int64(count_of_cell[level, cell])
         if count == _SEVERAL:
-            state = _next(state)
-            uniform = (cell + _uniform(state)) / _CELLS
+            uniform = (cell + _uniform(_next(own))) / _CELLS
             count = 0
             while distribution[level, count] <= uniform:
                 count += 1
         numbers[i] = count
+    state = _later(state, 2 * len(mean))
     for _ in range(events):
         state = _next(state)
         i = np.int64(_uniform(state) * len(mean))
