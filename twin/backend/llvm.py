@@ -15,8 +15,8 @@ import os
 import re
 import sys
 import time
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -104,6 +104,18 @@ def prepare_llvm() -> LlvmLibrary:
         ctypes.CDLL(str(companion))
     os.environ[VARIABLE] = str(library.path)
     return library
+
+
+@contextmanager
+def threads_kept() -> Iterator[int]:
+    """The number of Dr.Jit's threads, restored afterwards."""
+    import drjit as dr
+
+    threads = dr.thread_count()
+    try:
+        yield threads
+    finally:
+        dr.set_thread_count(threads)
 
 
 def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:

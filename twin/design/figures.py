@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.backend.llvm import prepare_llvm
+from twin.backend.llvm import prepare_llvm, threads_kept
 from twin.design.geometry import (
     Array,
     ImagePoints,
@@ -424,16 +424,13 @@ def _compiled_over_volume(
     designs = p.baseline_mm.size
     over_volume, at = _frozen(follow, reflectance), (converted(_SHARES), converted(_PLACES))
     blocks: list[tuple[dict[str, Array], ...]] = []
-    threads = dr.thread_count()
-    dr.set_thread_count(1)
-    try:
+    with threads_kept():
+        dr.set_thread_count(1)
         for first in range(0, designs, _BLOCK):
             block = p.at(np.minimum(np.arange(first, first + _BLOCK), designs - 1))
             followers, near, far, field = over_volume({n: converted(values) for n, values in vars(block).items()}, *at)
             tables = followers, {"near": near, "far": far}, field
             blocks.append(tuple({name: array.numpy() for name, array in table.items()} for table in tables))
-    finally:
-        dr.set_thread_count(threads)
     followers, ends, field = (
         {name: np.concatenate([table[name] for table in parts])[:designs] for name in parts[0]}
         for parts in zip(*blocks, strict=True)

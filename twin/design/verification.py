@@ -22,6 +22,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from twin.backend.llvm import threads_kept
 from twin.design.description import Study
 from twin.design.designs import Marked
 from twin.design.figures import figures_of, scatter_at
@@ -141,15 +142,14 @@ def _record(
 
     from twin.recording.studio import record_scene
 
-    (recording, options), threads = job, dr.thread_count()
-    dr.set_thread_count(1)
-    try:
-        path = _capture(folder, recording)
-        record_scene(recording.scene, recording.sensor, path, options=options, overwrite=True)
-    except Error as error:
-        raise type(error)(f"{recording.scene.title}: {error}") from error
-    finally:
-        dr.set_thread_count(threads)
+    recording, options = job
+    with threads_kept():
+        dr.set_thread_count(1)
+        try:
+            path = _capture(folder, recording)
+            record_scene(recording.scene, recording.sensor, path, options=options, overwrite=True)
+        except Error as error:
+            raise type(error)(f"{recording.scene.title}: {error}") from error
 
 
 def _run(command: str, *arguments: str, fails_as: type[Error]) -> None:

@@ -1,4 +1,4 @@
-"""What is true of a frame: the stripe's centres and the surface there, depths, and where points of a scene are seen."""
+"""Ground truth of a frame: the stripe's centres, the surface there, depths, and the image of points of a scene."""
 
 from dataclasses import dataclass
 

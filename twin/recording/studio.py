@@ -1,9 +1,8 @@
 """A sensor before a scene: its images with exposures and noise, and their recording into a capture with the truth."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from importlib.metadata import version
 from itertools import product
@@ -14,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from twin.backend.llvm import threads_kept
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.options import Options
@@ -392,16 +392,6 @@ def lit_level(peaks: np.ndarray) -> float:
     return float(np.quantile(lit, BRIGHT_SHARE)) if len(lit) else 0.0
 
 
-@contextmanager
-def _threads_kept() -> Iterator[int]:
-    """The number of Dr.Jit's threads, as it is again afterwards."""
-    threads = dr.thread_count()
-    try:
-        yield threads
-    finally:
-        dr.set_thread_count(threads)
-
-
 def _threads_for(shot: Shot, threads: int) -> int:
     """How many of Dr.Jit's threads render a shot while another thread exposes and writes the one before.
 
@@ -481,7 +471,7 @@ def record_scene(
     with (
         CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer,
         ThreadPoolExecutor(1) as camera,
-        _threads_kept() as threads,
+        threads_kept() as threads,
     ):
         done = len(writer)
 

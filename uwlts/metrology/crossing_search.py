@@ -22,7 +22,7 @@ from uwlts.metrology.patches import Patches, distances_between
 from uwlts.metrology.path_estimate import FEWEST, Pair, PathEstimate
 
 SIGMAS = 3.0
-"""How far, in standard deviations of the drift, a crossing is searched."""
+"""Search range of crossings, in standard deviations of the drift."""
 _GATE = float(chi2.ppf(0.9973, 6))
 """Of the squared Mahalanobis distance of a shift and a turn: as likely as three standard deviations of one number."""
 _REFINED = 12

@@ -272,7 +272,7 @@ class PathEstimate:
                 break
 
     def settle(self) -> None:
-        """Estimate the path and the shares of its drift by turns; pairs that do not agree then are given up."""
+        """Estimate the path and the kind of its drift alternately; pairs that do not agree afterwards are dropped."""
         self._settled()
         if len(agreeing := [pair for pair in self.pairs if self.agrees(pair)]) < len(self.pairs):
             self.pairs = agreeing
@@ -308,7 +308,7 @@ class PathEstimate:
         return found, np.abs(found.distance_mm) < 5 * found.std_mm
 
     def held_out(self, pair: Pair, found: PatchDistances) -> np.ndarray:
-        """Which distances (Q,) from the later piece to the earlier the estimate has not used."""
+        """Mask (Q,) of the distances from the later piece to the earlier that are held out of the estimate."""
         return self.pieces[pair[1]].held_out[found.source] | self.pieces[pair[0]].held_out[found.target]
 
     def _laid(self, own: np.ndarray) -> Piece | None:
@@ -408,7 +408,7 @@ class PathEstimate:
         if not ways:
             return normal, gradient
         middle = np.vstack([found.places_mm[used] for _, _, found, used, _ in ways]).mean(axis=0)
-        told = np.eye(6) if seed is not None else _told([each[2:] for each in ways], middle)
+        observable = np.eye(6) if seed is not None else _observable([each[2:] for each in ways], middle)
         back = np.eye(4) if seed is None else np.linalg.inv(seed)
         for source, target, found, used, weight in ways:
             normals, places = found.normals[used], found.places_mm[used]
@@ -422,7 +422,7 @@ class PathEstimate:
                 off = now[number] - patches[number].places_mm[rows]
                 later = np.einsum("qi,qi->q", piece.slopes[rows], off)
                 times = piece.times_s[rows] + later
-                by = np.hstack([normals, np.cross(places - middle, normals)]) @ told
+                by = np.hstack([normals, np.cross(places - middle, normals)]) @ observable
                 # Turns are about the platform where the present correction has it.
                 platform = piece.platform_mm[rows] + later[:, None] * piece.speed[rows]
                 platform += self.corrections(times)[:, :3]
@@ -453,7 +453,7 @@ def _slopes(tree: KDTree, times: np.ndarray) -> np.ndarray:
     return np.linalg.solve(normal, np.einsum("pki,pk->pi", about, later)[:, :, None])[:, :, 0]
 
 
-def _told(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middle: np.ndarray) -> np.ndarray:
+def _observable(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middle: np.ndarray) -> np.ndarray:
     """Projection (6, 6) of shift and turn about a middle to the part that distances tell more of than noise would."""
     normal, spurious = np.zeros((6, 6)), np.zeros((6, 6))
     places = np.vstack([found.places_mm[used] for found, used, _ in ways]) - middle

@@ -22,8 +22,8 @@ from uwlts.model.trajectory import Trajectory, on_clock
 from uwlts.storage.cloud import PointCloud, read_cloud
 
 _SMOOTH, _ROUGH = (0.0, 0.3, 0.01), (0.0, 0.2, 0.4)
-"""Kinds of drift with which crossings are searched, the second where the first finds none: a
-path that hardly bends is told apart from false crossings best."""
+"""Kinds of drift assumed in the search of crossings, the second where the first finds none: fewer
+false crossings fit a stiffer path."""
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import numpy as np
 from uwlts.model.errors import CaptureError, OutputError
 from uwlts.model.input_file import opened
 from uwlts.storage.files import written_aside
-from uwlts.storage.las_file import INTENSITY_LIMITS, LAZ_STEP_M, las_middle, library
+from uwlts.storage.las_file import INTENSITY_LIMITS, LAZ_STEP_M, brief, las_middle, library
 
 SUFFIX = ".copc.laz"
 
@@ -213,7 +213,7 @@ def read_copc(
             box = None if box_mm is None else laspy.copc.Bounds(1e-3 * box_mm[0], 1e-3 * box_mm[1])
             found = _queried(reader, box, at_most)
     except (OSError, RuntimeError, ValueError, KeyError, laspy.errors.LaspyException) as error:
-        raise CaptureError(f"{path} is not a complete COPC file: {' '.join(str(error).split())[:200]}") from error
+        raise CaptureError(f"{path} is not a complete COPC file: {brief(error)}") from error
     columns = {name: np.asarray(found[name]) for name in found.point_format.dimension_names if name in _FIELDS}
     deviation = columns.get("deviation_mm")
     return CopcPoints(

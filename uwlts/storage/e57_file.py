@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from uwlts.model.errors import CaptureError, OutputError
-from uwlts.storage.las_file import library
+from uwlts.storage.las_file import brief, library
 
 PREFIX, EXTENSION = "uwlts", "urn:uwlts:point-fields"
 """Of the fields that the standard does not have: an extension is a prefix of their names, and its own name as a URI."""
@@ -33,7 +33,7 @@ def write_e57(
     points_mm: np.ndarray,
     columns: dict[str, np.ndarray],
     *,
-    name: str,
+    to: Path,
     time_s: np.ndarray | None = None,
     further: dict[str, np.ndarray] | None = None,
 ) -> None:
@@ -41,7 +41,9 @@ def write_e57(
 
     Coordinates and real numbers are of 32 bits, times of 64. A time is ``acquisitionStart``, the last whole second
     before all of them, and ``timeStamp`` from there on, which the standard wants positive; further fields are
-    ``uwlts:NAME``. OutputError where storage fails; SetupError where pye57 is not installed.
+    ``uwlts:NAME``. ``to`` is the name that the file gets in the end.
+
+    OutputError where storage fails; SetupError where pye57 is not installed.
     """
     pye57 = library("pye57", "E57")
     lib = pye57.libe57
@@ -69,7 +71,7 @@ def write_e57(
 
             scan, prototype, buffers = lib.StructureNode(image), lib.StructureNode(image), lib.VectorSourceDestBuffer()
             scan.set("guid", lib.StringNode(image, f"{{{uuid.uuid4()}}}"))
-            scan.set("name", lib.StringNode(image, name))
+            scan.set("name", lib.StringNode(image, to.stem))
             named = list(zip(("x", "y", "z"), coordinates, strict=True))
             scan.set("cartesianBounds", structure(_limits(named, float)))
             if "intensity" in fields:
@@ -96,7 +98,7 @@ def write_e57(
             writer.write(len(points_mm))
             writer.close()
     except lib.E57Exception as error:
-        raise OutputError(f"cannot write {name}.e57: {' '.join(str(error).split())[:200]}") from error
+        raise OutputError(f"cannot write {to}: {brief(error)}") from error
 
 
 def _limits(named: Sequence[tuple[str, np.ndarray]], kind: type[int] | type[float]) -> dict[str, int | float]:
@@ -118,7 +120,7 @@ def read_e57(path: Path) -> E57Points:
                 for number in range(file.scan_count)
             ]
     except (pye57.libe57.E57Exception, OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:
-        raise CaptureError(f"{path} is not a complete E57 file: {' '.join(str(error).split())[:200]}") from error
+        raise CaptureError(f"{path} is not a complete E57 file: {brief(error)}") from error
     if not scans:
         raise CaptureError(f"{path} is an E57 file without scans")
     points = 1e3 * np.concatenate([np.column_stack([scan[f"cartesian{axis}"] for axis in "XYZ"]) for scan in scans])

@@ -222,4 +222,4 @@ def _write_e57(cloud: PointCloud, aside: Path, path: Path) -> None:
     if all(numbers.min() >= 0 and numbers.max() < 2**16 for numbers in (cloud.frame, cloud.line)):
         columns |= {"columnIndex": cloud.frame.astype(np.uint16), "rowIndex": cloud.line.astype(np.uint16)}
     further = covariance_columns(cloud)
-    write_e57(aside, cloud.points_mm, columns, name=path.stem, time_s=cloud.time_s, further=further)
+    write_e57(aside, cloud.points_mm, columns, to=path, time_s=cloud.time_s, further=further)

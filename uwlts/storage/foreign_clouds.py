@@ -12,7 +12,7 @@ import numpy as np
 from uwlts.model.errors import CaptureError, DescriptionError
 from uwlts.model.input_file import opened
 from uwlts.storage.e57_file import read_e57
-from uwlts.storage.las_file import library
+from uwlts.storage.las_file import brief, library
 from uwlts.storage.pose_files import read_columns
 
 TEXT_FORMATS = (".xyz", ".txt", ".csv", ".asc")
@@ -95,7 +95,7 @@ def _read_las(path: Path, start: bytes) -> ForeignPoints:
         struct.error,
         laspy.errors.LaspyException,
     ) as error:
-        raise CaptureError(f"{path} is not a complete LAS file: {' '.join(str(error).split())[:200]}") from error
+        raise CaptureError(f"{path} is not a complete LAS file: {brief(error)}") from error
     times = column.get("gps_time")
     return ForeignPoints(
         points,

@@ -61,3 +61,8 @@ def library(name: Literal["laspy", "lazrs", "copclib", "pye57"], format: str) ->
             f"{format} needs the library {name}, which is not installed: pip install 'uwlts[clouds]', or write "
             "PLY or XYZ"
         ) from error
+
+
+def brief(error: BaseException) -> str:
+    """The message of a library's error in one line of 200 characters at most."""
+    return " ".join(str(error).split())[:200]

@@ -15,7 +15,7 @@ GAP, _LONG_GAP = 12, 24
 """Lines that a dim stripe may be lost for and go on; and those after which it still does where it goes on straight."""
 
 SLACK_PX = 2.0
-"""How much farther a stripe may have moved for each line that it was lost for."""
+"""Further movement allowed for each line on which the stripe was not found."""
 
 _SMOOTH_PX, _ROUGH, _ROUGHEST = 1.5, 0.03, 0.15
 """Departure from the straight way that noise explains, cost in jumps of each px beyond it, and the highest: stripes are

@@ -153,10 +153,10 @@ def test_e57_gives_its_times_back(cloud, tmp_path):
 
 def test_e57_times_that_are_marked_invalid_are_not_known(cloud, tmp_path):
     columns = {"isTimeStampInvalid": (np.arange(len(cloud)) % 7 == 0).astype(np.uint8)}
-    write_e57(tmp_path / "a.e57", cloud.points_mm, columns, name="a", time_s=cloud.time_s)
+    write_e57(tmp_path / "a.e57", cloud.points_mm, columns, to=tmp_path / "a.e57", time_s=cloud.time_s)
     assert uwlts.read_cloud(tmp_path / "a.e57").time_s is None
     columns = {"cartesianInvalidState": columns["isTimeStampInvalid"]}
-    write_e57(tmp_path / "b.e57", cloud.points_mm, columns, name="b", time_s=cloud.time_s)
+    write_e57(tmp_path / "b.e57", cloud.points_mm, columns, to=tmp_path / "b.e57", time_s=cloud.time_s)
     placed = np.arange(len(cloud)) % 7 > 0
     np.testing.assert_array_equal(uwlts.read_cloud(tmp_path / "b.e57").time_s, cloud.time_s[placed])
 
