@@ -13,7 +13,11 @@ _AGAIN_S = 0.01
 
 @contextmanager
 def interrupts_kept() -> Iterator[None]:
-    """Deliver an interrupt again that fell into the callback of a weak reference, where Python reports and drops it."""
+    """Deliver an interrupt that Python or a library has changed into something else.
+
+    One that falls into the callback of a weak reference is reported and dropped by Python; one that falls into a loop
+    that Dr.Jit records is the cause of a RuntimeError.
+    """
     plain = sys.unraisablehook
 
     def report(dropped: Any) -> None:
@@ -26,5 +30,12 @@ def interrupts_kept() -> Iterator[None]:
     sys.unraisablehook = report
     try:
         yield
+    except Exception as error:
+        cause = error.__cause__
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__cause__
+        if cause is None:
+            raise
+        raise KeyboardInterrupt from error
     finally:
         sys.unraisablehook = plain

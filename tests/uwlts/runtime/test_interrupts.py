@@ -1,8 +1,10 @@
-"""Interrupts that fall into callbacks."""
+"""Interrupts that fall into callbacks and into libraries."""
 
 import time
 import weakref
 
+import drjit as dr
+import mitsuba as mi
 import pytest
 
 from uwlts.runtime.interrupts import interrupts_kept
@@ -21,3 +23,18 @@ def test_an_interrupt_within_a_callback_is_not_lost(capsys: pytest.CaptureFixtur
         time.sleep(1)
     assert reference() is None
     assert capsys.readouterr().err == ""
+
+
+def test_an_interrupt_within_a_recorded_loop_is_not_lost():
+    """Dr.Jit raises a RuntimeError from whatever a loop's body raises."""
+
+    def body(i: mi.UInt32) -> tuple[mi.UInt32]:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), interrupts_kept():
+        dr.while_loop((mi.UInt32([0, 1]),), lambda i: i < 3, body)
+
+
+def test_an_error_within_a_recorded_loop_stays_what_it_is():
+    with pytest.raises(RuntimeError, match="encountered an exception"), interrupts_kept():
+        dr.while_loop((mi.UInt32([0, 1]),), lambda i: i < 3, lambda i: (i + [],))
