@@ -39,11 +39,12 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--sensors", type=int, nargs="+", required=True)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
+    parser.add_argument("--sensor", default="thesis")
     parser.add_argument("--denser", type=int, default=1)
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     plan = given.folder / "calibration.toml"
-    plan.write_text(CAMPAIGN)
+    plan.write_text(f'sensor = "{given.sensor}"\nas_built = "{given.sensor}-as-built"\n{CAMPAIGN}')
     for number in given.sensors:
         folder = given.folder / f"sensor-{number}"
         if not (folder / "calibration.json").exists():

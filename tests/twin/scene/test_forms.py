@@ -122,12 +122,26 @@ def test_a_sea_floor_has_ripples_and_stones():
     at = stony.stone_places()
     np.testing.assert_allclose(seabed_height(stony, *at.T), 5.0)
     mesh = mesh_of(stony)
-    assert mesh.euler_number == 1 and mesh.face_normals[:, 2].max() < 0
+    # The sediment and five stones, each a disc as topology has it.
+    assert mesh.euler_number == 6 and mesh.face_normals[:, 2].max() < 0
     x, y, z = middles(mesh).T
-    away = np.abs(z + seabed_height(stony, x, y))
-    beside = np.min([np.abs(np.hypot(x - u, y - v) - 10.0) for u, v in at], axis=0) > 2.0
-    # Chords along both axes: at most twice 0.02 mm.
-    assert away[beside].max() < 0.04
+    above = -z - seabed_height(stony, x, y)
+    # What is seen lies on the formula, what does not lies below it: chords along both axes, at most twice 0.04 mm.
+    assert above.max() < 0.08
+    shown = above > -0.08
+    nearest = np.min([np.hypot(x - u, y - v) for u, v in at], axis=0)
+    assert shown[nearest > 10.0].all() and shown[nearest < 10.0].sum() > 1000
+
+
+def test_stones_of_several_sizes_lie_between_the_smallest_and_the_largest():
+    bed = Seabed(kind="seabed", width_mm=4000.0, height_mm=4000.0, stones=2000, stone_diameter_mm=80.0)
+    assert (bed.stone_diameters() == 80.0).all()
+    sizes = bed.model_copy(update={"smallest_stone_mm": 20.0}).stone_diameters()
+    # The median of logarithms spread evenly over log 4 has a standard error of log 4 / (2 sqrt(2000)): six are 0.093.
+    assert 20.0 <= sizes.min() < 21.0 and 79.0 < sizes.max() <= 80.0
+    assert np.median(sizes) == pytest.approx(40.0, rel=0.1)
+    at = bed.stone_places()[0]
+    assert seabed_height(bed, *at) >= 20.0
 
 
 WRONG = {
@@ -137,6 +151,7 @@ WRONG = {
     "is not smaller": (Flange, {"kind": "flange", "bore_diameter_mm": 200.0}),
     "cannot lie on an arc": (Cable, {"kind": "cable", "bend_radius_mm": 5.0}),
     "barnacle_diameter_mm": (OvergrownPipe, {"kind": "overgrown_pipe", "barnacle_diameter_mm": 60.0}),
+    "smallest_stone_mm 20 is more": (Seabed, {"kind": "seabed", "smallest_stone_mm": 20.0}),
     "stone_diameter_mm": (Seabed, {"kind": "seabed", "stone_diameter_mm": 400.0}),
 }
 

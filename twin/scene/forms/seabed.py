@@ -5,12 +5,12 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.scene.forms.triangles import grid_faces, require_few, step_of, waves
+from twin.scene.forms.triangles import grid_faces, require_few, step_of, tube, waves
 from twin.scene.placed import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
 _SAG_MM = 0.02
-"""Largest distance of the facets from the surface; at the foot of stones ten times that."""
+"""Largest distance of the sediment's facets from the surface; that of the stones' facets is twice as large."""
 _SHORTEST, _LONGEST = 0.2, 1.0
 """Wavelengths of the roughness over the ripples' pitch."""
 
@@ -20,7 +20,8 @@ class Seabed(FreeForm):
 
     Ripples run along y, with ``ripple_pitch_mm`` from crest to crest along x and ``ripple_height_mm`` from trough to
     crest; the surface between is uneven by up to ``roughness_mm``. ``stones`` of ``stone_diameter_mm`` lie half buried,
-    at places that ``seed`` chooses (`seabed_height`).
+    at places that ``seed`` chooses (`seabed_height`). With ``smallest_stone_mm`` the logarithms of their diameters are
+    evenly spread from that on.
     """
 
     kind: Literal["seabed"]
@@ -29,8 +30,9 @@ class Seabed(FreeForm):
     ripple_pitch_mm: Positive = 60.0
     ripple_height_mm: NotNegative = 6.0
     roughness_mm: NotNegative = 1.0
-    stones: Annotated[int, Field(ge=0, le=1000)] = 6
+    stones: Annotated[int, Field(ge=0, le=10_000)] = 6
     stone_diameter_mm: Positive = 15.0
+    smallest_stone_mm: Positive | None = None
     seed: Annotated[int, Field(ge=0)] = 0
 
     @model_validator(mode="after")
@@ -40,6 +42,10 @@ class Seabed(FreeForm):
                 f"stone_diameter_mm {self.stone_diameter_mm:g} is more than width_mm {self.width_mm:g} or height_mm "
                 f"{self.height_mm:g}"
             )
+        if self.smallest_stone_mm is not None and self.smallest_stone_mm > self.stone_diameter_mm:
+            raise ValueError(
+                f"smallest_stone_mm {self.smallest_stone_mm:g} is more than stone_diameter_mm {self.stone_diameter_mm:g}"
+            )
         return self
 
     def stone_places(self) -> np.ndarray:
@@ -47,18 +53,54 @@ class Seabed(FreeForm):
         most = 0.5 * (np.array([self.width_mm, self.height_mm]) - self.stone_diameter_mm)
         return np.random.default_rng([self.seed, 1]).uniform(-1, 1, (self.stones, 2)) * most
 
+    def stone_diameters(self) -> np.ndarray:
+        """Diameters (stones,) of the stones, in mm."""
+        smallest = self.smallest_stone_mm or self.stone_diameter_mm
+        share = np.random.default_rng([self.seed, 2]).uniform(0, 1, self.stones)
+        return self.stone_diameter_mm * (smallest / self.stone_diameter_mm) ** share
+
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """An open surface whose facets deviate by `_SAG_MM`, more at the foot of stones."""
+        """The open surface of the sediment and, above it and into it, those of the stones."""
         k = 2 * np.pi / self.ripple_pitch_mm
         curvature = 0.5 * self.ripple_height_mm * k**2 + 0.25 * self.roughness_mm * (k / _SHORTEST) ** 2
-        if self.stones:
-            curvature += 4 / self.stone_diameter_mm
         step = step_of(_SAG_MM, max(curvature, 8 * _SAG_MM / min(self.width_mm, self.height_mm) ** 2))
         columns, rows = (int(np.ceil(side / step)) + 1 for side in (self.width_mm, self.height_mm))
-        require_few(rows * columns, step_mm=step, advice="make it smaller, its ripples longer, or its stones larger")
+        diameters = self.stone_diameters()
+        count = rows * columns + sum(int(np.prod(_stone_facets(each))) for each in diameters)
+        require_few(count, step_mm=step, advice="make it smaller, its ripples longer, or its stones fewer")
         x, y = (np.linspace(-0.5, 0.5, count) for count in (columns, rows))
         x, y = np.meshgrid(x * self.width_mm, y * self.height_mm, indexing="ij")
-        return np.stack([x, y, -seabed_height(self, x, y)], axis=-1).reshape(-1, 3), grid_faces(x.shape)
+        vertices = [np.stack([x, y, -_sediment_height(self, x, y)], axis=-1).reshape(-1, 3)]
+        faces, used = [grid_faces(x.shape)], x.size
+        for place, diameter in zip(self.stone_places(), diameters, strict=True):
+            own, facets = _stone(diameter)
+            vertices.append(own + (*place, 0.0))
+            faces.append(facets + used)
+            used += len(own)
+        return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _stone_facets(diameter_mm: float) -> tuple[int, int]:
+    """Rings from a stone's rim to its top, and facets around it.
+
+    On an ellipse whose larger half axis is a, a chord over the angle p of its parameter deviates by a p^2 / 8 at most.
+    """
+    angle = step_of(2 * _SAG_MM, 0.5 * diameter_mm)
+    return int(np.ceil(0.5 * np.pi / angle)) + 1, int(np.ceil(2 * np.pi / angle))
+
+
+def _stone(diameter_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and faces (F, 3) of the upper half of a spheroid, half as high as wide, about its middle."""
+    rings, around = _stone_facets(diameter_mm)
+    angle = np.linspace(0, 0.5 * np.pi, rings)
+    radius = np.tile(0.5 * diameter_mm * np.cos(angle)[:, None], around)
+    turns = np.linspace(0, 2 * np.pi, around, endpoint=False)
+    vertices, faces = tube(0.25 * diameter_mm * np.sin(angle), turns, radius)
+    # The last ring is the top, one place.
+    faces = np.minimum(faces, (rings - 1) * around)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    # The tube's axis, x, becomes -z.
+    return np.stack([vertices[:, 2], vertices[:, 1], -vertices[:, 0]], axis=1)[: (rings - 1) * around + 1], faces
 
 
 def seabed_height(bed: Seabed, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -67,13 +109,17 @@ def seabed_height(bed: Seabed, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     Cosine ripples and smooth waves between -roughness and roughness, and above them the upper halves of spheroids,
     half as high as wide: height d / 4 sqrt(1 - t^2) over the plane, with t from 0 in a stone's middle to 1 at its rim.
     """
-    places = np.stack(np.broadcast_arrays(x, y)) / bed.ripple_pitch_mm
-    height = 0.5 * bed.ripple_height_mm * np.cos(2 * np.pi * places[0])
-    height = height + bed.roughness_mm * waves(
-        places, np.random.default_rng([bed.seed, 0]), shortest=_SHORTEST, longest=_LONGEST
-    )
-    for at_x, at_y in bed.stone_places():
-        squared = (np.square(x - at_x) + np.square(y - at_y)) / (0.5 * bed.stone_diameter_mm) ** 2
-        stone = 0.25 * bed.stone_diameter_mm * np.sqrt(np.maximum(1 - squared, 0))
+    height = _sediment_height(bed, x, y)
+    for (at_x, at_y), diameter in zip(bed.stone_places(), bed.stone_diameters(), strict=True):
+        squared = (np.square(x - at_x) + np.square(y - at_y)) / (0.5 * diameter) ** 2
+        stone = 0.25 * diameter * np.sqrt(np.maximum(1 - squared, 0))
         height = np.where(squared < 1, np.maximum(height, stone), height)
     return height
+
+
+def _sediment_height(bed: Seabed, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The same without stones."""
+    places = np.stack(np.broadcast_arrays(x, y)) / bed.ripple_pitch_mm
+    height = 0.5 * bed.ripple_height_mm * np.cos(2 * np.pi * places[0])
+    rng = np.random.default_rng([bed.seed, 0])
+    return height + bed.roughness_mm * waves(places, rng, shortest=_SHORTEST, longest=_LONGEST)

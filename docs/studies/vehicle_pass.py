@@ -1,0 +1,174 @@
+"""Pass of a vehicle over 20 m with three crossings, rendered: errors of its path and of lengths, before and after.
+
+Five sensors with imperfections, each with its joint calibration and a mount by 15 poses of a sphere on a robot, take two
+passes each with other errors of the navigation:
+
+    for k in 1 2 3 4 5; do python docs/studies/moving_recordings.py FOLDER robot-sphere vehicle-pass \\
+        --sensor thesis-small --sensors $k --seeds $((2 * k - 2)) $((2 * k - 1)); done
+    python docs/studies/vehicle_pass.py FOLDER
+
+The offset of the clocks is given. Figures of each pass are kept beside its capture. ``--again`` calculates them anew.
+"""
+
+import argparse
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from moving_scenes import captured, truth_of
+from robot_campaigns import FOR_THE_MOUNT, RADIUS_MM
+from stripe_tables import table
+
+import uwlts
+from twin.scene.platforms import Vehicle
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.pose_files import trajectory_path
+from uwlts.storage.truth import Truth
+
+INSIDE_MM = 70.0
+"""Points so near to the middle of a crossing belong to it: the swath is 185 mm wide."""
+PAIRS = 20_000
+"""Lengths that are drawn in each crossing."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Errors of one pass, mm, before and after: of the path (rms), of it up to the last crossing, of lengths (rms).
+
+    ``stated_mm`` are the root of the mean variance of the path after, whole and up to the last crossing. ``within`` is
+    the share of positions, in the frame of the first one, whose error is within twice the stated uncertainty.
+    """
+
+    path_mm: tuple[float, float]
+    to_last_mm: tuple[float, float]
+    behind_mm: tuple[float, float]
+    stated_mm: tuple[float, float]
+    lengths_mm: tuple[tuple[float, float], ...]
+    within: float
+    doubtful: int
+    refused: str = ""
+
+
+def aligned_pass(path: Path) -> Figures:
+    """Calibrate the mount, reconstruct and align one pass; what is off by the truth."""
+    motion, truth = truth_of(path)
+    assert isinstance(motion, Vehicle) and truth.pose is not None
+    robot = captured(path.parent / path.name.replace("vehicle-pass", "robot-sphere"))
+    mount = uwlts.calibrate_mount(robot.selected(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
+    reported = uwlts.read_trajectory(trajectory_path(path), pose_format="quaternion-xyzw")
+    clock = {"clock_offset_s": motion.clock_offset_s}
+    cloud = uwlts.reconstruct(
+        path, path.parent / "calibration.json", mount=mount, trajectory=reported, with_uncertainty=False, **clock
+    )
+    with uwlts.open_capture(path) as capture:
+        times = capture.time_s[:]
+    true = truth.pose @ np.linalg.inv((motion.true_mount or motion.mount).matrix())
+    before = reported.poses_at(times + motion.clock_offset_s)
+    crossings = crossings_of(truth.pose[:, :2, 3])
+    last = times <= times[max(second for _, second in crossings)]
+
+    def errors(poses: np.ndarray, part: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(np.sum((poses[part, :3, 3] - true[part, :3, 3]) ** 2, axis=1))))
+
+    parts = np.ones(len(times), bool), last, ~last
+    try:
+        found = uwlts.align_trajectory(cloud, reported, **clock)
+    except uwlts.Error as error:
+        kept = [(errors(before, part),) * 2 for part in parts]
+        lengths = tuple((length_error(cloud, truth, each),) * 2 for each in crossings)
+        return Figures(*kept, (np.nan, np.nan), lengths, np.nan, 0, str(error))
+    after = found.trajectory.poses_at(times + motion.clock_offset_s)
+    covariance = found.trajectory.covariance_at(times + motion.clock_offset_s)
+    assert covariance is not None
+    variance = np.einsum("nii->ni", covariance[:, :3, :3])
+    # The alignment takes the start as exact: the frame is that of the first pose.
+    own = (np.linalg.inv(true[0]) @ true)[:, :3, 3] - (np.linalg.inv(after[0]) @ after)[:, :3, 3]
+    stated = np.sqrt(np.einsum("ji,njk,ki->ni", true[0, :3, :3], covariance[:, :3, :3], true[0, :3, :3]))
+    return Figures(
+        *((errors(before, part), errors(after, part)) for part in parts),
+        (float(np.sqrt(variance.sum(axis=1).mean())), float(np.sqrt(variance[last].sum(axis=1).mean()))),
+        tuple((length_error(cloud, truth, each), length_error(found.cloud, truth, each)) for each in crossings),
+        float(np.mean(np.abs(own) < 2 * stated)),
+        len(found.doubtful_s),
+    )
+
+
+def crossings_of(places: np.ndarray) -> list[tuple[int, int]]:
+    """Numbers of the images before both passes of each crossing of a path (N, 2)."""
+    found = []
+    start, step = places[:-1], np.diff(places, axis=0)
+    for k in range(2, len(step)):
+        # Where segment k meets an earlier one: start + a step = start_k + b step_k.
+        apart, area = start[k] - start[: k - 1], _area(step[: k - 1], step[k])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = _area(apart, step[k]) / area, _area(apart, step[: k - 1]) / area
+        found += [(int(j), k) for j in np.flatnonzero((a >= 0) & (a < 1) & (b >= 0) & (b < 1))]
+    return found
+
+
+def _area(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Signed area between vectors (N, 2) and another (2,) or as many."""
+    return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+
+
+def length_error(cloud: PointCloud, truth: Truth, crossing: tuple[int, int]) -> float:
+    """Root mean square error of lengths from points of one pass of a crossing to points of the other, mm."""
+    assert cloud.frame is not None and cloud.line is not None and truth.pose is not None
+    middle = truth.pose[list(crossing), :2, 3].mean(axis=0)
+    place = truth.point_mm[cloud.frame, cloud.line]
+    inside = np.linalg.norm(place[:, :2] - middle, axis=1) < INSIDE_MM
+    rng, ends = np.random.default_rng(0), []
+    for number in crossing:
+        near = np.flatnonzero(inside & (np.abs(cloud.frame - number) < 200))
+        ends.append(rng.choice(near, PAIRS))
+    lengths = [np.linalg.norm(points[ends[0]] - points[ends[1]], axis=1) for points in (cloud.points_mm, place)]
+    return float(np.sqrt(np.mean((lengths[0] - lengths[1]) ** 2)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--again", action="store_true")
+    given = parser.parse_args()
+    rows, all_figures = [], []
+    for path in sorted(given.folder.glob("sensor-*/vehicle-pass-?.h5")):
+        kept = path.with_suffix(".pass.json")
+        if given.again or not kept.exists():
+            kept.write_text(json.dumps(asdict(aligned_pass(path))))
+        each = Figures(**json.loads(kept.read_text()))
+        all_figures.append(each)
+        (path_before, path_after), (_, to_last), (_, behind) = each.path_mm, each.to_last_mm, each.behind_mm
+        lengths = np.sqrt(np.mean(np.square(each.lengths_mm), axis=0))
+        rows.append(
+            [
+                f"{path.parent.name[-1]}, {path.stem[-1]}",
+                f"{path_before:.1f}",
+                f"{path_after:.1f} ({each.stated_mm[0]:.1f})",
+                f"{path_before / path_after:.1f}",
+                f"{to_last:.1f} ({each.stated_mm[1]:.1f})",
+                f"{behind:.1f}",
+                f"{lengths[0]:.1f}",
+                f"{lengths[1]:.2f}",
+                f"{100 * each.within:.0f} %",
+                each.refused or str(each.doubtful),
+            ]
+        )
+    head = ["sensor, pass", "before", "after", "times", "to the last crossing", "behind it"]
+    head += ["lengths before", "lengths after", "within twice the stated", "doubtful crossings"]
+    print(table(head, rows))
+    path, lengths = (np.array([getattr(each, name) for each in all_figures]) for name in ("path_mm", "lengths_mm"))
+    ratio = path[:, 0] / path[:, 1]
+    print(
+        f"{len(path)} passes: path {_rms(path[:, 0]):.1f} to {_rms(path[:, 1]):.1f} mm (rms of all), "
+        f"{_rms(path[:, 0]) / _rms(path[:, 1]):.1f} times; mean of the passes {ratio.mean():.1f} times "
+        f"({ratio.min():.1f} to {ratio.max():.1f}); lengths {_rms(lengths[..., 0]):.1f} to {_rms(lengths[..., 1]):.2f} mm"
+    )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+if __name__ == "__main__":
+    main()
