@@ -13,11 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline
-from scipy.linalg import eigh, solve_triangular
+from scipy.linalg import eigh, inv, solve, solve_triangular
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -45,12 +46,12 @@ _VOXEL = 0.4
 """Of the radius of patches: points for a search by heights."""
 _INTERVALS = 100
 """Of the spline: between two knots a random walk goes a tenth of the drift of the whole path."""
-_SHARES = [
-    (smooth, wander, walk)
-    for smooth in (0.0, 0.1, 0.3, 1.0, 3.0, 10.0)
-    for wander in (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
-    for walk in (1e-5, 1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6)
-]
+_MOST_KNOTS = 500
+_SHARES = (
+    (0.0, 0.1, 0.3, 1.0, 3.0, 10.0),
+    (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0),
+    (1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6),
+)
 _TURNS, _LITTLE = 8, 0.2
 """Times that patches are laid anew at most, and by how much of a standard deviation the path may still move then."""
 _BESIDE = 13
@@ -60,7 +61,7 @@ FEWEST = 30
 _ROUNDS = 15
 _STILL_MM = 1e-3
 EXACT_MM, EXACT_RAD = 1e-3, 1e-7
-"""Standard uncertainty of the start of the path, which is the frame's: as good as exact."""
+"""The least drift at the end: navigation is not better."""
 _HELD_OUT = 5
 """Every fifth cube of a crossing, of four radii, is held out and judges the gain."""
 _AGREEING = 0.9
@@ -68,29 +69,33 @@ _AGREEING = 0.9
 of those held out. Wrong places reach 0.8 where the path bends to them."""
 _FEWEST_HELD_OUT = 10
 """Held-out patches whose share is judged."""
-_PER_PARAMETER = 3.0
+_PER_PARAMETER = 1.5
 """Independent distances of a crossing for each parameter of the path that it determines: a surface without features
 fits anywhere if the path may bend as much as it takes."""
 _NOISE = 5.0
 """Times the information that the noise of normals alone would give: a movement with less is open."""
-_TELLING = 1e-4
-"""Of the information that the drift is known with beforehand: less does not tell one kind of drift from another."""
+_EXACT = 1e-10
+"""Of the variance at the end: variance of the start of the path, which is the frame's and as good as exact."""
 _ROUNDING = 1e-9
 """Of the information on the best determined movement: less is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
 class PathSpline:
-    """A trajectory, the knots of the spline over the time of the points, and the drift at its end, mm and rad."""
+    """A trajectory, the knots of the spline over the time of the points, and the drift (6,) at its end, mm
+    and rad.
+
+    Knots lie evenly, and closer where the path crosses itself: there the surface tells how the drift walks.
+    """
 
     trajectory: Trajectory
     knots: np.ndarray
-    drift: tuple[float, float]
+    drift: np.ndarray
     first_s: float
     last_s: float
 
     @classmethod
-    def of(cls, trajectory: Trajectory, drift: tuple[float, float], times_s: np.ndarray) -> PathSpline:
+    def of(cls, trajectory: Trajectory, drift: np.ndarray, times_s: np.ndarray) -> PathSpline:
         """The spline over the times (N,) of the points."""
         first, last = float(times_s.min()), float(times_s.max())
         inner = np.linspace(first, last, _INTERVALS + 1)
@@ -102,41 +107,70 @@ class PathSpline:
         """Number C of coefficients, each of six numbers."""
         return len(self.knots) - 4
 
+    def resolved(self, times_s: np.ndarray, step_s: float) -> PathSpline:
+        """The spline with knots about every ``step_s`` around times (N,), evenly elsewhere."""
+        interval = (self.last_s - self.first_s) / _INTERVALS
+        halvings = max(0, round(float(np.log2(interval / step_s))))
+        while True:
+            parts = 2**halvings
+            cells = np.unique(np.floor((times_s - self.first_s) / interval * parts).astype(int))
+            # A cell more on both sides: a spline bends over three intervals.
+            closer = np.unique(cells[:, None] + np.arange(-1, 3))
+            inner = np.union1d(np.arange(_INTERVALS + 1) * parts, np.clip(closer, 0, _INTERVALS * parts))
+            if len(inner) <= _MOST_KNOTS or halvings == 0:
+                break
+            halvings -= 1
+        at = self.first_s + inner * (interval / parts)
+        at[-1] = self.last_s
+        knots = np.concatenate([np.repeat(self.first_s, 3), at, np.repeat(self.last_s, 3)])
+        return replace(self, knots=knots)
+
+    @property
+    def at_s(self) -> np.ndarray:
+        """Times (C,) at which each coefficient is about the correction: the mean of its knots (Greville)."""
+        return np.array([self.knots[k + 1 : k + 4].mean() for k in range(self.count)])
+
     def basis(self, times_s: np.ndarray) -> np.ndarray:
         """Weights (N, C) of the coefficients at times (N,)."""
         inside = np.clip(times_s, self.first_s, self.last_s)
         return BSpline.design_matrix(inside, self.knots, 3).toarray()
+
+    def weights(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Weights (N, 4) that are not zero at times (N,), and numbers (N, 4) of their coefficients."""
+        matrix = BSpline.design_matrix(np.clip(times_s, self.first_s, self.last_s), self.knots, 3)
+        return matrix.data.reshape(-1, 4), matrix.indices.reshape(-1, 4)
 
     def corrections(self, coefficients: np.ndarray, times_s: np.ndarray, *, rates: bool = False) -> np.ndarray:
         """Shift and turn (N, 6) at times (N,) by coefficients (6 C,), or their rates per second."""
         spline = BSpline(self.knots, coefficients.reshape(-1, 6), 3)
         return (spline.derivative() if rates else spline)(np.clip(times_s, self.first_s, self.last_s))
 
-    def shape(self, shares: Shares) -> np.ndarray:
-        """Covariance (C, C) of the coefficients of one component, over the variance that is stated for the end."""
-        # A coefficient stands for the correction at the mean of its knots (Greville).
-        at = np.array([self.knots[k + 1 : k + 4].mean() for k in range(self.count)])
-        t = (at - self.first_s) / (self.last_s - self.first_s)
-        first, second = np.minimum(t[:, None], t), np.maximum(t[:, None], t)
+    def kernel(self, shares: Shares, earlier_s: np.ndarray, later_s: np.ndarray) -> np.ndarray:
+        """Covariance of a component of the drift between times, over the variance that is stated for the end."""
+        t, u = ((each - self.first_s) / (self.last_s - self.first_s) for each in (earlier_s, later_s))
+        first, second = np.minimum(t, u), np.maximum(t, u)
         # Integrals of a random walk from zero, twice and once; each is one at the end.
         smooth = first**3 * (10 * second**2 - 5 * first * second + first**2) / 6
         wandering = first**2 * (3 * second - first) / 2
-        kinds = np.outer(t, t), smooth, wandering, first
-        parts = zip((1.0, *shares), kinds, strict=True)
-        return sum((part * kind for part, kind in parts), 1e-10 * np.eye(len(t)))
+        kinds = t * u, smooth, wandering, first
+        return sum((part * kind for part, kind in zip((1.0, *shares), kinds, strict=True)), np.zeros_like(first))
 
-    def information(self, shares: Shares) -> np.ndarray:
-        """Inverse covariance (6 C, 6 C) of the coefficients, ordered coefficient by coefficient; see `shape`."""
-        shape = self.shape(shares)
-        result = np.zeros((6 * self.count,) * 2)
-        for component, (size, exact) in enumerate(zip(self.sizes, (EXACT_MM,) * 3 + (EXACT_RAD,) * 3, strict=True)):
-            result[component::6, component::6] = np.linalg.inv(size**2 * shape + exact**2 * np.eye(self.count))
-        return result
+    def root(self, shares: Shares) -> np.ndarray:
+        """Lower triangular root (C, C) of the covariance of the coefficients of one component; see `kernel`."""
+        at = self.at_s
+        return np.linalg.cholesky(self.kernel(shares, at[:, None], at) + _EXACT * np.eye(len(at)))
+
+    def unresolved(self, shares: Shares, times_s: np.ndarray) -> np.ndarray:
+        """Variance (N,) of a component at times (N,) that the spline cannot follow, as `kernel`."""
+        basis = BSpline.design_matrix(np.clip(times_s, self.first_s, self.last_s), self.knots, 3)
+        along = basis @ self.root(shares)
+        inside = np.clip(times_s, self.first_s, self.last_s)
+        return np.maximum(self.kernel(shares, inside, inside) - np.einsum("nc,nc->n", along, along), 0.0)
 
     @property
-    def sizes(self) -> np.ndarray:
-        """Drift (6,) of each component at the end, mm and rad."""
-        return np.repeat(self.drift, 3)
+    def units(self) -> np.ndarray:
+        """Drift (6 C,) at the end that belongs to each unknown, mm and rad."""
+        return np.tile(self.drift, self.count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,14 +216,13 @@ class PathEstimate:
     """Coefficients of the correction, round by round, and the pairs of pieces that cross."""
 
     def __init__(self, cloud: PointCloud, times_s: np.ndarray, path: PathSpline, shares: Shares) -> None:
-        self.cloud, self.path, self.shares = cloud, path, shares
+        self.cloud = cloud
         moments, self._image = np.unique(times_s, return_inverse=True)
         self._moments, self._platform = moments, path.trajectory.poses_at(moments)[:, :3, 3]
         self._speed = path.trajectory.rates_at(moments)[:, :3]
-        self.prior = path.information(shares)
         self.coefficients = np.zeros(6 * path.count)
-        self.covariance = np.linalg.inv(self.prior)
         self.pairs: list[Pair] = []
+        self._assume(path, shares)
         self._own, self._radius = _divided(cloud, times_s)
         laid = [(own, self._laid(own)) for own in self._own]
         self._own = [own for own, piece in laid if piece is not None]
@@ -235,27 +268,46 @@ class PathEstimate:
         drifting += piece.speed - turn.apply(piece.speed)
         return turn.as_matrix() + drifting[:, :, None] * piece.slopes[:, None]
 
-    def by_relative_movement(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
-        """Derivatives (6, 6 C) of shift and turn of the later piece against the earlier, at a place (3,)."""
-        result = np.zeros((6, 6 * self.path.count))
-        for number, sign in zip(pair, (-1.0, 1.0), strict=True):
+    def relative_movement(self, pair: Pair, at_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Times (2,) of both pieces, and derivatives (2, 6, 6) of shift and turn of the later against the earlier, at
+        a place (3,), by the corrections then."""
+        times = np.array([self.pieces[number].middle_s for number in pair])
+        twists = np.tile(np.eye(6), (2, 1, 1))
+        for twist, number, time in zip(twists, pair, times, strict=True):
             piece = self.pieces[number]
-            basis = self.path.basis(np.array([piece.middle_s]))
-            platform = piece.platform_mm[np.argmin(np.abs(piece.times_s - piece.middle_s))]
-            lever = at_mm - platform - self.corrections(np.array([piece.middle_s]))[0, :3]
-            twist = np.eye(6)
-            twist[:3, 3:] = np.cross(np.eye(3), lever).T
-            result += sign * np.einsum("c,ij->icj", basis[0], twist).reshape(6, -1)
-        return result
+            platform = piece.platform_mm[np.argmin(np.abs(piece.times_s - time))]
+            twist[:3, 3:] = np.cross(np.eye(3), at_mm - platform - self.corrections(time[None])[0, :3]).T
+        return times, np.array([-1.0, 1.0])[:, None, None] * twists
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of the coefficients (6 C, 6 C)."""
+        if self._covariance is None:
+            inverse = inv(self._whitened, assume_a="pos", overwrite_a=False)
+            self._covariance = _on_both_sides(self._root, inverse) * np.outer(self.path.units, self.path.units)
+        return self._covariance
+
+    def covariance_at(self, times_s: np.ndarray) -> np.ndarray:
+        """Covariances (N, 6, 6) of the corrections at times (N,), with what the spline cannot follow."""
+        result = np.zeros((len(times_s), 6, 6))
+        blocks = self.covariance.reshape(self.path.count, 6, self.path.count, 6)
+        weights, number = self.path.weights(times_s)
+        for first in range(4):
+            for second in range(4):
+                weight = weights[:, first] * weights[:, second]
+                result += weight[:, None, None] * blocks[number[:, first], :, number[:, second]]
+        left = self.path.unresolved(self.shares, times_s)
+        return result + left[:, None, None] * np.diag(self.path.drift**2)
 
     def state(self) -> tuple[Any, ...]:
         """What `restore` needs to return to the present estimate."""
-        return self.coefficients, self.covariance, tuple(self.pairs), tuple(self.pieces)
+        return self.coefficients, self.path, self.shares, self._root, self._whitened, self.pairs[:], self.pieces[:]
 
     def restore(self, state: tuple[Any, ...]) -> None:
         """Return to an earlier estimate."""
-        self.coefficients, self.covariance = state[:2]
-        self.pairs, self.pieces = list(state[2]), list(state[3])
+        self.coefficients, self.path, self.shares, self._root, self._whitened = state[:5]
+        self.pairs, self.pieces = state[5][:], state[6][:]
+        self._covariance = None
 
     def lay_anew(self, numbers: Iterable[int]) -> None:
         """Fit the patches of pieces to the points along the path as it is now.
@@ -267,6 +319,7 @@ class PathEstimate:
 
     def estimate(self, seed: dict[Pair, np.ndarray]) -> None:
         """Estimate until nothing moves any more; poses (4, 4) of pairs give their first matches."""
+        self._assume(self._resolved(seed), self.shares)
         for done in range(_ROUNDS):
             if self._round(seed if done == 0 else {}) < _STILL_MM and (done > 1 or not seed):
                 break
@@ -282,23 +335,29 @@ class PathEstimate:
         """Lay the patches and estimate anew until the path moves by little and its drift is of the likeliest kind."""
         self.estimate({})
         for _ in range(_TURNS):
-            before = self.coefficients
+            path, before = self.path, self.coefficients
             self.lay_anew({number for pair in self.pairs for number in pair})
             self.estimate({})
-            still = np.max(np.abs(self.coefficients - before) / np.sqrt(np.diag(self.covariance))) < _LITTLE
+            at = self.path.at_s
+            moved = self.corrections(at) - path.corrections(before, at)
+            still = np.max(np.abs(moved.ravel()) / np.sqrt(np.diag(self.covariance))) < _LITTLE
             if (shares := self._likeliest()) == self.shares and still:
                 break
-            self.shares, self.prior = shares, self.path.information(shares)
+            self._assume(self.path, shares)
 
     def agrees(self, pair: Pair) -> bool:
-        """Whether the surfaces of a pair agree, also where they were held out, and tell more than they determine."""
+        """Whether the surfaces of a pair agree, also where they were held out."""
         found, fits = self.matched(pair)
         if np.count_nonzero(fits) < FEWEST or np.mean(fits) < _AGREEING:
             return False
         held = self.held_out(pair, found)
-        if np.count_nonzero(held) >= _FEWEST_HELD_OUT and np.mean(fits[held]) < _AGREEING:
-            return False
-        determined = float(np.sum(self._of_pair(pair, None)[0] * self.covariance))
+        return np.count_nonzero(held) < _FEWEST_HELD_OUT or bool(np.mean(fits[held]) >= _AGREEING)
+
+    def tells(self, pair: Pair) -> bool:
+        """Whether the surfaces of a pair tell more than they determine of the path."""
+        fits = self.matched(pair)[1]
+        columns, normal, _ = self._of_pair(pair, None)
+        determined = float(np.sum(normal * self.covariance[np.ix_(columns, columns)]))
         return bool(np.count_nonzero(fits) / self.pieces[pair[1]].patches.shared > _PER_PARAMETER * determined)
 
     def matched(self, pair: Pair) -> tuple[PatchDistances, np.ndarray]:
@@ -346,47 +405,82 @@ class PathEstimate:
         )
         return replace(piece, back=np.linalg.inv(self._around(piece)))
 
+    def _assume(self, path: PathSpline, shares: Shares) -> None:
+        """Take a kind of drift, and a path with other knots; the correction stays as it is."""
+        if path is not getattr(self, "path", path):
+            at = path.at_s
+            self.coefficients = np.linalg.solve(path.basis(at), self.corrections(at)).ravel()
+        self.path, self.shares, self._root = path, shares, path.root(shares)
+        self._whitened, self._covariance = np.eye(6 * path.count), None
+
+    def _resolved(self, seed: dict[Pair, np.ndarray]) -> PathSpline:
+        """The path with knots as close as patches tell, where pairs lie on each other."""
+        times, steps = [], []
+        for pair in self.pairs:
+            earlier, later = (self.moved(number) for number in pair)
+            pose = seed.get(pair, np.eye(4))
+            found = distances_between(later, pose, earlier, np.eye(4), reach_mm=2 * self.reach_mm)
+            for number, rows in zip(pair, (found.target, found.source), strict=True):
+                piece = self.pieces[number]
+                times.append(piece.times_s[rows])
+                steps.append(self._radius * np.linalg.norm(piece.slopes[rows], axis=1))
+        if not times or not len(together := np.concatenate(times)):
+            return self.path
+        return self.path.resolved(together, float(np.median(np.concatenate(steps))))
+
     def _round(self, seed: dict[Pair, np.ndarray]) -> float:
         """One step of least squares; returns the largest shift of a coefficient."""
         normal, gradient = self._evidence(seed)
-        normal, gradient = normal + self.prior, gradient + self.prior @ self.coefficients
-        self.covariance = np.linalg.inv(normal)
-        step = -self.covariance @ gradient
+        told = self.path.units * (normal @ self.coefficients - gradient)
+        self._whitened, self._covariance = (
+            np.eye(len(told)) + _on_both_sides(self._root.T, normal * np.outer(self.path.units, self.path.units)),
+            None,
+        )
+        by = (self._root.T @ told.reshape(self.path.count, 6)).ravel()
+        found = solve(self._whitened, by, assume_a="pos").reshape(self.path.count, 6)
+        step = self.path.units * (self._root @ found).ravel() - self.coefficients
         self.coefficients = self.coefficients + step
         return float(np.abs(step.reshape(-1, 6)[:, :3]).max())
 
     def _likeliest(self) -> Shares:
         """Shares of the drift with which the matches as they are now are likeliest."""
         normal, gradient = self._evidence({})
-        # In units of the drift the evidence is that of as many independent numbers as it tells of.
-        units = np.tile(self.path.sizes, self.path.count)
-        values, vectors = np.linalg.eigh(normal * np.outer(units, units))
-        telling = values > _TELLING
-        roots = np.sqrt(values[telling])
-        at = vectors[:, telling].T @ (units * (normal @ self.coefficients - gradient)) / roots
-        ways = (vectors[:, telling] * roots).reshape(self.path.count, -1)
+        told = normal @ self.coefficients - gradient
+        # Coefficients of which the matches tell nothing are integrated out.
+        near = np.flatnonzero(normal.any(axis=0).reshape(-1, 6).any(axis=1))
+        columns = (6 * near[:, None] + np.arange(6)).ravel()
+        units = self.path.units[columns]
+        normal, told = normal[np.ix_(columns, columns)] * np.outer(units, units), units * told[columns]
+        at = self.path.at_s[near]
 
+        @cache
         def likelihood(shares: Shares) -> float:
             """Twice the logarithm, but for what all shares have in common: the path is integrated out."""
-            moved = (self.path.shape(shares) @ ways).reshape(len(units), -1)
-            root = np.linalg.cholesky(np.eye(len(roots)) + ways.reshape(moved.shape).T @ moved)
-            off = solve_triangular(root, at, lower=True)
-            return float(at @ at - off @ off - 2 * np.sum(np.log(np.diag(root))))
+            root = np.linalg.cholesky(self.path.kernel(shares, at[:, None], at) + _EXACT * np.eye(len(at)))
+            factor = np.linalg.cholesky(np.eye(len(columns)) + _on_both_sides(root.T, normal))
+            off = solve_triangular(factor, (root.T @ told.reshape(-1, 6)).ravel(), lower=True)
+            return float(off @ off - 2 * np.sum(np.log(np.diag(factor))))
 
-        return max(_SHARES, key=likelihood)
+        best, before = self.shares, None
+        while best != before:
+            before = best
+            for kind, values in enumerate(_SHARES):
+                best = max(((*best[:kind], value, *best[kind + 1 :]) for value in values), key=likelihood)
+        return best
 
     def _evidence(self, seed: dict[Pair, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix and gradient of the distances between all pairs, without what is known beforehand."""
-        normal, gradient = np.zeros_like(self.prior), np.zeros_like(self.coefficients)
+        count = 6 * self.path.count
+        normal, gradient = np.zeros((count, count)), np.zeros(count)
         for pair in self.pairs:
-            own = self._of_pair(pair, seed.get(pair))
-            normal += own[0]
-            gradient += own[1]
+            columns, own, slope = self._of_pair(pair, seed.get(pair))
+            normal[np.ix_(columns, columns)] += own
+            gradient[columns] += slope
         return normal, gradient
 
-    def _of_pair(self, pair: Pair, seed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Normal matrix and gradient of one pair; by its pose (4, 4) where that differs from the present one."""
-        normal, gradient = np.zeros_like(self.prior), np.zeros_like(self.coefficients)
+    def _of_pair(self, pair: Pair, seed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Numbers (K,) of the unknowns that one pair tells of, normal matrix and gradient; by its pose (4, 4) where
+        that differs from the present one."""
         patches = {number: self.moved(number) for number in pair}
         poses = {pair[0]: np.eye(4), pair[1]: np.eye(4) if seed is None else seed}
         ways = []
@@ -406,36 +500,41 @@ class PathEstimate:
             # Both directions count by half.
             ways.append((source, target, found, used, (1 - u * u) ** 2 / std**2 / (2 * patches[source].shared)))
         if not ways:
-            return normal, gradient
+            return np.zeros(0, int), np.zeros((0, 0)), np.zeros(0)
         middle = np.vstack([found.places_mm[used] for _, _, found, used, _ in ways]).mean(axis=0)
         observable = np.eye(6) if seed is not None else _observable([each[2:] for each in ways], middle)
         back = np.eye(4) if seed is None else np.linalg.inv(seed)
+        rows = []
         for source, target, found, used, weight in ways:
             normals, places = found.normals[used], found.places_mm[used]
             # Matched by another pose than the present one: where the later piece's surface lies now.
             now = {pair[0]: places, pair[1]: places @ back[:3, :3].T + back[:3, 3]}
             gap = np.einsum("qi,qi->q", now[source] - now[target], normals)
-            parts = []
-            for number, rows, sign in ((source, found.source[used], 1.0), (target, found.target[used], -1.0)):
+            derivatives = 0.0
+            for number, at, sign in ((source, found.source[used], 1.0), (target, found.target[used], -1.0)):
                 piece = self.pieces[number]
                 # Beside the middle of a patch the surface was seen a little earlier or later.
-                off = now[number] - patches[number].places_mm[rows]
-                later = np.einsum("qi,qi->q", piece.slopes[rows], off)
-                times = piece.times_s[rows] + later
+                off = now[number] - patches[number].places_mm[at]
+                later = np.einsum("qi,qi->q", piece.slopes[at], off)
+                times = piece.times_s[at] + later
                 by = np.hstack([normals, np.cross(places - middle, normals)]) @ observable
                 # Turns are about the platform where the present correction has it.
-                platform = piece.platform_mm[rows] + later[:, None] * piece.speed[rows]
+                platform = piece.platform_mm[at] + later[:, None] * piece.speed[at]
                 platform += self.corrections(times)[:, :3]
                 by[:, 3:] += np.cross(middle + now[number] - places - platform, by[:, :3])
-                parts.append((sign * self.path.basis(times), by))
-            # Of all coefficients those around both passes.
-            near = np.flatnonzero(np.any([basis.any(axis=0) for basis, _ in parts], axis=0))
-            derivatives = sum(np.einsum("qc,qi->qci", basis[:, near], by) for basis, by in parts)
-            derivatives = np.reshape(derivatives, (len(weight), -1))
-            columns = (6 * near[:, None] + np.arange(6)).ravel()
-            normal[np.ix_(columns, columns)] += derivatives.T @ (weight[:, None] * derivatives)
-            gradient[columns] += derivatives.T @ (weight * (found.distance_mm[used] + gap))
-        return normal, gradient
+                derivatives = derivatives + sign * np.einsum("qc,qi->qci", self.path.basis(times), by)
+            rows.append((np.reshape(derivatives, (len(weight), -1)), weight, found.distance_mm[used] + gap))
+        derivatives, weight, off = (np.concatenate(each) for each in zip(*rows, strict=True))
+        # Of all coefficients those around both passes.
+        columns = np.flatnonzero(derivatives.any(axis=0))
+        derivatives = derivatives[:, columns]
+        return columns, derivatives.T @ (weight[:, None] * derivatives), derivatives.T @ (weight * off)
+
+
+def _on_both_sides(root: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """A symmetric matrix (6 C, 6 C) multiplied from both sides by a root (C, C), for each of six components."""
+    half = (root @ matrix.reshape(len(root), -1)).reshape(matrix.shape)
+    return (root @ half.T.reshape(len(root), -1)).reshape(matrix.shape)
 
 
 def _moved(correction: np.ndarray, platform: np.ndarray, places: np.ndarray) -> np.ndarray:
