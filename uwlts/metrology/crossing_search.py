@@ -150,7 +150,7 @@ def _poses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> list[Hypoth
 def _bent(estimate: PathEstimate) -> float:
     """By how much a piece is bent as long as the drift is unknown, mm: by its steady rate and by its random walk."""
     part = 1 / len(estimate.pieces)
-    return estimate.path.drift[:3].max() * float(np.sqrt(part**2 + estimate.shares[2] * part))
+    return estimate.path.drift[:3].max() * float(np.sqrt(part**2 + estimate.prior.kind.walk * part))
 
 
 def _refined(own: Patches, other: Patches, pose: np.ndarray, *, bent_mm: float) -> tuple[int, np.ndarray] | None:

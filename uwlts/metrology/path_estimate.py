@@ -1,12 +1,9 @@
 """Least squares for a smooth correction of a path, by the surfaces that it shows more than once.
 
-Unknown is a correction of every pose, a shift (mm) and a turn (rad) in the base frame about the platform, as a cubic
-B-spline in time. Known beforehand is by how much a navigation drifts from an exact start: by a steady rate (a bias of
-velocity or gyroscope), by a rate that changes smoothly (temperature), by one that wanders (instability of the bias),
-and by a random walk (noise of the velocity); these are the integrated Wiener processes of orders two, one and none.
-How large the others are beside the steady rate is what makes the evidence likeliest (empirical Bayes: MacKay, Neural
-Computation 4, 1992). Residuals are distances between patches of the surface where the path crosses itself. Movements
-that the surface leaves open there, as along a plain pipe, stay with what is known beforehand.
+Unknown is a correction of every pose, a shift (mm) and a turn (rad) in the base frame about the platform, with what
+`path_prior` knows beforehand of it. Of which kind the drift is, is what makes the evidence likeliest (empirical Bayes:
+MacKay, Neural Computation 4, 1992). Residuals are distances between patches of the surface where the path crosses
+itself. Movements that the surface leaves open there, as along a plain pipe, stay with what is known beforehand.
 """
 
 from __future__ import annotations
@@ -17,7 +14,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import BSpline
 from scipy.linalg import eigh, inv, solve, solve_triangular
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -31,27 +27,26 @@ from uwlts.metrology.patches import (
     scatter,
     surface_patches,
 )
+from uwlts.metrology.path_prior import DriftKind, PathPrior, PathSpline
 from uwlts.model.errors import EvaluationError
-from uwlts.model.trajectory import Trajectory
 from uwlts.storage.cloud import PointCloud
 
-Shares = tuple[float, float, float]
-"""Variances at the end of a rate that changes smoothly, of one that wanders, and of a random walk, over that of a
-steady rate, which alone would come to the drift as it is stated."""
 Pair = tuple[int, int]
 """Numbers of two pieces that show the same surface, the earlier first."""
 
 _TUKEY = 4.685
 _VOXEL = 0.4
 """Of the radius of patches: points for a search by heights."""
-_INTERVALS = 100
-"""Of the spline: between two knots a random walk goes a tenth of the drift of the whole path."""
-_MOST_KNOTS = 500
-_SHARES = (
-    (0.0, 0.1, 0.3, 1.0, 3.0, 10.0),
-    (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0),
-    (1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6),
-)
+_KINDS = {
+    "smooth": (0.0, 0.1, 0.3, 1.0, 3.0, 10.0),
+    "wandering": (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0),
+    "walk": (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6),
+    "by_heading": (0.0, 1.0),
+}
+"""Values of `DriftKind` that are compared."""
+_STRONG = 6.0
+"""Twice the logarithm of a ratio of likelihoods that is strong evidence (Kass and Raftery, Journal of the American
+Statistical Association 90, 1995): by so much a drift that the heading makes must be likelier than one without."""
 _TURNS, _LITTLE = 8, 0.2
 """Times that patches are laid anew at most, and by how much of a standard deviation the path may still move then."""
 _BESIDE = 13
@@ -74,103 +69,8 @@ _PER_PARAMETER = 1.5
 fits anywhere if the path may bend as much as it takes."""
 _NOISE = 5.0
 """Times the information that the noise of normals alone would give: a movement with less is open."""
-_EXACT = 1e-10
-"""Of the variance at the end: variance of the start of the path, which is the frame's and as good as exact."""
 _ROUNDING = 1e-9
 """Of the information on the best determined movement: less is rounding."""
-
-
-@dataclass(frozen=True, eq=False)
-class PathSpline:
-    """A trajectory, the knots of the spline over the time of the points, and the drift (6,) at its end, mm
-    and rad.
-
-    Knots lie evenly, and closer where the path crosses itself: there the surface tells how the drift walks.
-    """
-
-    trajectory: Trajectory
-    knots: np.ndarray
-    drift: np.ndarray
-    first_s: float
-    last_s: float
-
-    @classmethod
-    def of(cls, trajectory: Trajectory, drift: np.ndarray, times_s: np.ndarray) -> PathSpline:
-        """The spline over the times (N,) of the points."""
-        first, last = float(times_s.min()), float(times_s.max())
-        inner = np.linspace(first, last, _INTERVALS + 1)
-        knots = np.concatenate([np.repeat(first, 3), inner, np.repeat(last, 3)])
-        return cls(trajectory, knots, drift, first, last)
-
-    @property
-    def count(self) -> int:
-        """Number C of coefficients, each of six numbers."""
-        return len(self.knots) - 4
-
-    def resolved(self, times_s: np.ndarray, step_s: float) -> PathSpline:
-        """The spline with knots about every ``step_s`` around times (N,), evenly elsewhere."""
-        interval = (self.last_s - self.first_s) / _INTERVALS
-        halvings = max(0, round(float(np.log2(interval / step_s))))
-        while True:
-            parts = 2**halvings
-            cells = np.unique(np.floor((times_s - self.first_s) / interval * parts).astype(int))
-            # A cell more on both sides: a spline bends over three intervals.
-            closer = np.unique(cells[:, None] + np.arange(-1, 3))
-            inner = np.union1d(np.arange(_INTERVALS + 1) * parts, np.clip(closer, 0, _INTERVALS * parts))
-            if len(inner) <= _MOST_KNOTS or halvings == 0:
-                break
-            halvings -= 1
-        at = self.first_s + inner * (interval / parts)
-        at[-1] = self.last_s
-        knots = np.concatenate([np.repeat(self.first_s, 3), at, np.repeat(self.last_s, 3)])
-        return replace(self, knots=knots)
-
-    @property
-    def at_s(self) -> np.ndarray:
-        """Times (C,) at which each coefficient is about the correction: the mean of its knots (Greville)."""
-        return np.array([self.knots[k + 1 : k + 4].mean() for k in range(self.count)])
-
-    def basis(self, times_s: np.ndarray) -> np.ndarray:
-        """Weights (N, C) of the coefficients at times (N,)."""
-        inside = np.clip(times_s, self.first_s, self.last_s)
-        return BSpline.design_matrix(inside, self.knots, 3).toarray()
-
-    def weights(self, times_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Weights (N, 4) that are not zero at times (N,), and numbers (N, 4) of their coefficients."""
-        matrix = BSpline.design_matrix(np.clip(times_s, self.first_s, self.last_s), self.knots, 3)
-        return matrix.data.reshape(-1, 4), matrix.indices.reshape(-1, 4)
-
-    def corrections(self, coefficients: np.ndarray, times_s: np.ndarray, *, rates: bool = False) -> np.ndarray:
-        """Shift and turn (N, 6) at times (N,) by coefficients (6 C,), or their rates per second."""
-        spline = BSpline(self.knots, coefficients.reshape(-1, 6), 3)
-        return (spline.derivative() if rates else spline)(np.clip(times_s, self.first_s, self.last_s))
-
-    def kernel(self, shares: Shares, earlier_s: np.ndarray, later_s: np.ndarray) -> np.ndarray:
-        """Covariance of a component of the drift between times, over the variance that is stated for the end."""
-        t, u = ((each - self.first_s) / (self.last_s - self.first_s) for each in (earlier_s, later_s))
-        first, second = np.minimum(t, u), np.maximum(t, u)
-        # Integrals of a random walk from zero, twice and once; each is one at the end.
-        smooth = first**3 * (10 * second**2 - 5 * first * second + first**2) / 6
-        wandering = first**2 * (3 * second - first) / 2
-        kinds = t * u, smooth, wandering, first
-        return sum((part * kind for part, kind in zip((1.0, *shares), kinds, strict=True)), np.zeros_like(first))
-
-    def root(self, shares: Shares) -> np.ndarray:
-        """Lower triangular root (C, C) of the covariance of the coefficients of one component; see `kernel`."""
-        at = self.at_s
-        return np.linalg.cholesky(self.kernel(shares, at[:, None], at) + _EXACT * np.eye(len(at)))
-
-    def unresolved(self, shares: Shares, times_s: np.ndarray) -> np.ndarray:
-        """Variance (N,) of a component at times (N,) that the spline cannot follow, as `kernel`."""
-        basis = BSpline.design_matrix(np.clip(times_s, self.first_s, self.last_s), self.knots, 3)
-        along = basis @ self.root(shares)
-        inside = np.clip(times_s, self.first_s, self.last_s)
-        return np.maximum(self.kernel(shares, inside, inside) - np.einsum("nc,nc->n", along, along), 0.0)
-
-    @property
-    def units(self) -> np.ndarray:
-        """Drift (6 C,) at the end that belongs to each unknown, mm and rad."""
-        return np.tile(self.drift, self.count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,18 +115,23 @@ class Piece:
 class PathEstimate:
     """Coefficients of the correction, round by round, and the pairs of pieces that cross."""
 
-    def __init__(self, cloud: PointCloud, times_s: np.ndarray, path: PathSpline, shares: Shares) -> None:
+    def __init__(self, cloud: PointCloud, times_s: np.ndarray, path: PathSpline, kind: DriftKind) -> None:
         self.cloud = cloud
         moments, self._image = np.unique(times_s, return_inverse=True)
         self._moments, self._platform = moments, path.trajectory.poses_at(moments)[:, :3, 3]
         self._speed = path.trajectory.rates_at(moments)[:, :3]
         self.coefficients = np.zeros(6 * path.count)
+        self.prior, self._normal = PathPrior(path, kind), np.eye(6 * path.count)
+        self._covariance: Any = None
         self.pairs: list[Pair] = []
-        self._assume(path, shares)
         self._own, self._radius = _divided(cloud, times_s)
         laid = [(own, self._laid(own)) for own in self._own]
         self._own = [own for own, piece in laid if piece is not None]
         self.pieces = [piece for _, piece in laid if piece is not None]
+
+    @property
+    def path(self) -> PathSpline:
+        return self.prior.path
 
     @property
     def reach_mm(self) -> float:
@@ -283,8 +188,7 @@ class PathEstimate:
     def covariance(self) -> np.ndarray:
         """Of the coefficients (6 C, 6 C)."""
         if self._covariance is None:
-            inverse = inv(self._whitened, assume_a="pos", overwrite_a=False)
-            self._covariance = _on_both_sides(self._root, inverse) * np.outer(self.path.units, self.path.units)
+            self._covariance = self.prior.covariance(inv(self._normal, assume_a="pos"))
         return self._covariance
 
     def covariance_at(self, times_s: np.ndarray) -> np.ndarray:
@@ -296,18 +200,16 @@ class PathEstimate:
             for second in range(4):
                 weight = weights[:, first] * weights[:, second]
                 result += weight[:, None, None] * blocks[number[:, first], :, number[:, second]]
-        left = self.path.unresolved(self.shares, times_s)
-        return result + left[:, None, None] * np.diag(self.path.drift**2)
+        return result + self.prior.unresolved(times_s)[:, :, None] * np.eye(6)
 
     def state(self) -> tuple[Any, ...]:
         """What `restore` needs to return to the present estimate."""
-        return self.coefficients, self.path, self.shares, self._root, self._whitened, self.pairs[:], self.pieces[:]
+        return self.coefficients, self.prior, self._normal, self.pairs[:], self.pieces[:]
 
     def restore(self, state: tuple[Any, ...]) -> None:
         """Return to an earlier estimate."""
-        self.coefficients, self.path, self.shares, self._root, self._whitened = state[:5]
-        self.pairs, self.pieces = state[5][:], state[6][:]
-        self._covariance = None
+        self.coefficients, self.prior, self._normal = state[:3]
+        self.pairs, self.pieces, self._covariance = state[3][:], state[4][:], None
 
     def lay_anew(self, numbers: Iterable[int]) -> None:
         """Fit the patches of pieces to the points along the path as it is now.
@@ -319,7 +221,7 @@ class PathEstimate:
 
     def estimate(self, seed: dict[Pair, np.ndarray]) -> None:
         """Estimate until nothing moves any more; poses (4, 4) of pairs give their first matches."""
-        self._assume(self._resolved(seed), self.shares)
+        self._assume(PathPrior(self._resolved(seed), self.prior.kind))
         for done in range(_ROUNDS):
             if self._round(seed if done == 0 else {}) < _STILL_MM and (done > 1 or not seed):
                 break
@@ -334,16 +236,17 @@ class PathEstimate:
     def _settled(self) -> None:
         """Lay the patches and estimate anew until the path moves by little and its drift is of the likeliest kind."""
         self.estimate({})
+        kind = self.prior.kind
         for _ in range(_TURNS):
             path, before = self.path, self.coefficients
             self.lay_anew({number for pair in self.pairs for number in pair})
+            self._assume(PathPrior(self.path, kind))
             self.estimate({})
             at = self.path.at_s
             moved = self.corrections(at) - path.corrections(before, at)
             still = np.max(np.abs(moved.ravel()) / np.sqrt(np.diag(self.covariance))) < _LITTLE
-            if (shares := self._likeliest()) == self.shares and still:
+            if (kind := self._likeliest()) == self.prior.kind and still:
                 break
-            self._assume(self.path, shares)
 
     def agrees(self, pair: Pair) -> bool:
         """Whether the surfaces of a pair agree, also where they were held out."""
@@ -351,7 +254,7 @@ class PathEstimate:
         if np.count_nonzero(fits) < FEWEST or np.mean(fits) < _AGREEING:
             return False
         held = self.held_out(pair, found)
-        return np.count_nonzero(held) < _FEWEST_HELD_OUT or bool(np.mean(fits[held]) >= _AGREEING)
+        return bool(np.count_nonzero(held) < _FEWEST_HELD_OUT or np.mean(fits[held]) >= _AGREEING)
 
     def tells(self, pair: Pair) -> bool:
         """Whether the surfaces of a pair tell more than they determine of the path."""
@@ -405,13 +308,13 @@ class PathEstimate:
         )
         return replace(piece, back=np.linalg.inv(self._around(piece)))
 
-    def _assume(self, path: PathSpline, shares: Shares) -> None:
-        """Take a kind of drift, and a path with other knots; the correction stays as it is."""
-        if path is not getattr(self, "path", path):
-            at = path.at_s
-            self.coefficients = np.linalg.solve(path.basis(at), self.corrections(at)).ravel()
-        self.path, self.shares, self._root = path, shares, path.root(shares)
-        self._whitened, self._covariance = np.eye(6 * path.count), None
+    def _assume(self, prior: PathPrior) -> None:
+        """Take a kind of drift, or a path with other knots; the correction stays as it is."""
+        if prior.path is not self.path:
+            at = prior.path.at_s
+            self.coefficients = np.linalg.solve(prior.path.basis(at), self.corrections(at)).ravel()
+        self.prior, self._covariance = prior, None
+        self._normal = np.eye(len(self.coefficients))
 
     def _resolved(self, seed: dict[Pair, np.ndarray]) -> PathSpline:
         """The path with knots as close as patches tell, where pairs lie on each other."""
@@ -431,41 +334,30 @@ class PathEstimate:
     def _round(self, seed: dict[Pair, np.ndarray]) -> float:
         """One step of least squares; returns the largest shift of a coefficient."""
         normal, gradient = self._evidence(seed)
-        told = self.path.units * (normal @ self.coefficients - gradient)
-        self._whitened, self._covariance = (
-            np.eye(len(told)) + _on_both_sides(self._root.T, normal * np.outer(self.path.units, self.path.units)),
-            None,
-        )
-        by = (self._root.T @ told.reshape(self.path.count, 6)).ravel()
-        found = solve(self._whitened, by, assume_a="pos").reshape(self.path.count, 6)
-        step = self.path.units * (self._root @ found).ravel() - self.coefficients
-        self.coefficients = self.coefficients + step
+        self._normal, self._covariance = self.prior.with_evidence(normal), None
+        told = self.prior.times_transposed_root((normal @ self.coefficients - gradient)[:, None])
+        found = self.prior.times_root(solve(self._normal, told, assume_a="pos"))[:, 0]
+        step, self.coefficients = found - self.coefficients, found
         return float(np.abs(step.reshape(-1, 6)[:, :3]).max())
 
-    def _likeliest(self) -> Shares:
-        """Shares of the drift with which the matches as they are now are likeliest."""
+    def _likeliest(self) -> DriftKind:
+        """Kind of the drift with which the matches as they are now are likeliest."""
         normal, gradient = self._evidence({})
-        told = normal @ self.coefficients - gradient
-        # Coefficients of which the matches tell nothing are integrated out.
-        near = np.flatnonzero(normal.any(axis=0).reshape(-1, 6).any(axis=1))
-        columns = (6 * near[:, None] + np.arange(6)).ravel()
-        units = self.path.units[columns]
-        normal, told = normal[np.ix_(columns, columns)] * np.outer(units, units), units * told[columns]
-        at = self.path.at_s[near]
+        told = (normal @ self.coefficients - gradient)[:, None]
 
         @cache
-        def likelihood(shares: Shares) -> float:
-            """Twice the logarithm, but for what all shares have in common: the path is integrated out."""
-            root = np.linalg.cholesky(self.path.kernel(shares, at[:, None], at) + _EXACT * np.eye(len(at)))
-            factor = np.linalg.cholesky(np.eye(len(columns)) + _on_both_sides(root.T, normal))
-            off = solve_triangular(factor, (root.T @ told.reshape(-1, 6)).ravel(), lower=True)
-            return float(off @ off - 2 * np.sum(np.log(np.diag(factor))))
+        def likelihood(kind: DriftKind) -> float:
+            """Twice the logarithm, but for what all kinds have in common: the path is integrated out."""
+            prior = PathPrior(self.path, kind)
+            factor = np.linalg.cholesky(prior.with_evidence(normal))
+            off = solve_triangular(factor, prior.times_transposed_root(told), lower=True)
+            return float(np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor)))) - _STRONG * kind.by_heading
 
-        best, before = self.shares, None
+        best, before = self.prior.kind, None
         while best != before:
             before = best
-            for kind, values in enumerate(_SHARES):
-                best = max(((*best[:kind], value, *best[kind + 1 :]) for value in values), key=likelihood)
+            for name, values in _KINDS.items():
+                best = max((best._replace(**{name: value}) for value in values), key=likelihood)
         return best
 
     def _evidence(self, seed: dict[Pair, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -529,12 +421,6 @@ class PathEstimate:
         columns = np.flatnonzero(derivatives.any(axis=0))
         derivatives = derivatives[:, columns]
         return columns, derivatives.T @ (weight[:, None] * derivatives), derivatives.T @ (weight * off)
-
-
-def _on_both_sides(root: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """A symmetric matrix (6 C, 6 C) multiplied from both sides by a root (C, C), for each of six components."""
-    half = (root @ matrix.reshape(len(root), -1)).reshape(matrix.shape)
-    return (root @ half.T.reshape(len(root), -1)).reshape(matrix.shape)
 
 
 def _moved(correction: np.ndarray, platform: np.ndarray, places: np.ndarray) -> np.ndarray:

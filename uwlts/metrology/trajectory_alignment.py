@@ -14,14 +14,16 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.metrology.crossing_search import SIGMAS, close_crossings, complete
 from uwlts.metrology.patches import scatter
-from uwlts.metrology.path_estimate import EXACT_MM, EXACT_RAD, Pair, PathEstimate, PathSpline
+from uwlts.metrology.path_estimate import EXACT_MM, EXACT_RAD, Pair, PathEstimate
+from uwlts.metrology.path_prior import DriftKind, PathSpline
 from uwlts.metrology.path_uncertainty import along_corrected_path
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory, on_clock
 from uwlts.storage.cloud import PointCloud, read_cloud
 
-_SMOOTH, _ROUGH = (0.0, 0.3, 0.01), (0.0, 0.2, 0.4)
+_SMOOTH = DriftKind(smooth=0.0, wandering=0.3, walk=0.01)
+_ROUGH = DriftKind(smooth=0.0, wandering=0.2, walk=0.4)
 """Kinds of drift assumed in the search of crossings, the second where the first finds none: fewer
 false crossings fit a stiffer path."""
 
@@ -140,8 +142,8 @@ def align_trajectory(
     times = on_clock(cloud.time_s, offset_s=clock_offset_s, drift_ppm=clock_drift_ppm)
     path = PathSpline.of(trajectory, _drift(trajectory, drift_mm, drift_deg), times)
     left_out: tuple[tuple[float, float], ...] = ()
-    for turn, shares in enumerate((_SMOOTH, _ROUGH)):
-        estimate = PathEstimate(cloud, times, path, shares)
+    for turn, kind in enumerate((_SMOOTH, _ROUGH)):
+        estimate = PathEstimate(cloud, times, path, kind)
 
         def searched(done: int, total: int, turn: int = turn) -> None:
             progress(turn * total + done, (turn + 1) * total)
