@@ -24,6 +24,8 @@ PASS_MM = np.array(
 )
 """Crosses itself at (700, 0), (2000, 0) and (2000, 1600)."""
 SWATH_MM, LENGTH_MM = 140.0, 19_400.0
+PASSING_S = 1.5
+"""Around the middle of a piece, in which the pass lies over the crossing."""
 CROSSINGS = (0.057, 0.500), (0.124, 0.608), (0.351, 0.691)
 """Of the pass, as parts of its length."""
 
@@ -110,16 +112,23 @@ def _rms(values: list[np.ndarray]) -> float:
 
 
 def _apart(found: uwlts.Trajectory, true: uwlts.Trajectory, times: tuple[float, float]) -> np.ndarray:
-    """Errors (9,) of lengths from points of the first pass to points of the second, within a crossing, mm."""
+    """Errors (9,) of lengths from points of the first pass to points of the second, within a crossing, mm.
+
+    A point has the errors of the image in which its pass saw it.
+    """
+    passes = [np.flatnonzero(np.abs(true.times_s - time) < PASSING_S) for time in times]
+    first, second = (true.poses[images, :2, 3] for images in passes)
+    apart = np.linalg.norm(first[:, None] - second, axis=2)
+    crossed = passes[0][np.unravel_index(np.argmin(apart), apart.shape)[0]]
+    middle = true.poses[crossed, :3, 3] - [0, 0, ALTITUDE_MM]
     moved, places = [], []
-    k = int(np.argmin(np.abs(true.times_s - times[0])))
-    middle = true.poses[k, :3, 3] - [0, 0, ALTITUDE_MM]
-    for time, corners in zip(times, ([-1, -1, 0], [1, 1, 0]), strict=True):
-        k = int(np.argmin(np.abs(true.times_s - time)))
-        wrong = found.poses[k] @ np.linalg.inv(true.poses[k])
+    for images, corners in zip(passes, ([-1, -1, 0], [1, 1, 0]), strict=True):
         points = middle + 0.5 * SWATH_MM * np.array([corners, np.multiply(corners, [1, -0.5, 0]), np.zeros(3)])
+        along = np.einsum("pni,ni->pn", points[:, None] - true.poses[images, :3, 3], true.poses[images, :3, 0])
+        seen = images[np.argmin(np.abs(along), axis=1)]
+        wrong = found.poses[seen] @ np.linalg.inv(true.poses[seen])
         places.append(points)
-        moved.append(points @ wrong[:3, :3].T + wrong[:3, 3])
+        moved.append(np.einsum("pij,pj->pi", wrong[:, :3, :3], points) + wrong[:, :3, 3])
     lengths = [np.linalg.norm(second[None] - first[:, None], axis=2).ravel() for first, second in (moved, places)]
     return lengths[0] - lengths[1]
 

@@ -88,6 +88,7 @@ def complete(estimate: PathEstimate, count: int) -> None:
                 if len(found.source) >= FEWEST:
                     estimate.pairs.append(pair)
     if len(estimate.pairs) > len(closed):
+        estimate.resolve({})
         estimate.estimate({})
         estimate.lay_anew({number for pair in estimate.pairs for number in pair})
         estimate.estimate({})
@@ -190,6 +191,7 @@ def _closed(estimate: PathEstimate, hypothesis: Hypothesis) -> bool:
     """Estimate the path with a hypothesis; whether it agrees then. Else the estimate stays as it was."""
     before = estimate.state()
     estimate.pairs.append(hypothesis.pair)
+    estimate.resolve({hypothesis.pair: hypothesis.pose})
     estimate.estimate({hypothesis.pair: hypothesis.pose})
     estimate.lay_anew(hypothesis.pair)
     estimate.estimate({})

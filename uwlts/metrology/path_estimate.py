@@ -14,7 +14,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from scipy.linalg import eigh, inv, solve, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, eigh, inv, solve_triangular
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -47,14 +47,15 @@ _KINDS = {
 _STRONG = 6.0
 """Twice the logarithm of a ratio of likelihoods that is strong evidence (Kass and Raftery, Journal of the American
 Statistical Association 90, 1995): by so much a drift that the heading makes must be likelier than one without."""
-_TURNS, _LITTLE = 8, 0.2
-"""Times that patches are laid anew at most, and by how much of a standard deviation the path may still move then."""
+_STEP = 0.5
+_TURNS, _LITTLE = 8, 0.1
+"""Times that patches are laid anew at most, and by how much of its standard deviations the path may still move then."""
 _BESIDE = 13
 """Patches from which it is taken how times grow: two rings around one."""
 FEWEST = 30
 """Patches of a piece, and of a crossing."""
 _ROUNDS = 15
-_STILL_MM = 1e-3
+_STILL_MM = 3e-3
 EXACT_MM, EXACT_RAD = 1e-3, 1e-7
 """The least drift at the end: navigation is not better."""
 _HELD_OUT = 5
@@ -211,6 +212,21 @@ class PathEstimate:
         self.coefficients, self.prior, self._normal = state[:3]
         self.pairs, self.pieces, self._covariance = state[3][:], state[4][:], None
 
+    def resolve(self, seed: dict[Pair, np.ndarray]) -> None:
+        """Lay knots as close as patches tell where pairs lie on each other, later pieces in poses (4, 4) that differ."""
+        times, steps = [], []
+        for pair in self.pairs:
+            earlier, later = (self.moved(number) for number in pair)
+            pose = seed.get(pair, np.eye(4))
+            found = distances_between(later, pose, earlier, np.eye(4), reach_mm=2 * self.reach_mm)
+            for number, rows in zip(pair, (found.target, found.source), strict=True):
+                piece = self.pieces[number]
+                times.append(piece.times_s[rows])
+                steps.append(_STEP * self._radius * np.linalg.norm(piece.slopes[rows], axis=1))
+        if times and len(together := np.concatenate(times)):
+            path = self.path.resolved(together, float(np.median(np.concatenate(steps))))
+            self._assume(PathPrior(path, self.prior.kind))
+
     def lay_anew(self, numbers: Iterable[int]) -> None:
         """Fit the patches of pieces to the points along the path as it is now.
 
@@ -221,7 +237,6 @@ class PathEstimate:
 
     def estimate(self, seed: dict[Pair, np.ndarray]) -> None:
         """Estimate until nothing moves any more; poses (4, 4) of pairs give their first matches."""
-        self._assume(PathPrior(self._resolved(seed), self.prior.kind))
         for done in range(_ROUNDS):
             if self._round(seed if done == 0 else {}) < _STILL_MM and (done > 1 or not seed):
                 break
@@ -235,17 +250,19 @@ class PathEstimate:
 
     def _settled(self) -> None:
         """Lay the patches and estimate anew until the path moves by little and its drift is of the likeliest kind."""
+        self.resolve({})
         self.estimate({})
-        kind = self.prior.kind
+        kind, known = self.prior.kind, False
         for _ in range(_TURNS):
-            path, before = self.path, self.coefficients
+            before = self.coefficients
             self.lay_anew({number for pair in self.pairs for number in pair})
             self._assume(PathPrior(self.path, kind))
             self.estimate({})
-            at = self.path.at_s
-            moved = self.corrections(at) - path.corrections(before, at)
-            still = np.max(np.abs(moved.ravel()) / np.sqrt(np.diag(self.covariance))) < _LITTLE
-            if (kind := self._likeliest()) == self.prior.kind and still:
+            if not known:
+                kind = self._likeliest()
+                known = kind == self.prior.kind
+            moved = (self.coefficients - before) ** 2 / np.diag(self.covariance)
+            if known and np.sqrt(np.mean(moved)) < _LITTLE:
                 break
 
     def agrees(self, pair: Pair) -> bool:
@@ -316,27 +333,12 @@ class PathEstimate:
         self.prior, self._covariance = prior, None
         self._normal = np.eye(len(self.coefficients))
 
-    def _resolved(self, seed: dict[Pair, np.ndarray]) -> PathSpline:
-        """The path with knots as close as patches tell, where pairs lie on each other."""
-        times, steps = [], []
-        for pair in self.pairs:
-            earlier, later = (self.moved(number) for number in pair)
-            pose = seed.get(pair, np.eye(4))
-            found = distances_between(later, pose, earlier, np.eye(4), reach_mm=2 * self.reach_mm)
-            for number, rows in zip(pair, (found.target, found.source), strict=True):
-                piece = self.pieces[number]
-                times.append(piece.times_s[rows])
-                steps.append(self._radius * np.linalg.norm(piece.slopes[rows], axis=1))
-        if not times or not len(together := np.concatenate(times)):
-            return self.path
-        return self.path.resolved(together, float(np.median(np.concatenate(steps))))
-
     def _round(self, seed: dict[Pair, np.ndarray]) -> float:
         """One step of least squares; returns the largest shift of a coefficient."""
         normal, gradient = self._evidence(seed)
         self._normal, self._covariance = self.prior.with_evidence(normal), None
         told = self.prior.times_transposed_root((normal @ self.coefficients - gradient)[:, None])
-        found = self.prior.times_root(solve(self._normal, told, assume_a="pos"))[:, 0]
+        found = self.prior.times_root(cho_solve(cho_factor(self._normal, check_finite=False), told))[:, 0]
         step, self.coefficients = found - self.coefficients, found
         return float(np.abs(step.reshape(-1, 6)[:, :3]).max())
 
@@ -402,7 +404,7 @@ class PathEstimate:
             # Matched by another pose than the present one: where the later piece's surface lies now.
             now = {pair[0]: places, pair[1]: places @ back[:3, :3].T + back[:3, 3]}
             gap = np.einsum("qi,qi->q", now[source] - now[target], normals)
-            derivatives = 0.0
+            parts = []
             for number, at, sign in ((source, found.source[used], 1.0), (target, found.target[used], -1.0)):
                 piece = self.pieces[number]
                 # Beside the middle of a patch the surface was seen a little earlier or later.
@@ -414,13 +416,18 @@ class PathEstimate:
                 platform = piece.platform_mm[at] + later[:, None] * piece.speed[at]
                 platform += self.corrections(times)[:, :3]
                 by[:, 3:] += np.cross(middle + now[number] - places - platform, by[:, :3])
-                derivatives = derivatives + sign * np.einsum("qc,qi->qci", self.path.basis(times), by)
-            rows.append((np.reshape(derivatives, (len(weight), -1)), weight, found.distance_mm[used] + gap))
-        derivatives, weight, off = (np.concatenate(each) for each in zip(*rows, strict=True))
+                parts.append((sign * self.path.basis(times), by))
+            rows.append((parts, weight, found.distance_mm[used] + gap))
         # Of all coefficients those around both passes.
-        columns = np.flatnonzero(derivatives.any(axis=0))
-        derivatives = derivatives[:, columns]
-        return columns, derivatives.T @ (weight[:, None] * derivatives), derivatives.T @ (weight * off)
+        near = np.flatnonzero(np.any([basis.any(axis=0) for parts, _, _ in rows for basis, _ in parts], axis=0))
+        columns = (6 * near[:, None] + np.arange(6)).ravel()
+        normal, gradient = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
+        for parts, weight, off in rows:
+            derivatives = sum(np.einsum("qc,qi->qci", basis[:, near], by) for basis, by in parts)
+            derivatives = np.reshape(derivatives, (len(weight), -1))
+            normal += derivatives.T @ (weight[:, None] * derivatives)
+            gradient += derivatives.T @ (weight * off)
+        return columns, normal, gradient
 
 
 def _moved(correction: np.ndarray, platform: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -176,7 +176,10 @@ class PathPrior:
 
     def _of_components(self, root: np.ndarray, matrix: np.ndarray) -> np.ndarray:
         """A matrix (C, C) times each of the six components of another (6 C, K)."""
-        return (root @ matrix.reshape(self.path.count, -1)).reshape(matrix.shape)
+        rows = matrix.reshape(self.path.count, -1)
+        # Matches tell of coefficients near crossings alone.
+        told = rows.any(axis=1)
+        return (root[:, told] @ rows[told]).reshape(matrix.shape)
 
 
 def _knots(inner: np.ndarray) -> np.ndarray:
