@@ -213,7 +213,7 @@ class PathEstimate:
         self.pairs, self.pieces, self._covariance = state[3][:], state[4][:], None
 
     def resolve(self, seed: dict[Pair, np.ndarray]) -> None:
-        """Lay knots as close as patches tell where pairs lie on each other, later pieces in poses (4, 4) that differ."""
+        """Lay knots as close as patches tell where pairs lie on each other; poses (4, 4) as in `estimate`."""
         times, steps = [], []
         for pair in self.pairs:
             earlier, later = (self.moved(number) for number in pair)
