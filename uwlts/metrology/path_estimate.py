@@ -65,7 +65,7 @@ _AGREEING = 0.9
 of those held out. Wrong places reach 0.8 where the path bends to them."""
 _FEWEST_HELD_OUT = 10
 """Held-out patches whose share is judged."""
-_PER_PARAMETER = 1.5
+_PER_PARAMETER = 3.0
 """Independent distances of a crossing for each parameter of the path that it determines: a surface without features
 fits anywhere if the path may bend as much as it takes."""
 _NOISE = 5.0
@@ -274,10 +274,15 @@ class PathEstimate:
         return bool(np.count_nonzero(held) < _FEWEST_HELD_OUT or np.mean(fits[held]) >= _AGREEING)
 
     def tells(self, pair: Pair) -> bool:
-        """Whether the surfaces of a pair tell more than they determine of the path."""
-        fits = self.matched(pair)[1]
+        """Whether the surfaces of a pair tell more than they determine of the path, but for its random walk.
+
+        The walk is small within a crossing; patches that are held out judge what it takes.
+        """
         columns, normal, _ = self._of_pair(pair, None)
-        determined = float(np.sum(normal * self.covariance[np.ix_(columns, columns)]))
+        steady = PathPrior(self.path, self.prior.kind._replace(walk=_KINDS["walk"][0]))
+        covariance = steady.covariance(inv(steady.with_evidence(self._evidence({})[0]), assume_a="pos"))
+        determined = float(np.sum(normal * covariance[np.ix_(columns, columns)]))
+        fits = self.matched(pair)[1]
         return bool(np.count_nonzero(fits) / self.pieces[pair[1]].patches.shared > _PER_PARAMETER * determined)
 
     def matched(self, pair: Pair) -> tuple[PatchDistances, np.ndarray]:
