@@ -37,10 +37,12 @@ Pair = tuple[int, int]
 _TUKEY = 4.685
 _VOXEL = 0.4
 """Of the radius of patches: points for a search by heights."""
+_WALKS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6)
 _KINDS = {
     "smooth": (0.0, 0.1, 0.3, 1.0, 3.0, 10.0),
     "wandering": (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0),
-    "walk": (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6),
+    "walk": _WALKS,
+    "turn_walk": _WALKS,
     "by_heading": (0.0, 1.0),
 }
 """Values of `DriftKind` that are compared."""
@@ -55,7 +57,7 @@ _BESIDE = 13
 FEWEST = 30
 """Patches of a piece, and of a crossing."""
 _ROUNDS = 15
-_STILL_MM = 3e-3
+_STILL_MM = 0.01
 EXACT_MM, EXACT_RAD = 1e-3, 1e-7
 """The least drift at the end: navigation is not better."""
 _HELD_OUT = 5
@@ -279,7 +281,7 @@ class PathEstimate:
         The walk is small within a crossing; patches that are held out judge what it takes.
         """
         columns, normal, _ = self._of_pair(pair, None)
-        steady = PathPrior(self.path, self.prior.kind._replace(walk=_KINDS["walk"][0]))
+        steady = PathPrior(self.path, self.prior.kind._replace(walk=_WALKS[0], turn_walk=_WALKS[0]))
         covariance = steady.covariance(inv(steady.with_evidence(self._evidence({})[0]), assume_a="pos"))
         determined = float(np.sum(normal * covariance[np.ix_(columns, columns)]))
         fits = self.matched(pair)[1]
@@ -364,7 +366,11 @@ class PathEstimate:
         while best != before:
             before = best
             for name, values in _KINDS.items():
-                best = max((best._replace(**{name: value}) for value in values), key=likelihood)
+                for side in (1, -1):
+                    at = values.index(getattr(best, name)) + side
+                    while 0 <= at < len(values) and likelihood(best._replace(**{name: values[at]})) > likelihood(best):
+                        best = best._replace(**{name: values[at]})
+                        at += side
         return best
 
     def _evidence(self, seed: dict[Pair, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

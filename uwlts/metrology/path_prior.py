@@ -4,7 +4,8 @@ A navigation drifts from an exact start by a steady rate (a bias of velocity or 
 smoothly (temperature), by one that wanders (instability of the bias), and by a random walk (noise of the velocity);
 these are the integrated Wiener processes of orders two, one and none. A heading that is wrong by e turns the way that
 is reckoned from velocities: the position errs by the integral of e z x v (Farrell, Aided Navigation, 2008, chapter 12).
-The correction is a cubic B-spline in time.
+What is measured all along, as a depth or a tilt, walks within the bounds of its variance. The correction is a cubic
+B-spline in time.
 """
 
 from __future__ import annotations
@@ -27,18 +28,21 @@ _EXACT = 1e-10
 
 
 class DriftKind(NamedTuple):
-    """Variances at the end of a rate that changes smoothly, of one that wanders, and of a random walk, over that of a
-    steady rate, which alone would come to the drift as it is stated; and whether the heading turns the way (1 or 0)."""
+    """Variances at the end of a rate that changes smoothly, of one that wanders, and of random walks of shifts and of
+    turns, over that of a steady rate, which alone would come to the drift as it is stated; and whether the heading
+    turns the way (1 or 0)."""
 
     smooth: float
     wandering: float
     walk: float
+    turn_walk: float
     by_heading: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class PathSpline:
-    """A trajectory, the knots of the spline over the times of the points, and the drift (6,) at its end, mm and rad.
+    """A trajectory, the knots of the spline over the times of the points, and the drift (6,) at its end, mm and rad, of
+    components of which some (6,) are measured all along.
 
     Knots lie evenly, and closer where the path crosses itself: there the surface tells how the drift walks.
     """
@@ -46,14 +50,15 @@ class PathSpline:
     trajectory: Trajectory
     knots: np.ndarray
     drift: np.ndarray
+    measured: np.ndarray
     first_s: float
     last_s: float
 
     @classmethod
-    def of(cls, trajectory: Trajectory, drift: np.ndarray, times_s: np.ndarray) -> PathSpline:
+    def of(cls, trajectory: Trajectory, drift: np.ndarray, measured: np.ndarray, times_s: np.ndarray) -> PathSpline:
         """The spline over the times (N,) of the points."""
         first, last = float(times_s.min()), float(times_s.max())
-        return cls(trajectory, _knots(np.linspace(first, last, _INTERVALS + 1)), drift, first, last)
+        return cls(trajectory, _knots(np.linspace(first, last, _INTERVALS + 1)), drift, measured, first, last)
 
     def resolved(self, times_s: np.ndarray, step_s: float) -> PathSpline:
         """The spline with knots about every ``step_s`` around times (N,), evenly elsewhere."""
@@ -104,7 +109,7 @@ class PathPrior:
     """Normal distribution of the coefficients of a path, by the kind of its drift.
 
     The coefficients are a root R (6 C, 6 C) times as many independent numbers of variance one. R is not formed:
-    components are alike, but for their size, and for the way that the heading turns.
+    components are independent, but for the way that the heading turns.
     """
 
     path: PathSpline
@@ -112,7 +117,7 @@ class PathPrior:
 
     def times_root(self, matrix: np.ndarray) -> np.ndarray:
         """R times a matrix (6 C, K)."""
-        result = self._drift[:, None] * self._of_components(self._root, matrix)
+        result = self._drift[:, None] * self._of_components(matrix)
         if self.kind.by_heading:
             result[0::6] -= self._turned[1] @ result[5::6]
             result[1::6] += self._turned[0] @ result[5::6]
@@ -123,7 +128,7 @@ class PathPrior:
         if self.kind.by_heading:
             matrix = matrix.copy()
             matrix[5::6] += self._turned[0].T @ matrix[1::6] - self._turned[1].T @ matrix[0::6]
-        return self._of_components(self._root.T, self._drift[:, None] * matrix)
+        return self._of_components(self._drift[:, None] * matrix, transposed=True)
 
     def with_evidence(self, normal: np.ndarray) -> np.ndarray:
         """Normal matrix (6 C, 6 C) of the independent numbers by that of the coefficients without this prior."""
@@ -137,24 +142,39 @@ class PathPrior:
     def unresolved(self, times_s: np.ndarray) -> np.ndarray:
         """Variances (N, 6) of the drift at times (N,) that the spline cannot follow."""
         inside = np.clip(times_s, self.path.first_s, self.path.last_s)
-        along = BSpline.design_matrix(inside, self.path.knots, 3) @ self._root
-        left = self._kernel(inside, inside) - np.einsum("nc,nc->n", along, along)
-        return np.maximum(left, 0.0)[:, None] * self.path.drift**2
+        basis = BSpline.design_matrix(inside, self.path.knots, 3)
+        result = np.empty((len(times_s), 6))
+        for components, shares, root in self._groups:
+            left = self._kernel(shares, inside, inside) - np.sum((basis @ root) ** 2, axis=1)
+            result[:, components] = np.maximum(left, 0.0)[:, None]
+        return result * self.path.drift**2
 
-    def _kernel(self, earlier_s: np.ndarray, later_s: np.ndarray) -> np.ndarray:
+    def _kernel(self, shares: tuple[float, ...], earlier_s: np.ndarray, later_s: np.ndarray) -> np.ndarray:
         """Covariance of a component between times, over the variance that is stated for the end."""
         t, u = ((each - self.path.first_s) / (self.path.last_s - self.path.first_s) for each in (earlier_s, later_s))
         first, second = np.minimum(t, u), np.maximum(t, u)
         # Integrals of a random walk from zero, twice and once; each is one at the end.
         smooth = first**3 * (10 * second**2 - 5 * first * second + first**2) / 6
         wandering = first**2 * (3 * second - first) / 2
-        return t * u + self.kind.smooth * smooth + self.kind.wandering * wandering + self.kind.walk * first
+        kinds = t * u, smooth, wandering, first
+        return sum((share * each for share, each in zip(shares, kinds, strict=True)), np.zeros_like(first))
 
     @cached_property
-    def _root(self) -> np.ndarray:
-        """Lower triangular root (C, C) of the covariance of the coefficients of one component."""
-        at = self.path.at_s
-        return np.linalg.cholesky(self._kernel(at[:, None], at) + _EXACT * np.eye(len(at)))
+    def _groups(self) -> list[tuple[np.ndarray, tuple[float, ...], np.ndarray]]:
+        """Components that drift alike, shares of the steady rate and of `DriftKind`, and the lower triangular root
+        (C, C) of the covariance of their coefficients over the variance at the end."""
+        shift, measured, at = np.arange(6) < 3, self.path.measured, self.path.at_s
+        rates, walk = (1.0, self.kind.smooth, self.kind.wandering), (0.0, 0.0, 0.0, 1.0)
+        groups = []
+        for which, shares in (
+            (shift & ~measured, (*rates, self.kind.walk)),
+            (~shift & ~measured, (*rates, self.kind.turn_walk)),
+            (measured, walk),
+        ):
+            if which.any():
+                root = np.linalg.cholesky(self._kernel(shares, at[:, None], at) + _EXACT * np.eye(len(at)))
+                groups.append((np.flatnonzero(which), shares, root))
+        return groups
 
     @cached_property
     def _drift(self) -> np.ndarray:
@@ -174,12 +194,17 @@ class PathPrior:
         velocity, basis = self.path.trajectory.rates_at(times)[:, :2], self.path.basis(times)
         return np.array([until @ (along[:, None] * basis) for along in velocity.T])
 
-    def _of_components(self, root: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-        """A matrix (C, C) times each of the six components of another (6 C, K)."""
-        rows = matrix.reshape(self.path.count, -1)
-        # Matches tell of coefficients near crossings alone.
-        told = rows.any(axis=1)
-        return (root[:, told] @ rows[told]).reshape(matrix.shape)
+    def _of_components(self, matrix: np.ndarray, *, transposed: bool = False) -> np.ndarray:
+        """The roots of the components, or their transposes, times the rows of each in a matrix (6 C, K)."""
+        parts = matrix.reshape(self.path.count, 6, -1)
+        result = np.empty_like(parts)
+        for components, _, lower in self._groups:
+            rows = parts[:, components].reshape(self.path.count, -1)
+            # Matches tell of coefficients near crossings alone.
+            told = rows.any(axis=1)
+            root = (lower.T if transposed else lower)[:, told]
+            result[:, components] = (root @ rows[told]).reshape(self.path.count, len(components), -1)
+        return result.reshape(matrix.shape)
 
 
 def _knots(inner: np.ndarray) -> np.ndarray:

@@ -22,8 +22,8 @@ from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory, on_clock
 from uwlts.storage.cloud import PointCloud, read_cloud
 
-_SMOOTH = DriftKind(smooth=0.0, wandering=0.3, walk=0.01)
-_ROUGH = DriftKind(smooth=0.0, wandering=0.2, walk=0.4)
+_SMOOTH = DriftKind(smooth=0.0, wandering=0.3, walk=0.01, turn_walk=0.01)
+_ROUGH = DriftKind(smooth=0.0, wandering=0.3, walk=0.3, turn_walk=0.3)
 """Kinds of drift assumed in the search of crossings, the second where the first finds none: fewer
 false crossings fit a stiffer path."""
 
@@ -140,7 +140,7 @@ def align_trajectory(
     if cloud.time_s is None:
         raise EvaluationError("the cloud has no times of its points: reconstruct it with a trajectory")
     times = on_clock(cloud.time_s, offset_s=clock_offset_s, drift_ppm=clock_drift_ppm)
-    path = PathSpline.of(trajectory, _drift(trajectory, drift_mm, drift_deg), times)
+    path = PathSpline.of(trajectory, *_drift(trajectory, drift_mm, drift_deg), times)
     left_out: tuple[tuple[float, float], ...] = ()
     for turn, kind in enumerate((_SMOOTH, _ROUGH)):
         estimate = PathEstimate(cloud, times, path, kind)
@@ -162,22 +162,22 @@ def align_trajectory(
     )
 
 
-def _drift(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> np.ndarray:
-    """Drift (6,) of each component of the poses at the end, mm and rad."""
+def _drift(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Drift (6,) of each component of the poses at the end, mm and rad, and which (6,) are measured all along."""
     if (drift_mm is None) != (drift_deg is None):
         raise EvaluationError("the drift needs both parts: drift_mm and drift_deg")
     if drift_mm is not None and drift_deg is not None:
         if not (0 < drift_mm < np.inf and 0 < drift_deg < 90):
             raise EvaluationError(f"the drift is {drift_mm:g} mm and {drift_deg:g} deg; expected positive numbers")
-        return np.repeat([drift_mm, float(np.radians(drift_deg))], 3)
+        return np.repeat([drift_mm, float(np.radians(drift_deg))], 3), np.zeros(6, bool)
     if trajectory.covariance is None:
         raise EvaluationError("the trajectory states no covariance: give drift_mm and drift_deg")
     variance = np.einsum("nii->ni", trajectory.covariance)
     grown = np.maximum(variance.max(axis=0) - variance[0], 0.0)
-    # What is measured all along, as depth and tilt, wanders by up to twice its variance, though that does not grow.
-    most = np.repeat(grown.reshape(2, 3).max(axis=1), 3)
-    grown = np.maximum(grown, np.minimum(2 * variance[0], most))
-    return np.maximum(np.sqrt(grown), np.repeat([EXACT_MM, EXACT_RAD], 3))
+    # What is measured all along, as depth and tilt, differs from its start by up to twice its variance.
+    measured = (grown < variance[0]) & (2 * variance[0] < np.repeat(grown.reshape(2, 3).max(axis=1), 3))
+    drift = np.sqrt(np.where(measured, 2 * variance[0], grown))
+    return np.maximum(drift, np.repeat([EXACT_MM, EXACT_RAD], 3)), measured
 
 
 def _result(

@@ -7,6 +7,7 @@ from uwlts.model.trajectory import Trajectory
 
 SECONDS, SPEED_MM_S = 20.0, 200.0
 DRIFT = np.array([30.0, 20.0, 10.0, 0.01, 0.01, 0.02])
+MEASURED = np.array([False, False, True, False, False, False])
 
 
 def straight_path() -> Trajectory:
@@ -19,7 +20,7 @@ def straight_path() -> Trajectory:
 
 def spline(*, closer_s: np.ndarray | None = None) -> PathSpline:
     """The path's spline, with closer knots where wanted."""
-    path = PathSpline.of(straight_path(), DRIFT, np.linspace(0, SECONDS, 41))
+    path = PathSpline.of(straight_path(), DRIFT, MEASURED, np.linspace(0, SECONDS, 41))
     return path if closer_s is None else path.resolved(closer_s, 0.02)
 
 
@@ -32,7 +33,7 @@ def covariance(prior: PathPrior, times_s: np.ndarray) -> np.ndarray:
 
 
 def test_kinds_of_drift_have_the_covariance_of_drifts_drawn_step_by_step():
-    kind = DriftKind(smooth=0.7, wandering=0.4, walk=0.2)
+    kind = DriftKind(smooth=0.7, wandering=0.4, walk=0.2, turn_walk=0.2)
     draws, steps = 20_000, 400
     rng = np.random.default_rng(4)
     t = np.arange(1, steps + 1) / steps
@@ -48,7 +49,7 @@ def test_kinds_of_drift_have_the_covariance_of_drifts_drawn_step_by_step():
     times = SECONDS * t[rows]
     found = covariance(prior, times)
     size = np.sqrt(np.diag(expected))
-    for component in range(6):
+    for component in np.flatnonzero(~MEASURED):
         own = found[:, component, :, component] + np.diag(prior.unresolved(times)[:, component])
         # Five standard errors of a drawn covariance, sqrt(2 / draws), and a step's share in the sums.
         np.testing.assert_allclose(
@@ -56,8 +57,15 @@ def test_kinds_of_drift_have_the_covariance_of_drifts_drawn_step_by_step():
         )
 
 
+def test_what_is_measured_walks_within_the_bounds_of_its_variance():
+    prior = PathPrior(spline(), DriftKind(smooth=0.7, wandering=0.4, walk=0.2, turn_walk=0.2))
+    found = covariance(prior, np.array([SECONDS / 4, SECONDS]))[:, 2, :, 2] / DRIFT[2] ** 2
+    # A spline between knots of 1/100 of the path is a little stiffer than a walk.
+    np.testing.assert_allclose(found, [[0.25, 0.25], [0.25, 1.0]], atol=0.01)
+
+
 def test_closer_knots_follow_a_random_walk():
-    kind = DriftKind(smooth=0.0, wandering=0.003, walk=0.1)
+    kind = DriftKind(smooth=0.0, wandering=0.003, walk=0.1, turn_walk=0.1)
     times = np.linspace(9.5, 10.5, 200)
     even, closer = PathPrior(spline(), kind), PathPrior(spline(closer_s=np.linspace(9, 11, 50)), kind)
     assert closer.path.count < 2.5 * even.path.count
@@ -66,8 +74,8 @@ def test_closer_knots_follow_a_random_walk():
 
 
 def test_a_wrong_heading_turns_the_way():
-    prior = PathPrior(spline(), DriftKind(smooth=0.0, wandering=0.003, walk=1e-7, by_heading=1.0))
-    alone = PathPrior(spline(), DriftKind(smooth=0.0, wandering=0.003, walk=1e-7))
+    prior = PathPrior(spline(), DriftKind(smooth=0.0, wandering=0.003, walk=1e-7, turn_walk=1e-7, by_heading=1.0))
+    alone = PathPrior(spline(), DriftKind(smooth=0.0, wandering=0.003, walk=1e-7, turn_walk=1e-7))
     with_, without = (covariance(each, np.array([SECONDS]))[0, :, 0] for each in (prior, alone))
     # A heading that grows steadily to e turns the way by e / 2 of its length, to the side.
     aside = DRIFT[5] * SPEED_MM_S * SECONDS / 2
@@ -77,7 +85,7 @@ def test_a_wrong_heading_turns_the_way():
 
 
 def test_the_root_is_one_of_the_covariance():
-    prior = PathPrior(spline(), DriftKind(smooth=0.3, wandering=0.1, walk=0.01, by_heading=1.0))
+    prior = PathPrior(spline(), DriftKind(smooth=0.3, wandering=0.1, walk=0.01, turn_walk=0.1, by_heading=1.0))
     count = 6 * prior.path.count
     root = prior.times_root(np.eye(count))
     np.testing.assert_allclose(prior.times_transposed_root(np.eye(count)), root.T, atol=1e-9)
