@@ -108,8 +108,8 @@ def apart(cloud: PointCloud, true_points: np.ndarray, crossed: tuple[float, floa
 
 @pytest.mark.slow
 def test_a_random_walk_is_followed_within_a_crossing():
-    drift = {"drift_mm": 60.0, "drift_deg": 0.3}
-    cloud, reported, true = ride(np.random.default_rng(SEED), LOOP_MM, walk=0.1, **drift)
+    cloud, reported, true = ride(np.random.default_rng(SEED), LOOP_MM, walk=0.1, drift_mm=60.0, drift_deg=0.3)
+    assert cloud.time_s is not None
     local = np.einsum(
         "nij,nj->ni", np.linalg.inv(reported.poses_at(cloud.time_s)), np.c_[cloud.points_mm, np.ones(len(cloud))]
     )
@@ -124,6 +124,7 @@ def test_a_random_walk_is_followed_within_a_crossing():
     assert (np.sqrt(np.mean(after**2, axis=0)) < [1.0, 1.0, 0.2]).all()
     assert position_errors(found.trajectory, true) < position_errors(reported, true) / 3
     # Errors along the path are alike: few independent numbers of standard deviation one, so that three is one in 300.
+    assert found.trajectory.covariance is not None
     std = np.sqrt(np.einsum("nii->ni", found.trajectory.covariance))[1:, :3]
     off = (found.trajectory.poses - true.poses)[1:, :3, 3] / std
     assert np.sqrt(np.mean(off**2)) < 3
