@@ -45,7 +45,7 @@ PAIRS: dict[str, tuple[str, set[str], set[str]]] = {
     "uwlts reconstruct": (
         "uwlts.reconstruct",
         WRITES | METHOD | {"peak", "pose_format", "pose_unit"},
-        {"stripe", "with_uncertainty"},
+        {"stripe"},
     ),
     "uwlts evaluate": ("uwlts.evaluate", WRITES | {"coloured"}, {"source"}),
     "uwlts compare": ("uwlts.compare_clouds", WRITES | {"coloured"}, set()),

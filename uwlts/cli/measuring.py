@@ -31,6 +31,7 @@ def reconstruct(
     method: Method = None,
     stripe: Stripe = (),
     peak: Literal["direct", "strongest", "first", "last"] | None = None,
+    with_uncertainty: bool | None = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Turn a capture into a point cloud.
@@ -57,6 +58,8 @@ def reconstruct(
         pose_correlation_s: Time over which errors of poses stay alike, inf where all err together. Unless given, poses
             in the capture err each by itself, and those of a trajectory as a navigation filter's of its covariances.
         peak: Which of several stripes on a line counts; the direct one, or as the sensor's table [stripe] says.
+        with_uncertainty: Calculate and write the uncertainty of the points, by default from a joint calibration; without
+            it files of long passes are a tenth as large.
     """
     refuse_unsuitable(out, overwrite=overwrite)
     known = uwlts.load_calibration(calibration)
@@ -72,6 +75,7 @@ def reconstruct(
             pose_correlation_s=pose_correlation_s,
             stripe=stripe_settings(stripe, method, peak),
             index=index,
+            with_uncertainty=with_uncertainty,
             progress=progress,
         )
         lit = int(opened.laser_on.sum())
