@@ -57,7 +57,7 @@ _BESIDE = 13
 FEWEST = 30
 """Patches of a piece, and of a crossing."""
 _ROUNDS = 15
-_STILL_MM = 0.01
+_STILL = 0.03
 EXACT_MM, EXACT_RAD = 1e-3, 1e-7
 """The least drift at the end: navigation is not better."""
 _HELD_OUT = 5
@@ -125,6 +125,7 @@ class PathEstimate:
         self._speed = path.trajectory.rates_at(moments)[:, :3]
         self.coefficients = np.zeros(6 * path.count)
         self.prior, self._normal = PathPrior(path, kind), np.eye(6 * path.count)
+        self._numbers = np.zeros((6 * path.count, 1))
         self._covariance: Any = None
         self.pairs: list[Pair] = []
         self._own, self._radius = _divided(cloud, times_s)
@@ -207,12 +208,12 @@ class PathEstimate:
 
     def state(self) -> tuple[Any, ...]:
         """What `restore` needs to return to the present estimate."""
-        return self.coefficients, self.prior, self._normal, self.pairs[:], self.pieces[:]
+        return self.coefficients, self.prior, self._normal, self._numbers, self.pairs[:], self.pieces[:]
 
     def restore(self, state: tuple[Any, ...]) -> None:
         """Return to an earlier estimate."""
-        self.coefficients, self.prior, self._normal = state[:3]
-        self.pairs, self.pieces, self._covariance = state[3][:], state[4][:], None
+        self.coefficients, self.prior, self._normal, self._numbers = state[:4]
+        self.pairs, self.pieces, self._covariance = state[4][:], state[5][:], None
 
     def resolve(self, seed: dict[Pair, np.ndarray]) -> None:
         """Lay knots as close as patches tell where pairs lie on each other; poses (4, 4) as in `estimate`."""
@@ -240,7 +241,7 @@ class PathEstimate:
     def estimate(self, seed: dict[Pair, np.ndarray]) -> None:
         """Estimate until nothing moves any more; poses (4, 4) of pairs give their first matches."""
         for done in range(_ROUNDS):
-            if self._round(seed if done == 0 else {}) < _STILL_MM and (done > 1 or not seed):
+            if self._round(seed if done == 0 else {}) < _STILL and (done > 1 or not seed):
                 break
 
     def settle(self) -> None:
@@ -338,16 +339,17 @@ class PathEstimate:
             at = prior.path.at_s
             self.coefficients = np.linalg.solve(prior.path.basis(at), self.corrections(at)).ravel()
         self.prior, self._covariance = prior, None
-        self._normal = np.eye(len(self.coefficients))
+        self._normal, self._numbers = np.eye(len(self.coefficients)), np.zeros((len(self.coefficients), 1))
 
     def _round(self, seed: dict[Pair, np.ndarray]) -> float:
-        """One step of least squares; returns the largest shift of a coefficient."""
+        """One step of least squares; returns its root mean square, in standard deviations of what is estimated."""
         normal, gradient = self._evidence(seed)
         self._normal, self._covariance = self.prior.with_evidence(normal), None
         told = self.prior.times_transposed_root((normal @ self.coefficients - gradient)[:, None])
-        found = self.prior.times_root(cho_solve(cho_factor(self._normal, check_finite=False), told))[:, 0]
-        step, self.coefficients = found - self.coefficients, found
-        return float(np.abs(step.reshape(-1, 6)[:, :3]).max())
+        before, self._numbers = self._numbers, cho_solve(cho_factor(self._normal, check_finite=False), told)
+        self.coefficients = self.prior.times_root(self._numbers)[:, 0]
+        step = self._numbers - before
+        return float(np.sqrt(np.sum(step * (self._normal @ step)) / len(step)))
 
     def _likeliest(self) -> DriftKind:
         """Kind of the drift with which the matches as they are now are likeliest."""
