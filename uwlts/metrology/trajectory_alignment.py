@@ -1,6 +1,7 @@
-"""Self-consistency of a scan along a path: a smooth correction of the path, by surfaces that it shows more than once.
+"""Self-consistency of a scan along a path: a correction of the path, by surfaces that it shows more than once.
 
-`path_estimate` states what is unknown and what is known beforehand, `crossing_search` how crossings are found.
+`path_prior` states what is known beforehand, `path_estimate` how the correction is found, `crossing_search` how
+crossings are.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ def align_trajectory(
         runs faster than theirs.
     drift_mm, drift_deg
         Standard uncertainty that the navigation has gathered at the end, along each axis; from the covariance of the
-        trajectory unless given.
+        trajectory unless given. Of which kind the drift is, a steady or changing rate or a random walk, is estimated.
 
     Raises
     ------
