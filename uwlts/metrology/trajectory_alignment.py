@@ -153,6 +153,7 @@ def align_trajectory(
         if estimate.pairs:
             estimate.settle()
             complete(estimate, len(estimate.pieces))
+            estimate.average()
         left_out = tuple(_times(estimate, pair) for pair in doubtful if pair not in estimate.pairs)
         if estimate.pairs:
             return _result(estimate, trajectory, times, left_out)
