@@ -260,14 +260,19 @@ class PathEstimate:
 
     def average(self) -> None:
         """Average over the kinds of rates, each by its likelihood: few crossings hardly tell them apart, and behind the
-        last one they differ (Hoeting et al., Statistical Science 14, 1999)."""
+        last one they differ (Hoeting et al., Statistical Science 14, 1999).
+
+        Standard deviations of equal steps are equally likely beforehand (Gelman, Bayesian Analysis 1, 2006).
+        """
         normal, told = self._told()
         kinds = [
             self.prior.kind._replace(smooth=smooth, wandering=wandering)
             for smooth, wandering in product(_KINDS["smooth"], _KINDS["wandering"])
         ]
         likelihoods = np.array([_integrated(PathPrior(self.path, kind), normal, told)[0] for kind in kinds])
-        weights = np.exp((likelihoods - likelihoods.max()) / 2)
+        steps = (np.gradient(np.sqrt(_KINDS[name])) for name in ("smooth", "wandering"))
+        weights = np.exp((likelihoods - likelihoods.max()) / 2) * np.outer(*steps).ravel()
+        weights /= weights.max()
         kept = np.flatnonzero(weights > _UNLIKELY)
         mean, square = np.zeros_like(self.coefficients), np.zeros_like(normal)
         for number in kept:
