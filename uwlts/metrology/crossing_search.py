@@ -92,8 +92,10 @@ def complete(estimate: PathEstimate, count: int) -> None:
         estimate.estimate({})
         estimate.lay_anew({number for pair in estimate.pairs for number in pair})
         estimate.estimate({})
-        estimate.pairs = [pair for pair in estimate.pairs if pair in closed or estimate.agrees(pair)]
-        estimate.estimate({})
+        agreeing = [pair for pair in estimate.pairs if pair in closed or estimate.agrees(pair)]
+        if len(agreeing) < len(estimate.pairs):
+            estimate.pairs = agreeing
+            estimate.estimate({})
 
 
 def _hypotheses(estimate: PathEstimate, number: int) -> list[Hypothesis]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -50,14 +51,20 @@ _STRONG = 6.0
 """Twice the logarithm of a ratio of likelihoods that is strong evidence (Kass and Raftery, Journal of the American
 Statistical Association 90, 1995): by so much a drift that the heading makes must be likelier than one without."""
 _STEP = 0.5
+"""Of the radius of patches: distance of knots within a crossing. With a whole one a random walk of a third of a
+millimetre an image leaves more between knots than patches scatter; with a quarter nothing is gained.
+"""
+_UNLIKELY = 0.02
+"""Of the likelihood of the likeliest kind: less is left out of the average."""
 _TURNS, _LITTLE = 8, 0.1
 """Times that patches are laid anew at most, and by how much of its standard deviations the path may still move then."""
 _BESIDE = 13
 """Patches from which it is taken how times grow: two rings around one."""
 FEWEST = 30
 """Patches of a piece, and of a crossing."""
-_ROUNDS = 15
-_STILL_MM = 0.01
+_ROUNDS, _STILL = 15, 0.03
+"""Rounds of an estimate at most, and the step that ends it, root mean square in standard deviations: matches that come
+and go keep smaller ones from ending."""
 EXACT_MM, EXACT_RAD = 1e-3, 1e-7
 """The least drift at the end: navigation is not better."""
 _HELD_OUT = 5
@@ -125,6 +132,7 @@ class PathEstimate:
         self._speed = path.trajectory.rates_at(moments)[:, :3]
         self.coefficients = np.zeros(6 * path.count)
         self.prior, self._normal = PathPrior(path, kind), np.eye(6 * path.count)
+        self._numbers = np.zeros((6 * path.count, 1))
         self._covariance: Any = None
         self.pairs: list[Pair] = []
         self._own, self._radius = _divided(cloud, times_s)
@@ -207,12 +215,12 @@ class PathEstimate:
 
     def state(self) -> tuple[Any, ...]:
         """What `restore` needs to return to the present estimate."""
-        return self.coefficients, self.prior, self._normal, self.pairs[:], self.pieces[:]
+        return self.coefficients, self.prior, self._normal, self._numbers, self.pairs[:], self.pieces[:]
 
     def restore(self, state: tuple[Any, ...]) -> None:
         """Return to an earlier estimate."""
-        self.coefficients, self.prior, self._normal = state[:3]
-        self.pairs, self.pieces, self._covariance = state[3][:], state[4][:], None
+        self.coefficients, self.prior, self._normal, self._numbers = state[:4]
+        self.pairs, self.pieces, self._covariance = state[4][:], state[5][:], None
 
     def resolve(self, seed: dict[Pair, np.ndarray]) -> None:
         """Lay knots as close as patches tell where pairs lie on each other; poses (4, 4) as in `estimate`."""
@@ -240,7 +248,7 @@ class PathEstimate:
     def estimate(self, seed: dict[Pair, np.ndarray]) -> None:
         """Estimate until nothing moves any more; poses (4, 4) of pairs give their first matches."""
         for done in range(_ROUNDS):
-            if self._round(seed if done == 0 else {}) < _STILL_MM and (done > 1 or not seed):
+            if self._round(seed if done == 0 else {}) < _STILL and (done > 1 or not seed):
                 break
 
     def settle(self) -> None:
@@ -249,6 +257,32 @@ class PathEstimate:
         if len(agreeing := [pair for pair in self.pairs if self.agrees(pair)]) < len(self.pairs):
             self.pairs = agreeing
             self._settled()
+
+    def average(self) -> None:
+        """Average over the kinds of rates, each by its likelihood: few crossings hardly tell them apart, and behind the
+        last one they differ (Hoeting et al., Statistical Science 14, 1999).
+
+        Standard deviations of equal steps are equally likely beforehand (Gelman, Bayesian Analysis 1, 2006).
+        """
+        normal, told = self._told()
+        kinds = [
+            self.prior.kind._replace(smooth=smooth, wandering=wandering)
+            for smooth, wandering in product(_KINDS["smooth"], _KINDS["wandering"])
+        ]
+        likelihoods = np.array([_integrated(PathPrior(self.path, kind), normal, told)[0] for kind in kinds])
+        steps = (np.gradient(np.sqrt(_KINDS[name])) for name in ("smooth", "wandering"))
+        weights = np.exp((likelihoods - likelihoods.max()) / 2) * np.outer(*steps).ravel()
+        weights /= weights.max()
+        kept = np.flatnonzero(weights > _UNLIKELY)
+        mean, square = np.zeros_like(self.coefficients), np.zeros_like(normal)
+        for number in kept:
+            weight, prior = weights[number] / weights[kept].sum(), PathPrior(self.path, kinds[number])
+            factor = _integrated(prior, normal, told)[1]
+            inverse = cho_solve((factor, True), np.eye(len(factor)))
+            found = prior.times_root(inverse @ prior.times_transposed_root(told))[:, 0]
+            mean += weight * found
+            square += weight * (prior.covariance(inverse) + np.outer(found, found))
+        self.coefficients, self._covariance = mean, square - np.outer(mean, mean)
 
     def _settled(self) -> None:
         """Lay the patches and estimate anew until the path moves by little and its drift is of the likeliest kind."""
@@ -338,29 +372,25 @@ class PathEstimate:
             at = prior.path.at_s
             self.coefficients = np.linalg.solve(prior.path.basis(at), self.corrections(at)).ravel()
         self.prior, self._covariance = prior, None
-        self._normal = np.eye(len(self.coefficients))
+        self._normal, self._numbers = np.eye(len(self.coefficients)), np.zeros((len(self.coefficients), 1))
 
     def _round(self, seed: dict[Pair, np.ndarray]) -> float:
-        """One step of least squares; returns the largest shift of a coefficient."""
+        """One step of least squares; returns its root mean square, in standard deviations of what is estimated."""
         normal, gradient = self._evidence(seed)
         self._normal, self._covariance = self.prior.with_evidence(normal), None
         told = self.prior.times_transposed_root((normal @ self.coefficients - gradient)[:, None])
-        found = self.prior.times_root(cho_solve(cho_factor(self._normal, check_finite=False), told))[:, 0]
-        step, self.coefficients = found - self.coefficients, found
-        return float(np.abs(step.reshape(-1, 6)[:, :3]).max())
+        before, self._numbers = self._numbers, cho_solve(cho_factor(self._normal, check_finite=False), told)
+        self.coefficients = self.prior.times_root(self._numbers)[:, 0]
+        step = self._numbers - before
+        return float(np.sqrt(np.sum(step * (self._normal @ step)) / len(step)))
 
     def _likeliest(self) -> DriftKind:
         """Kind of the drift with which the matches as they are now are likeliest."""
-        normal, gradient = self._evidence({})
-        told = (normal @ self.coefficients - gradient)[:, None]
+        normal, told = self._told()
 
         @cache
         def likelihood(kind: DriftKind) -> float:
-            """Twice the logarithm, but for what all kinds have in common: the path is integrated out."""
-            prior = PathPrior(self.path, kind)
-            factor = np.linalg.cholesky(prior.with_evidence(normal))
-            off = solve_triangular(factor, prior.times_transposed_root(told), lower=True)
-            return float(np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor)))) - _STRONG * kind.by_heading
+            return _integrated(PathPrior(self.path, kind), normal, told)[0]
 
         best, before = self.prior.kind, None
         while best != before:
@@ -372,6 +402,11 @@ class PathEstimate:
                         best = best._replace(**{name: values[at]})
                         at += side
         return best
+
+    def _told(self) -> tuple[np.ndarray, np.ndarray]:
+        """Normal matrix (6 C, 6 C) of the matches as they are now, and its product (6 C, 1) with what they say."""
+        normal, gradient = self._evidence({})
+        return normal, (normal @ self.coefficients - gradient)[:, None]
 
     def _evidence(self, seed: dict[Pair, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix and gradient of the distances between all pairs, without what is known beforehand."""
@@ -439,6 +474,14 @@ class PathEstimate:
             normal += derivatives.T @ (weight[:, None] * derivatives)
             gradient += derivatives.T @ (weight * off)
         return columns, normal, gradient
+
+
+def _integrated(prior: PathPrior, normal: np.ndarray, told: np.ndarray) -> tuple[float, np.ndarray]:
+    """Twice the logarithm of the likelihood, but for what all kinds have in common, with the path integrated out; and
+    the lower root (6 C, 6 C) of the normal matrix with the prior."""
+    factor = np.linalg.cholesky(prior.with_evidence(normal))
+    off = solve_triangular(factor, prior.times_transposed_root(told), lower=True)
+    return float(np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor)))) - _STRONG * prior.kind.by_heading, factor
 
 
 def _moved(correction: np.ndarray, platform: np.ndarray, places: np.ndarray) -> np.ndarray:

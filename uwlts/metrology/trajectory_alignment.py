@@ -1,6 +1,7 @@
-"""Self-consistency of a scan along a path: a smooth correction of the path, by surfaces that it shows more than once.
+"""Self-consistency of a scan along a path: a correction of the path, by surfaces that it shows more than once.
 
-`path_estimate` states what is unknown and what is known beforehand, `crossing_search` how crossings are found.
+`path_prior` states what is known beforehand, `path_estimate` how the correction is found, `crossing_search` how
+crossings are.
 """
 
 from __future__ import annotations
@@ -125,7 +126,7 @@ def align_trajectory(
         runs faster than theirs.
     drift_mm, drift_deg
         Standard uncertainty that the navigation has gathered at the end, along each axis; from the covariance of the
-        trajectory unless given.
+        trajectory unless given. Of which kind the drift is, a steady or changing rate or a random walk, is estimated.
 
     Raises
     ------
@@ -152,6 +153,7 @@ def align_trajectory(
         if estimate.pairs:
             estimate.settle()
             complete(estimate, len(estimate.pieces))
+            estimate.average()
         left_out = tuple(_times(estimate, pair) for pair in doubtful if pair not in estimate.pairs)
         if estimate.pairs:
             return _result(estimate, trajectory, times, left_out)
