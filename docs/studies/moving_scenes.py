@@ -6,8 +6,8 @@
     twin simulate vehicle-pipe --sensor thesis-small --out FOLDER/vehicle.h5
     python docs/studies/moving_scenes.py FOLDER
 
-The mount for a pipe is that of the robot's capture of the same seed by the same sensor, and the pipe's poses are known as
-well as that robot's.
+The mount for a pipe is that of the robot's capture of the same seed by the same sensor, and the pipe's poses are known
+as well as that robot's.
 """
 
 import sys
