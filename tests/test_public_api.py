@@ -42,11 +42,7 @@ PAIRS: dict[str, tuple[str, set[str], set[str]]] = {
     "uwlts import": ("uwlts.import_images", set(), set()),
     "uwlts export": ("uwlts.export", set(), set()),
     # The trajectory is read by read_trajectory.
-    "uwlts reconstruct": (
-        "uwlts.reconstruct",
-        WRITES | METHOD | {"peak", "pose_format", "pose_unit"},
-        {"stripe"},
-    ),
+    "uwlts reconstruct": ("uwlts.reconstruct", WRITES | METHOD | {"peak", "pose_format", "pose_unit"}, {"stripe"}),
     "uwlts evaluate": ("uwlts.evaluate", WRITES | {"coloured"}, {"source"}),
     "uwlts compare": ("uwlts.compare_clouds", WRITES | {"coloured"}, set()),
     "uwlts mesh": ("uwlts.mesh", WRITES, set()),

@@ -1,7 +1,7 @@
 """Pass of a vehicle over 20 m with three crossings, rendered: errors of its path and of lengths, before and after.
 
-Five sensors with imperfections, each with its joint calibration and a mount by 15 poses of a sphere on a robot, take two
-passes each with other errors of the navigation:
+Five sensors with imperfections, each with its joint calibration and a mount by 15 poses of a sphere on a robot, take
+two passes each with other errors of the navigation:
 
     for k in 1 2 3 4 5; do python docs/studies/moving_recordings.py FOLDER robot-sphere vehicle-pass \\
         --sensor thesis-small --sensors $k --seeds $((2 * k - 2)) $((2 * k - 1)); done
@@ -162,7 +162,8 @@ def main() -> None:
     print(
         f"{len(path)} passes: path {_rms(path[:, 0]):.1f} to {_rms(path[:, 1]):.1f} mm (rms of all), "
         f"{_rms(path[:, 0]) / _rms(path[:, 1]):.1f} times; mean of the passes {ratio.mean():.1f} times "
-        f"({ratio.min():.1f} to {ratio.max():.1f}); lengths {_rms(lengths[..., 0]):.1f} to {_rms(lengths[..., 1]):.2f} mm"
+        f"({ratio.min():.1f} to {ratio.max():.1f}); "
+        f"lengths {_rms(lengths[..., 0]):.1f} to {_rms(lengths[..., 1]):.2f} mm"
     )
 
 

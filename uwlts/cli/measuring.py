@@ -58,8 +58,8 @@ def reconstruct(
         pose_correlation_s: Time over which errors of poses stay alike, inf where all err together. Unless given, poses
             in the capture err each by itself, and those of a trajectory as a navigation filter's of its covariances.
         peak: Which of several stripes on a line counts; the direct one, or as the sensor's table [stripe] says.
-        with_uncertainty: Calculate and write the uncertainty of the points, by default from a joint calibration; without
-            it files of long passes are a tenth as large.
+        with_uncertainty: Calculate and write the uncertainty of the points, by default from a joint calibration, with
+            which files are more than ten times as large.
     """
     refuse_unsuitable(out, overwrite=overwrite)
     known = uwlts.load_calibration(calibration)

@@ -44,7 +44,8 @@ class Seabed(FreeForm):
             )
         if self.smallest_stone_mm is not None and self.smallest_stone_mm > self.stone_diameter_mm:
             raise ValueError(
-                f"smallest_stone_mm {self.smallest_stone_mm:g} is more than stone_diameter_mm {self.stone_diameter_mm:g}"
+                f"smallest_stone_mm {self.smallest_stone_mm:g} is more than stone_diameter_mm "
+                f"{self.stone_diameter_mm:g}"
             )
         return self
 
