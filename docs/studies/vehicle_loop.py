@@ -1,12 +1,20 @@
-"""A vehicle crosses its own path over the sea floor: rendered images, reconstructed and aligned, against the truth."""
+"""Loop of a vehicle over the sea floor, rendered, reconstructed and aligned: errors of its path and of lengths.
+
+    python docs/studies/vehicle_loop.py FOLDER
+
+The sensor is as drawn, and images are 2.5 mm apart.
+"""
+
+import sys
+from pathlib import Path
 
 import numpy as np
-import pytest
+from moving_scenes import truth_of
+from vehicle_pass import crossings_of, length_error
 
 import twin
 import uwlts
-from twin.scene.description import load_scene
-from uwlts.storage.truth import read_truth
+from uwlts.storage.pose_files import trajectory_path
 
 SPEED_MM_S, RADIUS_MM, SEED = 150.0, 150.0, 4
 BIAS_MM_S, GYRO_DEG_S = 4.0, 0.03
@@ -60,34 +68,35 @@ def loop() -> str:
     return ", ".join(f"{{position_mm = [{x}, {y}, 0.0], rotation_deg = [0.0, 0.0, {turn}]}}" for x, y, turn in places)
 
 
-@pytest.mark.slow
-def test_a_rendered_crossing_is_aligned(tmp_path):
+def main(folder: Path) -> None:
+    """Render and print all figures."""
     described = {"speed": SPEED_MM_S, "bias": BIAS_MM_S, "gyro": GYRO_DEG_S, "seed": SEED}
-    scene, capture = tmp_path / "loop.toml", tmp_path / "loop.h5"
-    scene.write_text(SCENE.format(waypoints=loop(), **described))
-    twin.simulate(scene, sensor="thesis-small", spp=8, seed=SEED, out=capture)
-    clock = {"clock_offset_s": 0.012}
-    reported = uwlts.read_trajectory(tmp_path / "loop.trajectory.csv", pose_format="quaternion-xyzw")
+    folder.mkdir(parents=True, exist_ok=True)
+    path, capture = folder / "loop.toml", folder / "loop.h5"
+    path.write_text(SCENE.format(waypoints=loop(), **described))
+    if not capture.exists():
+        twin.simulate(path, sensor="thesis-small", spp=8, seed=SEED, out=capture)
+    motion, truth = truth_of(capture)
+    assert truth.pose is not None
+    clock = {"clock_offset_s": motion.clock_offset_s}
+    reported = uwlts.read_trajectory(trajectory_path(capture), pose_format="quaternion-xyzw")
     cloud = uwlts.reconstruct(capture, uwlts.nominal("thesis-small", medium="water"), trajectory=reported, **clock)
     found = uwlts.align_trajectory(cloud, reported, **clock)
-
-    motion = load_scene(scene).motion
-    truth = read_truth(tmp_path / "loop.truth.h5")[1]
+    print(*found.lines(), sep="\n")
     with uwlts.open_capture(capture) as images:
-        times = images.time_s[:]
+        times = images.time_s[:] + motion.clock_offset_s
     true = truth.pose @ np.linalg.inv(motion.mount.matrix())
     before, after = (
-        np.linalg.norm((path.poses_at(times + 0.012) - true)[:, :3, 3], axis=1) for path in (reported, found.trajectory)
+        np.sqrt(np.mean(np.sum((each.poses_at(times) - true)[:, :3, 3] ** 2, axis=1)))
+        for each in (reported, found.trajectory)
     )
-    print(np.sqrt(np.mean(before**2)), np.sqrt(np.mean(after**2)), found.lines())
-    place = truth.point_mm[cloud.frame, cloud.line]
-    near = np.linalg.norm(place[:, :2] - (100.0, 0.0), axis=1) < 60
-    first, second = (np.flatnonzero(near & late) for late in (cloud.time_s < 5, cloud.time_s >= 5))
-    rng = np.random.default_rng(SEED)
-    ends = rng.choice(first, 5000), rng.choice(second, 5000)
+    (crossing,) = crossings_of(truth.pose[:, :2, 3])
+    lengths = [length_error(each, truth, crossing) for each in (cloud, found.cloud)]
+    print(
+        f"path {before:.1f} to {after:.1f} mm (rms), lengths between both passes {lengths[0]:.2f} to "
+        f"{lengths[1]:.3f} mm"
+    )
 
-    def wrong(points: np.ndarray) -> float:
-        lengths = (np.linalg.norm(at[ends[0]] - at[ends[1]], axis=1) for at in (points, place))
-        return float(np.sqrt(np.nanmean(np.subtract(*lengths) ** 2)))
 
-    print(wrong(cloud.points_mm), wrong(found.cloud.points_mm), len(first), len(second))
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
