@@ -235,7 +235,7 @@ def _found(
     status, wide, several, peak = search(profiles, left, detection.rules)
     glare = wide.copy()
     # A plateau wider than the window does not even stick out.
-    white = low.max(axis=0) >= clip if brightest >= clip else np.zeros(len(status), np.bool_)
+    white = low.max(axis=0) >= clip if brightest >= clip and low.max() >= clip else np.zeros(len(status), np.bool_)
     wide |= white
     amplitude, width = np.full((2, len(status)), np.nan, np.float32)
     found = _Lines(np.full(len(status), np.nan), amplitude, width, status, wide, white)

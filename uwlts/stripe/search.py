@@ -120,7 +120,10 @@ def search_all(
     peaks, found, clear = _windows(most, rules), np.empty(most, np.intp), np.empty(most, np.bool_)
     count = _search_all(profiles, board, lines, *_room(peaks), rules, found, clear, peaks)
     kept = np.flatnonzero(found[:count] >= 0)
-    kept = kept[np.bincount(found[kept])[found[kept]] >= fewest]
+    if fewest > 1:
+        kept = kept[np.bincount(found[kept])[found[kept]] >= fewest]
+    if not kept.size:
+        return found[:0], clear[:0], peaks.first(0)
     return found[kept], clear[kept], peaks.keep(kept)
 
 
