@@ -2,7 +2,9 @@
 
 Sensors, their calibrations and the robot's captures of a sphere, with their truth, are those of `moving_recordings.py`:
 
-    python docs/studies/moving_recordings.py FOLDER robot-sphere --sensors 1 2 3 4 5 --seeds 0 1
+    for k in 1 2 3 4 5; do
+        python docs/studies/moving_recordings.py FOLDER robot-sphere --sensors $k --seeds ${k}0 ${k}1 ${k}2 ${k}3
+    done
     python docs/studies/robot_campaigns.py FOLDER
 """
 
