@@ -8,6 +8,7 @@ error, that is told the displacement at the three crossings exactly (`best`), fo
 """
 
 import argparse
+from itertools import product
 
 import numpy as np
 
@@ -22,7 +23,9 @@ PASS_MM = np.array(
     float,
 )
 """Crosses itself at (700, 0), (2000, 0) and (2000, 1600)."""
-SWATH_MM = 140.0
+SWATH_MM, LENGTH_MM = 140.0, 19_400.0
+PASSING_S = 1.5
+"""Around the middle of a piece, in which the pass lies over the crossing."""
 CROSSINGS = (0.057, 0.500), (0.124, 0.608), (0.351, 0.691)
 """Of the pass, as parts of its length."""
 
@@ -45,6 +48,10 @@ def main() -> None:
         kinds = ("steady rate", "wandering rate", "random walk")
         words = ", ".join(f"{kind} {100 * share:.0f} %" for kind, share in zip(kinds, shares, strict=True) if share)
         print(f"{words}: at best {min(best(*shares), 1000):.1f} times")
+    # Of `ride`: a rate of 0.7 to 1.2 times the drift, a wave of a fifth of it, and the walk.
+    own = {"rate": (1.2**3 - 0.7**3) / 1.5, "wandering": 0.0, "walk": given.walk**2, "wave": 0.2}
+    told = min(best(**own), 1000), min(best(**own, apart=SWATH_MM / LENGTH_MM), 1000)
+    print(f"drift of these rides: at best {told[0]:.1f} times, {told[1]:.1f} times by the rates within crossings, too")
     for seed in given.seeds:
         drift = {"drift_mm": given.drift_mm, "drift_deg": given.drift_deg}
         cloud, reported, true = ride(np.random.default_rng(seed), PASS_MM, walk=given.walk, **drift)
@@ -78,19 +85,23 @@ def main() -> None:
         )
 
 
-def best(rate: float, wandering: float, walk: float) -> float:
+def best(rate: float, wandering: float, walk: float, *, wave: float = 0.0, apart: float = 0.0) -> float:
     """Times by which three exact crossings lower the rms error of a path, at best: the drift is a Gaussian process.
 
     The parts of its variance at the end are those of a steady rate, of a rate that walks at random, and of a random
-    walk. A linear Gaussian estimate by the true covariance has the least error of all.
+    walk; ``wave`` is the amplitude of that of `ride`. Told are the displacements at two places ``apart`` of the path
+    within each crossing, which tell the rates there, too. A linear Gaussian estimate by the true covariance has the
+    least error of all.
     """
-    count = 1000
+    count = 2000
     t = np.arange(1, count + 1) / count
     first, second = np.minimum(t[:, None], t), np.maximum(t[:, None], t)
     before = rate * np.outer(t, t) + wandering * first**2 * (3 * second - first) / 2 + walk * first
-    seen = np.zeros((len(CROSSINGS), count))
-    for row, ends in zip(seen, CROSSINGS, strict=True):
-        row[[int(count * end) for end in ends]] = -1, 1
+    turns = 2 * np.pi * 0.8 * t
+    before += wave**2 / 2 * (np.cos(turns[:, None] - turns) - np.cos(turns)[:, None] - np.cos(turns) + 1)
+    seen = np.zeros((2 * len(CROSSINGS), count))
+    for row, (ends, off) in zip(seen, product(CROSSINGS, (-apart / 2, apart / 2)), strict=True):
+        row[[int(count * (end + off)) for end in ends]] = -1, 1
     gain = before @ seen.T
     after = before - gain @ np.linalg.solve(seen @ gain + 1e-10 * np.eye(len(seen)), gain.T)
     return float(np.sqrt(np.trace(before) / np.trace(after)))
@@ -101,16 +112,23 @@ def _rms(values: list[np.ndarray]) -> float:
 
 
 def _apart(found: uwlts.Trajectory, true: uwlts.Trajectory, times: tuple[float, float]) -> np.ndarray:
-    """Errors (9,) of lengths from points of the first pass to points of the second, within a crossing, mm."""
+    """Errors (9,) of lengths from points of the first pass to points of the second, within a crossing, mm.
+
+    A point has the errors of the image in which its pass saw it.
+    """
+    passes = [np.flatnonzero(np.abs(true.times_s - time) < PASSING_S) for time in times]
+    first, second = (true.poses[images, :2, 3] for images in passes)
+    apart = np.linalg.norm(first[:, None] - second, axis=2)
+    crossed = passes[0][np.unravel_index(np.argmin(apart), apart.shape)[0]]
+    middle = true.poses[crossed, :3, 3] - [0, 0, ALTITUDE_MM]
     moved, places = [], []
-    k = int(np.argmin(np.abs(true.times_s - times[0])))
-    middle = true.poses[k, :3, 3] - [0, 0, ALTITUDE_MM]
-    for time, corners in zip(times, ([-1, -1, 0], [1, 1, 0]), strict=True):
-        k = int(np.argmin(np.abs(true.times_s - time)))
-        wrong = found.poses[k] @ np.linalg.inv(true.poses[k])
+    for images, corners in zip(passes, ([-1, -1, 0], [1, 1, 0]), strict=True):
         points = middle + 0.5 * SWATH_MM * np.array([corners, np.multiply(corners, [1, -0.5, 0]), np.zeros(3)])
+        along = np.einsum("pni,ni->pn", points[:, None] - true.poses[images, :3, 3], true.poses[images, :3, 0])
+        seen = images[np.argmin(np.abs(along), axis=1)]
+        wrong = found.poses[seen] @ np.linalg.inv(true.poses[seen])
         places.append(points)
-        moved.append(points @ wrong[:3, :3].T + wrong[:3, 3])
+        moved.append(np.einsum("pij,pj->pi", wrong[:, :3, :3], points) + wrong[:, :3, 3])
     lengths = [np.linalg.norm(second[None] - first[:, None], axis=2).ravel() for first, second in (moved, places)]
     return lengths[0] - lengths[1]
 

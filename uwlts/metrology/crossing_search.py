@@ -88,11 +88,14 @@ def complete(estimate: PathEstimate, count: int) -> None:
                 if len(found.source) >= FEWEST:
                     estimate.pairs.append(pair)
     if len(estimate.pairs) > len(closed):
+        estimate.resolve({})
         estimate.estimate({})
         estimate.lay_anew({number for pair in estimate.pairs for number in pair})
         estimate.estimate({})
-        estimate.pairs = [pair for pair in estimate.pairs if pair in closed or estimate.agrees(pair)]
-        estimate.estimate({})
+        agreeing = [pair for pair in estimate.pairs if pair in closed or estimate.agrees(pair)]
+        if len(agreeing) < len(estimate.pairs):
+            estimate.pairs = agreeing
+            estimate.estimate({})
 
 
 def _hypotheses(estimate: PathEstimate, number: int) -> list[Hypothesis]:
@@ -118,7 +121,8 @@ def _reach(estimate: PathEstimate, pair: Pair) -> np.ndarray | None:
 
 def _relative_covariance(estimate: PathEstimate, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
     """Covariance (6, 6) of shift and turn of the later piece against the earlier, at a place (3,)."""
-    by = estimate.by_relative_movement(pair, at_mm)
+    times, twists = estimate.relative_movement(pair, at_mm)
+    by = np.einsum("mc,mij->icj", estimate.path.basis(times), twists).reshape(6, -1)
     used = np.flatnonzero(by.any(axis=0))
     return by[:, used] @ estimate.covariance[np.ix_(used, used)] @ by[:, used].T
 
@@ -147,8 +151,9 @@ def _poses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> list[Hypoth
 
 
 def _bent(estimate: PathEstimate) -> float:
-    """By how much a piece is bent as long as the drift is unknown, mm."""
-    return estimate.path.drift[0] / len(estimate.pieces)
+    """By how much a piece is bent as long as the drift is unknown, mm: by its steady rate and by its random walk."""
+    part = 1 / len(estimate.pieces)
+    return estimate.path.drift[:3].max() * float(np.sqrt(part**2 + estimate.prior.kind.walk * part))
 
 
 def _refined(own: Patches, other: Patches, pose: np.ndarray, *, bent_mm: float) -> tuple[int, np.ndarray] | None:
@@ -188,10 +193,11 @@ def _closed(estimate: PathEstimate, hypothesis: Hypothesis) -> bool:
     """Estimate the path with a hypothesis; whether it agrees then. Else the estimate stays as it was."""
     before = estimate.state()
     estimate.pairs.append(hypothesis.pair)
+    estimate.resolve({hypothesis.pair: hypothesis.pose})
     estimate.estimate({hypothesis.pair: hypothesis.pose})
     estimate.lay_anew(hypothesis.pair)
     estimate.estimate({})
-    if estimate.agrees(hypothesis.pair):
+    if estimate.agrees(hypothesis.pair) and estimate.tells(hypothesis.pair):
         return True
     estimate.restore(before)
     return False
@@ -199,7 +205,9 @@ def _closed(estimate: PathEstimate, hypothesis: Hypothesis) -> bool:
 
 def _has_rival(estimate: PathEstimate, best: Hypothesis, waiting: list[Hypothesis], before: tuple[Any, ...]) -> bool:
     """Whether another hypothesis contradicts the closed one, and holds as well from the estimate before."""
-    closed = estimate.coefficients
+    middle = estimate.moved(best.pair[1]).places_mm.mean(axis=0)
+    times, twists = estimate.relative_movement(best.pair, middle)
+    closed = estimate.corrections(times)
     rivals = [
         each
         for each in waiting
@@ -209,8 +217,7 @@ def _has_rival(estimate: PathEstimate, best: Hypothesis, waiting: list[Hypothesi
         estimate.restore(before)
         if _closed(estimate, rival):
             # A pose that was found badly may lead to the same place.
-            middle = estimate.moved(best.pair[1]).places_mm.mean(axis=0)
-            apart = estimate.by_relative_movement(best.pair, middle) @ (estimate.coefficients - closed)
+            apart = np.einsum("mij,mj->i", twists, estimate.corrections(times) - closed)
             if np.linalg.norm(apart[:3]) > estimate.reach_mm:
                 return True
     return False

@@ -1,23 +1,21 @@
 """Least squares for a smooth correction of a path, by the surfaces that it shows more than once.
 
-Unknown is a correction of every pose, a shift (mm) and a turn (rad) in the base frame about the platform, as a cubic
-B-spline in time. Known beforehand is by how much a navigation drifts from an exact start: by a steady rate (a bias of
-velocity or gyroscope), by a rate that changes smoothly (temperature), by one that wanders (instability of the bias),
-and by a random walk (noise of the velocity); these are the integrated Wiener processes of orders two, one and none.
-How large the others are beside the steady rate is what makes the evidence likeliest (empirical Bayes: MacKay, Neural
-Computation 4, 1992). Residuals are distances between patches of the surface where the path crosses itself. Movements
-that the surface leaves open there, as along a plain pipe, stay with what is known beforehand.
+Unknown is a correction of every pose, a shift (mm) and a turn (rad) in the base frame about the platform, with what
+`path_prior` knows beforehand of it. Of which kind the drift is, is what makes the evidence likeliest (empirical Bayes:
+MacKay, Neural Computation 4, 1992). Residuals are distances between patches of the surface where the path crosses
+itself. Movements that the surface leaves open there, as along a plain pipe, stay with what is known beforehand.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import BSpline
-from scipy.linalg import eigh, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, eigh, inv, solve_triangular
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -30,37 +28,45 @@ from uwlts.metrology.patches import (
     scatter,
     surface_patches,
 )
+from uwlts.metrology.path_prior import DriftKind, PathPrior, PathSpline
 from uwlts.model.errors import EvaluationError
-from uwlts.model.trajectory import Trajectory
 from uwlts.storage.cloud import PointCloud
 
-Shares = tuple[float, float, float]
-"""Variances at the end of a rate that changes smoothly, of one that wanders, and of a random walk, over that of a
-steady rate, which alone would come to the drift as it is stated."""
 Pair = tuple[int, int]
 """Numbers of two pieces that show the same surface, the earlier first."""
 
 _TUKEY = 4.685
 _VOXEL = 0.4
 """Of the radius of patches: points for a search by heights."""
-_INTERVALS = 100
-"""Of the spline: between two knots a random walk goes a tenth of the drift of the whole path."""
-_SHARES = [
-    (smooth, wander, walk)
-    for smooth in (0.0, 0.1, 0.3, 1.0, 3.0, 10.0)
-    for wander in (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0)
-    for walk in (1e-5, 1e-4, 1e-3, 0.01, 0.03, 0.1, 0.3, 0.6)
-]
-_TURNS, _LITTLE = 8, 0.2
-"""Times that patches are laid anew at most, and by how much of a standard deviation the path may still move then."""
+_WALKS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6)
+_KINDS = {
+    "smooth": (0.0, 0.1, 0.3, 1.0, 3.0, 10.0),
+    "wandering": (0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 1.0),
+    "walk": _WALKS,
+    "turn_walk": _WALKS,
+    "by_heading": (0.0, 1.0),
+}
+"""Values of `DriftKind` that are compared."""
+_STRONG = 6.0
+"""Twice the logarithm of a ratio of likelihoods that is strong evidence (Kass and Raftery, Journal of the American
+Statistical Association 90, 1995): by so much a drift that the heading makes must be likelier than one without."""
+_STEP = 0.5
+"""Of the radius of patches: distance of knots within a crossing. With a whole one a random walk of a third of a
+millimetre an image leaves more between knots than patches scatter; with a quarter nothing is gained.
+"""
+_UNLIKELY = 0.02
+"""Of the likelihood of the likeliest kind: less is left out of the average."""
+_TURNS, _LITTLE = 8, 0.1
+"""Times that patches are laid anew at most, and by how much of its standard deviations the path may still move then."""
 _BESIDE = 13
 """Patches from which it is taken how times grow: two rings around one."""
 FEWEST = 30
 """Patches of a piece, and of a crossing."""
-_ROUNDS = 15
-_STILL_MM = 1e-3
+_ROUNDS, _STILL = 15, 0.03
+"""Rounds of an estimate at most, and the step that ends it, root mean square in standard deviations: matches that come
+and go keep smaller ones from ending."""
 EXACT_MM, EXACT_RAD = 1e-3, 1e-7
-"""Standard uncertainty of the start of the path, which is the frame's: as good as exact."""
+"""The least drift at the end: navigation is not better."""
 _HELD_OUT = 5
 """Every fifth cube of a crossing, of four radii, is held out and judges the gain."""
 _AGREEING = 0.9
@@ -73,70 +79,8 @@ _PER_PARAMETER = 3.0
 fits anywhere if the path may bend as much as it takes."""
 _NOISE = 5.0
 """Times the information that the noise of normals alone would give: a movement with less is open."""
-_TELLING = 1e-4
-"""Of the information that the drift is known with beforehand: less does not tell one kind of drift from another."""
 _ROUNDING = 1e-9
 """Of the information on the best determined movement: less is rounding."""
-
-
-@dataclass(frozen=True, eq=False)
-class PathSpline:
-    """A trajectory, the knots of the spline over the time of the points, and the drift at its end, mm and rad."""
-
-    trajectory: Trajectory
-    knots: np.ndarray
-    drift: tuple[float, float]
-    first_s: float
-    last_s: float
-
-    @classmethod
-    def of(cls, trajectory: Trajectory, drift: tuple[float, float], times_s: np.ndarray) -> PathSpline:
-        """The spline over the times (N,) of the points."""
-        first, last = float(times_s.min()), float(times_s.max())
-        inner = np.linspace(first, last, _INTERVALS + 1)
-        knots = np.concatenate([np.repeat(first, 3), inner, np.repeat(last, 3)])
-        return cls(trajectory, knots, drift, first, last)
-
-    @property
-    def count(self) -> int:
-        """Number C of coefficients, each of six numbers."""
-        return len(self.knots) - 4
-
-    def basis(self, times_s: np.ndarray) -> np.ndarray:
-        """Weights (N, C) of the coefficients at times (N,)."""
-        inside = np.clip(times_s, self.first_s, self.last_s)
-        return BSpline.design_matrix(inside, self.knots, 3).toarray()
-
-    def corrections(self, coefficients: np.ndarray, times_s: np.ndarray, *, rates: bool = False) -> np.ndarray:
-        """Shift and turn (N, 6) at times (N,) by coefficients (6 C,), or their rates per second."""
-        spline = BSpline(self.knots, coefficients.reshape(-1, 6), 3)
-        return (spline.derivative() if rates else spline)(np.clip(times_s, self.first_s, self.last_s))
-
-    def shape(self, shares: Shares) -> np.ndarray:
-        """Covariance (C, C) of the coefficients of one component, over the variance that is stated for the end."""
-        # A coefficient stands for the correction at the mean of its knots (Greville).
-        at = np.array([self.knots[k + 1 : k + 4].mean() for k in range(self.count)])
-        t = (at - self.first_s) / (self.last_s - self.first_s)
-        first, second = np.minimum(t[:, None], t), np.maximum(t[:, None], t)
-        # Integrals of a random walk from zero, twice and once; each is one at the end.
-        smooth = first**3 * (10 * second**2 - 5 * first * second + first**2) / 6
-        wandering = first**2 * (3 * second - first) / 2
-        kinds = np.outer(t, t), smooth, wandering, first
-        parts = zip((1.0, *shares), kinds, strict=True)
-        return sum((part * kind for part, kind in parts), 1e-10 * np.eye(len(t)))
-
-    def information(self, shares: Shares) -> np.ndarray:
-        """Inverse covariance (6 C, 6 C) of the coefficients, ordered coefficient by coefficient; see `shape`."""
-        shape = self.shape(shares)
-        result = np.zeros((6 * self.count,) * 2)
-        for component, (size, exact) in enumerate(zip(self.sizes, (EXACT_MM,) * 3 + (EXACT_RAD,) * 3, strict=True)):
-            result[component::6, component::6] = np.linalg.inv(size**2 * shape + exact**2 * np.eye(self.count))
-        return result
-
-    @property
-    def sizes(self) -> np.ndarray:
-        """Drift (6,) of each component at the end, mm and rad."""
-        return np.repeat(self.drift, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,19 +125,24 @@ class Piece:
 class PathEstimate:
     """Coefficients of the correction, round by round, and the pairs of pieces that cross."""
 
-    def __init__(self, cloud: PointCloud, times_s: np.ndarray, path: PathSpline, shares: Shares) -> None:
-        self.cloud, self.path, self.shares = cloud, path, shares
+    def __init__(self, cloud: PointCloud, times_s: np.ndarray, path: PathSpline, kind: DriftKind) -> None:
+        self.cloud = cloud
         moments, self._image = np.unique(times_s, return_inverse=True)
         self._moments, self._platform = moments, path.trajectory.poses_at(moments)[:, :3, 3]
         self._speed = path.trajectory.rates_at(moments)[:, :3]
-        self.prior = path.information(shares)
         self.coefficients = np.zeros(6 * path.count)
-        self.covariance = np.linalg.inv(self.prior)
+        self.prior, self._normal = PathPrior(path, kind), np.eye(6 * path.count)
+        self._numbers = np.zeros((6 * path.count, 1))
+        self._covariance: Any = None
         self.pairs: list[Pair] = []
         self._own, self._radius = _divided(cloud, times_s)
         laid = [(own, self._laid(own)) for own in self._own]
         self._own = [own for own, piece in laid if piece is not None]
         self.pieces = [piece for _, piece in laid if piece is not None]
+
+    @property
+    def path(self) -> PathSpline:
+        return self.prior.path
 
     @property
     def reach_mm(self) -> float:
@@ -235,27 +184,58 @@ class PathEstimate:
         drifting += piece.speed - turn.apply(piece.speed)
         return turn.as_matrix() + drifting[:, :, None] * piece.slopes[:, None]
 
-    def by_relative_movement(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
-        """Derivatives (6, 6 C) of shift and turn of the later piece against the earlier, at a place (3,)."""
-        result = np.zeros((6, 6 * self.path.count))
-        for number, sign in zip(pair, (-1.0, 1.0), strict=True):
+    def relative_movement(self, pair: Pair, at_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Times (2,) of both pieces, and derivatives (2, 6, 6) of shift and turn of the later against the earlier, at
+        a place (3,), by the corrections then."""
+        times = np.array([self.pieces[number].middle_s for number in pair])
+        twists = np.tile(np.eye(6), (2, 1, 1))
+        for twist, number, time in zip(twists, pair, times, strict=True):
             piece = self.pieces[number]
-            basis = self.path.basis(np.array([piece.middle_s]))
-            platform = piece.platform_mm[np.argmin(np.abs(piece.times_s - piece.middle_s))]
-            lever = at_mm - platform - self.corrections(np.array([piece.middle_s]))[0, :3]
-            twist = np.eye(6)
-            twist[:3, 3:] = np.cross(np.eye(3), lever).T
-            result += sign * np.einsum("c,ij->icj", basis[0], twist).reshape(6, -1)
-        return result
+            platform = piece.platform_mm[np.argmin(np.abs(piece.times_s - time))]
+            twist[:3, 3:] = np.cross(np.eye(3), at_mm - platform - self.corrections(time[None])[0, :3]).T
+        return times, np.array([-1.0, 1.0])[:, None, None] * twists
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of the coefficients (6 C, 6 C)."""
+        if self._covariance is None:
+            self._covariance = self.prior.covariance(inv(self._normal, assume_a="pos"))
+        return self._covariance
+
+    def covariance_at(self, times_s: np.ndarray) -> np.ndarray:
+        """Covariances (N, 6, 6) of the corrections at times (N,), with what the spline cannot follow."""
+        result = np.zeros((len(times_s), 6, 6))
+        blocks = self.covariance.reshape(self.path.count, 6, self.path.count, 6)
+        weights, number = self.path.weights(times_s)
+        for first in range(4):
+            for second in range(4):
+                weight = weights[:, first] * weights[:, second]
+                result += weight[:, None, None] * blocks[number[:, first], :, number[:, second]]
+        return result + self.prior.unresolved(times_s)[:, :, None] * np.eye(6)
 
     def state(self) -> tuple[Any, ...]:
         """What `restore` needs to return to the present estimate."""
-        return self.coefficients, self.covariance, tuple(self.pairs), tuple(self.pieces)
+        return self.coefficients, self.prior, self._normal, self._numbers, self.pairs[:], self.pieces[:]
 
     def restore(self, state: tuple[Any, ...]) -> None:
         """Return to an earlier estimate."""
-        self.coefficients, self.covariance = state[:2]
-        self.pairs, self.pieces = list(state[2]), list(state[3])
+        self.coefficients, self.prior, self._normal, self._numbers = state[:4]
+        self.pairs, self.pieces, self._covariance = state[4][:], state[5][:], None
+
+    def resolve(self, seed: dict[Pair, np.ndarray]) -> None:
+        """Lay knots as close as patches tell where pairs lie on each other; poses (4, 4) as in `estimate`."""
+        times, steps = [], []
+        for pair in self.pairs:
+            earlier, later = (self.moved(number) for number in pair)
+            pose = seed.get(pair, np.eye(4))
+            found = distances_between(later, pose, earlier, np.eye(4), reach_mm=2 * self.reach_mm)
+            for number, rows in zip(pair, (found.target, found.source), strict=True):
+                piece = self.pieces[number]
+                times.append(piece.times_s[rows])
+                steps.append(_STEP * self._radius * np.linalg.norm(piece.slopes[rows], axis=1))
+        if times and len(together := np.concatenate(times)):
+            path = self.path.resolved(together, float(np.median(np.concatenate(steps))))
+            self._assume(PathPrior(path, self.prior.kind))
 
     def lay_anew(self, numbers: Iterable[int]) -> None:
         """Fit the patches of pieces to the points along the path as it is now.
@@ -268,7 +248,7 @@ class PathEstimate:
     def estimate(self, seed: dict[Pair, np.ndarray]) -> None:
         """Estimate until nothing moves any more; poses (4, 4) of pairs give their first matches."""
         for done in range(_ROUNDS):
-            if self._round(seed if done == 0 else {}) < _STILL_MM and (done > 1 or not seed):
+            if self._round(seed if done == 0 else {}) < _STILL and (done > 1 or not seed):
                 break
 
     def settle(self) -> None:
@@ -278,27 +258,67 @@ class PathEstimate:
             self.pairs = agreeing
             self._settled()
 
+    def average(self) -> None:
+        """Average over the kinds of rates, each by its likelihood: few crossings hardly tell them apart, and behind the
+        last one they differ (Hoeting et al., Statistical Science 14, 1999).
+
+        Standard deviations of equal steps are equally likely beforehand (Gelman, Bayesian Analysis 1, 2006).
+        """
+        normal, told = self._told()
+        kinds = [
+            self.prior.kind._replace(smooth=smooth, wandering=wandering)
+            for smooth, wandering in product(_KINDS["smooth"], _KINDS["wandering"])
+        ]
+        likelihoods = np.array([_integrated(PathPrior(self.path, kind), normal, told)[0] for kind in kinds])
+        steps = (np.gradient(np.sqrt(_KINDS[name])) for name in ("smooth", "wandering"))
+        weights = np.exp((likelihoods - likelihoods.max()) / 2) * np.outer(*steps).ravel()
+        weights /= weights.max()
+        kept = np.flatnonzero(weights > _UNLIKELY)
+        mean, square = np.zeros_like(self.coefficients), np.zeros_like(normal)
+        for number in kept:
+            weight, prior = weights[number] / weights[kept].sum(), PathPrior(self.path, kinds[number])
+            factor = _integrated(prior, normal, told)[1]
+            inverse = cho_solve((factor, True), np.eye(len(factor)))
+            found = prior.times_root(inverse @ prior.times_transposed_root(told))[:, 0]
+            mean += weight * found
+            square += weight * (prior.covariance(inverse) + np.outer(found, found))
+        self.coefficients, self._covariance = mean, square - np.outer(mean, mean)
+
     def _settled(self) -> None:
         """Lay the patches and estimate anew until the path moves by little and its drift is of the likeliest kind."""
+        self.resolve({})
         self.estimate({})
+        kind, known = self.prior.kind, False
         for _ in range(_TURNS):
             before = self.coefficients
             self.lay_anew({number for pair in self.pairs for number in pair})
+            self._assume(PathPrior(self.path, kind))
             self.estimate({})
-            still = np.max(np.abs(self.coefficients - before) / np.sqrt(np.diag(self.covariance))) < _LITTLE
-            if (shares := self._likeliest()) == self.shares and still:
+            if not known:
+                kind = self._likeliest()
+                known = kind == self.prior.kind
+            moved = (self.coefficients - before) ** 2 / np.diag(self.covariance)
+            if known and np.sqrt(np.mean(moved)) < _LITTLE:
                 break
-            self.shares, self.prior = shares, self.path.information(shares)
 
     def agrees(self, pair: Pair) -> bool:
-        """Whether the surfaces of a pair agree, also where they were held out, and tell more than they determine."""
+        """Whether the surfaces of a pair agree, also where they were held out."""
         found, fits = self.matched(pair)
         if np.count_nonzero(fits) < FEWEST or np.mean(fits) < _AGREEING:
             return False
         held = self.held_out(pair, found)
-        if np.count_nonzero(held) >= _FEWEST_HELD_OUT and np.mean(fits[held]) < _AGREEING:
-            return False
-        determined = float(np.sum(self._of_pair(pair, None)[0] * self.covariance))
+        return bool(np.count_nonzero(held) < _FEWEST_HELD_OUT or np.mean(fits[held]) >= _AGREEING)
+
+    def tells(self, pair: Pair) -> bool:
+        """Whether the surfaces of a pair tell more than they determine of the path, but for its random walk.
+
+        The walk is small within a crossing; patches that are held out judge what it takes.
+        """
+        columns, normal, _ = self._of_pair(pair, None)
+        steady = PathPrior(self.path, self.prior.kind._replace(walk=_WALKS[0], turn_walk=_WALKS[0]))
+        covariance = steady.covariance(inv(steady.with_evidence(self._evidence({})[0]), assume_a="pos"))
+        determined = float(np.sum(normal * covariance[np.ix_(columns, columns)]))
+        fits = self.matched(pair)[1]
         return bool(np.count_nonzero(fits) / self.pieces[pair[1]].patches.shared > _PER_PARAMETER * determined)
 
     def matched(self, pair: Pair) -> tuple[PatchDistances, np.ndarray]:
@@ -346,47 +366,61 @@ class PathEstimate:
         )
         return replace(piece, back=np.linalg.inv(self._around(piece)))
 
+    def _assume(self, prior: PathPrior) -> None:
+        """Take a kind of drift, or a path with other knots; the correction stays as it is."""
+        if prior.path is not self.path:
+            at = prior.path.at_s
+            self.coefficients = np.linalg.solve(prior.path.basis(at), self.corrections(at)).ravel()
+        self.prior, self._covariance = prior, None
+        self._normal, self._numbers = np.eye(len(self.coefficients)), np.zeros((len(self.coefficients), 1))
+
     def _round(self, seed: dict[Pair, np.ndarray]) -> float:
-        """One step of least squares; returns the largest shift of a coefficient."""
+        """One step of least squares; returns its root mean square, in standard deviations of what is estimated."""
         normal, gradient = self._evidence(seed)
-        normal, gradient = normal + self.prior, gradient + self.prior @ self.coefficients
-        self.covariance = np.linalg.inv(normal)
-        step = -self.covariance @ gradient
-        self.coefficients = self.coefficients + step
-        return float(np.abs(step.reshape(-1, 6)[:, :3]).max())
+        self._normal, self._covariance = self.prior.with_evidence(normal), None
+        told = self.prior.times_transposed_root((normal @ self.coefficients - gradient)[:, None])
+        before, self._numbers = self._numbers, cho_solve(cho_factor(self._normal, check_finite=False), told)
+        self.coefficients = self.prior.times_root(self._numbers)[:, 0]
+        step = self._numbers - before
+        return float(np.sqrt(np.sum(step * (self._normal @ step)) / len(step)))
 
-    def _likeliest(self) -> Shares:
-        """Shares of the drift with which the matches as they are now are likeliest."""
+    def _likeliest(self) -> DriftKind:
+        """Kind of the drift with which the matches as they are now are likeliest."""
+        normal, told = self._told()
+
+        @cache
+        def likelihood(kind: DriftKind) -> float:
+            return _integrated(PathPrior(self.path, kind), normal, told)[0]
+
+        best, before = self.prior.kind, None
+        while best != before:
+            before = best
+            for name, values in _KINDS.items():
+                for side in (1, -1):
+                    at = values.index(getattr(best, name)) + side
+                    while 0 <= at < len(values) and likelihood(best._replace(**{name: values[at]})) > likelihood(best):
+                        best = best._replace(**{name: values[at]})
+                        at += side
+        return best
+
+    def _told(self) -> tuple[np.ndarray, np.ndarray]:
+        """Normal matrix (6 C, 6 C) of the matches as they are now, and its product (6 C, 1) with what they say."""
         normal, gradient = self._evidence({})
-        # In units of the drift the evidence is that of as many independent numbers as it tells of.
-        units = np.tile(self.path.sizes, self.path.count)
-        values, vectors = np.linalg.eigh(normal * np.outer(units, units))
-        telling = values > _TELLING
-        roots = np.sqrt(values[telling])
-        at = vectors[:, telling].T @ (units * (normal @ self.coefficients - gradient)) / roots
-        ways = (vectors[:, telling] * roots).reshape(self.path.count, -1)
-
-        def likelihood(shares: Shares) -> float:
-            """Twice the logarithm, but for what all shares have in common: the path is integrated out."""
-            moved = (self.path.shape(shares) @ ways).reshape(len(units), -1)
-            root = np.linalg.cholesky(np.eye(len(roots)) + ways.reshape(moved.shape).T @ moved)
-            off = solve_triangular(root, at, lower=True)
-            return float(at @ at - off @ off - 2 * np.sum(np.log(np.diag(root))))
-
-        return max(_SHARES, key=likelihood)
+        return normal, (normal @ self.coefficients - gradient)[:, None]
 
     def _evidence(self, seed: dict[Pair, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix and gradient of the distances between all pairs, without what is known beforehand."""
-        normal, gradient = np.zeros_like(self.prior), np.zeros_like(self.coefficients)
+        count = 6 * self.path.count
+        normal, gradient = np.zeros((count, count)), np.zeros(count)
         for pair in self.pairs:
-            own = self._of_pair(pair, seed.get(pair))
-            normal += own[0]
-            gradient += own[1]
+            columns, own, slope = self._of_pair(pair, seed.get(pair))
+            normal[np.ix_(columns, columns)] += own
+            gradient[columns] += slope
         return normal, gradient
 
-    def _of_pair(self, pair: Pair, seed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Normal matrix and gradient of one pair; by its pose (4, 4) where that differs from the present one."""
-        normal, gradient = np.zeros_like(self.prior), np.zeros_like(self.coefficients)
+    def _of_pair(self, pair: Pair, seed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Numbers (K,) of the unknowns that one pair tells of, normal matrix and gradient; by its pose (4, 4) where
+        that differs from the present one."""
         patches = {number: self.moved(number) for number in pair}
         poses = {pair[0]: np.eye(4), pair[1]: np.eye(4) if seed is None else seed}
         ways = []
@@ -406,36 +440,48 @@ class PathEstimate:
             # Both directions count by half.
             ways.append((source, target, found, used, (1 - u * u) ** 2 / std**2 / (2 * patches[source].shared)))
         if not ways:
-            return normal, gradient
+            return np.zeros(0, int), np.zeros((0, 0)), np.zeros(0)
         middle = np.vstack([found.places_mm[used] for _, _, found, used, _ in ways]).mean(axis=0)
         observable = np.eye(6) if seed is not None else _observable([each[2:] for each in ways], middle)
         back = np.eye(4) if seed is None else np.linalg.inv(seed)
+        rows = []
         for source, target, found, used, weight in ways:
             normals, places = found.normals[used], found.places_mm[used]
             # Matched by another pose than the present one: where the later piece's surface lies now.
             now = {pair[0]: places, pair[1]: places @ back[:3, :3].T + back[:3, 3]}
             gap = np.einsum("qi,qi->q", now[source] - now[target], normals)
             parts = []
-            for number, rows, sign in ((source, found.source[used], 1.0), (target, found.target[used], -1.0)):
+            for number, at, sign in ((source, found.source[used], 1.0), (target, found.target[used], -1.0)):
                 piece = self.pieces[number]
                 # Beside the middle of a patch the surface was seen a little earlier or later.
-                off = now[number] - patches[number].places_mm[rows]
-                later = np.einsum("qi,qi->q", piece.slopes[rows], off)
-                times = piece.times_s[rows] + later
+                off = now[number] - patches[number].places_mm[at]
+                later = np.einsum("qi,qi->q", piece.slopes[at], off)
+                times = piece.times_s[at] + later
                 by = np.hstack([normals, np.cross(places - middle, normals)]) @ observable
                 # Turns are about the platform where the present correction has it.
-                platform = piece.platform_mm[rows] + later[:, None] * piece.speed[rows]
+                platform = piece.platform_mm[at] + later[:, None] * piece.speed[at]
                 platform += self.corrections(times)[:, :3]
                 by[:, 3:] += np.cross(middle + now[number] - places - platform, by[:, :3])
                 parts.append((sign * self.path.basis(times), by))
-            # Of all coefficients those around both passes.
-            near = np.flatnonzero(np.any([basis.any(axis=0) for basis, _ in parts], axis=0))
+            rows.append((parts, weight, found.distance_mm[used] + gap))
+        # Of all coefficients those around both passes.
+        near = np.flatnonzero(np.any([basis.any(axis=0) for parts, _, _ in rows for basis, _ in parts], axis=0))
+        columns = (6 * near[:, None] + np.arange(6)).ravel()
+        normal, gradient = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
+        for parts, weight, off in rows:
             derivatives = sum(np.einsum("qc,qi->qci", basis[:, near], by) for basis, by in parts)
             derivatives = np.reshape(derivatives, (len(weight), -1))
-            columns = (6 * near[:, None] + np.arange(6)).ravel()
-            normal[np.ix_(columns, columns)] += derivatives.T @ (weight[:, None] * derivatives)
-            gradient[columns] += derivatives.T @ (weight * (found.distance_mm[used] + gap))
-        return normal, gradient
+            normal += derivatives.T @ (weight[:, None] * derivatives)
+            gradient += derivatives.T @ (weight * off)
+        return columns, normal, gradient
+
+
+def _integrated(prior: PathPrior, normal: np.ndarray, told: np.ndarray) -> tuple[float, np.ndarray]:
+    """Twice the logarithm of the likelihood, but for what all kinds have in common, with the path integrated out; and
+    the lower root (6 C, 6 C) of the normal matrix with the prior."""
+    factor = np.linalg.cholesky(prior.with_evidence(normal))
+    off = solve_triangular(factor, prior.times_transposed_root(told), lower=True)
+    return float(np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor)))) - _STRONG * prior.kind.by_heading, factor
 
 
 def _moved(correction: np.ndarray, platform: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -11,11 +11,9 @@ _MOST_SHAPES = 12
 """Shapes along the path; what they leave counts as independent from image to image."""
 _LEFT = 0.01
 """Share of the variance that may be left to that."""
-_SAMPLE = 4000
+_SAMPLE = 1500
 """Points by which the shapes are chosen."""
 _BLOCK = 50_000
-_EXACT = np.diag([1e-12] * 3 + [1e-18] * 3)
-"""Covariance (6, 6) of a pose, mm and rad, far below what can be measured: the start of a path is exact."""
 
 
 def along_corrected_path(
@@ -25,12 +23,14 @@ def along_corrected_path(
     image: np.ndarray,
     basis: np.ndarray,
     covariance: np.ndarray,
+    poses: np.ndarray,
 ) -> PointUncertainty:
     """Uncertainty of N points after a correction of the path's poses, in place of that by the navigation.
 
     What they have by the calibrations of sensor and mount (``shared`` of ``known``) stays and turns with them, and so
     does their noise; all else was the navigation's and goes. The correction is a shift (mm) and a turn (rad) about the
-    platform: the C coefficients of ``covariance`` (6 C, 6 C) with the weights ``basis`` (F, C) at the F images.
+    platform: the C coefficients of ``covariance`` (6 C, 6 C) with the weights ``basis`` (F, C) at the F images. What
+    the covariances ``poses`` (F, 6, 6) of these have besides is independent from image to image.
 
     Parameters
     ----------
@@ -47,15 +47,16 @@ def along_corrected_path(
         by = np.moveaxis(by_image[image[here]], 2, 0)
         return by[:, :, :3] + np.cross(by[:, :, 3:], levers_mm[here])
 
-    by_image = np.einsum("fc,cik->fik", basis, root, optimize=True)
     some = np.linspace(0, len(image) - 1, min(_SAMPLE, len(image))).astype(int)
-    flat = moved(by_image, some).reshape(len(values), -1)
+    by_pose = np.einsum("nc,cik->kni", basis[image[some]], root, optimize=True)
+    flat = (by_pose[:, :, :3] + np.cross(by_pose[:, :, 3:], levers_mm[some])).reshape(len(values), -1)
     strengths, ways = np.linalg.eigh(flat @ flat.T)
     strengths, ways = np.maximum(strengths[::-1], 0.0), ways[:, ::-1]
     left = 1 - np.cumsum(strengths) / max(strengths.sum(), 1e-300)
     count = min(1 + int(np.argmax(left <= _LEFT)), _MOST_SHAPES)
-    shapes, others = by_image @ ways[:, :count], by_image @ ways[:, count:]
-    rest = np.linalg.cholesky(others @ others.transpose(0, 2, 1) + _EXACT)
+    shapes = np.einsum("fc,cik->fik", basis, root @ ways[:, :count], optimize=True)
+    variances, axes = np.linalg.eigh(poses - shapes @ shapes.transpose(0, 2, 1))
+    rest = axes * np.sqrt(np.maximum(variances, 0.0))[:, None]
     # As few patterns as before that consist of the parts of sensor and mount alone.
     names = list(known.shared)
     parts = np.vstack([known.shared[name].T for name in names]) if names else np.zeros((0, len(known.patterns_mm)))

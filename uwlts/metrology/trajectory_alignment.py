@@ -1,6 +1,7 @@
-"""Self-consistency of a scan along a path: a smooth correction of the path, by surfaces that it shows more than once.
+"""Self-consistency of a scan along a path: a correction of the path, by surfaces that it shows more than once.
 
-`path_estimate` states what is unknown and what is known beforehand, `crossing_search` how crossings are found.
+`path_prior` states what is known beforehand, `path_estimate` how the correction is found, `crossing_search` how
+crossings are.
 """
 
 from __future__ import annotations
@@ -14,14 +15,16 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.metrology.crossing_search import SIGMAS, close_crossings, complete
 from uwlts.metrology.patches import scatter
-from uwlts.metrology.path_estimate import EXACT_MM, EXACT_RAD, Pair, PathEstimate, PathSpline
+from uwlts.metrology.path_estimate import EXACT_MM, EXACT_RAD, Pair, PathEstimate
+from uwlts.metrology.path_prior import DriftKind, PathSpline
 from uwlts.metrology.path_uncertainty import along_corrected_path
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory, on_clock
 from uwlts.storage.cloud import PointCloud, read_cloud
 
-_SMOOTH, _ROUGH = (0.0, 0.3, 0.01), (0.0, 0.2, 0.4)
+_SMOOTH = DriftKind(smooth=0.0, wandering=0.3, walk=0.01, turn_walk=0.01)
+_ROUGH = DriftKind(smooth=0.0, wandering=0.3, walk=0.3, turn_walk=0.3)
 """Kinds of drift assumed in the search of crossings, the second where the first finds none: fewer
 false crossings fit a stiffer path."""
 
@@ -123,7 +126,7 @@ def align_trajectory(
         runs faster than theirs.
     drift_mm, drift_deg
         Standard uncertainty that the navigation has gathered at the end, along each axis; from the covariance of the
-        trajectory unless given.
+        trajectory unless given. Of which kind the drift is, a steady or changing rate or a random walk, is estimated.
 
     Raises
     ------
@@ -138,10 +141,10 @@ def align_trajectory(
     if cloud.time_s is None:
         raise EvaluationError("the cloud has no times of its points: reconstruct it with a trajectory")
     times = on_clock(cloud.time_s, offset_s=clock_offset_s, drift_ppm=clock_drift_ppm)
-    path = PathSpline.of(trajectory, _drift(trajectory, drift_mm, drift_deg), times)
+    path = PathSpline.of(trajectory, *_drift(trajectory, drift_mm, drift_deg), times)
     left_out: tuple[tuple[float, float], ...] = ()
-    for turn, shares in enumerate((_SMOOTH, _ROUGH)):
-        estimate = PathEstimate(cloud, times, path, shares)
+    for turn, kind in enumerate((_SMOOTH, _ROUGH)):
+        estimate = PathEstimate(cloud, times, path, kind)
 
         def searched(done: int, total: int, turn: int = turn) -> None:
             progress(turn * total + done, (turn + 1) * total)
@@ -150,6 +153,7 @@ def align_trajectory(
         if estimate.pairs:
             estimate.settle()
             complete(estimate, len(estimate.pieces))
+            estimate.average()
         left_out = tuple(_times(estimate, pair) for pair in doubtful if pair not in estimate.pairs)
         if estimate.pairs:
             return _result(estimate, trajectory, times, left_out)
@@ -160,41 +164,41 @@ def align_trajectory(
     )
 
 
-def _drift(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> tuple[float, float]:
+def _drift(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Drift (6,) of each component of the poses at the end, mm and rad, and which (6,) are measured all along."""
     if (drift_mm is None) != (drift_deg is None):
         raise EvaluationError("the drift needs both parts: drift_mm and drift_deg")
     if drift_mm is not None and drift_deg is not None:
         if not (0 < drift_mm < np.inf and 0 < drift_deg < 90):
             raise EvaluationError(f"the drift is {drift_mm:g} mm and {drift_deg:g} deg; expected positive numbers")
-        return drift_mm, float(np.radians(drift_deg))
+        return np.repeat([drift_mm, float(np.radians(drift_deg))], 3), np.zeros(6, bool)
     if trajectory.covariance is None:
         raise EvaluationError("the trajectory states no covariance: give drift_mm and drift_deg")
     variance = np.einsum("nii->ni", trajectory.covariance)
     grown = np.maximum(variance.max(axis=0) - variance[0], 0.0)
-    shift, turn = np.sqrt(grown[:3].max()), np.sqrt(grown[3:].max())
-    return max(float(shift), EXACT_MM), max(float(turn), EXACT_RAD)
+    # What is measured all along, as depth and tilt, differs from its start by up to twice its variance.
+    measured = (grown < variance[0]) & (2 * variance[0] < np.repeat(grown.reshape(2, 3).max(axis=1), 3))
+    drift = np.sqrt(np.where(measured, 2 * variance[0], grown))
+    return np.maximum(drift, np.repeat([EXACT_MM, EXACT_RAD], 3)), measured
 
 
 def _result(
     estimate: PathEstimate, trajectory: Trajectory, times: np.ndarray, doubtful: tuple[tuple[float, float], ...]
 ) -> AlignedTrajectory:
     cloud = estimate.cloud
-    basis = estimate.path.basis(trajectory.times_s)
     correction = estimate.corrections(trajectory.times_s)
     poses = trajectory.poses.copy()
     poses[:, :3, :3] = Rotation.from_rotvec(correction[:, 3:]).as_matrix() @ poses[:, :3, :3]
     poses[:, :3, 3] += correction[:, :3]
-    blocks = estimate.covariance.reshape(estimate.path.count, 6, estimate.path.count, 6)
-    covariance = np.einsum("nc,cidj,nd->nij", basis, blocks, basis, optimize=True)
-    covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
+    covariance = estimate.covariance_at(trajectory.times_s)
     moments, image = np.unique(times, return_inverse=True)
-    at_image = estimate.path.basis(moments)
     by_point = estimate.corrections(moments)[image]
     platform = trajectory.poses_at(moments)[image, :3, 3]
     levers = Rotation.from_rotvec(by_point[:, 3:]).apply(cloud.points_mm - platform)
     known = cloud.uncertainty
     if known is not None:
-        known = along_corrected_path(known, by_point[:, 3:], levers, image, at_image, estimate.covariance)
+        at_image, by_image = estimate.path.basis(moments), estimate.covariance_at(moments)
+        known = along_corrected_path(known, by_point[:, 3:], levers, image, at_image, estimate.covariance, by_image)
     return AlignedTrajectory(
         Trajectory(trajectory.times_s, poses, covariance),
         correction,

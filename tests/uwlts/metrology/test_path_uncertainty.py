@@ -24,7 +24,9 @@ def test_points_have_the_covariance_of_the_path_and_of_their_sensor():
     own = noise @ noise.transpose(0, 2, 1)
     pairs = np.stack([own[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))], axis=1)
     known = PointUncertainty(pairs, np.zeros((count, 3)), patterns, shared={"sensor": mixed[:, :2]})
-    found = along_corrected_path(known, np.zeros((count, 3)), levers, image, basis, covariance)
+    blocks = covariance.reshape(coefficients, 6, coefficients, 6)
+    poses = np.einsum("fc,cidj,fd->fij", basis, blocks, basis)
+    found = along_corrected_path(known, np.zeros((count, 3)), levers, image, basis, covariance, poses)
     cross = np.zeros((count, 3, 6))
     cross[:, :, :3] = np.eye(3)
     for axis, unit in enumerate(np.eye(3)):

@@ -1,6 +1,7 @@
 """Alignment of a trajectory by its crossings: against the true path of a simulated vehicle over a sea bed."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,6 +90,44 @@ def test_a_surface_that_fits_in_many_places_is_refused():
     cloud, reported, _ = ride(np.random.default_rng(SEED), LOOP_MM, ground=ground, **drift)
     with pytest.raises(uwlts.Error, match="fits in several places"):
         uwlts.align_trajectory(cloud, reported, **drift)
+
+
+def apart(cloud: PointCloud, true_points: np.ndarray, crossed: tuple[float, float]) -> np.ndarray:
+    """By how much two passes place the same squares of 30 mm apart, (K, 3) mm, in an overlap about a place."""
+    assert cloud.time_s is not None
+    inside = np.all(np.abs(true_points[:, :2] - crossed) < 90, axis=1)
+    errors, late = (cloud.points_mm - true_points)[inside], cloud.time_s[inside] > np.median(cloud.time_s)
+    square = np.floor(true_points[inside, :2] / 30).astype(int) @ [1, 1000]
+    return np.array(
+        [
+            errors[late & (square == each)].mean(axis=0) - errors[~late & (square == each)].mean(axis=0)
+            for each in np.unique(square)
+        ]
+    )
+
+
+@pytest.mark.slow
+def test_a_random_walk_is_followed_within_a_crossing():
+    cloud, reported, true = ride(np.random.default_rng(SEED), LOOP_MM, walk=0.1, drift_mm=60.0, drift_deg=0.3)
+    assert cloud.time_s is not None
+    local = np.einsum(
+        "nij,nj->ni", np.linalg.inv(reported.poses_at(cloud.time_s)), np.c_[cloud.points_mm, np.ones(len(cloud))]
+    )
+    points = np.einsum("nij,nj->ni", true.poses_at(cloud.time_s), local)[:, :3]
+    sizes = np.array([60.0] * 3 + [np.radians(0.3)] * 3)
+    grown = np.square((true.times_s / true.times_s[-1])[:, None] * sizes)
+    found = uwlts.align_trajectory(cloud, replace(reported, covariance=grown[:, :, None] * np.eye(6)))
+    before, after = (apart(each, points, (450, 0)) for each in (cloud, found.cloud))
+    # The walk goes 60 mm x 0.1 x sqrt(1.5 s / 20 s) = 1.6 mm while a pass is over the crossing.
+    assert len(after) >= 30 and (before.std(axis=0) > 1.0).all()
+    # The goal for lengths within a crossing; along the normal the surface tells more than across it.
+    assert (np.sqrt(np.mean(after**2, axis=0)) < [1.0, 1.0, 0.2]).all()
+    assert position_errors(found.trajectory, true) < position_errors(reported, true) / 3
+    # Errors along the path are alike: few independent numbers of standard deviation one, so that three is one in 300.
+    assert found.trajectory.covariance is not None
+    std = np.sqrt(np.einsum("nii->ni", found.trajectory.covariance))[1:, :3]
+    off = (found.trajectory.poses - true.poses)[1:, :3, 3] / std
+    assert np.sqrt(np.mean(off**2)) < 3
 
 
 @pytest.mark.slow
