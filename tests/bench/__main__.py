@@ -17,6 +17,10 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
+# As the commands do (`uwlts.runtime.console.run`), before NumPy is imported: what is measured on one core must not wait
+# for a thread of the matrix library on another one, which took half of the time where that had other work.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import cv2
 import numpy as np
 from rich.console import Console

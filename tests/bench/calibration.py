@@ -48,11 +48,14 @@ def joint_calibration(targets: list[Path], steps: list[Path]) -> tuple[Calibrati
 
 
 def measuring_rate(scans: list[Path], calibration: Calibration) -> float:
-    """Frames per second from images in memory to points with their covariance, of scans that follow a first one."""
+    """Frames per second from images in memory to points with their covariance, of scans that follow a first one.
+
+    The median over scans that are measured in turn.
+    """
     with ExitStack() as stack:
         recordings = [_InMemory(stack.enter_context(Capture(path))) for path in scans]
         seconds = []
-        for images in recordings * 4:
+        for images in recordings * 12:
             start = time.perf_counter()
             cloud = reconstruct_stripes(images.capture, find_stripes(images), calibration, with_uncertainty=True)
             assert cloud.uncertainty is not None and cloud.uncertainty.covariance_mm2().shape == (len(cloud), 3, 3)

@@ -164,10 +164,10 @@ def sum_series(series: np.ndarray, row: np.ndarray, at: np.ndarray, result: np.n
 @compiled_part
 def sum_terms(terms: np.ndarray, x: float, sums: np.ndarray) -> None:
     """Sums (K,) of a line's terms (n, K) times Chebyshev polynomials, each by recurrence from the two before."""
-    before, polynomial = x, 1.0
+    before, polynomial, first = 1.0, x, terms[0]
     for k in range(sums.size):
-        sums[k] = 0.0
-    for term in range(terms.shape[0]):
+        sums[k] = first[k]
+    for term in range(1, terms.shape[0]):
         weights = terms[term]
         for k in range(sums.size):
             sums[k] += polynomial * weights[k]

@@ -88,6 +88,11 @@ def compiled_part(function: Callable[_Parameters, _Result]) -> Callable[_Paramet
     return njit(**options)(function)
 
 
+def compiled_inline(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
+    """A part that is called at one place: it is compiled within the function there, and not once more by itself."""
+    return njit(inline="always", **_NO_ARRAYS)(function)
+
+
 @cache
 def _stamp(folder: Path) -> tuple[tuple[str, int, int], ...]:
     """Names, times and sizes of the source files of a folder's package: the one next below ``uwlts``."""

@@ -63,7 +63,8 @@ def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
     background cut off at black is met better this way than by the deviation of single pixels.
     """
     sample = contrast.ravel()[:: max(1, contrast.size // _NOISE_SAMPLES)].copy()
-    middle = np.partition(sample, sample.size // 2)[sample.size // 2]
+    sample.partition(sample.size // 2)
+    middle = sample[sample.size // 2]
     median = float(middle)
     if contrast.dtype.kind in "iu":
         # Whole grey levels make the plain median jump; read it off the cumulative histogram with straight bins.

@@ -47,19 +47,21 @@ def _half_lit(good: np.ndarray, centre: np.ndarray, *, lines: int, jump_px: floa
     ``good`` (L,) marks the lines with a centre. A stripe ends where more than a few lines in a row have none, and
     jumps where neighbouring centres lie more than ``jump_px`` apart. The image's own border is no end.
     """
-    if good.all() and np.abs(centre[1:] - centre[:-1]).max(initial=0.0) <= jump_px:
-        return _NONE
     found = np.flatnonzero(good)
     if len(found) == 0:
         return found
     place = centre[found]
     # Breaks stand before these of the lines found, and after all of them.
-    apart = (found[1:] - found[:-1] > _SHORT_GAP + 1) | (np.abs(place[1:] - place[:-1]) > jump_px)
+    apart = np.abs(place[1:] - place[:-1]) > jump_px
+    if len(found) < len(good):
+        apart |= found[1:] - found[:-1] > _SHORT_GAP + 1
     breaks = (1 + np.flatnonzero(apart)).tolist()
     if found[0] > _SHORT_GAP:
         breaks.append(0)
     if len(good) - 1 - found[-1] > _SHORT_GAP:
         breaks.append(len(found))
+    if not breaks:
+        return _NONE
     beside = np.zeros(len(found) + 2 * lines, np.bool_)
     for each in breaks:
         beside[each : each + 2 * lines] = True

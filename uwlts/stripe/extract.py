@@ -100,10 +100,8 @@ def see_stripes(
     if seen is None or options.peak is not PeakRule.DIRECT:
         return SeenStripes(found.stripe, None, options.threshold_floor, jump_px, options.end_lines)
     lines = np.flatnonzero(found.several | found.glare)
-    clear = (found.stripe.status[lines] == _OK) & ~found.glare[lines]
-    if clear.any():
-        of_rivals = with_rivals(found.profiles, seen.left, lines[clear], seen.rules)
-        lines = np.sort(np.concatenate([of_rivals, lines[~clear]]))
+    known = (found.stripe.status[lines] != _OK) | found.glare[lines]
+    lines = lines[with_rivals(found.profiles, seen.left, lines, known, seen.rules)]
     rivals = found.candidates(lines, rivals=True) if len(lines) else None
     if rivals is not None and len(rivals.line) == 0:
         rivals = None
@@ -237,7 +235,7 @@ def _found(
     status, wide, several, peak = search(profiles, left, detection.rules)
     glare = wide.copy()
     # A plateau wider than the window does not even stick out.
-    white = low.max(axis=0) >= clip if brightest >= clip else np.zeros(len(status), np.bool_)
+    white = low.max(axis=0) >= clip if brightest >= clip and low.max() >= clip else np.zeros(len(status), np.bool_)
     wide |= white
     amplitude, width = np.full((2, len(status)), np.nan, np.float32)
     found = _Lines(np.full(len(status), np.nan), amplitude, width, status, wide, white)
@@ -294,9 +292,9 @@ class _Extracted:
         line, clear, peak = np.empty(0, np.intp), np.empty(0, np.bool_), None
         if len(lines):
             board = np.ascontiguousarray(seen.board[:, lines].T)
-            line, clear, peak = search_all(self.profiles, board, lines, seen.rules)
-            kept = np.bincount(line, minlength=count)[line] >= 2 if rivals else clear
-            line, clear, peak = line[kept], clear[kept], peak.keep(kept)
+            line, clear, peak = search_all(self.profiles, board, lines, seen.rules, fewest=2 if rivals else 1)
+            if not rivals:
+                line, clear, peak = line[clear], clear[clear], peak.keep(clear)
         place, amplitude = np.empty(len(line)), np.empty(len(line), np.float32)
         width, certainty = np.full(len(line), np.nan, np.float32), np.zeros(len(line))
         if peak is not None and len(line):

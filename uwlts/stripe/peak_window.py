@@ -9,7 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from uwlts.runtime.compiled import compiled, compiled_part
+from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 """Full width at half maximum of a Gaussian over its standard deviation."""
@@ -209,7 +209,7 @@ def greatest(values: np.ndarray, first: int, end: int) -> np.float32:
     return result
 
 
-@compiled_part
+@compiled_inline
 def _least(values: np.ndarray, first: int, end: int) -> np.float32:
     """The least of some numbers; more than any where there are none."""
     result, part = np.float32(np.inf), values[first:end]
@@ -218,7 +218,7 @@ def _least(values: np.ndarray, first: int, end: int) -> np.float32:
     return result
 
 
-@compiled_part
+@compiled_inline
 def _rises_again(
     values: np.ndarray, first: int, end: int, step: int, ground: np.floating, rise: np.floating, rules: SearchRules
 ) -> np.bool_:

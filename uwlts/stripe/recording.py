@@ -73,7 +73,6 @@ def find_stripes(
     along, full_dn = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
     chosen = StripeOptions.of(capture.header.sensor, options)
     found: list[tuple[np.ndarray, ...]] = []
-    statuses = np.zeros(len(StripeStatus), int)
     numbers: list[int] = []
 
     def images() -> Iterator[SeenStripes]:
@@ -82,15 +81,16 @@ def find_stripes(
             yield see_stripes(seen, stripe_along=along, options=chosen, saturation=saturation)
             progress(number + 1, len(capture))
 
-    for count, stripe in enumerate(direct_stripes(images(), farther=farther(capture.header.sensor))):
-        statuses += np.bincount(stripe.status, minlength=len(StripeStatus))
+    for stripe in direct_stripes(images(), farther=farther(capture.header.sensor)):
         good = stripe.lines
         of_lines = (values[good] for values in (stripe.centre_px, stripe.amplitude, stripe.width_px))
-        found.append((np.full(len(good), numbers[count]), good, *of_lines))
+        found.append((stripe.status, good, *of_lines))
     if not found:
         raise CaptureError(
             f"{capture.path.name} holds no image with the laser on among {len(capture)}: nothing to reconstruct"
         )
+    status_of_lines, *columns = map(np.concatenate, zip(*found, strict=True))
+    statuses = np.bincount(status_of_lines, minlength=len(StripeStatus))
     by_status = {status.name.lower(): int(statuses[status]) for status in StripeStatus}
     if statuses[StripeStatus.OK] == 0:
         if not capture.has_image[capture.laser_on].all():
@@ -101,7 +101,8 @@ def find_stripes(
         lit = (capture.image(number) for number in np.flatnonzero(capture.laser_on).tolist())
         reason = why_no_stripe(lit, stripe_along=along, full_dn=full_dn)
         raise CaptureError(f"no stripe in any of the {len(found)} laser images of {capture.path.name}: {reason}")
-    return FoundStripes(*map(np.concatenate, zip(*found, strict=True)), lines_by_status=by_status)
+    frame = np.repeat(numbers, [len(good) for _, good, *_ in found])
+    return FoundStripes(frame, *columns, lines_by_status=by_status)
 
 
 def is_black(image: np.ndarray, full_dn: float) -> bool:

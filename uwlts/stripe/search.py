@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from uwlts.model.stripe import StripeStatus
-from uwlts.runtime.compiled import compiled, compiled_part
+from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
 from uwlts.stripe.peak_window import (
     FIRST,
     FLANK,
@@ -107,9 +107,11 @@ def _room(peaks: PeakWindow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def search_all(
-    profiles: np.ndarray, board: np.ndarray, lines: np.ndarray, rules: SearchRules
+    profiles: np.ndarray, board: np.ndarray, lines: np.ndarray, rules: SearchRules, *, fewest: int = 1
 ) -> tuple[np.ndarray, np.ndarray, PeakWindow]:
-    """All stripes on some lines (M,): the line of each, in their order, whether it can be measured, and its window.
+    """All stripes on those of some lines (M,) that hold the ``fewest`` or more.
+
+    The line of each, in their order, whether it can be measured, and its window.
 
     ``board`` (M, B + 2 `MARGIN`) are the contrasts on these lines, else as of `search`. Two stripes of which one
     reaches into the other's pixels cannot be measured, nor one that is bright and too wide, or cut off by the border.
@@ -118,14 +120,23 @@ def search_all(
     peaks, found, clear = _windows(most, rules), np.empty(most, np.intp), np.empty(most, np.bool_)
     count = _search_all(profiles, board, lines, *_room(peaks), rules, found, clear, peaks)
     kept = np.flatnonzero(found[:count] >= 0)
+    if fewest > 1:
+        kept = kept[np.bincount(found[kept])[found[kept]] >= fewest]
+    if not kept.size:
+        return found[:0], clear[:0], peaks.first(0)
     return found[kept], clear[kept], peaks.keep(kept)
 
 
-def with_rivals(profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, rules: SearchRules) -> np.ndarray:
-    """Those of some lines (M,) on which something stands out in the board ``left`` by `search` that is no spike."""
-    found = np.zeros(len(lines), np.bool_)
+def with_rivals(
+    profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, known: np.ndarray, rules: SearchRules
+) -> np.ndarray:
+    """On which of some lines (M,) something stands out in the board ``left`` by `search` that is no spike: (M,) bool.
+
+    Those of which it is ``known`` (M,) are not looked at.
+    """
+    found = known.copy()
     _see_rivals(profiles, left, lines, np.empty(rules.block + 2, np.float32), rules, found)
-    return lines[found]
+    return found
 
 
 def look_at(profiles: np.ndarray, lines: np.ndarray, centre: np.ndarray, options: StripeOptions) -> PeakWindow:
@@ -313,7 +324,7 @@ def _leave_minor_out(
                 found[k] = -1
 
 
-@compiled_part
+@compiled_inline
 def _followed(
     profiles: np.ndarray,
     line: int,
@@ -341,7 +352,7 @@ def _followed(
     return start + offset, peak
 
 
-@compiled_part
+@compiled_inline
 def _offset(peak: Peak, size: int, rules: SearchRules) -> int:
     """How far a window is to follow a peak of which a half-height crossing or a flank lies outside it."""
     to_end = np.float32(0.5 * (size - 1))
@@ -352,13 +363,13 @@ def _offset(peak: Peak, size: int, rules: SearchRules) -> int:
     return 0
 
 
-@compiled_part
+@compiled_inline
 def _is_too_wide(peak: Peak, rules: SearchRules) -> bool:
     """Whether what is no stripe is a bright one all the same that is too wide to be measured."""
     return bool((not peak.closed or peak.sigma > rules.widest) and peak.height >= rules.bright)
 
 
-@compiled_part
+@compiled_inline
 def _keep(peaks: PeakWindow, number: int, start: int, peak: Peak, window: np.ndarray) -> None:
     """Keep a peak and its window under a number."""
     peaks.start[number], peaks.middle[number], peaks.sigma[number] = start, peak.middle, peak.sigma

@@ -22,11 +22,11 @@ def scaled(x):
 print(scaled(2.0), sum(scaled.stats.cache_hits.values()))
 """
 CALLED = """\
-from uwlts.runtime.compiled import compiled_part
+from uwlts.runtime.compiled import {0}
 
-@compiled_part
+@{0}
 def factor():
-    return {}
+    return {1}
 """
 
 
@@ -36,18 +36,20 @@ def run(folder: Path) -> list[str]:
     return done.stdout.split()
 
 
-@pytest.mark.parametrize("other", ["inner", "beside"])
-def test_a_change_in_another_file_that_is_called_is_noticed(tmp_path: Path, other):
+@pytest.mark.parametrize(
+    ("other", "kind"), [("inner", "compiled_part"), ("beside", "compiled_part"), ("beside", "compiled_inline")]
+)
+def test_a_change_in_another_file_that_is_called_is_noticed(tmp_path: Path, other, kind):
     packages = tmp_path / "uwlts"
     for name in ("inner", "beside"):
         (packages / name).mkdir(parents=True)
         (packages / name / "__init__.py").touch()
     (packages / "inner" / "caller.py").write_text(CALLER.format(other))
     called = packages / other / "called.py"
-    called.write_text(CALLED.format("3.0"))
+    called.write_text(CALLED.format(kind, "3.0"))
     assert run(packages) == ["6.0", "0"]
     assert run(packages) == ["6.0", "1"]
-    called.write_text(CALLED.format("50.0"))
+    called.write_text(CALLED.format(kind, "50.0"))
     assert run(packages) == ["100.0", "0"]
 
 
