@@ -78,13 +78,15 @@ def main(folder: Path) -> None:
         twin.simulate(path, sensor="thesis-small", spp=8, seed=SEED, out=capture)
     motion, truth = truth_of(capture)
     assert truth.pose is not None
-    clock = {"clock_offset_s": motion.clock_offset_s}
+    offset = motion.clock_offset_s
     reported = uwlts.read_trajectory(trajectory_path(capture), pose_format="quaternion-xyzw")
-    cloud = uwlts.reconstruct(capture, uwlts.nominal("thesis-small", medium="water"), trajectory=reported, **clock)
-    found = uwlts.align_trajectory(cloud, reported, **clock)
+    cloud = uwlts.reconstruct(
+        capture, uwlts.nominal("thesis-small", medium="water"), trajectory=reported, clock_offset_s=offset
+    )
+    found = uwlts.align_trajectory(cloud, reported, clock_offset_s=offset)
     print(*found.lines(), sep="\n")
     with uwlts.open_capture(capture) as images:
-        times = images.time_s[:] + motion.clock_offset_s
+        times = images.time_s[:] + offset
     true = truth.pose @ np.linalg.inv(motion.mount.matrix())
     before, after = (
         np.sqrt(np.mean(np.sum((each.poses_at(times) - true)[:, :3, 3] ** 2, axis=1)))

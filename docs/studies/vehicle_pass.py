@@ -14,6 +14,7 @@ import argparse
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from moving_scenes import captured, truth_of
@@ -57,40 +58,51 @@ def aligned_pass(path: Path) -> Figures:
     robot = captured(path.parent / path.name.replace("vehicle-pass", "robot-sphere"))
     mount = uwlts.calibrate_mount(robot.selected(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
     reported = uwlts.read_trajectory(trajectory_path(path), pose_format="quaternion-xyzw")
-    clock = {"clock_offset_s": motion.clock_offset_s}
+    offset = motion.clock_offset_s
     cloud = uwlts.reconstruct(
-        path, path.parent / "calibration.json", mount=mount, trajectory=reported, with_uncertainty=False, **clock
+        path,
+        path.parent / "calibration.json",
+        mount=mount,
+        trajectory=reported,
+        with_uncertainty=False,
+        clock_offset_s=offset,
     )
     with uwlts.open_capture(path) as capture:
         times = capture.time_s[:]
     true = truth.pose @ np.linalg.inv((motion.true_mount or motion.mount).matrix())
-    before = reported.poses_at(times + motion.clock_offset_s)
+    before = reported.poses_at(times + offset)
     crossings = crossings_of(truth.pose[:, :2, 3])
     last = times <= times[max(second for _, second in crossings)]
 
     def errors(poses: np.ndarray, part: np.ndarray) -> float:
         return float(np.sqrt(np.mean(np.sum((poses[part, :3, 3] - true[part, :3, 3]) ** 2, axis=1))))
 
-    parts = np.ones(len(times), bool), last, ~last
+    def lengths(corrected: PointCloud) -> tuple[tuple[float, float], ...]:
+        return tuple((length_error(cloud, truth, each), length_error(corrected, truth, each)) for each in crossings)
+
+    def figures(after: np.ndarray, corrected: PointCloud, **others: Any) -> Figures:
+        whole, to_last, behind = (
+            (errors(before, part), errors(after, part)) for part in (np.ones(len(times), bool), last, ~last)
+        )
+        return Figures(whole, to_last, behind, lengths_mm=lengths(corrected), **others)
+
     try:
-        found = uwlts.align_trajectory(cloud, reported, **clock)
+        found = uwlts.align_trajectory(cloud, reported, clock_offset_s=offset)
     except uwlts.Error as error:
-        kept = [(errors(before, part),) * 2 for part in parts]
-        lengths = tuple((length_error(cloud, truth, each),) * 2 for each in crossings)
-        return Figures(*kept, (np.nan, np.nan), lengths, np.nan, 0, str(error))
-    after = found.trajectory.poses_at(times + motion.clock_offset_s)
-    covariance = found.trajectory.covariance_at(times + motion.clock_offset_s)
+        return figures(before, cloud, stated_mm=(np.nan, np.nan), within=np.nan, doubtful=0, refused=str(error))
+    after = found.trajectory.poses_at(times + offset)
+    covariance = found.trajectory.covariance_at(times + offset)
     assert covariance is not None
-    variance = np.einsum("nii->ni", covariance[:, :3, :3])
+    variance = np.einsum("nii->n", covariance[:, :3, :3])
     # The alignment takes the start as exact: the frame is that of the first pose.
     own = (np.linalg.inv(true[0]) @ true)[:, :3, 3] - (np.linalg.inv(after[0]) @ after)[:, :3, 3]
     stated = np.sqrt(np.einsum("ji,njk,ki->ni", true[0, :3, :3], covariance[:, :3, :3], true[0, :3, :3]))
-    return Figures(
-        *((errors(before, part), errors(after, part)) for part in parts),
-        (float(np.sqrt(variance.sum(axis=1).mean())), float(np.sqrt(variance[last].sum(axis=1).mean()))),
-        tuple((length_error(cloud, truth, each), length_error(found.cloud, truth, each)) for each in crossings),
-        float(np.mean(np.abs(own) < 2 * stated)),
-        len(found.doubtful_s),
+    return figures(
+        after,
+        found.cloud,
+        stated_mm=(float(np.sqrt(variance.mean())), float(np.sqrt(variance[last].mean()))),
+        within=float(np.mean(np.abs(own) < 2 * stated)),
+        doubtful=len(found.doubtful_s),
     )
 
 
