@@ -28,7 +28,7 @@ from uwlts.metrology.patches import (
     scatter,
     surface_patches,
 )
-from uwlts.metrology.path_prior import DriftKind, PathPrior, PathSpline
+from uwlts.metrology.path_prior import USUAL_DRIFT, DriftKind, PathPrior, PathSpline
 from uwlts.model.errors import EvaluationError
 from uwlts.storage.cloud import PointCloud
 
@@ -49,7 +49,8 @@ _KINDS = {
 """Values of `DriftKind` that are compared."""
 _STRONG = 6.0
 """Twice the logarithm of a ratio of likelihoods that is strong evidence (Kass and Raftery, Journal of the American
-Statistical Association 90, 1995): by so much a drift that the heading makes must be likelier than one without."""
+Statistical Association 90, 1995): by so much a drift must be likelier than that which is stated, and one that the
+heading makes than one without, or the reverse where that is stated."""
 _STEP = 0.5
 """Of the radius of patches: distance of knots within a crossing. With a whole one a random walk of a third of a
 millimetre an image leaves more between knots than patches scatter; with a quarter nothing is gained.
@@ -65,8 +66,6 @@ FEWEST = 30
 _ROUNDS, _STILL = 15, 0.03
 """Rounds of an estimate at most, and the step that ends it, root mean square in standard deviations: matches that come
 and go keep smaller ones from ending."""
-EXACT_MM, EXACT_RAD = 1e-3, 1e-7
-"""The least drift at the end: navigation is not better."""
 _HELD_OUT = 5
 """Every fifth cube of a crossing, of four radii, is held out and judges the gain."""
 _AGREEING = 0.9
@@ -125,8 +124,17 @@ class Piece:
 class PathEstimate:
     """Coefficients of the correction, round by round, and the pairs of pieces that cross."""
 
-    def __init__(self, cloud: PointCloud, times_s: np.ndarray, path: PathSpline, kind: DriftKind) -> None:
-        self.cloud = cloud
+    def __init__(
+        self,
+        cloud: PointCloud,
+        times_s: np.ndarray,
+        path: PathSpline,
+        kind: DriftKind,
+        *,
+        stated: DriftKind | None = None,
+    ) -> None:
+        """With the kind of drift that is assumed first, and that which the navigation states."""
+        self.cloud, self.stated = cloud, stated
         moments, self._image = np.unique(times_s, return_inverse=True)
         self._moments, self._platform = moments, path.trajectory.poses_at(moments)[:, :3, 3]
         self._speed = path.trajectory.rates_at(moments)[:, :3]
@@ -264,6 +272,8 @@ class PathEstimate:
 
         Standard deviations of equal steps are equally likely beforehand (Gelman, Bayesian Analysis 1, 2006).
         """
+        if self.prior.kind == self.stated:
+            return
         normal, told = self._told()
         kinds = [
             self.prior.kind._replace(smooth=smooth, wandering=wandering)
@@ -387,12 +397,14 @@ class PathEstimate:
     def _likeliest(self) -> DriftKind:
         """Kind of the drift with which the matches as they are now are likeliest."""
         normal, told = self._told()
+        usual = self.stated or USUAL_DRIFT
 
         @cache
         def likelihood(kind: DriftKind) -> float:
-            return _integrated(PathPrior(self.path, kind), normal, told)[0]
+            found = _integrated(PathPrior(self.path, kind), normal, told)[0]
+            return found - _STRONG * abs(kind.by_heading - usual.by_heading)
 
-        best, before = self.prior.kind, None
+        best, before = USUAL_DRIFT._replace(by_heading=usual.by_heading), None
         while best != before:
             before = best
             for name, values in _KINDS.items():
@@ -401,7 +413,9 @@ class PathEstimate:
                     while 0 <= at < len(values) and likelihood(best._replace(**{name: values[at]})) > likelihood(best):
                         best = best._replace(**{name: values[at]})
                         at += side
-        return best
+        if self.stated is None or likelihood(best) > likelihood(self.stated) + _STRONG:
+            return best
+        return self.stated
 
     def _told(self) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix (6 C, 6 C) of the matches as they are now, and its product (6 C, 1) with what they say."""
@@ -481,7 +495,7 @@ def _integrated(prior: PathPrior, normal: np.ndarray, told: np.ndarray) -> tuple
     the lower root (6 C, 6 C) of the normal matrix with the prior."""
     factor = np.linalg.cholesky(prior.with_evidence(normal))
     off = solve_triangular(factor, prior.times_transposed_root(told), lower=True)
-    return float(np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor)))) - _STRONG * prior.kind.by_heading, factor
+    return float(np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor)))), factor
 
 
 def _moved(correction: np.ndarray, platform: np.ndarray, places: np.ndarray) -> np.ndarray:

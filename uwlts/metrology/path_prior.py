@@ -39,6 +39,10 @@ class DriftKind(NamedTuple):
     by_heading: float = 0.0
 
 
+USUAL_DRIFT = DriftKind(smooth=0.0, wandering=0.3, walk=0.01, turn_walk=0.01)
+"""Assumed first where no kind is stated."""
+
+
 @dataclass(frozen=True, eq=False)
 class PathSpline:
     """A trajectory, the knots of the spline over the times of the points, and the drift (6,) at its end, mm and rad, of

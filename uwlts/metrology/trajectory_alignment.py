@@ -15,18 +15,18 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.metrology.crossing_search import SIGMAS, close_crossings, complete
 from uwlts.metrology.patches import scatter
-from uwlts.metrology.path_estimate import EXACT_MM, EXACT_RAD, Pair, PathEstimate
-from uwlts.metrology.path_prior import DriftKind, PathSpline
+from uwlts.metrology.path_estimate import Pair, PathEstimate
+from uwlts.metrology.path_prior import USUAL_DRIFT, DriftKind, PathSpline
 from uwlts.metrology.path_uncertainty import along_corrected_path
+from uwlts.metrology.stated_drift import stated_drift
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory, on_clock
 from uwlts.storage.cloud import PointCloud, read_cloud
 
-_SMOOTH = DriftKind(smooth=0.0, wandering=0.3, walk=0.01, turn_walk=0.01)
 _ROUGH = DriftKind(smooth=0.0, wandering=0.3, walk=0.3, turn_walk=0.3)
-"""Kinds of drift assumed in the search of crossings, the second where the first finds none: fewer
-false crossings fit a stiffer path."""
+"""Kind of drift that is assumed in the search where the stated or usual one finds no crossing: fewer false crossings
+fit a stiffer path."""
 
 
 @dataclass(frozen=True)
@@ -125,8 +125,9 @@ def align_trajectory(
         What to add to the times of the points for those of the trajectory, and by how many parts in a million its clock
         runs faster than theirs.
     drift_mm, drift_deg
-        Standard uncertainty that the navigation has gathered at the end, along each axis; from the covariance of the
-        trajectory unless given. Of which kind the drift is, a steady or changing rate or a random walk, is estimated.
+        Standard uncertainty that the navigation has gathered at the end, along each axis. Of which kind the drift is, a
+        steady or changing rate or a random walk, is estimated then. Unless given the covariance of the trajectory tells
+        both, and the kind is estimated where the surfaces strongly contradict it.
 
     Raises
     ------
@@ -141,10 +142,11 @@ def align_trajectory(
     if cloud.time_s is None:
         raise EvaluationError("the cloud has no times of its points: reconstruct it with a trajectory")
     times = on_clock(cloud.time_s, offset_s=clock_offset_s, drift_ppm=clock_drift_ppm)
-    path = PathSpline.of(trajectory, *_drift(trajectory, drift_mm, drift_deg), times)
+    drift = stated_drift(trajectory, drift_mm, drift_deg)
+    path = PathSpline.of(trajectory, drift.size, drift.measured, times)
     left_out: tuple[tuple[float, float], ...] = ()
-    for turn, kind in enumerate((_SMOOTH, _ROUGH)):
-        estimate = PathEstimate(cloud, times, path, kind)
+    for turn, kind in enumerate((drift.kind or USUAL_DRIFT, _ROUGH)):
+        estimate = PathEstimate(cloud, times, path, kind, stated=drift.kind)
 
         def searched(done: int, total: int, turn: int = turn) -> None:
             progress(turn * total + done, (turn + 1) * total)
@@ -162,24 +164,6 @@ def align_trajectory(
         f"the path shows no surface twice, within {SIGMAS:g} standard deviations of its drift, that tells where "
         f"it is{at}: cross an earlier part of the path over a surface with features"
     )
-
-
-def _drift(trajectory: Trajectory, drift_mm: float | None, drift_deg: float | None) -> tuple[np.ndarray, np.ndarray]:
-    """Drift (6,) of each component of the poses at the end, mm and rad, and which (6,) are measured all along."""
-    if (drift_mm is None) != (drift_deg is None):
-        raise EvaluationError("the drift needs both parts: drift_mm and drift_deg")
-    if drift_mm is not None and drift_deg is not None:
-        if not (0 < drift_mm < np.inf and 0 < drift_deg < 90):
-            raise EvaluationError(f"the drift is {drift_mm:g} mm and {drift_deg:g} deg; expected positive numbers")
-        return np.repeat([drift_mm, float(np.radians(drift_deg))], 3), np.zeros(6, bool)
-    if trajectory.covariance is None:
-        raise EvaluationError("the trajectory states no covariance: give drift_mm and drift_deg")
-    variance = np.einsum("nii->ni", trajectory.covariance)
-    grown = np.maximum(variance.max(axis=0) - variance[0], 0.0)
-    # What is measured all along, as depth and tilt, differs from its start by up to twice its variance.
-    measured = (grown < variance[0]) & (2 * variance[0] < np.repeat(grown.reshape(2, 3).max(axis=1), 3))
-    drift = np.sqrt(np.where(measured, 2 * variance[0], grown))
-    return np.maximum(drift, np.repeat([EXACT_MM, EXACT_RAD], 3)), measured
 
 
 def _result(
