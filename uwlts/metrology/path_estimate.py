@@ -320,12 +320,14 @@ class PathEstimate:
         return bool(np.count_nonzero(held) < _FEWEST_HELD_OUT or np.mean(fits[held]) >= _AGREEING)
 
     def tells(self, pair: Pair) -> bool:
-        """Whether the surfaces of a pair tell more than they determine of the path, but for its random walk.
+        """Whether the surfaces of a pair tell more than they determine of the path, but for its random walks.
 
-        The walk is small within a crossing; patches that are held out judge what it takes.
+        Walks are small within a crossing; patches that are held out judge what they take.
         """
         columns, normal, _ = self._of_pair(pair, None)
-        steady = PathPrior(self.path, self.prior.kind._replace(walk=_WALKS[0], turn_walk=_WALKS[0]))
+        # What is measured all along walks, too.
+        path = replace(self.path, measured=np.zeros(6, bool))
+        steady = PathPrior(path, self.prior.kind._replace(walk=_WALKS[0], turn_walk=_WALKS[0]))
         covariance = steady.covariance(inv(steady.with_evidence(self._evidence({})[0]), assume_a="pos"))
         determined = float(np.sum(normal * covariance[np.ix_(columns, columns)]))
         fits = self.matched(pair)[1]
