@@ -50,7 +50,9 @@ _KINDS = {
 _STRONG = 6.0
 """Twice the logarithm of a ratio of likelihoods that is strong evidence (Kass and Raftery, Journal of the American
 Statistical Association 90, 1995): by so much a drift must be likelier than that which is stated, and one that the
-heading makes than one without, or the reverse where that is stated."""
+heading makes than one without where nothing is stated."""
+_FLAT = 0.1
+"""The same that tells nothing."""
 _STEP = 0.5
 """Of the radius of patches: distance of knots within a crossing. With a whole one a random walk of a third of a
 millimetre an image leaves more between knots than patches scatter; with a quarter nothing is gained.
@@ -272,7 +274,7 @@ class PathEstimate:
 
         Standard deviations of equal steps are equally likely beforehand (Gelman, Bayesian Analysis 1, 2006).
         """
-        if self.prior.kind == self.stated:
+        if self.stated is not None and self.prior.kind[:2] == self.stated[:2]:
             return
         normal, told = self._told()
         kinds = [
@@ -397,27 +399,34 @@ class PathEstimate:
         return float(np.sqrt(np.sum(step * (self._normal @ step)) / len(step)))
 
     def _likeliest(self) -> DriftKind:
-        """Kind of the drift with which the matches as they are now are likeliest."""
+        """Kind of the drift with which the matches as they are now are likeliest.
+
+        Where a kind is stated only what they strongly contradict is changed.
+        """
         normal, told = self._told()
-        usual = self.stated or USUAL_DRIFT
+        least = 0.0 if self.stated is None else _STRONG
 
         @cache
         def likelihood(kind: DriftKind) -> float:
             found = _integrated(PathPrior(self.path, kind), normal, told)[0]
-            return found - _STRONG * abs(kind.by_heading - usual.by_heading)
+            return found - (_STRONG * kind.by_heading if self.stated is None else 0.0)
 
-        best, before = USUAL_DRIFT._replace(by_heading=usual.by_heading), None
+        best, before = self.stated or USUAL_DRIFT, None
         while best != before:
             before = best
             for name, values in _KINDS.items():
-                for side in (1, -1):
-                    at = values.index(getattr(best, name)) + side
-                    while 0 <= at < len(values) and likelihood(best._replace(**{name: values[at]})) > likelihood(best):
-                        best = best._replace(**{name: values[at]})
-                        at += side
-        if self.stated is None or likelihood(best) > likelihood(self.stated) + _STRONG:
-            return best
-        return self.stated
+                here = getattr(best, name)
+                larger, smaller = ([each for each in values if (each - here) * side > 0] for side in (1, -1))
+                for beyond in (larger, smaller[::-1]):
+                    found = best
+                    for value in beyond:
+                        tried = best._replace(**{name: value})
+                        if likelihood(tried) <= likelihood(found) + _FLAT:
+                            break
+                        found = tried
+                    if likelihood(found) > likelihood(best) + least:
+                        best = found
+        return best
 
     def _told(self) -> tuple[np.ndarray, np.ndarray]:
         """Normal matrix (6 C, 6 C) of the matches as they are now, and its product (6 C, 1) with what they say."""

@@ -127,7 +127,7 @@ def align_trajectory(
     drift_mm, drift_deg
         Standard uncertainty that the navigation has gathered at the end, along each axis. Of which kind the drift is, a
         steady or changing rate or a random walk, is estimated then. Unless given the covariance of the trajectory tells
-        both, and the kind is estimated where the surfaces strongly contradict it.
+        both, and what of the kind the surfaces strongly contradict is estimated.
 
     Raises
     ------
