@@ -4,7 +4,7 @@
 
 The vehicle, its navigation and the sea bed are those of `tests/uwlts/path_views.py`; ``--walk`` adds a random walk, a
 multiple of the drift. First it prints by which factor the best linear estimate of a drift of known kind lowers the path
-error, that is told the displacement at the three crossings exactly (`best`), for kinds of drift.
+error, given the exact displacement at the three crossings (`best`), for kinds of drift.
 """
 
 import argparse
@@ -50,8 +50,8 @@ def main() -> None:
         print(f"{words}: at best {min(best(*shares), 1000):.1f} times")
     # Of `ride`: a rate of 0.7 to 1.2 times the drift, a wave of a fifth of it, and the walk.
     own = {"rate": (1.2**3 - 0.7**3) / 1.5, "wandering": 0.0, "walk": given.walk**2, "wave": 0.2}
-    told = min(best(**own), 1000), min(best(**own, apart=SWATH_MM / LENGTH_MM), 1000)
-    print(f"drift of these rides: at best {told[0]:.1f} times, {told[1]:.1f} times by the rates within crossings, too")
+    bounds = [min(best(**own, apart=apart), 1000) for apart in (0.0, SWATH_MM / LENGTH_MM)]
+    print(f"drift of these rides: at best {bounds[0]:.1f} times, {bounds[1]:.1f} times with the rates within crossings")
     for seed in given.seeds:
         drift = {"drift_mm": given.drift_mm, "drift_deg": given.drift_deg}
         cloud, reported, true = ride(np.random.default_rng(seed), PASS_MM, walk=given.walk, **drift)
@@ -89,9 +89,9 @@ def best(rate: float, wandering: float, walk: float, *, wave: float = 0.0, apart
     """Times by which three exact crossings lower the rms error of a path, at best: the drift is a Gaussian process.
 
     The parts of its variance at the end are those of a steady rate, of a rate that walks at random, and of a random
-    walk; ``wave`` is the amplitude of that of `ride`. Told are the displacements at two places ``apart`` of the path
-    within each crossing, which tell the rates there, too. A linear Gaussian estimate by the true covariance has the
-    least error of all.
+    walk; ``wave`` is the amplitude of that of `ride`. Given are the displacements at two places ``apart`` of the path
+    within each crossing, which determine the rates there, too. A linear Gaussian estimate by the true covariance has
+    the least error of all.
     """
     count = 2000
     t = np.arange(1, count + 1) / count

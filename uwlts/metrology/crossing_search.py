@@ -197,7 +197,7 @@ def _closed(estimate: PathEstimate, hypothesis: Hypothesis) -> bool:
     estimate.estimate({hypothesis.pair: hypothesis.pose})
     estimate.lay_anew(hypothesis.pair)
     estimate.estimate({})
-    if estimate.agrees(hypothesis.pair) and estimate.tells(hypothesis.pair):
+    if estimate.agrees(hypothesis.pair) and estimate.is_overdetermined(hypothesis.pair):
         return True
     estimate.restore(before)
     return False

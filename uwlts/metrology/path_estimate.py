@@ -1,9 +1,9 @@
 """Least squares for a smooth correction of a path, by the surfaces that it shows more than once.
 
-Unknown is a correction of every pose, a shift (mm) and a turn (rad) in the base frame about the platform, with what
-`path_prior` knows beforehand of it. Of which kind the drift is, is what makes the evidence likeliest (empirical Bayes:
-MacKay, Neural Computation 4, 1992). Residuals are distances between patches of the surface where the path crosses
-itself. Movements that the surface leaves open there, as along a plain pipe, stay with what is known beforehand.
+The unknowns are a correction of every pose, a shift (mm) and a turn (rad) in the base frame about the platform, with
+the prior of `path_prior`. The kind of drift is the one of maximum marginal likelihood (empirical Bayes: MacKay, Neural
+Computation 4, 1992). Residuals are distances between patches of the surface where the path crosses itself. Movements
+that the surface leaves open there, as along a plain pipe, keep their prior.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _STRONG = 6.0
 Statistical Association 90, 1995): by so much a drift must be likelier than that which is stated, and one that the
 heading makes than one without where nothing is stated."""
 _FLAT = 0.1
-"""The same that tells nothing."""
+"""A smaller difference of the same counts as none."""
 _STEP = 0.5
 """Of the radius of patches: distance of knots within a crossing. With a whole one a random walk of a third of a
 millimetre an image leaves more between knots than patches scatter; with a quarter nothing is gained.
@@ -276,12 +276,13 @@ class PathEstimate:
         """
         if self.stated is not None and self.prior.kind[:2] == self.stated[:2]:
             return
-        normal, told = self._told()
+        normal, right = self._normal_equations({})
         kinds = [
             self.prior.kind._replace(smooth=smooth, wandering=wandering)
             for smooth, wandering in product(_KINDS["smooth"], _KINDS["wandering"])
         ]
-        likelihoods = np.array([_integrated(PathPrior(self.path, kind), normal, told)[0] for kind in kinds])
+        # The factors of all kinds together would take gigabytes: those that count are calculated again.
+        likelihoods = np.array([_integrated(PathPrior(self.path, kind), normal, right)[0] for kind in kinds])
         steps = (np.gradient(np.sqrt(_KINDS[name])) for name in ("smooth", "wandering"))
         weights = np.exp((likelihoods - likelihoods.max()) / 2) * np.outer(*steps).ravel()
         weights /= weights.max()
@@ -289,9 +290,9 @@ class PathEstimate:
         mean, square = np.zeros_like(self.coefficients), np.zeros_like(normal)
         for number in kept:
             weight, prior = weights[number] / weights[kept].sum(), PathPrior(self.path, kinds[number])
-            factor = _integrated(prior, normal, told)[1]
+            factor = _integrated(prior, normal, right)[1]
             inverse = cho_solve((factor, True), np.eye(len(factor)))
-            found = prior.times_root(inverse @ prior.times_transposed_root(told))[:, 0]
+            found = prior.times_root(inverse @ prior.times_transposed_root(right))[:, 0]
             mean += weight * found
             square += weight * (prior.covariance(inverse) + np.outer(found, found))
         self.coefficients, self._covariance = mean, square - np.outer(mean, mean)
@@ -321,16 +322,16 @@ class PathEstimate:
         held = self.held_out(pair, found)
         return bool(np.count_nonzero(held) < _FEWEST_HELD_OUT or np.mean(fits[held]) >= _AGREEING)
 
-    def tells(self, pair: Pair) -> bool:
-        """Whether the surfaces of a pair tell more than they determine of the path, but for its random walks.
+    def is_overdetermined(self, pair: Pair) -> bool:
+        """Whether a pair has several independent distances for each parameter of the path that it determines.
 
-        Walks are small within a crossing; patches that are held out judge what they take.
+        Random walks do not count: they are small within a crossing, and held-out patches judge what they take.
         """
         columns, normal, _ = self._of_pair(pair, None)
         # What is measured all along walks, too.
         path = replace(self.path, measured=np.zeros(6, bool))
         steady = PathPrior(path, self.prior.kind._replace(walk=_WALKS[0], turn_walk=_WALKS[0]))
-        covariance = steady.covariance(inv(steady.with_evidence(self._evidence({})[0]), assume_a="pos"))
+        covariance = steady.covariance(inv(steady.with_evidence(self._normal_equations({})[0]), assume_a="pos"))
         determined = float(np.sum(normal * covariance[np.ix_(columns, columns)]))
         fits = self.matched(pair)[1]
         return bool(np.count_nonzero(fits) / self.pieces[pair[1]].patches.shared > _PER_PARAMETER * determined)
@@ -390,10 +391,10 @@ class PathEstimate:
 
     def _round(self, seed: dict[Pair, np.ndarray]) -> float:
         """One step of least squares; returns its root mean square, in standard deviations of what is estimated."""
-        normal, gradient = self._evidence(seed)
+        normal, right = self._normal_equations(seed)
         self._normal, self._covariance = self.prior.with_evidence(normal), None
-        told = self.prior.times_transposed_root((normal @ self.coefficients - gradient)[:, None])
-        before, self._numbers = self._numbers, cho_solve(cho_factor(self._normal, check_finite=False), told)
+        factor = cho_factor(self._normal, check_finite=False)
+        before, self._numbers = self._numbers, cho_solve(factor, self.prior.times_transposed_root(right))
         self.coefficients = self.prior.times_root(self._numbers)[:, 0]
         step = self._numbers - before
         return float(np.sqrt(np.sum(step * (self._normal @ step)) / len(step)))
@@ -403,12 +404,12 @@ class PathEstimate:
 
         Where a kind is stated only what they strongly contradict is changed.
         """
-        normal, told = self._told()
+        normal, right = self._normal_equations({})
         least = 0.0 if self.stated is None else _STRONG
 
         @cache
         def likelihood(kind: DriftKind) -> float:
-            found = _integrated(PathPrior(self.path, kind), normal, told)[0]
+            found = _integrated(PathPrior(self.path, kind), normal, right)[0]
             return found - (_STRONG * kind.by_heading if self.stated is None else 0.0)
 
         best, before = self.stated or USUAL_DRIFT, None
@@ -428,23 +429,19 @@ class PathEstimate:
                         best = found
         return best
 
-    def _told(self) -> tuple[np.ndarray, np.ndarray]:
-        """Normal matrix (6 C, 6 C) of the matches as they are now, and its product (6 C, 1) with what they say."""
-        normal, gradient = self._evidence({})
-        return normal, (normal @ self.coefficients - gradient)[:, None]
-
-    def _evidence(self, seed: dict[Pair, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Normal matrix and gradient of the distances between all pairs, without what is known beforehand."""
+    def _normal_equations(self, seed: dict[Pair, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Normal matrix (6 C, 6 C) and right-hand side (6 C, 1) for the coefficients by the distances between all
+        pairs, without the prior."""
         count = 6 * self.path.count
         normal, gradient = np.zeros((count, count)), np.zeros(count)
         for pair in self.pairs:
             columns, own, slope = self._of_pair(pair, seed.get(pair))
             normal[np.ix_(columns, columns)] += own
             gradient[columns] += slope
-        return normal, gradient
+        return normal, (normal @ self.coefficients - gradient)[:, None]
 
     def _of_pair(self, pair: Pair, seed: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Numbers (K,) of the unknowns that one pair tells of, normal matrix and gradient; by its pose (4, 4) where
+        """Numbers (K,) of the unknowns that one pair depends on, normal matrix and gradient; by its pose (4, 4) where
         that differs from the present one."""
         patches = {number: self.moved(number) for number in pair}
         poses = {pair[0]: np.eye(4), pair[1]: np.eye(4) if seed is None else seed}
@@ -501,11 +498,11 @@ class PathEstimate:
         return columns, normal, gradient
 
 
-def _integrated(prior: PathPrior, normal: np.ndarray, told: np.ndarray) -> tuple[float, np.ndarray]:
+def _integrated(prior: PathPrior, normal: np.ndarray, right: np.ndarray) -> tuple[float, np.ndarray]:
     """Twice the logarithm of the likelihood, but for what all kinds have in common, with the path integrated out; and
     the lower root (6 C, 6 C) of the normal matrix with the prior."""
     factor = np.linalg.cholesky(prior.with_evidence(normal))
-    off = solve_triangular(factor, prior.times_transposed_root(told), lower=True)
+    off = solve_triangular(factor, prior.times_transposed_root(right), lower=True)
     return float(np.sum(off**2) - 2 * np.sum(np.log(np.diag(factor)))), factor
 
 

@@ -1,9 +1,10 @@
-"""What is known beforehand of the correction of a path: how far, and in which ways, its navigation drifts.
+"""Prior distribution of the correction of a path: how far, and in which ways, its navigation drifts.
 
 A navigation drifts from an exact start by a steady rate (a bias of velocity or gyroscope), by a rate that changes
 smoothly (temperature), by one that wanders (instability of the bias), and by a random walk (noise of the velocity);
-these are the integrated Wiener processes of orders two, one and none. A heading that is wrong by e turns the way that
-is reckoned from velocities: the position errs by the integral of e z x v (Farrell, Aided Navigation, 2008, chapter 12).
+these are the integrated Wiener processes of orders two, one and none. Where positions are dead-reckoned from velocities
+v, a heading error e adds the integral of e z x v to the error of the position (Farrell, Aided Navigation, 2008,
+chapter 12).
 What is measured all along, as a depth or a tilt, walks within the bounds of its variance. The correction is a cubic
 B-spline in time.
 """
@@ -29,8 +30,8 @@ _EXACT = 1e-10
 
 class DriftKind(NamedTuple):
     """Variances at the end of a rate that changes smoothly, of one that wanders, and of random walks of shifts and of
-    turns, over that of a steady rate, which alone would come to the drift as it is stated; and whether the heading
-    turns the way (1 or 0)."""
+    turns, over that of a steady rate, which alone would come to the drift as it is stated; and whether positions are
+    dead-reckoned with the heading (1 or 0)."""
 
     smooth: float
     wandering: float
@@ -48,7 +49,7 @@ class PathSpline:
     """A trajectory, the knots of the spline over the times of the points, and the drift (6,) at its end, mm and rad, of
     components of which some (6,) are measured all along.
 
-    Knots lie evenly, and closer where the path crosses itself: there the surface tells how the drift walks.
+    Knots lie evenly, and closer where the path crosses itself: there the surface determines the random walk.
     """
 
     trajectory: Trajectory
@@ -204,10 +205,10 @@ class PathPrior:
         result = np.empty_like(parts)
         for components, _, lower in self._groups:
             rows = parts[:, components].reshape(self.path.count, -1)
-            # Matches tell of coefficients near crossings alone.
-            told = rows.any(axis=1)
-            root = (lower.T if transposed else lower)[:, told]
-            result[:, components] = (root @ rows[told]).reshape(self.path.count, len(components), -1)
+            # Matches depend on coefficients near crossings alone.
+            used = rows.any(axis=1)
+            root = (lower.T if transposed else lower)[:, used]
+            result[:, components] = (root @ rows[used]).reshape(self.path.count, len(components), -1)
         return result.reshape(matrix.shape)
 
 

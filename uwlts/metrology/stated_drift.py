@@ -1,4 +1,4 @@
-"""How far a navigation drifts, and in which ways, as the covariance of its poses says."""
+"""Size and kind of a navigation's drift by the covariance of its poses."""
 
 from __future__ import annotations
 
@@ -14,8 +14,12 @@ from uwlts.model.trajectory import Trajectory
 
 _EXACT = np.repeat([1e-3, 1e-7], 3)
 """The least drift at the end, mm and rad: navigation is not better."""
-_LEAST_RATE, _LEAST_WALK = 1e-3, 1e-7
-"""Least part of a steady rate in the variance at the end, and of a random walk in that of a steady rate."""
+_LEAST_RATE = 1e-3
+"""Least part of a steady rate in the variance at the end."""
+_LEAST = 1e-7
+"""Smaller parts of a variance count as this one."""
+_AS_DEAD_RECKONED = 0.5
+"""Of the covariance of shift and heading by dead reckoning: positions with more are taken as dead-reckoned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +58,9 @@ def stated_drift(trajectory: Trajectory, drift_mm: float | None, drift_deg: floa
     if trajectory.covariance is None:
         raise EvaluationError("the trajectory states no covariance: give drift_mm and drift_deg")
     variance = np.einsum("nii->ni", trajectory.covariance).copy()
-    by_heading = _heading_turns_the_way(trajectory)
+    by_heading = _is_dead_reckoned(trajectory)
     if by_heading:
-        # What the heading does to the way comes besides.
+        # The prior adds the part that the heading causes.
         variance[:, :2] -= trajectory.covariance[:, :2, 5] ** 2 / np.maximum(variance[:, 5:], _EXACT[5] ** 2)
     grown = np.maximum(variance.max(axis=0) - variance[0], _EXACT**2)
     # What is measured all along differs from its start by up to twice its variance.
@@ -67,7 +71,7 @@ def stated_drift(trajectory: Trajectory, drift_mm: float | None, drift_deg: floa
         shares = _shares(trajectory.times_s, (variance / grown)[:, which])
         size[which] = shares[0] * grown[which]
         wandering.append(float(shares[1] / shares[0]))
-        walks.append(max(float(shares[2] / shares[0]), _LEAST_WALK))
+        walks.append(max(float(shares[2] / shares[0]), _LEAST))
     kind = DriftKind(0.0, wandering[0], *walks, by_heading=float(by_heading))
     return StatedDrift(np.maximum(np.sqrt(size), _EXACT), measured, kind)
 
@@ -82,7 +86,7 @@ def _shares(times_s: np.ndarray, variances: np.ndarray) -> np.ndarray:
     if count == 0:
         return np.array([1.0, 0.0, 0.0])
     t = np.tile((times_s - times_s[0]) / (times_s[-1] - times_s[0]), count)[:, None]
-    size = np.maximum(variances.T.reshape(-1, 1), _LEAST_WALK)
+    size = np.maximum(variances.T.reshape(-1, 1), _LEAST)
 
     def fit(before: float) -> tuple[np.ndarray, float]:
         return nnls((t + 10**before) ** (2, 3, 1) / size, np.ones(len(t)))
@@ -94,8 +98,8 @@ def _shares(times_s: np.ndarray, variances: np.ndarray) -> np.ndarray:
     return np.maximum(parts, (_LEAST_RATE, 0.0, 0.0))
 
 
-def _heading_turns_the_way(trajectory: Trajectory) -> bool:
-    """Whether the covariance of shift and heading is that of a way which is reckoned from velocities v.
+def _is_dead_reckoned(trajectory: Trajectory) -> bool:
+    """Whether the covariance of shift and heading is that of positions which are dead-reckoned from velocities v.
 
     A heading whose error grows steadily to a variance V gives sqrt(V(t)) times the integral of sqrt(V) z x v until t.
     """
@@ -105,4 +109,4 @@ def _heading_turns_the_way(trajectory: Trajectory) -> bool:
     aside = heading[:, None] * np.column_stack([-velocity[:, 1], velocity[:, 0]])
     expected = heading[:, None] * cumulative_trapezoid(aside, trajectory.times_s, axis=0, initial=0.0)
     stated = trajectory.covariance[:, :2, 5]
-    return bool(np.sum(stated * expected) > 0.5 * np.sum(expected**2))
+    return bool(np.sum(stated * expected) > _AS_DEAD_RECKONED * np.sum(expected**2))

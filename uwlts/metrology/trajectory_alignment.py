@@ -1,7 +1,7 @@
 """Self-consistency of a scan along a path: a correction of the path, by surfaces that it shows more than once.
 
-`path_prior` states what is known beforehand, `path_estimate` how the correction is found, `crossing_search` how
-crossings are.
+`path_prior` is the prior of the correction, `stated_drift` reads its size and kind from the trajectory, `path_estimate`
+finds the correction and `crossing_search` the crossings.
 """
 
 from __future__ import annotations

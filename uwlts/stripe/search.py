@@ -130,9 +130,9 @@ def search_all(
 def with_rivals(
     profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, known: np.ndarray, rules: SearchRules
 ) -> np.ndarray:
-    """On which of some lines (M,) something stands out in the board ``left`` by `search` that is no spike: (M,) bool.
+    """Mask (M,) of the lines on which something stands out in the board ``left`` by `search` that is no spike.
 
-    Those of which it is ``known`` (M,) are not looked at.
+    Lines that are ``known`` (M,) to have it are not searched.
     """
     found = known.copy()
     _see_rivals(profiles, left, lines, np.empty(rules.block + 2, np.float32), rules, found)

@@ -1,4 +1,4 @@
-"""What is known beforehand of a path, against drifts that are drawn step by step."""
+"""Prior of the correction of a path, against drifts that are drawn step by step."""
 
 import numpy as np
 
@@ -73,11 +73,11 @@ def test_closer_knots_follow_a_random_walk():
     assert closer.unresolved(times)[:, 0].mean() < even.unresolved(times)[:, 0].mean() / 4
 
 
-def test_a_wrong_heading_turns_the_way():
+def test_a_heading_error_adds_to_a_dead_reckoned_position():
     prior = PathPrior(spline(), DriftKind(smooth=0.0, wandering=0.003, walk=1e-7, turn_walk=1e-7, by_heading=1.0))
     alone = PathPrior(spline(), DriftKind(smooth=0.0, wandering=0.003, walk=1e-7, turn_walk=1e-7))
     with_, without = (covariance(each, np.array([SECONDS]))[0, :, 0] for each in (prior, alone))
-    # A heading that grows steadily to e turns the way by e / 2 of its length, to the side.
+    # A heading that grows steadily to e shifts the end by e / 2 of the length of the path, to the side.
     aside = DRIFT[5] * SPEED_MM_S * SECONDS / 2
     np.testing.assert_allclose(with_[1, 1] - without[1, 1], aside**2, rtol=0.01)
     np.testing.assert_allclose(with_[1, 5], aside * DRIFT[5], rtol=0.01)

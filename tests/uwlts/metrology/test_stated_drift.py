@@ -14,7 +14,7 @@ DEPTH_MM, TILT = 3.0, 2e-3
 
 
 def navigated(*, by_heading: bool) -> Trajectory:
-    """There and back along two sides of a square, from 2 s after the navigation's start on.
+    """Along X, then along Y, from 2 s after the navigation's start on.
 
     The state is the error of x, y and heading, and their biases.
     """
@@ -39,12 +39,12 @@ def navigated(*, by_heading: bool) -> Trajectory:
 
 
 @pytest.mark.parametrize("by_heading", [True, False])
-def test_a_covariance_tells_rates_walks_and_what_the_heading_does(by_heading: bool):
+def test_rates_walks_and_dead_reckoning_are_found_from_the_covariance(by_heading: bool):
     found = stated_drift(navigated(by_heading=by_heading), None, None)
     assert found.kind is not None
     assert found.kind.by_heading == by_heading
     assert found.measured.tolist() == [False, False, True, True, True, False]
-    # What the heading does is taken off; a walk of the heading leaves some of it.
+    # The part that the heading causes is taken off; its random walk leaves some of it.
     np.testing.assert_allclose(found.size[[0, 1, 5]], np.array([BIAS_MM_S, BIAS_MM_S, GYRO]) * SECONDS, rtol=0.05)
     np.testing.assert_allclose(found.size[2:5] ** 2, 2 * np.array([DEPTH_MM, TILT, TILT]) ** 2)
     # The rate has drifted for 2 s before: v(t) - v(0) is no square alone.
