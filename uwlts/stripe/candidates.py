@@ -15,6 +15,8 @@ from statistics import NormalDist
 import cv2
 import numpy as np
 
+from uwlts.runtime.compiled import compiled
+
 _NOISE_SAMPLES = 1024
 
 MEDIAN_SURROUNDINGS = NormalDist().inv_cdf(1.0 - (1.0 - math.sqrt(0.5)) ** 0.5)
@@ -27,19 +29,29 @@ def block_extremes(profiles: np.ndarray, block: int) -> tuple[np.ndarray, np.nda
     The largest of all pixels, and the smaller of two pixels half a block apart, which no hot pixel raises. The last
     block of a line may be smaller.
     """
-    count, lines = profiles.shape
-    whole = count // block
-    blocks = profiles[: whole * block].reshape(whole, block, lines)
-    # The two pixels of the background come first, so that they are fetched from memory only once.
-    first, *others = (blocks[:, k] for k in range(block))
-    middle = others.pop(block // 2 - 1)
-    high, low = cv2.max(first, middle), cv2.min(first, middle)
-    for pixel in others:
-        cv2.max(high, pixel, dst=high)
-    if whole * block == count:
-        return high, low
-    rest = profiles[whole * block :]
-    return np.vstack([high, rest.max(axis=0)]), np.vstack([low, np.minimum(rest[0], rest[rest.shape[0] // 2])])
+    high, low = np.empty((2, math.ceil(profiles.shape[0] / block), profiles.shape[1]), profiles.dtype)
+    _fill_extremes(profiles, block, high, low)
+    return high, low
+
+
+@compiled
+def _fill_extremes(profiles: np.ndarray, block: int, high: np.ndarray, low: np.ndarray) -> None:
+    """Fill the extremes of `block_extremes`, pixel by pixel as they lie in memory, which is what takes the time."""
+    count = profiles.shape[0]
+    for first in range(0, count, block):
+        largest, least = high[first // block], low[first // block]
+        middle = first + min(block, count - first) // 2
+        for n in range(first, min(first + block, count)):
+            pixels = profiles[n]
+            if n == first:
+                for k in range(pixels.size):
+                    largest[k] = least[k] = pixels[k]
+            elif n == middle:
+                for k in range(pixels.size):
+                    largest[k], least[k] = max(largest[k], pixels[k]), min(least[k], pixels[k])
+            else:
+                for k in range(pixels.size):
+                    largest[k] = max(largest[k], pixels[k])
 
 
 def block_contrast(high: np.ndarray, low: np.ndarray, *, out: np.ndarray) -> np.ndarray:

@@ -220,8 +220,6 @@ def _found(
         nothing = np.zeros(len(found.status), bool)
         return found, nothing, nothing, None
     block = options.half_window_px // 2
-    # Read in the order of memory first, an image costs a third less than by the rows of its blocks alone.
-    brightest = profiles.max()
     high, low = block_extremes(profiles, block)
     # Blocks more at either end of the lines, so that what one window covers can be crossed out without a check.
     board = np.zeros((high.shape[0] + 2 * MARGIN, high.shape[1]), high.dtype)
@@ -235,7 +233,7 @@ def _found(
     status, wide, several, peak = search(profiles, left, detection.rules)
     glare = wide.copy()
     # A plateau wider than the window does not even stick out.
-    white = low.max(axis=0) >= clip if brightest >= clip and low.max() >= clip else np.zeros(len(status), np.bool_)
+    white = low.max(axis=0) >= clip if low.max() >= clip else np.zeros(len(status), np.bool_)
     wide |= white
     amplitude, width = np.full((2, len(status)), np.nan, np.float32)
     found = _Lines(np.full(len(status), np.nan), amplitude, width, status, wide, white)
@@ -284,30 +282,33 @@ class _Extracted:
         rough, its width NaN.
         """
         stripe, seen, options = self.stripe, self.detection, self.options
-        count, along = len(stripe.status), stripe.stripe_along
         if seen is None:
-            lines = np.intersect1d(lines, stripe.lines)
-            centre, amplitude, width = (each[lines] for each in (stripe.centre_px, stripe.amplitude, stripe.width_px))
-            return StripeCandidates(lines, centre, amplitude, width, np.zeros(len(lines)), count, along)
-        line, clear, peak = np.empty(0, np.intp), np.empty(0, np.bool_), None
-        if len(lines):
-            board = np.ascontiguousarray(seen.board[:, lines].T)
-            line, clear, peak = search_all(self.profiles, board, lines, seen.rules, fewest=2 if rivals else 1)
-            if not rivals:
-                line, clear, peak = line[clear], clear[clear], peak.keep(clear)
-        place, amplitude = np.empty(len(line)), np.empty(len(line), np.float32)
+            return self._own(np.intersect1d(lines, stripe.lines))
+        board = np.ascontiguousarray(seen.board[:, lines].T)
+        line, clear, peak = search_all(self.profiles, board, lines, seen.rules, fewest=2 if rivals else 1)
+        if not rivals:
+            line, clear, peak = line[clear], clear[clear], peak.keep(clear)
+        if not len(line):
+            return self._own(line)
+        place, amplitude = peak.start + peak.middle.astype(float), peak.height.copy()
         width, certainty = np.full(len(line), np.nan, np.float32), np.zeros(len(line))
-        if peak is not None and len(line):
-            place[:], amplitude[:] = peak.start + peak.middle, peak.height
-            measured = peak.keep(clear)
-            centre, amplitude[clear] = place_centre(options.method, measured)
-            place[clear], width[clear] = measured.start + centre.astype(float), measured.sigma * FWHM_PER_SIGMA
-            # A matched filter: the squared height over the noise, summed over the profile of a Gaussian.
-            sharp = amplitude[clear] / max(seen.noise, _LEAST_NOISE)
-            certainty[clear] = 0.5 * math.sqrt(math.pi) * measured.kernel_sigma() * sharp**2
+        measured = peak.keep(clear)
+        centre, amplitude[clear] = place_centre(options.method, measured)
+        place[clear], width[clear] = measured.start + centre.astype(float), measured.sigma * FWHM_PER_SIGMA
+        # A matched filter: the squared height over the noise, summed over the profile of a Gaussian.
+        sharp = amplitude[clear] / max(seen.noise, _LEAST_NOISE)
+        certainty[clear] = 0.5 * math.sqrt(math.pi) * measured.kernel_sigma() * sharp**2
         order = np.lexsort((place, line))
         line, place, certainty = line[order], place[order], certainty[order]
-        return StripeCandidates(line, place, amplitude[order], width[order], certainty, count, along)
+        return StripeCandidates(
+            line, place, amplitude[order], width[order], certainty, len(stripe.status), stripe.stripe_along
+        )
+
+    def _own(self, lines: np.ndarray) -> StripeCandidates:
+        """The stripe itself on some of its lines (M,)."""
+        of = self.stripe
+        centre, amplitude, width = (each[lines] for each in (of.centre_px, of.amplitude, of.width_px))
+        return StripeCandidates(lines, centre, amplitude, width, np.zeros(len(lines)), len(of.status), of.stripe_along)
 
 
 @dataclass(frozen=True)

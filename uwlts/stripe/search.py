@@ -282,9 +282,7 @@ def _search_all(
             there = _greatest_block(blocks)
             if there < rules.coarse or there <= 0 or count == first + _MOST:
                 break
-            chosen = 0
-            while blocks[chosen] != there:
-                chosen += 1
+            chosen = _first_equal(blocks, there)
             blocks[chosen] = 0
             start = (chosen - MARGIN) * rules.block - rules.half
             if there < _CLEAR * rules.fine:
@@ -389,6 +387,15 @@ def _greatest_block(blocks: np.ndarray) -> np.number:
 
 
 @compiled_part
+def _first_equal(blocks: np.ndarray, height: np.number) -> int:
+    """The first block of a height that one has. All are looked at, many at a time: faster than to stop at the first."""
+    chosen = np.int32(blocks.size)
+    for k in range(np.int32(blocks.size)):
+        chosen = min(chosen, np.int32(k) if blocks[k] == height else np.int32(blocks.size))
+    return int(chosen)
+
+
+@compiled_part
 def _next_block(blocks: np.ndarray, highest: np.number, least: np.float32, rules: SearchRules) -> int:
     """The block that the rule names among those that reach `least`; -1 where none does.
 
@@ -396,11 +403,9 @@ def _next_block(blocks: np.ndarray, highest: np.number, least: np.float32, rules
     """
     if highest < least or highest <= 0:
         return -1
-    chosen = 0
     if rules.order == STRONGEST:
-        while blocks[chosen] != highest:
-            chosen += 1
-        return chosen
+        return _first_equal(blocks, highest)
+    chosen = 0
     wanted = max(least, np.float32(highest) * np.float32(rules.share * _COARSE_SLACK))
     if rules.order == FIRST:
         while blocks[chosen] < wanted:
