@@ -37,11 +37,13 @@ PAIRS = 20_000
 class Figures:
     """Errors of one pass, mm, before and after: of the path (rms), of it up to the last crossing, of lengths (rms).
 
-    ``stated_mm`` are the root of the mean variance of the path after, whole and up to the last crossing. ``within`` is
-    the share of positions, in the frame of the first one, whose error is within twice the stated uncertainty.
+    ``own_mm`` are those of the path (rms) less that of its first position, of which no surface tells. ``stated_mm`` are
+    the root of the mean variance of the path after, whole and up to the last crossing. ``within`` is the share of
+    coordinates whose error, less the first one, is within twice the stated uncertainty.
     """
 
     path_mm: tuple[float, float]
+    own_mm: tuple[float, float]
     to_last_mm: tuple[float, float]
     behind_mm: tuple[float, float]
     stated_mm: tuple[float, float]
@@ -75,7 +77,11 @@ def aligned_pass(path: Path) -> Figures:
     last = times <= times[max(second for _, second in crossings)]
 
     def errors(poses: np.ndarray, part: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(np.sum((poses[part, :3, 3] - true[part, :3, 3]) ** 2, axis=1))))
+        return _rms(np.linalg.norm(poses[part, :3, 3] - true[part, :3, 3], axis=1))
+
+    def own(poses: np.ndarray) -> np.ndarray:
+        off = poses[:, :3, 3] - true[:, :3, 3]
+        return off - off[0]
 
     def lengths(corrected: PointCloud) -> tuple[tuple[float, float], ...]:
         return tuple((length_error(cloud, truth, each), length_error(corrected, truth, each)) for each in crossings)
@@ -84,7 +90,8 @@ def aligned_pass(path: Path) -> Figures:
         whole, to_last, behind = (
             (errors(before, part), errors(after, part)) for part in (np.ones(len(times), bool), last, ~last)
         )
-        return Figures(whole, to_last, behind, lengths_mm=lengths(corrected), **others)
+        in_own = [_rms(np.linalg.norm(own(poses), axis=1)) for poses in (before, after)]
+        return Figures(whole, (in_own[0], in_own[1]), to_last, behind, lengths_mm=lengths(corrected), **others)
 
     try:
         found = uwlts.align_trajectory(cloud, reported, clock_offset_s=offset)
@@ -94,14 +101,13 @@ def aligned_pass(path: Path) -> Figures:
     covariance = found.trajectory.covariance_at(times + offset)
     assert covariance is not None
     variance = np.einsum("nii->n", covariance[:, :3, :3])
-    # The alignment takes the start as exact: the frame is that of the first pose.
-    own = (np.linalg.inv(true[0]) @ true)[:, :3, 3] - (np.linalg.inv(after[0]) @ after)[:, :3, 3]
-    stated = np.sqrt(np.einsum("ji,njk,ki->ni", true[0, :3, :3], covariance[:, :3, :3], true[0, :3, :3]))
+    # The alignment takes the start as exact.
+    stated = np.sqrt(np.einsum("nii->ni", covariance[:, :3, :3]))
     return figures(
         after,
         found.cloud,
         stated_mm=(float(np.sqrt(variance.mean())), float(np.sqrt(variance[last].mean()))),
-        within=float(np.mean(np.abs(own) < 2 * stated)),
+        within=float(np.mean(np.abs(own(after)) < 2 * stated)),
         doubtful=len(found.doubtful_s),
     )
 
@@ -150,7 +156,12 @@ def main() -> None:
             kept.write_text(json.dumps(asdict(aligned_pass(path))))
         each = Figures(**json.loads(kept.read_text()))
         all_figures.append(each)
-        (path_before, path_after), (_, to_last), (_, behind) = each.path_mm, each.to_last_mm, each.behind_mm
+        (path_before, path_after), (own_before, own_after), (_, to_last), (_, behind) = (
+            each.path_mm,
+            each.own_mm,
+            each.to_last_mm,
+            each.behind_mm,
+        )
         lengths = np.sqrt(np.mean(np.square(each.lengths_mm), axis=0))
         rows.append(
             [
@@ -158,6 +169,9 @@ def main() -> None:
                 f"{path_before:.1f}",
                 f"{path_after:.1f} ({each.stated_mm[0]:.1f})",
                 f"{path_before / path_after:.1f}",
+                f"{own_before:.1f}",
+                f"{own_after:.1f}",
+                f"{own_before / own_after:.1f}",
                 f"{to_last:.1f} ({each.stated_mm[1]:.1f})",
                 f"{behind:.1f}",
                 f"{lengths[0]:.1f}",
@@ -166,17 +180,27 @@ def main() -> None:
                 each.refused or str(each.doubtful),
             ]
         )
-    head = ["sensor, pass", "before", "after", "times", "to the last crossing", "behind it"]
+    head = [
+        "sensor, pass",
+        "before",
+        "after",
+        "times",
+        "from the start: before",
+        "after",
+        "times",
+        "to the last crossing",
+        "behind it",
+    ]
     head += ["lengths before", "lengths after", "within twice the stated", "doubtful crossings"]
     print(table(head, rows))
-    path, lengths = (np.array([getattr(each, name) for each in all_figures]) for name in ("path_mm", "lengths_mm"))
-    ratio = path[:, 0] / path[:, 1]
-    print(
-        f"{len(path)} passes: path {_rms(path[:, 0]):.1f} to {_rms(path[:, 1]):.1f} mm (rms of all), "
-        f"{_rms(path[:, 0]) / _rms(path[:, 1]):.1f} times; mean of the passes {ratio.mean():.1f} times "
-        f"({ratio.min():.1f} to {ratio.max():.1f}); "
-        f"lengths {_rms(lengths[..., 0]):.1f} to {_rms(lengths[..., 1]):.2f} mm"
-    )
+    for name in ("path_mm", "own_mm", "lengths_mm"):
+        before, after = np.moveaxis(np.array([getattr(each, name) for each in all_figures]), -1, 0)
+        ratio = before / after
+        print(
+            f"{name} of {len(all_figures)} passes: {_rms(before):.1f} to {_rms(after):.2f} mm (rms of all), "
+            f"{_rms(before) / _rms(after):.1f} times; mean of the ratios {ratio.mean():.1f} "
+            f"({ratio.min():.1f} to {ratio.max():.1f})"
+        )
 
 
 def _rms(values: np.ndarray) -> float:

@@ -132,14 +132,15 @@ def campaign() -> list[Row]:
         target, *steps, in_water = (folder / f"{number}.h5" for number in range(5))
         calibration, finding, estimating = joint_calibration([target, in_water], steps)
         cv2.setNumThreads(1)
-        rate = measuring_rate([folder / "13.h5", folder / "14.h5"], calibration)
+        by_stage, by_path = measuring_rate([folder / "13.h5", folder / "14.h5"], calibration)
     return [
         at_most(f"campaign of {frames} frames", seconds, "s", 60),
         at_most("campaign, peak memory", peak, "GiB", 3),
         at_most("campaign, time of the last frames over that of earlier ones", growth, "times", 1.3),
         at_most("joint calibration: targets and stripes found in its images", finding, "s", 3),
         at_most("joint calibration: the estimate", estimating, "s", 3),
-        at_least("spheres in water: stripes, points and their covariance", rate, "frames/s", 1000),
+        at_least("spheres in water: stripes, points and their covariance", by_stage, "frames/s", 1000),
+        at_least("the same along a trajectory", by_path, "frames/s", 1000),
     ]
 
 

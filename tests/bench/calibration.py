@@ -9,21 +9,28 @@ import numpy as np
 from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.measurement.moving import carried, platform_ride, with_platform
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.model.calibration import Calibration
+from uwlts.model.mount import Mount, SphereFound
+from uwlts.model.trajectory import Trajectory
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
 
+AS_OFTEN = 8
+"""So many times a scan's images are measured along a trajectory: some hundred, as moving sensors take."""
+
 
 class _InMemory:
-    """A capture whose images were read beforehand."""
+    """A capture whose images were read beforehand, or as if taken again so many times, an image a second."""
 
-    def __init__(self, capture: Capture):
+    def __init__(self, capture: Capture, times: int = 1):
         self.capture = capture
-        self.path, self.header, self.laser_on, self.pose = capture.path, capture.header, capture.laser_on, capture.pose
-        self.stage_mm, self.exposure_ms = capture.stage_mm, capture.exposure_ms
-        self.has_image = capture.has_image
-        self._images = [capture.image(number) for number in range(len(capture))]
+        self.path, self.header, self.pose = capture.path, capture.header, np.tile(capture.pose, (times, 1, 1))
+        self.laser_on, self.has_image = np.tile(capture.laser_on, times), np.tile(capture.has_image, times)
+        self.stage_mm, self.exposure_ms = np.tile(capture.stage_mm, times), np.tile(capture.exposure_ms, times)
+        self.speed_mm_per_s, self.time_s = np.tile(capture.speed_mm_per_s, times), np.arange(times * len(capture)) * 1.0
+        self._images = [capture.image(number) for number in range(len(capture))] * times
 
     def seen(self, index: int) -> np.ndarray:
         return self._images[index]
@@ -47,17 +54,55 @@ def joint_calibration(targets: list[Path], steps: list[Path]) -> tuple[Calibrati
         return calibration, found - start, time.perf_counter() - found
 
 
-def measuring_rate(scans: list[Path], calibration: Calibration) -> float:
+def measuring_rate(scans: list[Path], calibration: Calibration) -> tuple[float, float]:
     """Frames per second from images in memory to points with their covariance, of scans that follow a first one.
 
-    The median over scans that are measured in turn.
+    The median over scans that are measured in turn: with the stage's positions, and of `AS_OFTEN` as many images along
+    a trajectory of known covariance with a mount.
     """
+    mount = _mount()
     with ExitStack() as stack:
-        recordings = [_InMemory(stack.enter_context(Capture(path))) for path in scans]
-        seconds = []
-        for images in recordings * 12:
+        opened = [stack.enter_context(Capture(path)) for path in scans]
+        by_stage, by_path = [], []
+        for images in [_InMemory(each) for each in opened] * 12:
             start = time.perf_counter()
             cloud = reconstruct_stripes(images.capture, find_stripes(images), calibration, with_uncertainty=True)
             assert cloud.uncertainty is not None and cloud.uncertainty.covariance_mm2().shape == (len(cloud), 3, 3)
-            seconds.append((time.perf_counter() - start) / np.count_nonzero(images.laser_on))
-        return 1.0 / float(np.median(seconds[1:]))
+            by_stage.append((time.perf_counter() - start) / np.count_nonzero(images.laser_on))
+        for images in [_InMemory(each, AS_OFTEN) for each in opened] * 3:
+            trajectory = _trajectory(images.time_s)
+            start = time.perf_counter()
+            ride = platform_ride(images, trajectory, mount=mount, clock_offset_s=0.0)
+            table, stripes = carried(images, ride, mount), find_stripes(images)
+            cloud = reconstruct_stripes(table, stripes, calibration, with_uncertainty=True)
+            assert cloud.uncertainty is not None
+            known = with_platform(cloud.uncertainty, cloud.points_mm, cloud.frame, ride, mount)
+            assert known.covariance_mm2().shape == (len(cloud), 3, 3)
+            by_path.append((time.perf_counter() - start) / np.count_nonzero(images.laser_on))
+        return 1.0 / float(np.median(by_stage[1:])), 1.0 / float(np.median(by_path[1:]))
+
+
+def _trajectory(times_s: np.ndarray) -> Trajectory:
+    """Poses along X, 2 mm/s, a third as many as images, of a navigation that drifts by 0.3 m and 1 deg."""
+    at = np.linspace(times_s[0], times_s[-1], len(times_s) // 3)
+    poses = np.tile(np.eye(4), (len(at), 1, 1))
+    poses[:, 0, 3] = 2.0 * at
+    part = ((at - at[0]) / (at[-1] - at[0]))[:, None, None]
+    return Trajectory(at, poses, part**2 * np.diag(np.square(np.repeat([300.0, np.radians(1.0)], 3))))
+
+
+def _mount() -> Mount:
+    transform, std = np.eye(4), np.repeat([0.03, 1e-4], 3)
+    return Mount(
+        T_platform_sensor=tuple(map(tuple, transform.tolist())),
+        covariance=tuple(map(tuple, np.diag(std**2).tolist())),
+        coverage_factor=2.0,
+        artefact=SphereFound(centre_mm=(0.0, 0.0, 0.0), radius_mm=20.0),
+        time_offset_s=0.0,
+        time_offset_std_s=1e-4,
+        point_std_mm=0.02,
+        pose_std_mm=0.01,
+        rms_mm=0.02,
+        held_out_rms_mm=0.02,
+        poses=(),
+    )

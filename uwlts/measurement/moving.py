@@ -13,7 +13,7 @@ from hashlib import sha256
 import numpy as np
 
 from uwlts.calibration.joint.stored_estimate import covariance_root
-from uwlts.measurement.point_uncertainty import independent_patterns
+from uwlts.metrology.path_uncertainty import chief_parts, moved_by_poses, sampled
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount
 from uwlts.model.trajectory import Trajectory, on_clock
@@ -22,8 +22,10 @@ from uwlts.storage.cloud import PointUncertainty
 
 _MOST_SHAPES = 8
 """Shapes in time of errors along a path; faster ones are taken as independent from image to image."""
-_LEFT = 0.01
-"""Share of the variance that may be left to these."""
+_LEFT, _LEFT_OF_SHAPES = 0.01, 1e-3
+"""Share of the variance that may be left to these, in time and of all parts of the poses together."""
+_MOST_MOMENTS = 400
+"""By which shapes are found: they change slowly."""
 _LEAST = 1e-6
 """Of the largest variance: where a path begins exactly known, nothing is correlated with it."""
 
@@ -111,56 +113,55 @@ def with_platform(
     ``correlation_s`` is the time over which errors of poses stay alike, 0 where each errs by itself; by default 0
     without and as of a navigation filter with a trajectory. Images without a covariance have none of their pose.
     """
-    together, poses_mm = [uncertainty.patterns_mm], uncertainty.poses_mm
+    levers, errors, poses_mm = points_mm - ride.poses[frame, :3, 3], [], uncertainty.poses_mm
+    of_mount: list[str] = []
     if mount is not None:
-        covariance = np.array(mount.covariance) if mount_covariance is None else mount_covariance
-        together.append(_by_mount(points_mm, ride.poses[frame], mount.transform()[:3, 3], covariance))
+        own = np.array(mount.covariance) if mount_covariance is None else mount_covariance
+        errors.append(_by_mount(ride.poses, mount.transform()[:3, 3], own))
+        of_mount.append("mount " + sha256(mount.transform().tobytes() + own.tobytes()).hexdigest()[:16])
         if ride.rates is not None and mount.time_offset_std_s:
-            moved = _moved(ride.rates[frame] * mount.time_offset_std_s, points_mm, ride.poses[frame])
-            together.append(moved[None])
+            errors.append(ride.rates[:, :, None] * mount.time_offset_std_s)
     if ride.covariance is not None:
-        used, image = np.unique(frame, return_inverse=True)
-        roots = _roots(ride.covariance[used])
-        apart = np.ones(len(used))
-        if correlation_s is None:
-            correlation_s = 0.0 if ride.rates is None else None
+        left = ride.covariance
+        if correlation_s is None and ride.rates is None:
+            correlation_s = 0.0
         if correlation_s != 0:
-            shapes, apart = _shapes(_alike(ride.covariance[used], ride.times_s[used], correlation_s))
-            for shape in shapes:
-                for part in range(6):
-                    errors = roots[:, :, part] * shape[:, None]
-                    together.append(_moved(errors[image], points_mm, ride.poses[frame])[None])
-        own = [_moved((roots[:, :, k] * apart[:, None])[image], points_mm, ride.poses[frame]) for k in range(6)]
-        poses_mm = np.array(own, dtype=np.float32)
-    if len(together) == 1:
+            of_path = _along_path(ride, np.flatnonzero(np.bincount(frame)), correlation_s)
+            some = sampled(len(frame))
+            parts = chief_parts(moved_by_poses(of_path, frame[some], levers[some]), left=_LEFT_OF_SHAPES)
+            errors.append(of_path @ parts)
+            left = left - errors[-1] @ errors[-1].transpose(0, 2, 1)
+        poses_mm = moved_by_poses(_roots(left), frame, levers)
+    if not errors:
         return replace(uncertainty, poses_mm=poses_mm)
-    patterns, mixed = independent_patterns(np.concatenate(together))
+    patterns = moved_by_poses(np.concatenate(errors, axis=2), frame, levers, after=uncertainty.patterns_mm)
     count = len(uncertainty.patterns_mm)
-    shared = {name: mixed[:, :count] @ each for name, each in uncertainty.shared.items()}
-    if mount is not None:
-        covariance = np.array(mount.covariance) if mount_covariance is None else mount_covariance
-        digest = sha256(mount.transform().tobytes() + covariance.tobytes()).hexdigest()[:16]
-        shared[f"mount {digest}"] = mixed[:, count : count + len(together[1])]
+    shared = {name: np.eye(len(patterns), count) @ each for name, each in uncertainty.shared.items()}
+    shared |= {name: np.eye(len(patterns), errors[0].shape[2], -count) for name in of_mount}
     return replace(uncertainty, patterns_mm=patterns, poses_mm=poses_mm, shared=shared)
 
 
-def _by_mount(points_mm: np.ndarray, poses: np.ndarray, place_mm: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """How points (N, 3) move (6, N, 3) by independent parts of the mount's error; ``poses`` are the platform's of each.
+def _by_mount(poses: np.ndarray, place_mm: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Errors (F, 6, 6) of poses (F, 4, 4) that are like independent parts of the mount's error.
 
     A shift d and a turn w of the mount, both in the platform's frame, move a point p of the platform by
     d + w x (p - t), t being the sensor's place there, ``place_mm`` (3,).
     """
-    rotations = poses[:, :3, :3]
-    from_sensor = np.einsum("nji,nj->ni", rotations, points_mm - poses[:, :3, 3]) - place_mm
-    moved = []
-    for shift, turn in covariance_root(covariance).T.reshape(-1, 2, 3):
-        moved.append(np.einsum("nij,nj->ni", rotations, shift + np.cross(turn, from_sensor)))
-    return np.array(moved)
+    root = covariance_root(covariance)
+    turns, shifts = poses[:, :3, :3] @ root[3:], poses[:, :3, :3] @ root[:3]
+    return np.concatenate([shifts - np.cross(turns, (poses[:, :3, :3] @ place_mm)[:, :, None], axis=1), turns], axis=1)
 
 
-def _moved(errors: np.ndarray, points_mm: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """How points (N, 3) move by errors (N, 6) of their poses: shift, and rotation about the base's axes."""
-    return errors[:, :3] + np.cross(errors[:, 3:], points_mm - poses[:, :3, 3])
+def _along_path(ride: Ride, used: np.ndarray, correlation_s: float | None) -> np.ndarray:
+    """Independent errors (F, 6, K) of the poses of some images (U,) along a path, by shapes in time of each part."""
+    covariances, times = ride.covariance, ride.times_s
+    assert covariances is not None
+    some = used[np.linspace(0, len(used) - 1, min(_MOST_MOMENTS, len(used))).astype(int)]
+    shapes = _shapes(_alike(covariances[some], times[some], correlation_s))
+    at_images = np.stack([np.interp(times[used], times[some], shape) for shape in shapes], axis=1)
+    result = np.zeros((*covariances.shape[:2], 6 * len(shapes)))
+    result[used] = (_roots(covariances[used])[:, :, None] * at_images[:, None, :, None]).reshape(len(used), 6, -1)
+    return result
 
 
 def _roots(covariances: np.ndarray) -> np.ndarray:
@@ -185,11 +186,10 @@ def _alike(covariances: np.ndarray, times_s: np.ndarray, correlation_s: float | 
     return np.exp(-np.abs(way[:, None] - way))
 
 
-def _shapes(alike: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Shapes (K, F) in time whose squares add up to the correlations, and the part (F,) of each moment left over."""
+def _shapes(alike: np.ndarray) -> np.ndarray:
+    """Shapes (K, F) in time whose squares add up to the correlations, but for what is left out."""
     values, vectors = np.linalg.eigh(alike)
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
     share = 1 - np.cumsum(values) / values.sum()
     count = min(1 + int(np.argmax(share <= _LEFT)), _MOST_SHAPES, len(values))
-    shapes = (vectors[:, :count] * np.sqrt(values[:count])).T
-    return shapes, np.sqrt(np.maximum(1 - np.sum(shapes**2, axis=0), 0.0))
+    return (vectors[:, :count] * np.sqrt(values[:count])).T

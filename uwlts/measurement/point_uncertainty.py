@@ -238,16 +238,6 @@ def _derivatives(
     return result.reshape(len(line), -1)
 
 
-def independent_patterns(moved: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Patterns (M, N, 3), orthogonal over the points, from any (R, N, 3) that together have their covariance.
-
-    And how much (M, R) of each of these every pattern has.
-    """
-    flat = moved.reshape(len(moved), -1)
-    weights = _chief_patterns(flat)
-    return (weights.T @ flat).astype(np.float32).reshape(-1, *moved.shape[1:]), weights.T
-
-
 def _chief_patterns(moved: np.ndarray) -> np.ndarray:
     """Weights (R, M) of moves (R, 3 N) for as few patterns as hold all but what is negligible."""
     values, vectors = np.linalg.eigh(moved @ moved.T)

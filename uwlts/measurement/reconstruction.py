@@ -18,6 +18,7 @@ from uwlts.model.trajectory import Trajectory
 from uwlts.optics.brightness import LitSheet, footprint_std, sharp_lines, slopes_of_brightness
 from uwlts.optics.reconstruction import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile, stage_travel
 from uwlts.optics.window import RayStatus, require_index
+from uwlts.runtime.compiled import compiled
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, FrameTable, opened_capture, sensor_poses
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
@@ -276,9 +277,20 @@ def _posed(points: np.ndarray, capture: Capture | FrameTable, frame: np.ndarray)
     posed = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     if not posed.any():
         return points
-    own = np.ones(len(points), bool) if posed[frame].all() else posed[frame]
+    own = slice(None) if posed[frame].all() else posed[frame]
     at, direction = frame[own], np.array(capture.header.stage_direction)
     by_sensor = points[own] - capture.stage_mm[at, None] * direction
+    placed = np.empty_like(by_sensor)
+    _place(poses, at, by_sensor, placed)
     points = points.copy()
-    points[own] = np.einsum("nij,nj->ni", poses[at, :3, :3], by_sensor) + poses[at, :3, 3]
+    points[own] = placed
     return points
+
+
+@compiled
+def _place(poses: np.ndarray, image: np.ndarray, by_sensor: np.ndarray, placed: np.ndarray) -> None:
+    """Fill the places (N, 3) of points of the sensor's frame (N, 3) by the poses (F, 4, 4) of their images (N,)."""
+    for n in range(image.size):
+        pose, x, y, z = poses[image[n]], by_sensor[n, 0], by_sensor[n, 1], by_sensor[n, 2]
+        for axis in range(3):
+            placed[n, axis] = pose[axis, 0] * x + pose[axis, 1] * y + pose[axis, 2] * z + pose[axis, 3]

@@ -1,10 +1,11 @@
-"""Uncertainty of points along a corrected path: of sensor and mount as before, and of the corrected poses."""
+"""Uncertainty of points by the poses of their images, and along a corrected path."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwlts.runtime.compiled import compiled
 from uwlts.storage.cloud import PAIRS, PointUncertainty
 
 _MOST_SHAPES = 12
@@ -14,6 +15,54 @@ _LEFT = 0.01
 _SAMPLE = 1500
 """Points by which the shapes are chosen."""
 _BLOCK = 50_000
+
+
+def moved_by_poses(
+    errors: np.ndarray, image: np.ndarray, levers_mm: np.ndarray, *, after: np.ndarray | None = None
+) -> np.ndarray:
+    """Motions (K, N, 3) float32 of points by K errors (F, 6, K) of the poses of F images, shift (mm) and turn (rad).
+
+    ``image`` (N,) is that of each point, ``levers_mm`` (N, 3) its place from the platform along the base's axes. With
+    others, ``after`` (M, N, 3), the result (M + K, N, 3) begins with these.
+    """
+    first = 0 if after is None else len(after)
+    moved = np.empty((first + errors.shape[2], len(image), 3), np.float32)
+    if after is not None:
+        moved[:first] = after
+    by_image = np.ascontiguousarray(errors.transpose(0, 2, 1), dtype=float)
+    _move_by_poses(by_image, image.astype(np.int64), np.ascontiguousarray(levers_mm, dtype=float), moved[first:])
+    return moved
+
+
+@compiled
+def _move_by_poses(errors: np.ndarray, image: np.ndarray, levers: np.ndarray, moved: np.ndarray) -> None:
+    """Fill the motions (K, N, 3) by errors (F, K, 6); points of one image after the other are the fastest."""
+    first = 0
+    while first < image.size:
+        end = first + 1
+        while end < image.size and image[end] == image[first]:
+            end += 1
+        for k in range(errors.shape[1]):
+            by, out = errors[image[first], k], moved[k]
+            a, b, c, u, v, w = by[0], by[1], by[2], by[3], by[4], by[5]
+            for n in range(first, end):
+                x, y, z = levers[n, 0], levers[n, 1], levers[n, 2]
+                out[n, 0], out[n, 1], out[n, 2] = a + v * z - w * y, b + w * x - u * z, c + u * y - v * x
+        first = end
+
+
+def sampled(count: int) -> np.ndarray:
+    """Numbers of some of so many points, by which errors of poses are weighed."""
+    return np.linspace(0, count - 1, min(_SAMPLE, count)).astype(int)
+
+
+def chief_parts(moved: np.ndarray, *, left: float, most: int | None = None) -> np.ndarray:
+    """Weights (K, C) for the fewest independent sums of K motions (K, N, 3) that leave a share of the variance."""
+    flat = moved.reshape(len(moved), -1).astype(float)
+    strengths, ways = np.linalg.eigh(flat @ flat.T)
+    strengths, ways = np.maximum(strengths[::-1], 0.0), ways[:, ::-1]
+    missing = 1 - np.cumsum(strengths) / max(strengths.sum(), 1e-300)
+    return ways[:, :most][:, : 1 + int(np.argmax(missing <= left))]
 
 
 def along_corrected_path(
@@ -42,19 +91,10 @@ def along_corrected_path(
     values, vectors = np.linalg.eigh(covariance)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))).reshape(-1, 6, len(values))
 
-    def moved(by_image: np.ndarray, here: slice | np.ndarray) -> np.ndarray:
-        """Motion (K, n, 3) of points where the poses of all images move by (F, 6, K)."""
-        by = np.moveaxis(by_image[image[here]], 2, 0)
-        return by[:, :, :3] + np.cross(by[:, :, 3:], levers_mm[here])
-
-    some = np.linspace(0, len(image) - 1, min(_SAMPLE, len(image))).astype(int)
+    some = sampled(len(image))
     by_pose = np.einsum("nc,cik->kni", basis[image[some]], root, optimize=True)
-    flat = (by_pose[:, :, :3] + np.cross(by_pose[:, :, 3:], levers_mm[some])).reshape(len(values), -1)
-    strengths, ways = np.linalg.eigh(flat @ flat.T)
-    strengths, ways = np.maximum(strengths[::-1], 0.0), ways[:, ::-1]
-    left = 1 - np.cumsum(strengths) / max(strengths.sum(), 1e-300)
-    count = min(1 + int(np.argmax(left <= _LEFT)), _MOST_SHAPES)
-    shapes = np.einsum("fc,cik->fik", basis, root @ ways[:, :count], optimize=True)
+    by_pose = by_pose[:, :, :3] + np.cross(by_pose[:, :, 3:], levers_mm[some])
+    shapes = np.einsum("fc,cik->fik", basis, root @ chief_parts(by_pose, left=_LEFT, most=_MOST_SHAPES), optimize=True)
     variances, axes = np.linalg.eigh(poses - shapes @ shapes.transpose(0, 2, 1))
     rest = axes * np.sqrt(np.maximum(variances, 0.0))[:, None]
     # As few patterns as before that consist of the parts of sensor and mount alone.
@@ -64,8 +104,7 @@ def along_corrected_path(
     kept = sizes > 1e-6
     mixing, factors = sizes[kept, None] * rows[kept], factors[:, kept]
     random, position = np.empty_like(known.random_mm2), np.empty_like(known.position_mm)
-    patterns = np.empty((len(mixing) + count, len(image), 3), np.float32)
-    poses = np.empty((6, len(image), 3), np.float32)
+    own = np.empty((len(mixing), len(image), 3), np.float32)
     for start in range(0, len(image), _BLOCK):
         here = slice(start, start + _BLOCK)
         matrices = Rotation.from_rotvec(turns[here]).as_matrix()
@@ -75,13 +114,11 @@ def along_corrected_path(
         full = matrices @ full @ matrices.transpose(0, 2, 1)
         random[here] = np.stack([full[:, i, j] for i, j in PAIRS], axis=1)
         position[here] = np.einsum("nij,nj->ni", matrices, known.position_mm[here])
-        own = np.tensordot(mixing, known.patterns_mm[:, here], axes=1)
-        patterns[: len(mixing), here] = np.einsum("nij,knj->kni", matrices, own)
-        patterns[len(mixing) :, here] = moved(shapes, here)
-        poses[:, here] = moved(rest, here)
+        own[:, here] = np.einsum("nij,knj->kni", matrices, np.tensordot(mixing, known.patterns_mm[:, here], axes=1))
+    patterns = moved_by_poses(shapes, image, levers_mm, after=own)
     shared, first = {}, 0
     for name in names:
         last = first + known.shared[name].shape[1]
-        shared[name] = np.vstack([factors[first:last].T, np.zeros((count, last - first))])
+        shared[name] = np.vstack([factors[first:last].T, np.zeros((shapes.shape[2], last - first))])
         first = last
-    return PointUncertainty(random, position, patterns, poses, shared)
+    return PointUncertainty(random, position, patterns, moved_by_poses(rest, image, levers_mm), shared)

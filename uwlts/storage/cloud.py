@@ -49,6 +49,8 @@ WATER = "water"
 """With what the names of errors of a medium's index begin, which may drift between scans."""
 # CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
 _PIECE_LENGTH = 900
+_BLOCK = 8192
+"""Points whose covariances are added up at a time: their parts stay in the processor's cache."""
 _FARTHEST_MM = 1e12
 """Coordinates of maps in mm reach 1e10; squares and products of larger ones would leave the range of numbers."""
 _LONGEST_PLY_HEADER = 2**24
@@ -74,7 +76,7 @@ class PointUncertainty:
     position_mm : (N, 3) float32
         How each point moves for one standard deviation of its image's stage position, independent from image to image.
     patterns_mm : (M, N, 3) float32
-        How each point moves for one standard deviation of what is independent in calibration and stage, largest first.
+        How each point moves for one standard deviation of what is independent in calibration, stage and path.
     poses_mm : (K, N, 3) float32 or None
         How each point moves for one standard deviation of each independent part of its image's pose, which is
         independent from image to image.
@@ -107,8 +109,13 @@ class PointUncertainty:
 
     def covariance_mm2(self) -> np.ndarray:
         """Covariance (N, 3, 3) of the coordinates of each point, of all kinds together."""
-        pairs = _pairs_of(self.by_image_mm()) + (self.random_mm2 + self.systematic_mm2())
-        return pairs[:, [PAIRS.index((min(i, j), max(i, j))) for i in range(3) for j in range(3)]].reshape(-1, 3, 3)
+        order = [PAIRS.index((min(i, j), max(i, j))) for i in range(3) for j in range(3)]
+        result = np.empty((len(self.random_mm2), 3, 3), self.random_mm2.dtype)
+        for start in range(0, len(result), _BLOCK):
+            some = self[start : start + _BLOCK]
+            pairs = _pairs_of(some.by_image_mm()) + (some.random_mm2 + some.systematic_mm2())
+            result[start : start + _BLOCK] = pairs[:, order].reshape(-1, 3, 3)
+        return result
 
     def std_mm(self) -> np.ndarray:
         """Standard uncertainty (N, 3) of each coordinate, of all kinds together."""
