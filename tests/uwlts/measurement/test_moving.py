@@ -159,7 +159,7 @@ def test_the_mount_s_uncertainty_moves_points_as_other_mounts_do():
     np.testing.assert_allclose(np.sqrt(np.einsum("nii->ni", found)), np.std(drawn, axis=0), rtol=0.056)
 
 
-def drawn_points(rng, seen, poses, errors):
+def drawn_points(seen, poses, errors):
     """Points in the base frame of ``seen`` (n, 3) from poses (F, 4, 4) with errors (F, 6), (F, n, 3)."""
     turned = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
     return np.einsum("fij,nj->fni", turned, seen) + (poses[:, :3, 3] + errors[:, :3])[:, None]
@@ -172,12 +172,12 @@ def test_errors_of_each_pose_move_its_image_s_points_together():
     poses = np.array([platform_at(20.0 * number) for number in range(images)])
     root = np.tril(rng.normal(size=(6, 6))) * np.array([0.1, 0.1, 0.1, 4e-4, 4e-4, 4e-4])[:, None]
     covariance = np.tile(root @ root.T, (images, 1, 1))
-    points, frame = drawn_points(rng, seen, poses, np.zeros((images, 6))).reshape(-1, 3), np.repeat(range(images), 5)
+    points, frame = drawn_points(seen, poses, np.zeros((images, 6))).reshape(-1, 3), np.repeat(range(images), 5)
     none = PointUncertainty(np.zeros((30, 6)), np.zeros((30, 3)), np.zeros((1, 30, 3)))
     ride = Ride(poses, covariance, np.arange(6.0))
     found = with_platform(none, points, frame, ride, None)
     errors = rng.standard_normal((4000, images, 6)) @ root.T
-    drawn = np.array([drawn_points(rng, seen, poses, each).reshape(-1, 3) for each in errors])
+    drawn = np.array([drawn_points(seen, poses, each).reshape(-1, 3) for each in errors])
     # The standard deviation of 4000 is right to 1.1 %; 90 of them stay within five of those.
     np.testing.assert_allclose(found.std_mm(), drawn.std(axis=0), rtol=0.056)
     cloud = uwlts.PointCloud(points, np.ones(30), frame, np.arange(30), uncertainty=found)
@@ -208,11 +208,11 @@ def test_errors_along_a_path_are_as_alike_as_its_covariances_say(kind):
         covariance, correlation_s = np.tile(np.diag(std**2), (count, 1, 1)), 30.0
         alike = np.linalg.cholesky(np.exp(-np.abs(times[:, None] - times) / 30.0))
         errors = np.einsum("fg,mgk->mfk", alike, rng.standard_normal((4000, count, 6)) * std)
-    points = drawn_points(rng, seen, poses, np.zeros((count, 6)))[:, 0]
+    points = drawn_points(seen, poses, np.zeros((count, 6)))[:, 0]
     none = PointUncertainty(np.zeros((count, 6)), np.zeros((count, 3)), np.zeros((1, count, 3)))
     ride = Ride(poses, covariance, times, rates=np.zeros((count, 6)))
     found = with_platform(none, points, np.arange(count), ride, None, correlation_s=correlation_s)
-    drawn = np.array([drawn_points(rng, seen, poses, each)[:, 0] for each in errors])
+    drawn = np.array([drawn_points(seen, poses, each)[:, 0] for each in errors])
     # 1.1 % of 4000 draws five times, and 1 % of the variance.
     np.testing.assert_allclose(found.std_mm(), drawn.std(axis=0), rtol=0.065, atol=1e-3)
     together = found.patterns_mm
@@ -221,6 +221,25 @@ def test_errors_along_a_path_are_as_alike_as_its_covariances_say(kind):
         common = np.sqrt(np.sum((together[:, last] - together[:, first]) ** 2, axis=0))
         total = np.sqrt(common**2 + apart[first] ** 2 + apart[last] ** 2)
         np.testing.assert_allclose(total, (drawn[:, last] - drawn[:, first]).std(axis=0), rtol=0.08, atol=2e-3)
+
+
+def test_many_images_have_the_uncertainty_of_few():
+    """Of a random walk at 1200 images, by 400 moments, against a tenth of them."""
+    count, seen = 1200, np.array([[10.0, 0.0, 200.0]])
+    poses = np.array([platform_at(0.5 * number) for number in range(count)])
+    points = drawn_points(seen, poses, np.zeros((count, 6)))[:, 0]
+    variance = np.square([0.5, 0.7, 0.3, 1e-4, 2e-4, 3e-4])
+    covariance = np.diag(variance) * ((np.arange(count) + 1.0) / count)[:, None, None]
+    found = []
+    for images in (np.arange(count), np.arange(0, count, 10)):
+        none = PointUncertainty(np.zeros((len(images), 6)), np.zeros((len(images), 3)), np.zeros((1, len(images), 3)))
+        ride = Ride(poses[images], covariance[images], images * 1.0, rates=np.zeros((len(images), 6)))
+        found.append(with_platform(none, points[images], np.arange(len(images)), ride, None))
+    many, few = found[0][::10], found[1]
+    np.testing.assert_allclose(many.std_mm(), few.std_mm(), rtol=1e-5)
+    for first, last in ((0, 119), (60, 119), (60, 70)):
+        apart = [np.linalg.norm(each.patterns_mm[:, last] - each.patterns_mm[:, first], axis=0) for each in (many, few)]
+        np.testing.assert_allclose(*apart, rtol=0.05)
 
 
 def test_the_time_offset_s_uncertainty_moves_points_along_the_path():
