@@ -70,9 +70,9 @@ _ROUNDS, _STILL = 15, 0.03
 and go keep smaller ones from ending."""
 _HELD_OUT = 5
 """Every fifth cube of a crossing, of four radii, is held out and judges the gain."""
-_AGREEING = 0.9
-"""Of the patches of a crossing within four radii, those that agree within five of their standard deviations; the same
-of those held out. Wrong places reach 0.8 where the path bends to them."""
+_AGREEING, _AGREEING_HELD_OUT = 0.9, 0.8
+"""Of the patches of a crossing within four radii, those that agree within five of their standard deviations; and of
+those held out, which do not bend the path to them. Wrong places reach 0.8 of all where it bends, but few held out."""
 _FEWEST_HELD_OUT = 10
 """Held-out patches whose share is judged."""
 _PER_PARAMETER = 3.0
@@ -320,7 +320,7 @@ class PathEstimate:
         if np.count_nonzero(fits) < FEWEST or np.mean(fits) < _AGREEING:
             return False
         held = self.held_out(pair, found)
-        return bool(np.count_nonzero(held) < _FEWEST_HELD_OUT or np.mean(fits[held]) >= _AGREEING)
+        return bool(np.count_nonzero(held) < _FEWEST_HELD_OUT or np.mean(fits[held]) >= _AGREEING_HELD_OUT)
 
     def is_overdetermined(self, pair: Pair) -> bool:
         """Whether a pair has several independent distances for each parameter of the path that it determines.
