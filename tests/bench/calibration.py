@@ -69,7 +69,7 @@ def measuring_rate(scans: list[Path], calibration: Calibration) -> tuple[float, 
             cloud = reconstruct_stripes(images.capture, find_stripes(images), calibration, with_uncertainty=True)
             assert cloud.uncertainty is not None and cloud.uncertainty.covariance_mm2().shape == (len(cloud), 3, 3)
             by_stage.append((time.perf_counter() - start) / np.count_nonzero(images.laser_on))
-        for images in [_InMemory(each, AS_OFTEN) for each in opened] * 3:
+        for images in [_InMemory(each, AS_OFTEN) for each in opened] * 8:
             trajectory = _trajectory(images.time_s)
             start = time.perf_counter()
             ride = platform_ride(images, trajectory, mount=mount, clock_offset_s=0.0)
