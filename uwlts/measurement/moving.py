@@ -13,7 +13,7 @@ from hashlib import sha256
 import numpy as np
 
 from uwlts.calibration.joint.stored_estimate import covariance_root
-from uwlts.metrology.path_uncertainty import chief_parts, moved_by_poses, sampled
+from uwlts.metrology.path_uncertainty import chief_parts, moved_by_poses, pose_roots, sampled
 from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount
 from uwlts.model.trajectory import Trajectory, on_clock
@@ -114,11 +114,12 @@ def with_platform(
     without and as of a navigation filter with a trajectory. Images without a covariance have none of their pose.
     """
     levers, errors, poses_mm = points_mm - ride.poses[frame, :3, 3], [], uncertainty.poses_mm
-    of_mount: list[str] = []
+    count, shared = len(uncertainty.patterns_mm), dict(uncertainty.shared)
     if mount is not None:
         own = np.array(mount.covariance) if mount_covariance is None else mount_covariance
         errors.append(_by_mount(ride.poses, mount.transform()[:3, 3], own))
-        of_mount.append("mount " + sha256(mount.transform().tobytes() + own.tobytes()).hexdigest()[:16])
+        digest = sha256(mount.transform().tobytes() + own.tobytes()).hexdigest()[:16]
+        shared[f"mount {digest}"] = np.eye(count + 6, 6, -count)
         if ride.rates is not None and mount.time_offset_std_s:
             errors.append(ride.rates[:, :, None] * mount.time_offset_std_s)
     if ride.covariance is not None:
@@ -131,13 +132,12 @@ def with_platform(
             parts = chief_parts(moved_by_poses(of_path, frame[some], levers[some]), left=_LEFT_OF_SHAPES)
             errors.append(of_path @ parts)
             left = left - errors[-1] @ errors[-1].transpose(0, 2, 1)
-        poses_mm = moved_by_poses(_roots(left), frame, levers)
+        poses_mm = moved_by_poses(pose_roots(left), frame, levers)
     if not errors:
         return replace(uncertainty, poses_mm=poses_mm)
     patterns = moved_by_poses(np.concatenate(errors, axis=2), frame, levers, after=uncertainty.patterns_mm)
-    count = len(uncertainty.patterns_mm)
-    shared = {name: np.eye(len(patterns), count) @ each for name, each in uncertainty.shared.items()}
-    shared |= {name: np.eye(len(patterns), errors[0].shape[2], -count) for name in of_mount}
+    # Of what comes behind them clouds have nothing in common.
+    shared = {name: np.pad(each, ((0, len(patterns) - len(each)), (0, 0))) for name, each in shared.items()}
     return replace(uncertainty, patterns_mm=patterns, poses_mm=poses_mm, shared=shared)
 
 
@@ -156,22 +156,12 @@ def _along_path(ride: Ride, used: np.ndarray, correlation_s: float | None) -> np
     """Independent errors (F, 6, K) of the poses of some images (U,) along a path, by shapes in time of each part."""
     covariances, times = ride.covariance, ride.times_s
     assert covariances is not None
-    some = used[np.linspace(0, len(used) - 1, min(_MOST_MOMENTS, len(used))).astype(int)]
+    some = used[sampled(len(used), _MOST_MOMENTS)]
     shapes = _shapes(_alike(covariances[some], times[some], correlation_s))
     at_images = np.stack([np.interp(times[used], times[some], shape) for shape in shapes], axis=1)
     result = np.zeros((*covariances.shape[:2], 6 * len(shapes)))
-    result[used] = (_roots(covariances[used])[:, :, None] * at_images[:, None, :, None]).reshape(len(used), 6, -1)
+    result[used] = (pose_roots(covariances[used])[:, :, None] * at_images[:, None, :, None]).reshape(len(used), 6, -1)
     return result
-
-
-def _roots(covariances: np.ndarray) -> np.ndarray:
-    """Symmetric roots (F, 6, 6), which change as slowly along a path as the covariances do; 0 where one is NaN."""
-    known = np.where(np.isfinite(covariances).all(axis=(1, 2), keepdims=True), covariances, 0.0)
-    # Rotations are far smaller numbers than shifts: scaled, so that none is lost.
-    sizes = np.sqrt(np.maximum(np.einsum("nii->ni", known), 1e-30))
-    values, vectors = np.linalg.eigh(known / (sizes[:, :, None] * sizes[:, None]))
-    root = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
-    return sizes[:, :, None] * root
 
 
 def _alike(covariances: np.ndarray, times_s: np.ndarray, correlation_s: float | None) -> np.ndarray:

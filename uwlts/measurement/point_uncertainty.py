@@ -16,6 +16,7 @@ from uwlts.calibration.joint.evidence import STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, across_of
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, stored_estimate
 from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.metrology.path_uncertainty import chief_parts
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.errors import CalibrationError
@@ -151,7 +152,7 @@ def point_uncertainty(
     # What moves all points together is smooth, so that some of them show which patterns hold nearly all of it.
     few = slice(None, None, max(1, len(line) // _SAMPLED))
     sampled = moved(few, np.eye(2 + len(by_stage)))[1]
-    weights = _chief_patterns(sampled.reshape(len(sampled), -1).astype(float))
+    weights = chief_parts(sampled, left_mm=_NEGLIGIBLE_MM)
     random, patterns = moved(slice(None), weights)
     if not np.isfinite(random).all():
         raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
@@ -236,14 +237,6 @@ def _derivatives(
         if rigid.any():
             result[:, :, 1:] += rigid[:3] + np.cross(rigid[3:].T, points[:, None]).swapaxes(1, 2)
     return result.reshape(len(line), -1)
-
-
-def _chief_patterns(moved: np.ndarray) -> np.ndarray:
-    """Weights (R, M) of moves (R, 3 N) for as few patterns as hold all but what is negligible."""
-    values, vectors = np.linalg.eigh(moved @ moved.T)
-    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
-    left = 3.0 * np.append(np.cumsum(values[::-1])[::-1][1:], 0.0) / moved.shape[1]
-    return np.ascontiguousarray(vectors[:, : 1 + int(np.argmax(left <= _NEGLIGIBLE_MM**2))])
 
 
 def stage_root(known: StoredEstimate, calibration: Calibration, header: CaptureHeader, root: np.ndarray) -> np.ndarray:

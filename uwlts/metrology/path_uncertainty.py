@@ -51,18 +51,32 @@ def _move_by_poses(errors: np.ndarray, image: np.ndarray, levers: np.ndarray, mo
         first = end
 
 
-def sampled(count: int) -> np.ndarray:
-    """Numbers of some of so many points, by which errors of poses are weighed."""
-    return np.linspace(0, count - 1, min(_SAMPLE, count)).astype(int)
+def sampled(count: int, most: int = _SAMPLE) -> np.ndarray:
+    """Numbers of some of so many, evenly: points by which errors of poses are weighed, or moments."""
+    return np.linspace(0, count - 1, min(most, count)).astype(int)
 
 
-def chief_parts(moved: np.ndarray, *, left: float, most: int | None = None) -> np.ndarray:
-    """Weights (K, C) for the fewest independent sums of K motions (K, N, 3) that leave a share of the variance."""
+def chief_parts(moved: np.ndarray, *, left: float = 0.0, left_mm: float = 0.0, most: int | None = None) -> np.ndarray:
+    """Weights (K, C) for the fewest independent sums of K motions (K, N, 3) that hold nearly all of them.
+
+    They leave no more than a share ``left`` of the variance, or ``left_mm`` root mean square; at ``most`` so many.
+    """
     flat = moved.reshape(len(moved), -1).astype(float)
     strengths, ways = np.linalg.eigh(flat @ flat.T)
     strengths, ways = np.maximum(strengths[::-1], 0.0), ways[:, ::-1]
-    missing = 1 - np.cumsum(strengths) / max(strengths.sum(), 1e-300)
-    return ways[:, :most][:, : 1 + int(np.argmax(missing <= left))]
+    missing = np.append(np.cumsum(strengths[::-1])[::-1][1:], 0.0)
+    count = 1 + int(np.argmax(missing <= max(left * strengths.sum(), left_mm**2 * moved.shape[1])))
+    return np.ascontiguousarray(ways[:, :most][:, :count])
+
+
+def pose_roots(covariances: np.ndarray) -> np.ndarray:
+    """Symmetric roots (F, 6, 6), which change as slowly along a path as the covariances do; 0 where one is NaN."""
+    known = np.where(np.isfinite(covariances).all(axis=(1, 2), keepdims=True), covariances, 0.0)
+    # Rotations are far smaller numbers than shifts: scaled, so that none is lost.
+    sizes = np.sqrt(np.maximum(np.einsum("nii->ni", known), 1e-30))
+    values, vectors = np.linalg.eigh(known / (sizes[:, :, None] * sizes[:, None]))
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))[:, None]) @ np.swapaxes(vectors, 1, 2)
+    return sizes[:, :, None] * root
 
 
 def along_corrected_path(
@@ -95,8 +109,7 @@ def along_corrected_path(
     by_pose = np.einsum("nc,cik->kni", basis[image[some]], root, optimize=True)
     by_pose = by_pose[:, :, :3] + np.cross(by_pose[:, :, 3:], levers_mm[some])
     shapes = np.einsum("fc,cik->fik", basis, root @ chief_parts(by_pose, left=_LEFT, most=_MOST_SHAPES), optimize=True)
-    variances, axes = np.linalg.eigh(poses - shapes @ shapes.transpose(0, 2, 1))
-    rest = axes * np.sqrt(np.maximum(variances, 0.0))[:, None]
+    rest = pose_roots(poses - shapes @ shapes.transpose(0, 2, 1))
     # As few patterns as before that consist of the parts of sensor and mount alone.
     names = list(known.shared)
     parts = np.vstack([known.shared[name].T for name in names]) if names else np.zeros((0, len(known.patterns_mm)))
