@@ -49,7 +49,8 @@ if TYPE_CHECKING:
     from uwlts.report.registration_page import write_registration
     from uwlts.storage.calibration_file import load_calibration, write_calibration
     from uwlts.storage.capture import Capture, Frame, open_capture
-    from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
+    from uwlts.storage.cloud import PointCloud
+    from uwlts.storage.cloud_files import read_cloud, write_cloud
     from uwlts.storage.export_ import export
     from uwlts.storage.import_ import Imported, import_images
     from uwlts.storage.mesh_file import SurfaceMesh, write_mesh
@@ -197,7 +198,7 @@ _MODULES = {
     "nominal": "uwlts.optics.nominal",
     "open_capture": "uwlts.storage.capture",
     "plot": "uwlts.report.plot",
-    "read_cloud": "uwlts.storage.cloud",
+    "read_cloud": "uwlts.storage.cloud_files",
     "read_mount": "uwlts.storage.mount_files",
     "read_poses": "uwlts.storage.pose_files",
     "read_trajectory": "uwlts.storage.pose_files",
@@ -215,7 +216,7 @@ _MODULES = {
     "write_camera_page": "uwlts.report.camera_page",
     "write_certificate": "uwlts.report.certificate_page",
     "write_change": "uwlts.report.change_page",
-    "write_cloud": "uwlts.storage.cloud",
+    "write_cloud": "uwlts.storage.cloud_files",
     "write_evaluation": "uwlts.measurement.evaluation",
     "write_findings": "uwlts.report.findings_page",
     "write_mesh": "uwlts.storage.mesh_file",

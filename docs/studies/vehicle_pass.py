@@ -76,12 +76,14 @@ def aligned_pass(path: Path) -> Figures:
     crossings = crossings_of(truth.pose[:, :2, 3])
     last = times <= times[max(second for _, second in crossings)]
 
+    def off(poses: np.ndarray) -> np.ndarray:
+        return poses[:, :3, 3] - true[:, :3, 3]
+
     def errors(poses: np.ndarray, part: np.ndarray) -> float:
-        return _rms(np.linalg.norm(poses[part, :3, 3] - true[part, :3, 3], axis=1))
+        return _rms(np.linalg.norm(off(poses)[part], axis=1))
 
     def own(poses: np.ndarray) -> np.ndarray:
-        off = poses[:, :3, 3] - true[:, :3, 3]
-        return off - off[0]
+        return off(poses) - off(poses)[0]
 
     def lengths(corrected: PointCloud) -> tuple[tuple[float, float], ...]:
         return tuple((length_error(cloud, truth, each), length_error(corrected, truth, each)) for each in crossings)
@@ -156,12 +158,7 @@ def main() -> None:
             kept.write_text(json.dumps(asdict(aligned_pass(path))))
         each = Figures(**json.loads(kept.read_text()))
         all_figures.append(each)
-        (path_before, path_after), (own_before, own_after), (_, to_last), (_, behind) = (
-            each.path_mm,
-            each.own_mm,
-            each.to_last_mm,
-            each.behind_mm,
-        )
+        (path_before, path_after), (own_before, own_after) = each.path_mm, each.own_mm
         lengths = np.sqrt(np.mean(np.square(each.lengths_mm), axis=0))
         rows.append(
             [
@@ -172,25 +169,16 @@ def main() -> None:
                 f"{own_before:.1f}",
                 f"{own_after:.1f}",
                 f"{own_before / own_after:.1f}",
-                f"{to_last:.1f} ({each.stated_mm[1]:.1f})",
-                f"{behind:.1f}",
+                f"{each.to_last_mm[1]:.1f} ({each.stated_mm[1]:.1f})",
+                f"{each.behind_mm[1]:.1f}",
                 f"{lengths[0]:.1f}",
                 f"{lengths[1]:.2f}",
                 f"{100 * each.within:.0f} %",
                 each.refused or str(each.doubtful),
             ]
         )
-    head = [
-        "sensor, pass",
-        "before",
-        "after",
-        "times",
-        "from the start: before",
-        "after",
-        "times",
-        "to the last crossing",
-        "behind it",
-    ]
+    head = ["sensor, pass", "before", "after", "times", "from the start: before", "after", "times"]
+    head += ["to the last crossing", "behind it"]
     head += ["lengths before", "lengths after", "within twice the stated", "doubtful crossings"]
     print(table(head, rows))
     for name in ("path_mm", "own_mm", "lengths_mm"):

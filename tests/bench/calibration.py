@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.uwlts.mount_views import known_mount
 from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential import CalibrationOptions
 from uwlts.measurement.moving import carried, platform_ride, with_platform
 from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.model.calibration import Calibration
-from uwlts.model.mount import Mount, SphereFound
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
@@ -60,7 +60,7 @@ def measuring_rate(scans: list[Path], calibration: Calibration) -> tuple[float, 
     The median over scans that are measured in turn: with the stage's positions, and of `AS_OFTEN` as many images along
     a trajectory of known covariance with a mount.
     """
-    mount = _mount()
+    mount = known_mount(np.eye(4), time_offset_s=0.0, time_offset_std_s=1e-4)
     with ExitStack() as stack:
         opened = [stack.enter_context(Capture(path)) for path in scans]
         by_stage, by_path = [], []
@@ -89,20 +89,3 @@ def _trajectory(times_s: np.ndarray) -> Trajectory:
     poses[:, 0, 3] = 2.0 * at
     part = ((at - at[0]) / (at[-1] - at[0]))[:, None, None]
     return Trajectory(at, poses, part**2 * np.diag(np.square(np.repeat([300.0, np.radians(1.0)], 3))))
-
-
-def _mount() -> Mount:
-    transform, std = np.eye(4), np.repeat([0.03, 1e-4], 3)
-    return Mount(
-        T_platform_sensor=tuple(map(tuple, transform.tolist())),
-        covariance=tuple(map(tuple, np.diag(std**2).tolist())),
-        coverage_factor=2.0,
-        artefact=SphereFound(centre_mm=(0.0, 0.0, 0.0), radius_mm=20.0),
-        time_offset_s=0.0,
-        time_offset_std_s=1e-4,
-        point_std_mm=0.02,
-        pose_std_mm=0.01,
-        rms_mm=0.02,
-        held_out_rms_mm=0.02,
-        poses=(),
-    )

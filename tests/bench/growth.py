@@ -25,7 +25,8 @@ from uwlts.model.sensor import CaptureHeader
 from uwlts.report.page_toolkit import new_figure
 from uwlts.storage.capture import Capture, Frame
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import read_cloud, write_cloud
 from uwlts.stripe import extract_stripe, find_stripes
 
 PICTURE = Path(__file__).resolve().parents[2] / "docs" / "pictures" / "growth.svg"

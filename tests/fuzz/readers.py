@@ -39,7 +39,7 @@ from uwlts.report.gather import load_reference
 from uwlts.report.inventory import describe
 from uwlts.storage.calibration_file import load_calibration, read_calibration, write_calibration
 from uwlts.storage.capture import Capture
-from uwlts.storage.cloud import read_cloud, write_cloud
+from uwlts.storage.cloud_files import read_cloud, write_cloud
 from uwlts.storage.export_ import export_cloud
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import read_intrinsics, with_intrinsics

@@ -24,7 +24,8 @@ from uwlts.model.sensor import Sensor
 from uwlts.storage.calibration_file import read_calibration, write_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import read_cloud, write_cloud
 
 ROOT = Path(__file__).resolve().parents[2]
 WIDTH, HEIGHT = 160, 128

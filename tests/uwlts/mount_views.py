@@ -4,9 +4,12 @@ Independent of the code under test: every ray of the fan is intersected in the b
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from uwlts.model.mount import Mount, SphereFound
 
 SPHERE_MM = np.array([812.0, -131.0, 215.0])
 RADIUS_MM = 20.0
@@ -18,6 +21,7 @@ RING_AXIS = np.array([0.28, -0.35, 0.894]) / np.linalg.norm([0.28, -0.35, 0.894]
 MOUNT = np.eye(4)
 MOUNT[:3, :3] = Rotation.from_euler("ZYX", [37.0, -12.0, 8.0], degrees=True).as_matrix()
 MOUNT[:3, 3] = (63.0, -24.0, 118.0)
+MOUNT_STD = np.array([0.05, 0.08, 0.03, 4e-4, 2e-4, 3e-4])
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,3 +208,19 @@ def _ring_profile(
     profile = np.column_stack([rays[:, 0] * seen, rays[:, 2] * seen + noise_mm * rng.standard_normal(RAYS)])
     profile[rng.random(RAYS) < 0.03] = np.nan
     return profile
+
+
+def known_mount(transform: np.ndarray, **changed: Any) -> Mount:
+    """A mount as a calibration finds it, with the standard uncertainties `MOUNT_STD` (mm, rad)."""
+    fields: dict[str, Any] = {
+        "T_platform_sensor": tuple(map(tuple, transform.tolist())),
+        "covariance": tuple(map(tuple, np.diag(MOUNT_STD**2).tolist())),
+        "coverage_factor": 2.0,
+        "artefact": SphereFound(centre_mm=(0, 0, 0), radius_mm=20.0),
+        "point_std_mm": 0.02,
+        "pose_std_mm": 0.01,
+        "rms_mm": 0.02,
+        "held_out_rms_mm": 0.02,
+        "poses": (),
+    }
+    return Mount(**fields | changed)

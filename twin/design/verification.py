@@ -35,7 +35,7 @@ from uwlts.model.errors import Error
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.workers import Lost, Workers, work_through
 from uwlts.storage.capture import Capture, part_path
-from uwlts.storage.cloud import read_cloud
+from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.files import written_aside
 from uwlts.storage.truth import truth_path
 

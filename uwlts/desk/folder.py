@@ -12,7 +12,7 @@ from uwlts.model.input_file import is_regular_file
 from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT
 from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
 from uwlts.storage.capture import part_path
-from uwlts.storage.cloud import is_cloud
+from uwlts.storage.cloud_files import is_cloud
 from uwlts.storage.json_files import read_json
 
 _SHOWN = 500

@@ -30,7 +30,8 @@ from uwlts.model.command_files import own_files
 from uwlts.model.errors import DescriptionError, Error
 from uwlts.model.library import validated
 from uwlts.report.inventory import describe
-from uwlts.storage.cloud import PointCloud, read_region, read_thinned_cloud, write_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import read_region, read_thinned_cloud, write_cloud
 from uwlts.storage.copc_file import is_copc
 from uwlts.storage.files import refuse_unsuitable
 

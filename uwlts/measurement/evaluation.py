@@ -13,7 +13,8 @@ from uwlts.metrology.evaluation import ArtefactEvaluation, Figure, FigureKey, Qu
 from uwlts.metrology.truth_comparison import TruthComparison, best_fit_motion, compare_with_truth
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
 from uwlts.model.errors import EvaluationError, problems_of
-from uwlts.storage.cloud import PointCloud, read_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.json_files import read_model, write_model
 from uwlts.storage.truth import Truth, read_truth
 

@@ -26,7 +26,8 @@ from uwlts.metrology.point_spacing import disc_of
 from uwlts.metrology.registration import Registration, SampledSurface, register_to_surface
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
-from uwlts.storage.cloud import PAIRS, WATER, PointCloud, PointUncertainty, read_cloud
+from uwlts.storage.cloud import PAIRS, WATER, PointCloud, PointUncertainty
+from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.pose_files import Unit
 
 _MOST_PLACES = 20_000

@@ -17,7 +17,8 @@ from uwlts.metrology.point_spacing import POINTS_PER_DISC
 from uwlts.model.errors import CaptureError, DescriptionError, EvaluationError, problems_of
 from uwlts.model.input_file import MOST_TOML_BYTES, parsed_toml, read_text, require_regular_file
 from uwlts.model.sensor import Description, Positive, Vector
-from uwlts.storage.cloud import PointCloud, PointUncertainty, read_cloud
+from uwlts.storage.cloud import PointCloud, PointUncertainty
+from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.pose_files import MM_PER_UNIT, Unit, checked_unit
 
 _SAMPLES_PER_DISC = 60

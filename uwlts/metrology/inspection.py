@@ -11,7 +11,8 @@ from uwlts.metrology.pipe_form import LARGEST_OVALITY
 from uwlts.metrology.pipe_inspection import inspect_pipe
 from uwlts.metrology.weld_inspection import inspect_weld
 from uwlts.model.errors import EvaluationError
-from uwlts.storage.cloud import PointCloud, read_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import read_cloud
 
 InspectionKind = Literal["pipe", "weld", "step", "flange", "gap"]
 

@@ -25,7 +25,8 @@ from uwlts.metrology.patches import surface_patches
 from uwlts.model.calibration import is_rigid
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
-from uwlts.storage.cloud import PointCloud, read_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import read_cloud
 
 _ROUNDS = 60
 _STILL_MM = 1e-5

@@ -20,7 +20,8 @@ from uwlts.metrology.evaluation import TOWARDS_SENSOR
 from uwlts.metrology.local_surface import LocalSurface, SurfacePoints, surface_normals
 from uwlts.metrology.point_spacing import disc_of
 from uwlts.model.errors import EvaluationError
-from uwlts.storage.cloud import PointCloud, images_along, read_cloud, variance_along
+from uwlts.storage.cloud import PointCloud, images_along, variance_along
+from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.mesh_file import SurfaceMesh
 
 _BLOCK = 48

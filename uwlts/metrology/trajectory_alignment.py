@@ -22,7 +22,8 @@ from uwlts.metrology.stated_drift import stated_drift
 from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory, on_clock
-from uwlts.storage.cloud import PointCloud, read_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import read_cloud
 
 _ROUGH = DriftKind(smooth=0.0, wandering=0.3, walk=0.3, turn_walk=0.3)
 """Kind of drift that is assumed in the search where the stated or usual one finds no crossing: fewer false crossings

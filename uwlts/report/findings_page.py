@@ -44,7 +44,8 @@ from uwlts.report.page_toolkit import (
 from uwlts.report.pdf import print_pdf, refuse_unsuitable_pdf
 from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import load_calibration
-from uwlts.storage.cloud import PointCloud, read_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.files import refuse_unsuitable, sha256_of
 from uwlts.storage.json_files import json_text
 

@@ -18,7 +18,8 @@ from uwlts.model.library import find, read_table, validated
 from uwlts.model.sensor import Description, Sensor
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, CaptureHeader
-from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import is_cloud, read_cloud
 from uwlts.storage.json_files import read_json
 from uwlts.storage.truth import read_truth
 

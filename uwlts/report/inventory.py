@@ -24,7 +24,8 @@ from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT
 from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
 from uwlts.storage.calibration_file import read_calibration, read_polynomials
 from uwlts.storage.capture import Capture
-from uwlts.storage.cloud import PointCloud, is_cloud, read_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import is_cloud, read_cloud
 from uwlts.storage.json_files import read_json
 from uwlts.storage.mount_files import FORMAT as MOUNT_FORMAT
 from uwlts.storage.mount_files import read_mount

@@ -16,15 +16,8 @@ from uwlts.model.command_files import keeps_inputs
 from uwlts.model.errors import CaptureError, OutputError
 from uwlts.model.stripe import rows_of
 from uwlts.storage.capture import Capture
-from uwlts.storage.cloud import (
-    PointCloud,
-    cloud_parts,
-    is_cloud,
-    read_cloud,
-    read_region,
-    read_thinned_cloud,
-    write_cloud,
-)
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import cloud_parts, is_cloud, read_cloud, read_region, read_thinned_cloud, write_cloud
 from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.e57_file import write_e57
 from uwlts.storage.files import refuse_unsuitable, require_possible_name, written_aside
@@ -163,7 +156,7 @@ CLOUD_FORMATS = (".ply", ".h5", ".xyz", ".laz", ".e57", ".mcap")
 def export_cloud(cloud: PointCloud, path: Path, *, overwrite: bool = False) -> None:
     """Write a cloud in the format that the path's suffix names, whole or not at all.
 
-    - ``.ply``, ``.h5``: as `uwlts.storage.cloud.write_cloud`; mm, everything kept.
+    - ``.ply``, ``.h5``: as `uwlts.storage.cloud_files.write_cloud`; mm, everything kept.
     - ``.xyz``: text, a line of names, then X Y Z in mm and the intensity (nan where unknown) of every point, with all
       the digits that they have.
     - ``.laz``: LAS 1.4, point format 6, metres in steps of 1e-7 m. The standard intensity is rounded to whole numbers

@@ -27,7 +27,8 @@ from uwlts.model.errors import CalibrationError, CaptureError, EvaluationError
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.storage.calibration_file import load_calibration, write_calibration
 from uwlts.storage.capture import Capture
-from uwlts.storage.cloud import PointCloud, write_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import write_cloud
 from uwlts.storage.truth import read_truth, truth_path
 from uwlts.stripe import FoundStripes, find_stripes
 from uwlts.thesis.campaign import CampaignFolder, ScanFile

@@ -30,7 +30,7 @@ from uwlts.report.page_toolkit import (
 )
 from uwlts.report.pictures import stripe_picture, stripe_view
 from uwlts.storage.capture import Capture
-from uwlts.storage.cloud import read_cloud
+from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.files import refuse_unsuitable, written_aside
 from uwlts.thesis.campaign import campaign_folders
 from uwlts.thesis.evaluation import TRIALS, evaluate_campaign

@@ -32,7 +32,7 @@ from uwlts.runtime.console import run
 from uwlts.storage.calibration_file import load_calibration, read_polynomials, write_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.cloud import read_cloud
+from uwlts.storage.cloud_files import read_cloud
 from uwlts.targets import CircleTarget
 
 DEPTHS = np.arange(-60.0, 101.0, 10.0)

@@ -10,7 +10,8 @@ from uwlts.desk.folder import file_in, interrupted, kind_of, listed, new_in
 from uwlts.model.errors import DescriptionError
 from uwlts.optics.nominal import nominal
 from uwlts.storage.calibration_file import write_calibration
-from uwlts.storage.cloud import PointCloud, write_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import write_cloud
 
 
 @pytest.fixture

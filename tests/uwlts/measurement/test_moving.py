@@ -6,10 +6,9 @@ from scipy.spatial.transform import Rotation
 
 import uwlts
 from tests.uwlts.measurement.test_reconstruction import CALIBRATION, FRESH, HEIGHT, WIDTH, small_sensor, stripe_image
-from tests.uwlts.mount_views import MOUNT
+from tests.uwlts.mount_views import MOUNT, MOUNT_STD, known_mount
 from uwlts.measurement.figure_uncertainty import shift_std_mm
 from uwlts.measurement.moving import Ride, with_platform
-from uwlts.model.mount import Mount, SphereFound
 from uwlts.storage.capture import CaptureHeader
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointUncertainty
@@ -18,22 +17,6 @@ START = np.eye(4)
 START[:3, :3] = Rotation.from_euler("ZYX", [70, 20, -35], degrees=True).as_matrix()
 START[:3, 3] = (900.0, -340.0, 610.0)
 STEP_MM = 2.0
-STD = np.array([0.05, 0.08, 0.03, 4e-4, 2e-4, 3e-4])
-
-
-def mount_of(transform, **changed):
-    fields = {
-        "T_platform_sensor": tuple(map(tuple, transform.tolist())),
-        "covariance": tuple(map(tuple, np.diag(STD**2).tolist())),
-        "coverage_factor": 2.0,
-        "artefact": SphereFound(centre_mm=(0, 0, 0), radius_mm=20.0),
-        "point_std_mm": 0.02,
-        "pose_std_mm": 0.01,
-        "rms_mm": 0.02,
-        "held_out_rms_mm": 0.02,
-        "poses": (),
-    }
-    return Mount(**fields | changed)
 
 
 def platform_at(stage_mm):
@@ -73,7 +56,7 @@ def expected(tmp_path):
 
 def test_poses_in_the_capture_are_the_platform_s_with_a_mount(tmp_path, expected):
     path = record(tmp_path / "posed.h5", poses=True)
-    uwlts.write_mount(tmp_path / "mount.json", mount_of(MOUNT))
+    uwlts.write_mount(tmp_path / "mount.json", known_mount(MOUNT))
     cloud = uwlts.reconstruct(path, CALIBRATION, mount=tmp_path / "mount.json")
     np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
 
@@ -84,7 +67,7 @@ def test_images_are_placed_along_the_trajectory_at_their_times(tmp_path, expecte
     path = record(tmp_path / "moving.h5")
     times = np.array([99.5, 100.3, 101.0, 102.9, 104.2])
     trajectory = uwlts.Trajectory(times, np.array([platform_at(STEP_MM * (time - 100)) for time in times]))
-    known = mount_of(MOUNT) if with_offset else mount_of(MOUNT, time_offset_s=100.0, time_offset_std_s=1e-4)
+    known = known_mount(MOUNT) if with_offset else known_mount(MOUNT, time_offset_s=100.0, time_offset_std_s=1e-4)
     offset = 100.0 if with_offset else None
     cloud = uwlts.reconstruct(path, CALIBRATION, mount=known, trajectory=trajectory, clock_offset_s=offset)
     np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
@@ -96,7 +79,7 @@ def test_a_clock_may_run_faster_than_the_camera_s(tmp_path, expected):
     poses = np.array([platform_at(STEP_MM * time) for time in (-0.5, 0.3, 1.0, 2.9, 4.2)])
     clock = {"clock_offset_s": 50.0, "clock_drift_ppm": ppm}
     cloud = uwlts.reconstruct(
-        path, CALIBRATION, mount=mount_of(MOUNT), trajectory=uwlts.Trajectory(times, poses), **clock
+        path, CALIBRATION, mount=known_mount(MOUNT), trajectory=uwlts.Trajectory(times, poses), **clock
     )
     np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
     with pytest.raises(uwlts.Error, match="drifts by 1e[+]06 ppm"):
@@ -104,7 +87,7 @@ def test_a_clock_may_run_faster_than_the_camera_s(tmp_path, expected):
             path, CALIBRATION, trajectory=uwlts.Trajectory(times, poses), clock_offset_s=50.0, clock_drift_ppm=1e6
         )
     with pytest.raises(uwlts.Error, match="without a trajectory"):
-        uwlts.reconstruct(path, CALIBRATION, mount=mount_of(MOUNT), clock_drift_ppm=ppm)
+        uwlts.reconstruct(path, CALIBRATION, mount=known_mount(MOUNT), clock_drift_ppm=ppm)
 
 
 def test_a_trajectory_without_a_mount_is_the_sensor_s(tmp_path, expected):
@@ -119,14 +102,14 @@ def test_the_robot_s_scale_stretches_its_positions(tmp_path, expected):
     record(path)
     poses = np.array([platform_at(STEP_MM * time) for time in (0.0, 4.0)])
     poses[:, :3, 3] /= scale
-    trajectory, known = uwlts.Trajectory(np.array([0.0, 4.0]), poses), mount_of(MOUNT, robot_scale=scale)
+    trajectory, known = uwlts.Trajectory(np.array([0.0, 4.0]), poses), known_mount(MOUNT, robot_scale=scale)
     cloud = uwlts.reconstruct(path, CALIBRATION, mount=known, trajectory=trajectory)
     np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
 
 
 def test_a_mount_without_poses_is_refused(tmp_path):
     with pytest.raises(uwlts.Error, match="4 of 4 laser images have no pose.*trajectory"):
-        uwlts.reconstruct(record(tmp_path / "stage.h5", stage=True), CALIBRATION, mount=mount_of(MOUNT))
+        uwlts.reconstruct(record(tmp_path / "stage.h5", stage=True), CALIBRATION, mount=known_mount(MOUNT))
 
 
 def test_images_outside_the_trajectory_are_refused(tmp_path):
@@ -147,14 +130,14 @@ def test_the_mount_s_uncertainty_moves_points_as_other_mounts_do():
         return np.einsum("nij,nj->ni", poses[:, :3, :3], on_platform) + poses[:, :3, 3]
 
     drawn = []
-    for step in rng.standard_normal((4000, 6)) * STD:
+    for step in rng.standard_normal((4000, 6)) * MOUNT_STD:
         other = MOUNT.copy()
         other[:3, 3] += step[:3]
         other[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ MOUNT[:3, :3]
         drawn.append(points(other))
     none = PointUncertainty(np.zeros((30, 6)), np.zeros((30, 3)), np.zeros((1, 30, 3)))
     ride = Ride(poses, None, np.arange(30.0))
-    found = with_platform(none, points(MOUNT), np.arange(30), ride, mount_of(MOUNT)).covariance_mm2()
+    found = with_platform(none, points(MOUNT), np.arange(30), ride, known_mount(MOUNT)).covariance_mm2()
     # The standard deviation of 4000 is right to 1.1 %; 90 of them stay within five of those.
     np.testing.assert_allclose(np.sqrt(np.einsum("nii->ni", found)), np.std(drawn, axis=0), rtol=0.056)
 
@@ -247,7 +230,9 @@ def test_the_time_offset_s_uncertainty_moves_points_along_the_path():
     rates = np.tile([100.0, 0.0, 0.0, 0.0, 0.0, 0.1], (4, 1))
     points = poses[:, :3, 3] + np.array([0.0, 200.0, 0.0])
     none = PointUncertainty(np.zeros((4, 6)), np.zeros((4, 3)), np.zeros((1, 4, 3)))
-    mount = mount_of(MOUNT, time_offset_s=0.0, time_offset_std_s=2e-4, covariance=tuple(map(tuple, np.eye(6) * 1e-20)))
+    mount = known_mount(
+        MOUNT, time_offset_s=0.0, time_offset_std_s=2e-4, covariance=tuple(map(tuple, np.eye(6) * 1e-20))
+    )
     found = with_platform(none, points, np.arange(4), Ride(poses, None, np.arange(4.0), rates), mount)
     # 100 mm/s along x, less 0.1 rad/s about z at 200 mm along y: 80 mm/s in 0.2 ms.
     np.testing.assert_allclose(found.std_mm(), np.tile([0.016, 0.0, 0.0], (4, 1)), atol=1e-6)
@@ -261,7 +246,7 @@ def test_a_mount_of_the_drawing_is_used_with_a_warning(tmp_path, expected):
     assert "calibrate it" in cloud.warnings[-1]
     turned = MOUNT.copy()
     turned[0, 3] += 5.0
-    calibrated = uwlts.reconstruct(path, CALIBRATION, mount=mount_of(turned))
+    calibrated = uwlts.reconstruct(path, CALIBRATION, mount=known_mount(turned))
     shift = np.linalg.norm(calibrated.points_mm - expected, axis=1)
     np.testing.assert_allclose(shift, 5.0, atol=1e-8)
     assert not calibrated.warnings

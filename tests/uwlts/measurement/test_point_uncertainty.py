@@ -24,7 +24,8 @@ from uwlts.model.sensor import Medium
 from uwlts.optics.reconstruction import reconstruct_pixels
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, source_of
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty, read_cloud, write_cloud
+from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.cloud_files import read_cloud, write_cloud
 
 BUILT = built_sensor()
 DRAWS = 400

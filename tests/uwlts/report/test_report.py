@@ -33,7 +33,8 @@ from uwlts.report.tables import print_table, summary_table
 from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.capture import CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.cloud import PointCloud, write_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import write_cloud
 from uwlts.storage.truth import Truth, TruthHeader, write_truth
 from uwlts.stripe import extract_stripe
 

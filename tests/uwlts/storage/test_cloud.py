@@ -19,7 +19,8 @@ from tests.system.in_process import uwlts
 from tests.uwlts import drawn_stripes
 from uwlts.model.errors import CaptureError, OutputError
 from uwlts.storage.capture import Capture
-from uwlts.storage.cloud import PointCloud, PointUncertainty, is_cloud, read_cloud, read_thinned_cloud, write_cloud
+from uwlts.storage.cloud import PointCloud, PointUncertainty
+from uwlts.storage.cloud_files import is_cloud, read_cloud, read_thinned_cloud, write_cloud
 from uwlts.storage.files import written_aside
 
 KINDS = pytest.mark.parametrize("name", ["a.ply", "a.h5"])
@@ -97,7 +98,7 @@ def test_a_cloud_larger_than_memory_allows_is_read_thinned(tmp_path, name):
     points = np.arange(3.0 * count).reshape(-1, 3)
     write_cloud(tmp_path / name, PointCloud(points, np.zeros(count), np.zeros(count, int), np.zeros(count, int)))
     program = (
-        "import resource, sys\nfrom uwlts.storage.cloud import read_thinned_cloud\n"
+        "import resource, sys\nfrom uwlts.storage.cloud_files import read_thinned_cloud\n"
         "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024\n"
         "before = peak()\ncloud, total = read_thinned_cloud(sys.argv[1], 100_000)\n"
         "print(len(cloud), total, cloud.points_mm[-1, 0], peak() - before)"

@@ -17,7 +17,8 @@ from uwlts.model.errors import OutputError, SetupError
 from uwlts.runtime.console import run
 from uwlts.storage.capture import Capture, Frame
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.cloud import PointCloud, read_cloud, write_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import read_cloud, write_cloud
 from uwlts.storage.export_ import CLOUD_FORMATS, export_capture, export_cloud
 from uwlts.storage.import_ import import_images
 from uwlts.storage.las_file import LAZ_STEP_M

@@ -9,7 +9,7 @@ import pytest
 
 from tests.uwlts.storage.test_cloud import some_cloud
 from uwlts.model.errors import CaptureError
-from uwlts.storage.cloud import cloud_parts, is_cloud, read_cloud, read_thinned_cloud
+from uwlts.storage.cloud_files import cloud_parts, is_cloud, read_cloud, read_thinned_cloud
 from uwlts.storage.export_ import export_cloud
 
 

@@ -20,7 +20,8 @@ from uwlts.measurement.evaluation import evaluate
 from uwlts.model.errors import EvaluationError
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.capture import Capture
-from uwlts.storage.cloud import PointCloud, read_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import read_cloud
 from uwlts.thesis.campaign import ScanFile
 from uwlts.thesis.measurements import METHODS, _figures, _line_length, _range_within, measure_scan
 from uwlts.thesis.sphere_spacing import sphere_scan

@@ -17,7 +17,8 @@ from uwlts.model.sensor import Medium
 from uwlts.report.page_toolkit import svg_of
 from uwlts.storage.capture import CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.cloud import PointCloud, write_cloud
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import write_cloud
 from uwlts.thesis.campaign import CampaignFolder, campaign_folders
 from uwlts.thesis.report import (
     comparison_figure,

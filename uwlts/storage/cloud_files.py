@@ -1,0 +1,416 @@
+"""Files of point clouds: HDF5, or binary PLY that CloudCompare and MeshLab open with all its fields; and those of other
+programs."""
+
+import os
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import ArrayLike
+from plyfile import PlyData, PlyElement, PlyParseError
+
+from uwlts.model.errors import CaptureError
+from uwlts.model.input_file import opened, parsed_json, require_regular_file, shortened
+from uwlts.model.sensor import Description, Table
+from uwlts.storage.cloud import KINDS, NO_INDEX, PAIRS, PER_POINT, PointCloud, PointUncertainty, joined, metadata_json
+from uwlts.storage.copc_file import is_copc, read_copc
+from uwlts.storage.files import written_aside
+from uwlts.storage.foreign_clouds import FOREIGN_FORMATS, read_foreign
+from uwlts.storage.hdf5_file import find_dataset, format_of, read_array, read_label, write_label
+
+FORMAT = "uwlts-cloud"
+VERSION = 1
+
+POINTS_OF_PART = 1_000_000
+"""Points of a part of a large cloud."""
+
+CLOUD_ENDINGS = (".ply", ".h5", ".copc.laz", *FOREIGN_FORMATS)
+"""Endings of the clouds that can be read."""
+_CLOUDS_ALONE = (".ply", ".xyz", ".las", ".e57")
+"""Endings of clouds and of nothing else that is measured."""
+_UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
+_PAIR_NAMES = tuple("xyz"[i] + "xyz"[j] for i, j in PAIRS)
+_SHARED = "shared_errors"
+_COMMENT = "uwlts-metadata"
+# CloudCompare reads PLY with rply, which refuses a whole file for one comment of 1024 characters or more.
+_PIECE_LENGTH = 900
+_PIECE = re.compile(rf"{_COMMENT} (\d+)/(\d+) (.*);")
+_LONGEST_PLY_HEADER = 2**24
+_MOST_PROPERTIES = 1000
+_TYPE_BYTES = {"char": 1, "uchar": 1, "short": 2, "ushort": 2, "int": 4, "uint": 4, "float": 4, "double": 8}
+_TYPE_BYTES |= {f"{kind}{bits}": bits // 8 for kind in ("int", "uint", "float") for bits in (8, 16, 32, 64)}
+_Rows = Callable[[int], slice]
+
+
+def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool = False) -> None:
+    """Write a cloud as HDF5 where the path ends with ``.h5``, else as binary little-endian PLY; whole or not at all.
+
+    In HDF5 the datasets are those of `PointCloud` and `PointUncertainty`, by their names, with systematic_mm2 (N, 6)
+    besides. In PLY the vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int), and
+    perhaps time (double, s). Where the uncertainty is known there are its covariances in mm2, random_xx to random_zz
+    and systematic_xx to systematic_zz, and in mm position_x to position_z, pattern0_x, pattern0_y and so on, and
+    perhaps pose0_x to pose5_z (`PointUncertainty`). The metadata is JSON in numbered comments,
+    short enough for every reader.
+
+    Raises
+    ------
+    OutputError
+        The file exists and `overwrite` is not set, the folder is missing, the disk is full.
+    """
+    if _in_hdf5(path):
+        _write_hdf5(path, cloud, overwrite=overwrite)
+        return
+    deviation = np.full(len(cloud), np.nan, np.float32) if cloud.deviation_mm is None else cloud.deviation_mm
+    columns = dict(zip("xyz", cloud.points_mm.T, strict=True)) | {"intensity": cloud.intensity, "deviation": deviation}
+    if cloud.time_s is not None:
+        columns["time"] = cloud.time_s
+    columns |= {"frame": cloud.frame, "line": cloud.line} | _uncertainty_columns(cloud.uncertainty)
+    vertices = np.empty(len(cloud), [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
+    for name, values in columns.items():
+        vertices[name] = values
+    comments = _comments(_with_shared(cloud))
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
+    with written_aside(path, overwrite=overwrite) as aside:
+        ply.write(str(aside))
+
+
+def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
+    """Read a cloud from HDF5 (``.h5``), COPC (``.copc.laz``) or PLY, also another program's (x, y, z suffice).
+
+    Points of other programs may also come as text (``.xyz``, ``.csv`` and others, mm), LAS or E57 (m).
+    Fields that CloudCompare has saved again (`scalar_intensity` and so on) are recognised. Missing intensity is NaN,
+    missing frame and line are -1, a deviation that is missing or NaN throughout is None.
+
+    Raises
+    ------
+    CaptureError
+        The file is missing, no cloud, truncated, without vertices' x, y, z, or its metadata is damaged.
+    """
+    return read_thinned_cloud(path)[0]
+
+
+def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None) -> tuple[PointCloud, int]:
+    """Every n-th point of a cloud's file, ``at_most`` so many, and the number of points in the file; see `read_cloud`.
+
+    Of HDF5 and binary PLY only these are held in memory. Of COPC the upper levels are read, an even sample.
+    """
+    if is_copc(path):
+        return _read_copc(path, None, at_most)
+    if _is_foreign(path):
+        whole = _read_foreign(Path(path))
+        return whole.selected(_every(len(whole), at_most)), len(whole)
+    return _read_rows(Path(path), lambda count: _every(count, at_most))
+
+
+def read_region(
+    path: str | os.PathLike[str], low_mm: ArrayLike, high_mm: ArrayLike, at_most: int | None = None
+) -> PointCloud:
+    """The points of a cloud's file in the box from ``low_mm`` (3,) to ``high_mm`` (3,), an even sample of ``at_most``.
+
+    Of COPC only the nodes in the box are read, of other files a part at a time.
+    """
+    low, high = np.asarray(low_mm, float), np.asarray(high_mm, float)
+    if low.shape != (3,) or high.shape != (3,) or not (np.isfinite([low, high]).all() and (low < high).all()):
+        raise CaptureError(f"a region goes from x, y, z to larger x, y, z; found {low.tolist()} to {high.tolist()} mm")
+    if is_copc(path):
+        return _read_copc(path, (low, high), at_most)[0]
+    found = [
+        part.selected(np.flatnonzero(np.all((part.points_mm >= low) & (part.points_mm <= high), axis=1)))
+        for part in cloud_parts(path)
+    ]
+    whole = joined(found)
+    return whole.selected(_every(len(whole), at_most))
+
+
+def cloud_parts(path: str | os.PathLike[str], most: int = POINTS_OF_PART) -> Iterator[PointCloud]:
+    """The points of a cloud's file in their order, so many at a time, as `read_cloud` gives all of them.
+
+    Of HDF5 and binary PLY only one part is held in memory.
+    """
+    if is_copc(path) or _is_foreign(path):
+        whole = read_cloud(path)
+        yield from (whole.selected(slice(start, start + most)) for start in range(0, max(len(whole), 1), most))
+        return
+    start, total = 0, 1
+    while start < total:
+        part, total = _read_rows(Path(path), lambda _, start=start: slice(start, start + most))
+        yield part
+        start += most
+
+
+def _read_copc(
+    path: str | os.PathLike[str], box: tuple[np.ndarray, np.ndarray] | None, at_most: int | None
+) -> tuple[PointCloud, int]:
+    found = read_copc(path, box_mm=box, at_most=at_most)
+    unknown = np.full(len(found.points_mm), NO_INDEX)
+    frame, line = (unknown if each is None else each for each in (found.frame, found.line))
+    return PointCloud(found.points_mm, found.intensity, frame, line, found.deviation_mm), found.total
+
+
+def _is_foreign(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() in FOREIGN_FORMATS
+
+
+def _read_foreign(path: Path) -> PointCloud:
+    found = read_foreign(path)
+    none, unknown = np.full(len(found.points_mm), np.nan), np.full(len(found.points_mm), NO_INDEX)
+    try:
+        return PointCloud(
+            found.points_mm,
+            none if found.intensity is None else found.intensity,
+            unknown if found.frame is None else found.frame,
+            unknown if found.line is None else found.line,
+            deviation_mm=found.deviation_mm,
+            time_s=found.time_s,
+        )
+    except CaptureError as error:
+        raise CaptureError(f"{path}: {error}") from error
+
+
+def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
+    """The rows of a file that are selected by the number of all, and that number."""
+    if path.suffix.lower() not in (".ply", ".h5"):
+        with opened(path, called="cloud") as file:
+            if not file.read(4).startswith(b"ply"):
+                raise CaptureError(f"{path} ends with none of {', '.join(CLOUD_ENDINGS)}, the formats of clouds")
+    try:
+        return _read_hdf5(path, rows) if _in_hdf5(path) else _read_ply(path, rows)
+    except CaptureError as error:
+        raise CaptureError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+
+
+def _every(count: int, at_most: int | None) -> slice:
+    """The selection of every n-th of so many points."""
+    return slice(None, None, 1 if at_most is None else max(1, -(-count // at_most)))
+
+
+def is_cloud(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a cloud: by its ending, where that is not the captures' as well, and else by its label."""
+    if _in_hdf5(path):
+        return format_of(Path(path)) == FORMAT
+    return is_copc(path) or Path(path).suffix.lower() in _CLOUDS_ALONE
+
+
+def _in_hdf5(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() == ".h5"
+
+
+def _move_names(patterns: int) -> list[str]:
+    return [f"{move}_{axis}" for move in ("position", *(f"pattern{m}" for m in range(patterns))) for axis in "xyz"]
+
+
+def _uncertainty_columns(uncertainty: PointUncertainty | None) -> dict[str, np.ndarray]:
+    """Columns (N,) float32 by the names of their vertex properties."""
+    if uncertainty is None:
+        return {}
+    names = [f"{kind}_{pair}" for kind in ("random", "systematic") for pair in _PAIR_NAMES]
+    names += _move_names(len(uncertainty.patterns_mm))
+    patterns = np.moveaxis(uncertainty.patterns_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
+    parts = uncertainty.random_mm2.T, uncertainty.systematic_mm2().T, uncertainty.position_mm.T, patterns
+    columns = dict(zip(names, np.vstack(parts).astype(np.float32), strict=True))
+    if uncertainty.poses_mm is not None:
+        poses = np.moveaxis(uncertainty.poses_mm, 2, 1).reshape(-1, len(uncertainty.random_mm2))
+        columns |= dict(zip(_pose_names(len(uncertainty.poses_mm)), poses.astype(np.float32), strict=True))
+    return columns
+
+
+def _pose_names(count: int) -> list[str]:
+    return [f"pose{k}_{axis}" for k in range(count) for axis in "xyz"]
+
+
+def _with_shared(cloud: PointCloud) -> Table:
+    """Metadata in a file: with what the patterns share with other clouds."""
+    if cloud.uncertainty is None or not cloud.uncertainty.shared:
+        return cloud.metadata
+    shared: Table = {name: np.round(each, 9).tolist() for name, each in cloud.uncertainty.shared.items()}
+    return {**cloud.metadata, _SHARED: shared}
+
+
+def _without_shared(metadata: Table, known: PointUncertainty | None) -> tuple[Table, PointUncertainty | None]:
+    """Metadata and uncertainty of a cloud from those in a file; CaptureError where they do not fit together."""
+    if _SHARED not in metadata:
+        return metadata, known
+    rest = {name: each for name, each in metadata.items() if name != _SHARED}
+    if known is None:
+        return rest, None
+    stated = metadata[_SHARED]
+    try:
+        if not isinstance(stated, dict):
+            raise TypeError("not an object")
+        shared = {name: np.array(each, dtype=np.float64) for name, each in stated.items()}
+    except (TypeError, ValueError) as error:
+        raise CaptureError(f"its metadata is damaged: {_SHARED} holds no numbers") from error
+    if any(
+        each.ndim != 2 or len(each) != len(known.patterns_mm) or not np.isfinite(each).all() for each in shared.values()
+    ):
+        raise CaptureError(
+            f"its metadata is damaged: {_SHARED} does not belong to its {len(known.patterns_mm)} patterns"
+        )
+    return rest, replace(known, shared=shared)
+
+
+def _comments(metadata: Table) -> list[str]:
+    text = metadata_json(metadata)
+    pieces = [text[start : start + _PIECE_LENGTH] for start in range(0, len(text), _PIECE_LENGTH)]
+    # The semicolon keeps a piece's last blank from being stripped by readers.
+    return [f"{_COMMENT} {number}/{len(pieces)} {piece};" for number, piece in enumerate(pieces, start=1)]
+
+
+def _metadata(comments: list[str]) -> Table:
+    own = [comment for comment in comments if comment.startswith(_COMMENT)]
+    if not own:
+        return {}
+    pieces = [_PIECE.fullmatch(comment) for comment in own]
+    wanted = [(str(number), str(len(own))) for number in range(1, len(own) + 1)]
+    if [piece and piece.groups()[:2] for piece in pieces] != wanted:
+        raise CaptureError("its metadata is incomplete; write the file again or remove those comments")
+    try:
+        metadata = parsed_json("".join(piece.group(3) for piece in pieces if piece))
+    except ValueError as error:
+        raise CaptureError(f"its metadata is damaged: {error}") from error
+    if not isinstance(metadata, dict):
+        raise CaptureError(f"its metadata is a {type(metadata).__name__}; expected a JSON object")
+    return metadata
+
+
+def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
+    with opened(path, called="cloud") as file:
+        _refuse_impossible_header(file.read(_LONGEST_PLY_HEADER), size=os.fstat(file.fileno()).st_size, path=path)
+    try:
+        ply = PlyData.read(str(path))
+    except OSError as error:
+        raise CaptureError(f"{path} cannot be read: {error.strerror or error}") from error
+    except (PlyParseError, ValueError, MemoryError, ArithmeticError, LookupError) as error:
+        raise CaptureError(f"{path} is not a complete PLY file: {error}") from error
+    if "vertex" not in ply:
+        raise CaptureError(f"{path} is a PLY file without vertices; expected an element 'vertex'")
+    whole = ply["vertex"].data
+    vertices, names = whole[rows(len(whole))], whole.dtype.names or ()
+    if missing := [axis for axis in "xyz" if axis not in names]:
+        raise CaptureError(f"the vertices have no {', '.join(missing)}, only {', '.join(names) or 'nothing'}")
+    known = {name.removeprefix("scalar_"): name for name in names} | {name: name for name in names}
+
+    def column(name: str, default: float, kind: type = np.float32) -> np.ndarray:
+        if name not in known:
+            return np.full(len(vertices), default, kind)
+        values = vertices[known[name]]
+        if values.dtype.kind not in "iuf":
+            raise CaptureError(f"the property {known[name]} is a list; expected one number per point")
+        return values.astype(kind)
+
+    def indices(name: str) -> np.ndarray:
+        values = column(name, NO_INDEX, np.float64)
+        wrong = ~(np.isfinite(values) & (values == np.round(values)) & (np.abs(values) < 2**31))
+        if wrong.any():
+            raise CaptureError(f"{np.count_nonzero(wrong)} values of {name} are no whole numbers")
+        return values.astype(np.int32)
+
+    uncertainty, count = None, sum(f"pattern{m}_x" in known for m in range(len(known)))
+    wanted = [f"random_{pair}" for pair in _PAIR_NAMES] + _move_names(count)
+    if count and known.keys() >= set(wanted):
+        columns = np.stack([column(name, np.nan) for name in wanted])
+        random, position, patterns = columns[:6].T.copy(), columns[6:9].T.copy(), columns[9:].reshape(count, 3, -1)
+        uncertainty = PointUncertainty(random, position, np.ascontiguousarray(np.moveaxis(patterns, 1, 2)))
+        parts = sum(f"pose{k}_x" in known for k in range(len(known)))
+        if parts and known.keys() >= set(_pose_names(parts)):
+            poses = np.stack([column(name, np.nan) for name in _pose_names(parts)]).reshape(parts, 3, -1)
+            uncertainty = replace(uncertainty, poses_mm=np.ascontiguousarray(np.moveaxis(poses, 1, 2)))
+    deviation = column("deviation", np.nan)
+    metadata, uncertainty = _without_shared(_metadata(ply.comments), uncertainty)
+    cloud = PointCloud(
+        points_mm=np.column_stack([column(axis, np.nan, np.float64) for axis in "xyz"]),
+        intensity=column("intensity", np.nan),
+        frame=indices("frame"),
+        line=indices("line"),
+        deviation_mm=None if np.isnan(deviation).all() else deviation,
+        uncertainty=uncertainty,
+        time_s=column("time", np.nan, np.float64) if "time" in known else None,
+        metadata=metadata,
+    )
+    return cloud, len(whole)
+
+
+def _refuse_impossible_header(start: bytes, *, size: int, path: Path) -> None:
+    """CaptureError where a PLY file is shorter than what its header declares; other faults are left to the reader."""
+    header, end, _ = start.partition(b"end_header")
+    if not end:
+        raise CaptureError(f"{path} is not a complete PLY file: its header has no end in the first 16 MiB")
+    in_text, least, count, properties = b"format ascii" in header[:200], 0, 0, 0
+    for line in header.splitlines():
+        match line.decode("ascii", "replace").split():
+            case ["element", _, number] if number.isdecimal() and len(number) <= 18:
+                count = int(number)
+            case ["element", *_]:
+                raise CaptureError(f"{path} is not a complete PLY file: {shortened(repr(line))} is no element")
+            case ["property", kind, *_]:
+                # In text a number takes a digit and what parts it from the next; a list at least its length.
+                least += count * (2 if in_text else _TYPE_BYTES.get(kind, 1))
+                properties += 1
+    if properties > _MOST_PROPERTIES:
+        raise CaptureError(f"{path} has {properties:,} properties; this program reads up to {_MOST_PROPERTIES:,}")
+    if least > size:
+        raise CaptureError(
+            f"{path} is not a complete PLY file: early end-of-file, its header declares at least {least:,} bytes of "
+            f"values, and the file has {size:,}"
+        )
+
+
+class _CloudHeader(Description):
+    """Header of a cloud's HDF5 file."""
+
+    metadata: Table
+
+
+def _write_hdf5(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool) -> None:
+    arrays = {name: getattr(cloud, name) for name in PER_POINT}
+    arrays |= {name: each for name in ("deviation_mm", "time_s") if (each := getattr(cloud, name)) is not None}
+    if cloud.uncertainty is not None:
+        arrays |= {name: each for name in _UNCERTAINTY if (each := getattr(cloud.uncertainty, name)) is not None}
+        arrays["systematic_mm2"] = cloud.uncertainty.systematic_mm2()
+    # In memory first: HDF5 does not survive a full disk.
+    content = BytesIO()
+    with h5py.File(content, "w", libver="latest") as file:
+        write_label(file, format=FORMAT, version=VERSION, header=_CloudHeader(metadata=_with_shared(cloud)))
+        for name, data in arrays.items():
+            file.create_dataset(name, data=data, compression="gzip", compression_opts=1, shuffle=True, fletcher32=True)
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_bytes(content.getbuffer())
+
+
+def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
+    require_regular_file(path, called="cloud")
+    names = _UNCERTAINTY
+    try:
+        with h5py.File(path, "r") as file:
+            header = read_label(file, _CloudHeader, path=path, format=FORMAT, version=VERSION)
+            points = find_dataset(file, "points_mm", path=path)
+            total = 0 if points is None or not points.ndim else len(points)
+            chosen = rows(total)
+            selection: dict[str, tuple[slice, ...]] = dict.fromkeys((*KINDS, *names), (chosen,))
+            selection["patterns_mm"] = selection["poses_mm"] = (slice(None), chosen)
+            found = {name: read_array(file, name, path=path, selection=selection[name]) for name in selection}
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
+    arrays = {name: values for name, values in found.items() if values is not None}
+    # Whole numbers may not be cut, nor fractions become whole.
+    wanted_kinds = {name: np.dtype(KINDS.get(name, np.float32)).kind for name in arrays}
+    if unusable := [name for name, values in arrays.items() if values.dtype.kind != wanted_kinds[name]]:
+        raise CaptureError(f"{path} is damaged: {', '.join(unusable)} are no numbers of the expected kind")
+    if unusable := [
+        n for n in ("frame", "line") if n in arrays and (np.abs(arrays[n].astype(np.float64)) >= 2**31).any()
+    ]:
+        raise CaptureError(f"{path} is damaged: {', '.join(unusable)} has values of more than 32 bits")
+    needed = [name for name in names if name != "poses_mm"]
+    wanted = [*PER_POINT, *(needed if any(name in arrays for name in names) else ())]
+    if missing := [name for name in wanted if name not in arrays]:
+        raise CaptureError(f"{path} is damaged: it has no {', '.join(missing)}")
+    known = None
+    if needed[0] in arrays:
+        known = PointUncertainty(*(arrays[name] for name in needed), poses_mm=arrays.get("poses_mm"))
+    per_point = {name: arrays[name] for name in KINDS if name in arrays}
+    metadata, known = _without_shared(header.metadata, known)
+    return PointCloud(**per_point, uncertainty=known, metadata=metadata), total
