@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from twin.backend import packages
 from twin.backend.llvm import RUNTIME_LIBRARY
 from twin.backend.packages import Report, run_command
-from uwlts.model.errors import SetupError
+from uwlts.errors import SetupError
 from uwlts.runtime.shared_library import file_of, own_folders
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ import pytest
 
 from tests.browser import find_chromium, open_chromium
 from twin.options import CPU, use_variant
-from uwlts.model.errors import SetupError
+from uwlts.errors import SetupError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 

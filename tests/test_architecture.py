@@ -14,7 +14,7 @@ FORBIDDEN = {
     "twin/scene/bent_b.py": "import numpy as np, uwlts.optics.camera as c",
     "twin/scene/bent_c.py": "from uwlts.optics import camera, window",
     "twin/light/bent_d.py": "from uwlts.optics.window import refract",
-    "twin/light/bent_e.py": "def late():\n    from uwlts.measurement.reconstruction import reconstruct",
+    "twin/light/bent_e.py": "def late():\n    from uwlts.reconstruction.reconstruct import reconstruct",
     "twin/light/bent_f.py": "try:\n    import uwlts.stripe\nexcept ImportError:\n    pass",
     "twin/sensor/bent_g.py": "from uwlts.targets.detection import blobs",
     "uwlts/optics/bent_h.py": "import mitsuba as mi",

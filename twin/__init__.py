@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from twin.devices.serve import ServedTwin, serve
     from twin.recording.campaigns import record
     from twin.recording.demonstration import demo
-    from twin.recording.recording import Recording, render, simulate
+    from twin.recording.render import Recording, render, simulate
     from twin.recording.reproduce import reproduce
 
 __all__ = [
@@ -38,17 +38,17 @@ __all__ = [
 
 _MODULES = {
     "DataSet": "twin.datasets.loading",
-    "Recording": "twin.recording.recording",
+    "Recording": "twin.recording.render",
     "ServedTwin": "twin.devices.serve",
     "SweepResult": "twin.design.sweep",
     "dataset": "twin.datasets.generation",
     "demo": "twin.recording.demonstration",
     "load_dataset": "twin.datasets.loading",
     "record": "twin.recording.campaigns",
-    "render": "twin.recording.recording",
+    "render": "twin.recording.render",
     "reproduce": "twin.recording.reproduce",
     "serve": "twin.devices.serve",
-    "simulate": "twin.recording.recording",
+    "simulate": "twin.recording.render",
     "sweep": "twin.design.sweep",
 }
 

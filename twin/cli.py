@@ -17,9 +17,9 @@ from typing import Annotated, Any, Literal, cast, get_args, get_origin, get_type
 from cyclopts import App, Parameter
 
 import twin
-import uwlts
 from twin.options import CPU
 from twin.scene.description import load_scene
+from uwlts._version import __version__
 from uwlts.model.library import names
 from uwlts.model.waters import WATERS
 from uwlts.runtime.console import run
@@ -27,7 +27,7 @@ from uwlts.runtime.console import run
 app = App(
     name="twin",
     help="Digital twin of an underwater laser triangulation sensor.",
-    version=uwlts.__version__,
+    version=__version__,
     help_format="markdown",
 )
 _SHOWING = ("show_progress", "report")

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 from twin.backend.llvm import prepare_llvm
-from uwlts.model.errors import DescriptionError, SetupError
+from uwlts.errors import DescriptionError, SetupError
 
 CPU = "llvm_ad_mono"
 GPU = "cuda_ad_mono"

@@ -6,37 +6,39 @@ Every name of the public interface is imported when it is first used, so that im
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from uwlts._version import __version__ as __version__
+
 if TYPE_CHECKING:
+    from uwlts.alignment.align import AlignedTrajectory, align_trajectory
     from uwlts.calibration.calibrate import calibrate
+    from uwlts.calibration.camera.photographs import CameraCalibration, calibrate_camera, write_camera
     from uwlts.calibration.joint.refresh import Refreshed, refresh
     from uwlts.calibration.model_comparison.comparison import Comparison, compare_models
     from uwlts.calibration.mount import calibrate_mount
-    from uwlts.calibration.photographs import CameraCalibration, calibrate_camera, write_camera
-    from uwlts.calibration.polynomial import PolynomialResult, calibrate_polynomials
+    from uwlts.calibration.polynomial.polynomial_calibration_fit import PolynomialResult, calibrate_polynomials
+    from uwlts.comparison.change import SurfaceChange, compare_clouds
+    from uwlts.comparison.surface_mesh import mesh
     from uwlts.desk.guided import record_guided
     from uwlts.desk.operator_page import serve_desk
     from uwlts.desk.recording_view import watch
     from uwlts.doctor import Finding, examine
-    from uwlts.hardware.guided.recording import GuidedRecording
+    from uwlts.errors import Error
+    from uwlts.evaluation.evaluate import Evaluation, evaluate, write_evaluation
+    from uwlts.evaluation.gauge import GaugeStudy, gauge_study
+    from uwlts.hardware.guided.record import GuidedRecording
     from uwlts.hardware.scanning import scan
-    from uwlts.measurement.evaluation import Evaluation, evaluate, write_evaluation
-    from uwlts.measurement.reconstruction import ScanCloud, reconstruct
-    from uwlts.measurement.verification import Verification, verify
-    from uwlts.metrology.change import SurfaceChange, compare_clouds
-    from uwlts.metrology.features import Inspection
-    from uwlts.metrology.gauge import GaugeStudy, gauge_study
-    from uwlts.metrology.inspection import inspect
-    from uwlts.metrology.scan_registration import RegisteredScans, register
-    from uwlts.metrology.surface_mesh import mesh
-    from uwlts.metrology.trajectory_alignment import AlignedTrajectory, align_trajectory
+    from uwlts.inspection.features import Inspection
+    from uwlts.inspection.inspect import inspect
     from uwlts.model.calibration import Calibration
-    from uwlts.model.errors import Error
     from uwlts.model.library import load_sensor
     from uwlts.model.mount import Mount
     from uwlts.model.polynomial_calibration import PolynomialCalibration
     from uwlts.model.sensor import Sensor
     from uwlts.model.trajectory import Trajectory
     from uwlts.optics.nominal import nominal
+    from uwlts.reconstruction.reconstruct import ScanCloud, reconstruct
+    from uwlts.reconstruction.verify import Verification, verify
+    from uwlts.registration.register import RegisteredScans, register
     from uwlts.report import plot
     from uwlts.report.camera_page import write_camera_page
     from uwlts.report.campaign_page import Report, write_report
@@ -60,7 +62,6 @@ if TYPE_CHECKING:
     from uwlts.stripe import StripeOptions
     from uwlts.thesis.report import ThesisReport, evaluate_thesis
 
-__version__ = "0.1.0"
 
 __all__ = [
     "AlignedTrajectory",
@@ -146,55 +147,55 @@ __all__ = [
 ]
 
 _MODULES = {
-    "AlignedTrajectory": "uwlts.metrology.trajectory_alignment",
+    "AlignedTrajectory": "uwlts.alignment.align",
     "Calibration": "uwlts.model.calibration",
-    "CameraCalibration": "uwlts.calibration.photographs",
+    "CameraCalibration": "uwlts.calibration.camera.photographs",
     "Capture": "uwlts.storage.capture",
     "Comparison": "uwlts.calibration.model_comparison.comparison",
-    "Error": "uwlts.model.errors",
-    "Evaluation": "uwlts.measurement.evaluation",
+    "Error": "uwlts.errors",
+    "Evaluation": "uwlts.evaluation.evaluate",
     "Finding": "uwlts.doctor",
     "Frame": "uwlts.storage.capture",
-    "GaugeStudy": "uwlts.metrology.gauge",
-    "GuidedRecording": "uwlts.hardware.guided.recording",
+    "GaugeStudy": "uwlts.evaluation.gauge",
+    "GuidedRecording": "uwlts.hardware.guided.record",
     "Imported": "uwlts.storage.import_",
-    "Inspection": "uwlts.metrology.features",
+    "Inspection": "uwlts.inspection.features",
     "Mount": "uwlts.model.mount",
     "PointCloud": "uwlts.storage.cloud",
     "PolynomialCalibration": "uwlts.model.polynomial_calibration",
-    "PolynomialResult": "uwlts.calibration.polynomial",
+    "PolynomialResult": "uwlts.calibration.polynomial.polynomial_calibration_fit",
     "Refreshed": "uwlts.calibration.joint.refresh",
-    "RegisteredScans": "uwlts.metrology.scan_registration",
+    "RegisteredScans": "uwlts.registration.register",
     "Report": "uwlts.report.campaign_page",
-    "ScanCloud": "uwlts.measurement.reconstruction",
+    "ScanCloud": "uwlts.reconstruction.reconstruct",
     "Sensor": "uwlts.model.sensor",
     "StripeOptions": "uwlts.stripe",
-    "SurfaceChange": "uwlts.metrology.change",
+    "SurfaceChange": "uwlts.comparison.change",
     "SurfaceMesh": "uwlts.storage.mesh_file",
     "ThesisReport": "uwlts.thesis.report",
     "Trajectory": "uwlts.model.trajectory",
     "Truth": "uwlts.storage.truth",
-    "Verification": "uwlts.measurement.verification",
-    "align_trajectory": "uwlts.metrology.trajectory_alignment",
+    "Verification": "uwlts.reconstruction.verify",
+    "align_trajectory": "uwlts.alignment.align",
     "calibrate": "uwlts.calibration.calibrate",
-    "calibrate_camera": "uwlts.calibration.photographs",
+    "calibrate_camera": "uwlts.calibration.camera.photographs",
     "calibrate_mount": "uwlts.calibration.mount",
-    "calibrate_polynomials": "uwlts.calibration.polynomial",
+    "calibrate_polynomials": "uwlts.calibration.polynomial.polynomial_calibration_fit",
     "check_certificate": "uwlts.report.certificate",
-    "compare_clouds": "uwlts.metrology.change",
+    "compare_clouds": "uwlts.comparison.change",
     "compare_models": "uwlts.calibration.model_comparison.comparison",
     "describe": "uwlts.report.inventory",
     "design": "uwlts.report.inventory",
-    "evaluate": "uwlts.measurement.evaluation",
+    "evaluate": "uwlts.evaluation.evaluate",
     "evaluate_thesis": "uwlts.thesis.report",
     "examine": "uwlts.doctor",
     "export": "uwlts.storage.export_",
-    "gauge_study": "uwlts.metrology.gauge",
+    "gauge_study": "uwlts.evaluation.gauge",
     "import_images": "uwlts.storage.import_",
-    "inspect": "uwlts.metrology.inspection",
+    "inspect": "uwlts.inspection.inspect",
     "load_calibration": "uwlts.storage.calibration_file",
     "load_sensor": "uwlts.model.library",
-    "mesh": "uwlts.metrology.surface_mesh",
+    "mesh": "uwlts.comparison.surface_mesh",
     "nominal": "uwlts.optics.nominal",
     "open_capture": "uwlts.storage.capture",
     "plot": "uwlts.report.plot",
@@ -203,21 +204,21 @@ _MODULES = {
     "read_poses": "uwlts.storage.pose_files",
     "read_trajectory": "uwlts.storage.pose_files",
     "read_truth": "uwlts.storage.truth",
-    "reconstruct": "uwlts.measurement.reconstruction",
+    "reconstruct": "uwlts.reconstruction.reconstruct",
     "record_guided": "uwlts.desk.guided",
     "refresh": "uwlts.calibration.joint.refresh",
-    "register": "uwlts.metrology.scan_registration",
+    "register": "uwlts.registration.register",
     "scan": "uwlts.hardware.scanning",
     "serve_desk": "uwlts.desk.operator_page",
-    "verify": "uwlts.measurement.verification",
+    "verify": "uwlts.reconstruction.verify",
     "watch": "uwlts.desk.recording_view",
     "write_calibration": "uwlts.storage.calibration_file",
-    "write_camera": "uwlts.calibration.photographs",
+    "write_camera": "uwlts.calibration.camera.photographs",
     "write_camera_page": "uwlts.report.camera_page",
     "write_certificate": "uwlts.report.certificate_page",
     "write_change": "uwlts.report.change_page",
     "write_cloud": "uwlts.storage.cloud_files",
-    "write_evaluation": "uwlts.measurement.evaluation",
+    "write_evaluation": "uwlts.evaluation.evaluate",
     "write_findings": "uwlts.report.findings_page",
     "write_mesh": "uwlts.storage.mesh_file",
     "write_models": "uwlts.report.model_comparison",

@@ -26,7 +26,7 @@ import uwlts
 from twin.scene.description import load_scene
 from twin.scene.forms import Flange, Weld
 from twin.scene.forms.weld import weld_height
-from uwlts.metrology.features import Feature, FeatureKind, Inspection
+from uwlts.inspection.features import Feature, FeatureKind, Inspection
 from uwlts.storage.capture_writer import CaptureWriter
 
 HOLLOWS = FeatureKind.PIT, FeatureKind.DENT

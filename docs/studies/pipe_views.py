@@ -13,7 +13,7 @@ import numpy as np
 
 import uwlts
 from tests.uwlts.pipe_views import OVALITY_MM, RADIUS_MM, oval, views
-from uwlts.metrology.artefacts import evaluate_pipe
+from uwlts.evaluation.artefact_figures import evaluate_pipe
 from uwlts.model.artefacts import PipeStandard
 
 

@@ -19,7 +19,7 @@ import uwlts
 from twin.scene.description import Scene
 from twin.scene.platforms import Robot
 from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of
-from uwlts.metrology.fits import fit_sphere
+from uwlts.fitting.shapes import fit_sphere
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount, SphereFound
 from uwlts.storage.truth import read_truth, truth_path

@@ -11,7 +11,7 @@ from numpy.polynomial import polynomial
 
 from twin.options import ALL, NONE, Effects, Options
 from twin.scene.description import Scene, load_scene
-from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import MAD_TO_STD
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.stripe import StripeOptions, extract_stripe

@@ -14,7 +14,7 @@ from stripe_plan import NAME_CORE, PLACES, Plan
 from stripe_tables import table, write_tables
 
 from twin.options import use_variant
-from uwlts.report.numbers import fixed
+from uwlts.pages.numbers import fixed
 from uwlts.runtime.console import progress_bar
 
 PAGE = Path(__file__).parents[1] / "explanation" / "stripe-errors.md"

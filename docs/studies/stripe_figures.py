@@ -14,7 +14,7 @@ from stripe_plan import DEPTHS, F_NUMBERS, LEVELS, NAME_ALL, NAME_CORE, PLACES, 
 from twin.sensor.speckle import pixel_contrast
 from uwlts.model.library import load_sensor
 from uwlts.model.placement import camera_from_object, check_design
-from uwlts.report.page_toolkit import COLOURS, legend_below, new_figure
+from uwlts.pages.toolkit import COLOURS, legend_below, new_figure
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 
 TRUE, FOUND, PUBLISHED = "#ff7800", "#145ac8", "#e9dcc4"

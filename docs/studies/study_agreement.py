@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from twin.design.description import Study
 from twin.design.designs import EvaluatedDesign, Marked
 from twin.design.parameters import followed, parameters_of
+from twin.design.study import Study
 from twin.design.verification import verified
 from twin.options import CPU
 from uwlts.model.library import load_sensor, merged, validated

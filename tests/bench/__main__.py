@@ -151,7 +151,7 @@ def pipeline() -> list[Row]:
     from twin.scene.description import load_scene
     from uwlts.model.library import load_sensor
     from uwlts.optics.nominal import nominal_calibration
-    from uwlts.optics.reconstruction import reconstruct_pixels
+    from uwlts.optics.triangulation import reconstruct_pixels
     from uwlts.stripe import StripeOptions, extract_stripe
     from uwlts.targets import parse_target
 

@@ -9,11 +9,11 @@ import numpy as np
 from tests.uwlts.mount_views import known_mount
 from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.measurement.moving import carried, platform_ride, with_platform
-from uwlts.measurement.reconstruction import reconstruct_stripes
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.model.calibration import Calibration
 from uwlts.model.trajectory import Trajectory
+from uwlts.reconstruction.moving import carried, platform_ride, with_platform
+from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
 

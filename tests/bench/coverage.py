@@ -29,12 +29,11 @@ from tests.uwlts.simulated_campaign import (
 )
 from tests.virtual_sensors import altered
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.measurement.figure_uncertainty import figure_uncertainties
-from uwlts.measurement.reconstruction import reconstruct_stripes
-from uwlts.metrology.artefacts import evaluate_cloud
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.errors import CalibrationError
+from uwlts.evaluation.artefact_figures import evaluate_cloud
+from uwlts.evaluation.figure_uncertainty import figure_uncertainties
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CalibrationError
 from uwlts.model.library import load_sensor
 from uwlts.model.parameter_keys import (
     LensParameter,
@@ -46,6 +45,7 @@ from uwlts.model.parameter_keys import (
     WindowParameter,
 )
 from uwlts.model.sensor import Sensor
+from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter

@@ -14,7 +14,7 @@ from multiprocessing import get_context
 import numpy as np
 
 from twin.options import GPU, use_variant
-from uwlts.model.errors import SetupError
+from uwlts.errors import SetupError
 
 FRAMES = 40
 WARM_UP = 3

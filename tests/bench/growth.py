@@ -18,11 +18,11 @@ from tests.uwlts.joint_views import Noise, gathered, target_series
 from twin.options import Options, use_variant
 from twin.scene.description import load_scene
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.measurement.reconstruction import reconstruct_stripes
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import CaptureHeader
-from uwlts.report.page_toolkit import new_figure
+from uwlts.pages.toolkit import new_figure
+from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud

@@ -33,10 +33,10 @@ from rich.table import Table
 
 ROOT = Path(__file__).resolve().parents[2]
 TESTS = {
-    "uwlts/optics": ["tests/uwlts/optics", "tests/uwlts/measurement", "tests/uwlts/calibration", "tests/uwlts/thesis"],
-    "uwlts/stripe": ["tests/uwlts/stripe", "tests/uwlts/measurement"],
-    "uwlts/calibration/joint": ["tests/uwlts/calibration", "tests/uwlts/measurement"],
-    "uwlts/measurement": ["tests/uwlts/measurement", "tests/uwlts/report", "tests/system/test_joint_command.py"],
+    "uwlts/optics": [f"tests/uwlts/{name}" for name in ("optics", "reconstruction", "calibration", "thesis")],
+    "uwlts/stripe": ["tests/uwlts/stripe", "tests/uwlts/reconstruction"],
+    "uwlts/calibration/joint": ["tests/uwlts/calibration", "tests/uwlts/reconstruction"],
+    "uwlts/reconstruction": ["tests/uwlts/reconstruction", "tests/uwlts/report", "tests/system/test_joint_command.py"],
     "twin/light": ["tests/twin/light", "tests/twin/recording"],
     "twin/sensor": ["tests/twin/sensor", "tests/twin/light"],
 }

@@ -15,8 +15,8 @@ import numpy as np
 from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from uwlts.desk.board import Board
 from uwlts.desk.recording_view import LOOK_S, RecordingView, frames_of
-from uwlts.hardware.camera import CameraDevice
 from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor

@@ -7,8 +7,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from twin.design.description import Study, load_study
 from twin.design.screening import Batch, judged_part, read_parts, write_part
+from twin.design.study import Study, load_study
 from uwlts.runtime.workers import open_workers
 
 WORKERS = 2

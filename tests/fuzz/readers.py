@@ -19,18 +19,18 @@ from tests.uwlts.storage.test_capture import a_header, interrupted, record, smal
 from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
 from tests.uwlts.storage.test_truth import a_header as truth_header
 from tests.uwlts.storage.test_truth import a_truth
-from twin.design.description import load_study
 from twin.design.screening import as_part, read_parts
+from twin.design.study import load_study
 from twin.scene.campaign import load_campaign
 from twin.scene.description import Mesh, load_scene
 from twin.scene.finish import read_grey
 from twin.scene.objects import _surface_from_file
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.mount import calibrate_mount
-from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import load_plan
-from uwlts.measurement.evaluation import read_evaluation
 from uwlts.model.artefacts import read_artefact
 from uwlts.model.library import library_folder, load_sensor
 from uwlts.optics.nominal import nominal_calibration
@@ -43,13 +43,13 @@ from uwlts.storage.cloud_files import read_cloud, write_cloud
 from uwlts.storage.export_ import export_cloud
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import read_intrinsics, with_intrinsics
-from uwlts.storage.import_.description import capture_header, described_sensor, read_description, read_header
+from uwlts.storage.import_.folder_description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows
 from uwlts.storage.mount_files import read_mount, read_profiles, write_mount
 from uwlts.storage.pose_files import read_trajectory
 from uwlts.storage.truth import read_truth, write_truth
+from uwlts.thesis.published_tables import load_published
 from uwlts.thesis.results import CampaignResults, LineProfile, Measurement, SpacingInterval, WindowChoice, WindowProfile
-from uwlts.thesis.tables import load_published
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ def _too_slow(*_: object) -> None:
 def _child(folder: Path, seed: int) -> None:
     from tests.fuzz.mutation import changed
     from tests.fuzz.readers import READERS, seed_of
-    from uwlts.model.errors import Error
+    from uwlts.errors import Error
 
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)

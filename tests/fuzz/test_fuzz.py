@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from tests.fuzz.past_failures import PAST
 from tests.fuzz.readers import READERS
 from tests.fuzz.running import MOST_MIB, MOST_S, watched
-from uwlts.model.errors import CaptureError, OutputError
-from uwlts.model.input_file import parsed_json, parsed_toml, read_bytes
+from uwlts.errors import CaptureError, OutputError
+from uwlts.files.reading import parsed_json, parsed_toml, read_bytes
+from uwlts.files.writing import written_aside
 from uwlts.storage.calibration_file import load_calibration
-from uwlts.storage.files import written_aside
 
 CORPUS = Path(__file__).with_name("corpus")
 CASES = 2000

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered
-from twin.design.description import Study
 from twin.design.designs import Design, EvaluatedDesign, Marked, built
-from twin.design.figures import scatter_at
+from twin.design.figures_of_merit import scatter_at
 from twin.design.parameters import parameters_of
+from twin.design.study import Study
 from twin.design.verification import Agreement, Rendered, compared, render, verified
 from twin.options import CPU
 from uwlts.model.sensor import Sensor

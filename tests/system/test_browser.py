@@ -14,7 +14,7 @@ import pytest
 
 from tests import browser
 from twin.backend import packages
-from uwlts.model.errors import SetupError
+from uwlts.errors import SetupError
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

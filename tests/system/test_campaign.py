@@ -14,12 +14,16 @@ import pytest
 from twin.options import ALL, NONE, Options
 from twin.recording.studio import record_scene
 from twin.scene.description import load_scene
-from uwlts.calibration.sequential import CalibrationOptions, CalibrationResult, calibrate_sequentially
-from uwlts.measurement.evaluation import Evaluation, evaluate
-from uwlts.measurement.reconstruction import reconstruct
+from uwlts.calibration.sequential.sequential_calibration import (
+    CalibrationOptions,
+    CalibrationResult,
+    calibrate_sequentially,
+)
+from uwlts.evaluation.evaluate import Evaluation, evaluate
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
 from uwlts.optics.nominal import nominal_calibration
+from uwlts.reconstruction.reconstruct import reconstruct
 from uwlts.storage.capture import Capture
 from uwlts.storage.truth import truth_path
 

@@ -12,7 +12,7 @@ import pytest
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.storage.calibration_file import write_calibration
 
 pytestmark = pytest.mark.slow

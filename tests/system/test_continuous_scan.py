@@ -11,10 +11,10 @@ from tests.system.drawn_hardware import HEIGHT_PX, WIDTH_PX, write_plan
 from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
 from twin.sensor.peak_finder import PeakFinder
+from uwlts.errors import DescriptionError, EvaluationError, HardwareError, RangeError
 from uwlts.hardware import continuous
-from uwlts.measurement.latency import measure_latency
-from uwlts.model.errors import DescriptionError, EvaluationError, HardwareError, RangeError
 from uwlts.model.library import load_sensor
+from uwlts.reconstruction.latency import measure_latency
 from uwlts.storage.capture import Capture
 
 TRAVEL_MM, STEPS_PER_MM = 300.0, 100

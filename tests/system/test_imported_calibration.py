@@ -10,8 +10,8 @@ import tomli_w
 
 from tests.uwlts.calibration_views import turn
 from tests.uwlts.drawn_stripes import coarse_sensor
-from uwlts.calibration.intrinsics import CameraOptions
-from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
+from uwlts.calibration.camera.camera_parameters import CameraOptions
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.storage.capture import Capture
 from uwlts.storage.import_ import import_images

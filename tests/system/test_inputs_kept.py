@@ -19,11 +19,11 @@ import twin.cli
 import uwlts
 import uwlts.cli
 from tests.system.in_process import run_program
-from uwlts.model.command_files import OUTPUTS, command_files, note_input, own_files
-from uwlts.model.errors import OutputError
+from uwlts.errors import OutputError
+from uwlts.files.command_files import OUTPUTS, command_files, note_input, own_files
+from uwlts.files.one_writer import lock_path, one_writer
+from uwlts.files.writing import refuse_unsuitable, written_aside
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.files import refuse_unsuitable, written_aside
-from uwlts.storage.one_writer import lock_path, one_writer
 
 ROOT = Path(__file__).resolve().parents[2]
 APPS = {"uwlts": uwlts.cli.app, "twin": twin.cli.app}
@@ -213,7 +213,7 @@ def test_a_file_in_a_reported_folder_is_not_replaced_by_the_report(tmp_path, nom
 _HOLDER = """
 import sys, time
 from pathlib import Path
-from uwlts.storage.one_writer import one_writer
+from uwlts.files.one_writer import one_writer
 with one_writer(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
@@ -301,8 +301,8 @@ def test_the_works_of_a_program_that_goes_on_are_apart(tmp_path):
 def writer_elsewhere(path: Path) -> str:
     """What another process finds that wants to write a path."""
     program = (
-        "import sys\nfrom pathlib import Path\nfrom uwlts.model.errors import OutputError\n"
-        "from uwlts.storage.one_writer import one_writer\n"
+        "import sys\nfrom pathlib import Path\nfrom uwlts.errors import OutputError\n"
+        "from uwlts.files.one_writer import one_writer\n"
         "try:\n    with one_writer(Path(sys.argv[1])):\n        print('none')\n"
         "except OutputError:\n    print('another')\n"
     )

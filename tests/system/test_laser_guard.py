@@ -34,7 +34,7 @@ import sys, time
 import numpy as np
 from uwlts import cli
 from uwlts.hardware import scanning
-from uwlts.hardware.camera import CameraDevice, CameraInfo, Delivered
+from uwlts.hardware.camera_interface import CameraDevice, CameraInfo, Delivered
 from uwlts.hardware.grbl import GrblStage
 from uwlts.runtime import console
 

@@ -15,8 +15,8 @@ import pytest
 
 from uwlts.desk.board import Board
 from uwlts.desk.recording_view import RecordingView, frames_of
+from uwlts.errors import CaptureError
 from uwlts.model.any_calibration import AnyCalibration
-from uwlts.model.errors import CaptureError
 from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame

@@ -24,10 +24,10 @@ from websockets.sync.client import ClientConnection, connect
 from tests.waiting import within
 from uwlts.desk.access import PageAccess
 from uwlts.desk.board import Board, Picture
+from uwlts.desk.board_page import BoardView, laser_off_button, timed
 from uwlts.desk.guided import BoardScreen, answer_buttons
-from uwlts.desk.page import BoardView, laser_off_button, timed
 from uwlts.desk.server import DeskServer
-from uwlts.model.errors import SetupError
+from uwlts.errors import SetupError
 
 SOCKET = "/_nicegui_ws/socket.io/"
 PROTECTION = {"X-Frame-Options": "DENY", "Referrer-Policy": "no-referrer", "X-Content-Type-Options": "nosniff"}

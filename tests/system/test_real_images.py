@@ -12,13 +12,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import uwlts
-from uwlts.calibration.camera import solve_camera
-from uwlts.calibration.evidence import AirEvidence, air_evidence
-from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.camera.camera_parameters import CameraOptions
+from uwlts.calibration.camera.lens import LensChoice
+from uwlts.calibration.camera.target_poses import solve_camera
+from uwlts.calibration.capture_evidence import AirEvidence, air_evidence
 from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.lens import LensChoice
-from uwlts.calibration.sequential import CalibrationOptions, gather, solve
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, gather, solve
 from uwlts.calibration.target_stripes import stripe_on_target
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import PlaneFound

@@ -23,7 +23,7 @@ from twin.recording.campaigns import record as record_one
 from twin.recording.campaigns import record_campaigns
 from twin.recording.studio import record_scene
 from twin.scene.campaign import load_campaign, takes
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.truth import read_truth, truth_path
 

@@ -15,11 +15,11 @@ from twin.options import Flaws, Options
 from twin.recording.studio import record_scene
 from twin.scene.description import Scene
 from twin.sensor.peak_finder import INVALID, PeakFinder
+from uwlts.errors import DescriptionError, HardwareError
 from uwlts.hardware import aravis
-from uwlts.hardware.camera import Region
 from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.camera_interface import Region
 from uwlts.hardware.replay import ReplayCamera
-from uwlts.model.errors import DescriptionError, HardwareError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture

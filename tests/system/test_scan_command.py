@@ -18,7 +18,7 @@ from twin.devices.serve import ServedTwin, serve
 from twin.options import Options
 from twin.recording.studio import record_scene
 from twin.scene.description import Scene
-from uwlts.model.errors import CaptureError
+from uwlts.errors import CaptureError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, part_path
 from uwlts.stripe import extract_stripe

@@ -17,10 +17,10 @@ from twin.devices.serve import NAMES, Fault, ServedTwin, Track, parse_fault, ser
 from twin.options import Options
 from twin.recording.studio import record_scene
 from twin.scene.description import Scene, load_scene
-from uwlts.hardware.camera import CameraDevice
+from uwlts.errors import DescriptionError, DesignError, HardwareError, ImageError
 from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.grbl import GrblStage
-from uwlts.model.errors import DescriptionError, DesignError, HardwareError, ImageError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 from uwlts.stripe import extract_stripe

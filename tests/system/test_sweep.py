@@ -17,8 +17,8 @@ import pytest
 from tests.system.in_process import run_program
 from tests.waiting import within
 from twin import cli
-from twin.design.description import load_study
 from twin.design.screening import parts, read_parts, screen
+from twin.design.study import load_study
 from uwlts.model.library import load_sensor
 from uwlts.runtime.workers import open_workers
 

@@ -19,8 +19,8 @@ from twin.scene.campaign import Campaign, load_campaign
 from uwlts.model.calibration import Calibration
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
-from uwlts.thesis.campaign import CampaignFolder
-from uwlts.thesis.evaluation import evaluate_campaign
+from uwlts.thesis.campaign_folder import CampaignFolder
+from uwlts.thesis.evaluate_campaign import evaluate_campaign
 from uwlts.thesis.joint_comparison import compare_campaigns, joint_summary, summary_lines
 from uwlts.thesis.measurements import TWO, calibrations, measure_scan
 from uwlts.thesis.results import CampaignResults, Measurement

@@ -10,7 +10,7 @@ from tests.virtual_sensors import altered, image_of
 from twin.design.verification import _judged, _run, verify
 from twin.design.verification_scenes import STANDARD_DEPTHS, STEP_DEPTHS, TARGET_POSES, measured_range, recordings
 from twin.scene.description import Scene
-from uwlts.model.errors import CalibrationError, DescriptionError, DesignError, EvaluationError
+from uwlts.errors import CalibrationError, DescriptionError, DesignError, EvaluationError
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
 

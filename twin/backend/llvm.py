@@ -23,7 +23,7 @@ from pathlib import Path
 
 from twin.backend import packages
 from twin.backend.packages import run_command
-from uwlts.model.errors import SetupError
+from uwlts.errors import SetupError
 from uwlts.runtime.shared_library import file_of, load_with_companions, own_folders
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"

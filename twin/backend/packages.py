@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-from uwlts.model.errors import SetupError
+from uwlts.errors import SetupError
 
 COMMAND_SECONDS = 900
 """Downloads of some 100 MB over a slow line."""

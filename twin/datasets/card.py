@@ -13,9 +13,8 @@ import numpy as np
 from markupsafe import Markup
 from pydantic import JsonValue
 
-import uwlts
 from twin.datasets.coco import write_coco
-from twin.datasets.description import (
+from twin.datasets.data_set import (
     SPLITS,
     Constant,
     DataSetDescription,
@@ -29,9 +28,10 @@ from twin.datasets.description import (
 )
 from twin.datasets.loading import CARD, CARD_FORMAT, CARD_VERSION, DataCard, DataSet, Shard
 from twin.scene.paths import Value
-from uwlts.report.page_toolkit import BLUE, new_figure, plain_text, png_data_uri, render_page, svg_of, write_page
-from uwlts.storage.files import sha256_of, written_aside
-from uwlts.storage.json_files import write_model
+from uwlts._version import __version__
+from uwlts.files.json_files import write_model
+from uwlts.files.writing import sha256_of, written_aside
+from uwlts.pages.toolkit import BLUE, new_figure, plain_text, png_data_uri, render_page, svg_of, write_page
 
 README, PAGE = "README.md", "dataset.html"
 _SHOWN = 12
@@ -257,7 +257,7 @@ def _page(card: DataCard, description: DataSetDescription, found: _Collected, sa
         status=[[name, f"{count}", f"{100 * count / lines:.1f} %"] for name, count in status.items()],
         labels=[[name, words] for name, words in card.labels.items()],
         shards=[[one.name, one.split, f"{one.frames}", one.sha256[:16]] for one in card.shards],
-        version=uwlts.__version__,
+        version=__version__,
     )
 
 

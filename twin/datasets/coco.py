@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from twin.datasets.description import SPLITS, Mask
+from twin.datasets.data_set import SPLITS, Mask
 from twin.datasets.loading import DataCard, DataSet
-from uwlts.storage.files import written_aside
+from uwlts.files.writing import written_aside
 
 
 def coco_path(folder: Path, split: str) -> Path:

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twin.datasets.description import EXPOSURE, SPLITS, DataSetDescription, Split
+from twin.datasets.data_set import EXPOSURE, SPLITS, DataSetDescription, Split
 from twin.options import Options
 from twin.scene.description import Scene
 from twin.scene.paths import Value, with_values
-from uwlts.model.errors import Error
+from uwlts.errors import Error
 from uwlts.model.library import validated
 from uwlts.model.sensor import Sensor
 

@@ -19,19 +19,19 @@ from typing import TYPE_CHECKING, Any
 from pydantic import JsonValue
 
 from twin.datasets.card import PAGE, README, write_card
-from twin.datasets.description import SPLITS, DataSetDescription, Split, load_description
+from twin.datasets.data_set import SPLITS, DataSetDescription, Split, load_description
 from twin.datasets.draws import DrawnScene, draw_scene, split_of
 from twin.datasets.labels import labelled
 from twin.datasets.loading import CARD
 from twin.datasets.shards import SUFFIXES, Sample, written_shard
 from twin.options import CPU, Variant, use_variant
 from twin.recording.campaigns import PLAN, keep_to_plan
-from uwlts.model.command_files import keeps_inputs
-from uwlts.model.errors import DescriptionError, DesignError, OutputError
+from uwlts.errors import DescriptionError, DesignError, OutputError
+from uwlts.files.command_files import keeps_inputs
+from uwlts.files.one_writer import lock_path, one_writer
 from uwlts.model.placement import camera_from_object
 from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import work_through
-from uwlts.storage.one_writer import lock_path, one_writer
 
 if TYPE_CHECKING:
     from twin.recording.studio import Exposed, Studio

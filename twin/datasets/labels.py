@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from twin.datasets.description import FAINT_BELOW, Label, LineStatus, Mask
+from twin.datasets.data_set import FAINT_BELOW, Label, LineStatus, Mask
 from twin.scene.description import Printed
 from uwlts.model.sensor import Detector
 

@@ -8,11 +8,11 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-from twin.datasets.description import SPLITS, Split
+from twin.datasets.data_set import SPLITS, Split
 from twin.datasets.shards import SUFFIXES, Format, ShardReader
-from uwlts.model.errors import CaptureError, DescriptionError
+from uwlts.errors import CaptureError, DescriptionError
+from uwlts.files.json_files import read_model
 from uwlts.model.sensor import Description, Table
-from uwlts.storage.json_files import read_model
 
 CARD, CARD_FORMAT, CARD_VERSION = "dataset.json", "uwlts-dataset", 1
 

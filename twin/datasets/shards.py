@@ -21,8 +21,8 @@ import cv2
 import h5py
 import numpy as np
 
-from uwlts.model.errors import CaptureError
-from uwlts.storage.files import written_aside
+from uwlts.errors import CaptureError
+from uwlts.files.writing import written_aside
 
 Format = Literal["webdataset", "hdf5"]
 SUFFIXES: dict[Format, str] = {"webdataset": ".tar", "hdf5": ".h5"}

@@ -11,13 +11,13 @@ from types import ModuleType
 import numpy as np
 from scipy.optimize import minimize
 
-from twin.design.description import Study
 from twin.design.designs import Columns, Design, Marked, built, described, judged, row_of, sensor_of
-from twin.design.figures import DEPTHS, PLACES, Field, depths_in_view, field_of
+from twin.design.figures_of_merit import DEPTHS, PLACES, Field, depths_in_view, field_of
 from twin.design.geometry import Array, standoff_mm
 from twin.design.parameters import PARAMETER_OF, SensorArrays, followed, numbers_of, parameters_alone
+from twin.design.study import Study
 from twin.options import use_variant
-from uwlts.model.errors import DesignError, Error, EvaluationError, RangeError
+from uwlts.errors import DesignError, Error, EvaluationError, RangeError
 
 
 def pareto(values: np.ndarray) -> np.ndarray:

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import qmc
 
-from twin.design.description import OTHER_COLUMNS, Study
-from twin.design.figures import FIGURES, Figures, figures_of
+from twin.design.figures_of_merit import FIGURES, Figures, figures_of
 from twin.design.parameters import (
     PARAMETER_OF,
     SensorArrays,
@@ -23,8 +22,9 @@ from twin.design.parameters import (
     parameters_of,
     stacked,
 )
+from twin.design.study import OTHER_COLUMNS, Study
 from twin.scene.paths import Value, value_at, with_values
-from uwlts.model.errors import DesignError, Error
+from uwlts.errors import DesignError, Error
 from uwlts.model.library import validated
 from uwlts.model.sensor import Sensor
 

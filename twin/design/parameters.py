@@ -25,7 +25,7 @@ from twin.design.geometry import (
     where,
 )
 from twin.sensor.speckle import coherence, pixel_contrast
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Medium, Sensor
 

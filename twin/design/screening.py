@@ -24,13 +24,13 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import Trial, TrialState
 
-from twin.design.description import Study
 from twin.design.designs import Columns, Design, designs_of, failed, judged, number_of_designs
-from uwlts.model.errors import CaptureError, DescriptionError, OutputError
-from uwlts.model.input_file import require_regular_file
+from twin.design.study import Study
+from uwlts.errors import CaptureError, DescriptionError, OutputError
+from uwlts.files.json_files import another, read_json
+from uwlts.files.reading import require_regular_file
+from uwlts.files.writing import written_aside
 from uwlts.runtime.workers import Lost, Workers
-from uwlts.storage.files import written_aside
-from uwlts.storage.json_files import another, read_json
 
 _MOST_PART_BYTES = 2**28
 

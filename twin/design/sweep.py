@@ -17,17 +17,17 @@ import tomli_w
 from pydantic import TypeAdapter
 
 from twin.design.choice import choose
-from twin.design.description import Study, load_study
 from twin.design.designs import Columns, Marked
-from twin.design.report.page import page_text
+from twin.design.report.study_page import page_text
 from twin.design.screening import JOURNAL, PARTS, PLAN, read_parts, screen, write_csv
+from twin.design.study import Study, load_study
 from twin.design.verification import Agreement, render
 from twin.options import CPU
-from uwlts.model.errors import DescriptionError
-from uwlts.report.page_toolkit import write_page
+from uwlts.errors import DescriptionError
+from uwlts.files.writing import written_aside
+from uwlts.pages.toolkit import write_page
 from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import open_workers
-from uwlts.storage.files import written_aside
 
 RENDERED = "verified"
 PAGE, TABLE, WINNER, SUMMARY = "report.html", "designs.csv", "winner.toml", "summary.json"

@@ -23,20 +23,20 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from twin.backend.llvm import threads_kept
-from twin.design.description import Study
 from twin.design.designs import Marked
-from twin.design.figures import figures_of, scatter_at
+from twin.design.figures_of_merit import figures_of, scatter_at
 from twin.design.parameters import parameters_of
 from twin.design.screening import made_folder
+from twin.design.study import Study
 from twin.design.verification_scenes import PlannedRecording, recordings
 from twin.options import CPU, Options, use_variant
-from uwlts.model import errors
-from uwlts.model.errors import Error
+from uwlts import errors
+from uwlts.errors import Error
+from uwlts.files.writing import written_aside
 from uwlts.model.sensor import Sensor
 from uwlts.runtime.workers import Lost, Workers, work_through
 from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.cloud_files import read_cloud
-from uwlts.storage.files import written_aside
 from uwlts.storage.truth import truth_path
 
 _USER_ERROR = 2

@@ -11,7 +11,7 @@ import numpy as np
 
 from twin.design.geometry import Array, Lens, WindowGeometry, dot, seen
 from twin.scene.description import Scene
-from uwlts.model.errors import DesignError
+from uwlts.errors import DesignError
 from uwlts.model.library import validated
 from uwlts.model.placement import camera_from_object, check_design, laser_pose
 from uwlts.model.sensor import Camera, Exposure, Medium, Sensor, Volume

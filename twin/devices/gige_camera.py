@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from uwlts.model.errors import HardwareError, ImageError
+from uwlts.errors import HardwareError, ImageError
 from uwlts.runtime.shared_library import load_aravis
 
 # What 1 Gbit/s carries, and how many packets go out together, as sleeps are not exact.

@@ -19,10 +19,10 @@ import numpy as np
 from twin.devices.gige_camera import ExposedFrame, GigeCamera
 from twin.devices.grbl_controller import GrblController, StageState
 from twin.options import CPU, Options, Variant, use_variant
-from twin.recording.recording import AnyScene, AnySensor, choose_scene, choose_sensors
+from twin.recording.render import AnyScene, AnySensor, choose_scene, choose_sensors
 from twin.scene.description import altered
 from twin.scene.motion import Light, Motion, Shot
-from uwlts.model.errors import DescriptionError, DesignError
+from uwlts.errors import DescriptionError, DesignError
 from uwlts.model.sensor import Stage
 
 if TYPE_CHECKING:  # it needs Mitsuba

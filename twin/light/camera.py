@@ -26,7 +26,7 @@ from twin.backend.arrays import (
 )
 from twin.light.pose import Rays, SensorPose
 from twin.scene.objects import Objects
-from uwlts.model.errors import DesignError
+from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
 

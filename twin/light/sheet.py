@@ -23,7 +23,7 @@ from numpy.polynomial import Chebyshev
 from twin.backend.arrays import Float, Point3f, UInt32, Vector3f, opaque, opaque_point, to_jit
 from twin.light.camera import WindowFaces, frame_about
 from twin.light.pose import Rays
-from uwlts.model.errors import DesignError
+from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Laser, Medium, Sensor
 

@@ -10,14 +10,14 @@ from pydantic import JsonValue
 
 from twin.options import CPU, Flaws, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, load_campaign, takes
-from uwlts.model.command_files import own_files
-from uwlts.model.errors import CaptureError, DescriptionError, Error, OutputError
+from uwlts.errors import CaptureError, DescriptionError, Error, OutputError
+from uwlts.files.command_files import own_files
+from uwlts.files.json_files import another, read_json
+from uwlts.files.one_writer import one_writer
+from uwlts.files.writing import written_aside
 from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import part_path
-from uwlts.storage.files import written_aside
-from uwlts.storage.json_files import another, read_json
-from uwlts.storage.one_writer import one_writer
 from uwlts.storage.truth import truth_path
 
 PLAN = "plan.json"

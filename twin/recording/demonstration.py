@@ -12,7 +12,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from itertools import groupby
 from pathlib import Path
 
-from uwlts.model.errors import SetupError
+from uwlts.errors import SetupError
 from uwlts.runtime.console import INTERRUPTED
 from uwlts.runtime.workers import Lost, open_workers
 

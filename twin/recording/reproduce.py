@@ -7,7 +7,7 @@ from pathlib import Path
 from twin.options import CPU, Variant
 from twin.recording.campaigns import record_campaigns
 from twin.scene.campaign import load_campaign
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.runtime.console import progress_bar
 
 _LEAST_TRIALS = 20

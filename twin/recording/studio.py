@@ -26,7 +26,7 @@ from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
 from twin.sensor.flaws import as_built, delivered, dirt, laser_shares, veiled, vignette
 from twin.sensor.peak_finder import INVALID, PeakFinder
 from twin.sensor.speckle import Speckle, coherence
-from uwlts.model.errors import DesignError, OutputError
+from uwlts.errors import DesignError, OutputError
 from uwlts.model.library import validated
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium, Sensor, Table

@@ -11,7 +11,7 @@ from pydantic import Field
 from twin.scene.description import Block, Printed, Scene, altered, load_scene
 from twin.scene.motion import Motion
 from twin.scene.platforms import Platform
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.library import find, load_sensor, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Sensor
 

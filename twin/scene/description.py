@@ -16,7 +16,7 @@ from twin.scene.forms import AnyForm
 from twin.scene.motion import Motion
 from twin.scene.placed import Flat, Placed, Pose, Reflectance
 from twin.scene.platforms import IdealPath, LinearGuide, Platform, Robot, RotaryTable, Vehicle
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.library import find, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Positive, Table
 from uwlts.targets import CircleTarget, Target, parse_target

@@ -16,7 +16,7 @@ from pydantic import TypeAdapter
 
 from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, to_jit
 from twin.scene.description import AnyObject, Flat, Placed, Printed
-from uwlts.model.errors import DescriptionError, ImageError
+from uwlts.errors import DescriptionError, ImageError
 from uwlts.model.media import check_range
 from uwlts.storage.image_file import read_image
 

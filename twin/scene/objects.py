@@ -16,8 +16,8 @@ from twin.scene.description import AnyObject, Block, CirclePlate, Mesh, Pipe, Pl
 from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, square_on
 from twin.scene.forms.triangles import bowed_plate
 from twin.scene.placed import FreeForm
-from uwlts.model.errors import DescriptionError
-from uwlts.model.input_file import require_regular_file
+from uwlts.errors import DescriptionError
+from uwlts.files.reading import require_regular_file
 
 _MOST_MESH_BYTES = 2**28
 """Five million triangles of a binary STL file."""

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from twin.scene.motion import Light, Shot
 from twin.scene.navigation import Navigation, Sea, drift_of, waves_of
 from twin.scene.placed import Pose
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Bracket, Description, NotNegative, Positive, Vector
 from uwlts.storage.pose_files import Unit, read_trajectory
 

@@ -13,7 +13,7 @@ from typing import cast
 import numpy as np
 
 from twin.sensor.random_numbers import add_normal_numbers, poisson_numbers
-from uwlts.model.errors import ImageError
+from uwlts.errors import ImageError
 from uwlts.model.sensor import Camera, Detector
 from uwlts.runtime.compiled import compiled
 

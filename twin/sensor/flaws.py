@@ -12,7 +12,7 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 from twin.options import Flaws
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.library import merged, validated
 from uwlts.model.sensor import Camera, Sensor
 

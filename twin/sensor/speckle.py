@@ -23,7 +23,7 @@ from scipy import fft, ndimage, special
 from scipy.special import j1
 
 from twin.sensor.random_numbers import add_normal_numbers
-from uwlts.model.errors import DesignError, ImageError, RangeError
+from uwlts.errors import DesignError, ImageError, RangeError
 from uwlts.model.sensor import Camera
 
 # The pattern repeats across the stripe after this many pixels, more than a stripe is wide, and this many grains.

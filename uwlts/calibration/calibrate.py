@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, assert_never
 
-from uwlts.calibration.camera import Poses
-from uwlts.calibration.evidence import Progress
-from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.camera.camera_parameters import CameraOptions
+from uwlts.calibration.camera.lens import Distortion, LensChoice, Pixels
+from uwlts.calibration.camera.target_poses import Poses
+from uwlts.calibration.capture_evidence import Progress
 from uwlts.calibration.joint.procedure import calibrate_jointly
-from uwlts.calibration.lens import Distortion, LensChoice, Pixels
-from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
+from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.optics.window import require_index
 from uwlts.storage.capture import Capture, opened_captures
 from uwlts.stripe import StripeSettings

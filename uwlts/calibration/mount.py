@@ -15,8 +15,8 @@ from uwlts.calibration.mount_prediction import coverage_factor, held_out_mm, inv
 from uwlts.calibration.mount_profiles import LEAST_POINTS
 from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of, with_sensor
 from uwlts.calibration.mount_start import NoFit, require_surfaces, start
+from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount, MountPose
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.calibration_file import loaded_calibration

@@ -25,11 +25,11 @@ from uwlts.calibration.mount_board_images import (
 )
 from uwlts.calibration.mount_next_pose import missing_turns
 from uwlts.calibration.mount_sensor import with_sensor
+from uwlts.errors import CalibrationError
+from uwlts.files.writing import sha256_of
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CalibrationError
 from uwlts.model.mount import BoardFound, Mount, MountPose
 from uwlts.storage.capture import Capture
-from uwlts.storage.files import sha256_of
 from uwlts.storage.mount_files import SENSOR_AXES, SensorAxis, require_table
 
 _FALSE_ALARM = 1e-3

@@ -9,9 +9,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.joint.stored_estimate import StoredEstimate
+from uwlts.errors import CalibrationError, DescriptionError, TargetError
 from uwlts.model.any_calibration import check_fits
 from uwlts.model.calibration import Calibration, WindowModel
-from uwlts.model.errors import CalibrationError, DescriptionError, TargetError
 from uwlts.optics.camera import directions, project_through_window
 from uwlts.optics.window import trace_window
 from uwlts.storage.capture import Capture

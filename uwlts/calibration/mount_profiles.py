@@ -5,8 +5,8 @@ from itertools import combinations
 
 import numpy as np
 
-from uwlts.metrology.fits import algebraic_centres
-from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.shapes import algebraic_centres
 
 LEAST_POINTS = 12
 """Points on the artefact that a profile needs: four for each of a circle's three parameters."""

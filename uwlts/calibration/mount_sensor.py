@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, stored_estimate
+from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.any_calibration import calibration_digest, check_fits
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import SensorShare
-from uwlts.optics.reconstruction import reconstruct_profile
+from uwlts.optics.triangulation import reconstruct_profile
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
 

@@ -10,7 +10,7 @@ from uwlts.calibration.mount_artefacts import PlaneShape, RingShape, Seen, Spher
 from uwlts.calibration.mount_model import MountState, Problem, Scatter, cross_matrix
 from uwlts.calibration.mount_prediction import inverse, misfits
 from uwlts.calibration.mount_profiles import ProfileArc, ProfileLine, circles_through
-from uwlts.model.errors import CalibrationError
+from uwlts.errors import CalibrationError
 
 _SUBSETS, _SUBSET = 40, 8
 """Random choices of poses: with a fifth of the poses wrong one of six choices of eight has none of these."""

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import MAD_TO_STD
 from uwlts.stripe import Stripe, StripeOptions, StripeStatus, extract_stripe, stripe_in
 from uwlts.targets import Target, TargetView
 

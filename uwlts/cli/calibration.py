@@ -23,9 +23,9 @@ from uwlts.cli.options import (
     stripe_settings,
     warn,
 )
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.console import progress_bar
-from uwlts.storage.files import refuse_unsuitable
 
 
 @app.command
@@ -363,8 +363,8 @@ def models(
         poses: stage: one pose of the target for each capture, moved by the stage. free: every image has a pose of its
             own.
     """
+    from uwlts.pages.toolkit import refuse_unsuitable_page
     from uwlts.report.model_comparison import content_of, lines_of
-    from uwlts.report.page_toolkit import refuse_unsuitable_page
 
     if out is not None:
         refuse_unsuitable_page(out, example="models.html", overwrite=overwrite)

@@ -6,8 +6,8 @@ from typing import Literal
 
 import uwlts
 from uwlts.cli.options import Files, Flag, Overwrite, Workers, app, show
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.console import progress_bar
-from uwlts.storage.files import refuse_unsuitable
 
 
 @app.command
@@ -76,7 +76,7 @@ def compare(
         same_water: Both clouds were scanned in water of the same temperature and salinity.
         unit: Unit of the reference.
     """
-    from uwlts.report.page_toolkit import refuse_unsuitable_page
+    from uwlts.pages.toolkit import refuse_unsuitable_page
 
     refuse_unsuitable_page(out, example="change.html", overwrite=overwrite)
     if coloured:
@@ -126,7 +126,7 @@ def inspect(
         largest_ovality: Ovality over the diameter that a pipe may have where less than half of it was seen.
         datum: Cloud of another face in the same frame, to which a flange's face is to be parallel.
     """
-    from uwlts.storage.json_files import write_record
+    from uwlts.files.json_files import write_record
 
     for path in (out, coloured):
         if path:
@@ -169,7 +169,7 @@ def gauge(
         tolerance: Width of the tolerance.
         reference: True value of the only part: a type-1 study with Cg and Cgk.
     """
-    from uwlts.storage.json_files import write_record
+    from uwlts.files.json_files import write_record
 
     if out:
         refuse_unsuitable(out, overwrite=overwrite)
@@ -266,7 +266,7 @@ def report(
         workers: Number of processes that draw.
         overwrite: Replace an existing report, summary and pictures.
     """
-    from uwlts.report.tables import print_table
+    from uwlts.report.campaign_tables import print_table
 
     written = uwlts.write_report(
         folder, reference=reference, out=out, pictures=pictures, workers=workers, overwrite=overwrite

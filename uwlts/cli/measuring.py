@@ -7,9 +7,9 @@ from cyclopts import Parameter
 
 import uwlts
 from uwlts.cli.options import Flag, Index, Method, Overwrite, Stripe, app, show, stripe_settings, warn
-from uwlts.model.errors import OutputError
+from uwlts.errors import OutputError
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.console import progress_bar
-from uwlts.storage.files import refuse_unsuitable
 
 Direction = tuple[float, float, float]
 
@@ -127,7 +127,7 @@ def register(
         sphere_mm: Diameter of spheres in the scene that tie scans together.
         reach_mm: How far overlapping surfaces lie apart at the start, at most; a 20th of a scan's size unless given.
     """
-    from uwlts.report.page_toolkit import refuse_unsuitable_page
+    from uwlts.pages.toolkit import refuse_unsuitable_page
 
     for path in (out, poses_out):
         if path:
@@ -190,7 +190,7 @@ def align(
             says unless given.
         drift_deg: The same of its turns.
     """
-    from uwlts.storage.json_files import write_record
+    from uwlts.files.json_files import write_record
 
     beside = out.with_suffix(".json")
     for path in (out, beside, aligned):

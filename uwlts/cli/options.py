@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-import uwlts
+from uwlts._version import __version__
 
 app = App(
     name="uwlts",
     help="Software of an underwater laser triangulation sensor.",
-    version=uwlts.__version__,
+    version=__version__,
     help_format="markdown",
 )
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     MethodName = str
 else:
     # The names of the modules in uwlts.stripe.methods, which are not imported for a command's help.
-    _METHODS = Path(uwlts.__file__).parent / "stripe" / "methods"
+    _METHODS = Path(__file__).parents[1] / "stripe" / "methods"
     _NAMES = sorted(m.name.replace("_", "-") for m in pkgutil.iter_modules([str(_METHODS)]))
     MethodName = Literal[(*_NAMES, "learned")]
 Method = Annotated[
@@ -57,8 +57,8 @@ Stripe = Annotated[
 
 def stripe_settings(stripe: Stripe, method: Method, peak: str | None = None) -> dict[str, object]:
     """Settings of finding stripes that were given on the command line."""
-    from uwlts.model.errors import DescriptionError
-    from uwlts.model.input_file import parsed_json
+    from uwlts.errors import DescriptionError
+    from uwlts.files.reading import parsed_json
 
     settings: dict[str, object] = {}
     for setting in stripe:

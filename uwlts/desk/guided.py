@@ -11,12 +11,12 @@ from nicegui import ui
 
 from uwlts.calibration.guidance.pose_advice import Coverage
 from uwlts.desk.board import Board, Picture, png_of
-from uwlts.desk.page import BoardView, laser_off_button, timed
+from uwlts.desk.board_page import BoardView, laser_off_button, timed
 from uwlts.desk.server import DeskServer
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.operator import ANSWERS
 from uwlts.hardware.guided.plan import GuidedPlan, load_guided_plan
-from uwlts.hardware.guided.recording import GuidedRecording, guide
+from uwlts.hardware.guided.record import GuidedRecording, guide
 from uwlts.hardware.rig import LaserStage
 
 _COVERED, _EMPTY, _DOT = (70, 140, 70), (120, 60, 60), (230, 230, 230)

@@ -22,22 +22,22 @@ from uwlts.calibration.calibrate import calibrate
 from uwlts.desk.board import Board, Picture
 from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.recording_view import RecordingView
-from uwlts.hardware.camera import CameraDevice
+from uwlts.errors import DescriptionError, Error, HardwareError
+from uwlts.files.command_files import own_files
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.plan import GuidedPlan
-from uwlts.hardware.guided.recording import guide
+from uwlts.hardware.guided.record import guide
 from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, brightness, stripe_of
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scanning import check_camera, record_scan
 from uwlts.model.any_calibration import AnyCalibration
-from uwlts.model.command_files import own_files
-from uwlts.model.errors import DescriptionError, Error, HardwareError
 from uwlts.model.sensor import Sensor
 from uwlts.report.inventory import calibration_lines
 from uwlts.storage.calibration_file import load_calibration, write_calibration
 from uwlts.storage.capture import Capture, Frame, part_path, picture_of
-from uwlts.storage.files import refuse_unsuitable
 
 _PREVIEW_S = 0.15
 """Pause between two images that are only shown."""

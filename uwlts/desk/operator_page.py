@@ -16,24 +16,24 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
 from uwlts.desk.board import Board
-from uwlts.desk.folder import file_in, interrupted, kind_of, listed, new_in
+from uwlts.desk.board_page import BoardView, build_board, laser_off_button, timed
+from uwlts.desk.desk_files import file_in, interrupted, kind_of, listed, new_in
 from uwlts.desk.guided import answer_buttons
 from uwlts.desk.instrument import Instrument, InstrumentState
-from uwlts.desk.page import BoardView, build_board, laser_off_button, timed
 from uwlts.desk.server import DeskServer
 from uwlts.desk.thinned_cloud import table_of
+from uwlts.errors import DescriptionError, Error
+from uwlts.files.command_files import own_files
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
-from uwlts.measurement.inspection import Shape, length_between, point_near, shape_near
-from uwlts.measurement.reconstruction import reconstruct
-from uwlts.model.command_files import own_files
-from uwlts.model.errors import DescriptionError, Error
+from uwlts.inspection.picking import Shape, length_between, point_near, shape_near
 from uwlts.model.library import validated
+from uwlts.reconstruction.reconstruct import reconstruct
 from uwlts.report.inventory import describe
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_region, read_thinned_cloud, write_cloud
 from uwlts.storage.copc_file import is_copc
-from uwlts.storage.files import refuse_unsuitable
 
 _LIST_S = 2.0
 _MOST_SHOWN = 300_000

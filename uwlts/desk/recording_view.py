@@ -10,9 +10,9 @@ import numpy as np
 
 from uwlts.desk.board import Board, Picture
 from uwlts.desk.server import DeskServer
-from uwlts.measurement.reconstruction import reconstruct_stripes
+from uwlts.errors import CaptureError
 from uwlts.model.any_calibration import AnyCalibration
-from uwlts.model.errors import CaptureError
+from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, part_path, picture_of
 from uwlts.stripe import FoundStripes, stripe_in, warm_up

@@ -19,9 +19,9 @@ from starlette.responses import Response
 
 from uwlts.desk.access import GuardedApp, PageAccess, is_local
 from uwlts.desk.board import Board
-from uwlts.desk.page import build_board
+from uwlts.desk.board_page import build_board
 from uwlts.desk.thinned_cloud import packed
-from uwlts.model.errors import Error, SetupError
+from uwlts.errors import Error, SetupError
 
 _START_S, _END_S = 30.0, 5.0
 _PORTS = 100

@@ -16,7 +16,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from uwlts.doctor.machine import Finding
-from uwlts.model.errors import Error, HardwareError, SetupError
+from uwlts.errors import Error, HardwareError, SetupError
 
 PRODUCERS = "GENICAM_GENTL64_PATH"
 # Aravis waits a second for answers; drivers of broken USB devices may take for ever.

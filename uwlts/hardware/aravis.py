@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.hardware.camera import (
+from uwlts.errors import HardwareError
+from uwlts.hardware.camera_interface import (
     BUFFERS,
     CENTRE_LINES,
     CHUNKS,
@@ -32,7 +33,6 @@ from uwlts.hardware.camera import (
     Region,
     require_uncalibrated,
 )
-from uwlts.model.errors import HardwareError
 from uwlts.model.stripe import Coordinates
 from uwlts.runtime.shared_library import load_aravis
 

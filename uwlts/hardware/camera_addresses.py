@@ -1,10 +1,10 @@
 """Opens a camera by its address; apart from the interface, because it knows all drivers."""
 
+from uwlts.errors import HardwareError
 from uwlts.hardware.aravis import AravisCamera
-from uwlts.hardware.camera import CameraDevice
+from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.genicam import GenicamCamera
 from uwlts.hardware.replay import ReplayCamera
-from uwlts.model.errors import HardwareError
 
 ADDRESSES = """\
   gige:NAME or aravis:NAME       GigE Vision or USB3 Vision by Aravis: identifier, serial number or IP address;

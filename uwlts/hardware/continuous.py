@@ -15,14 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.hardware.camera import CameraDevice, GrabbedFrame
+from uwlts.errors import EvaluationError, HardwareError, RangeError
+from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.grbl import GrblStage, StageReport
 from uwlts.hardware.scan_plan import Continuous, ScanPlan
-from uwlts.measurement.latency import measure_latency
-from uwlts.metrology.least_squares import MAD_TO_STD
-from uwlts.model.errors import EvaluationError, HardwareError, RangeError
 from uwlts.model.sensor import CaptureHeader, Sensor
 from uwlts.model.stripe import Stripe
+from uwlts.reconstruction.latency import measure_latency
 from uwlts.storage.capture import Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import stripe_in

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.hardware.camera import (
+from uwlts.errors import HardwareError, SetupError
+from uwlts.hardware.camera_interface import (
     BUFFERS,
     CENTRE_LINES,
     CHUNKS,
@@ -28,7 +29,6 @@ from uwlts.hardware.camera import (
     Region,
     require_uncalibrated,
 )
-from uwlts.model.errors import HardwareError, SetupError
 from uwlts.model.stripe import Coordinates
 
 # GenApi's access modes count: not implemented, not available, write only, read only, both.

@@ -35,8 +35,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
 
+from uwlts.errors import HardwareError, RangeError
 from uwlts.hardware.grbl_line import FEED_HOLD, POLL_S, GrblLine, Status, parse_settings
-from uwlts.model.errors import HardwareError, RangeError
 
 # A stage that moves by less than a step in this time, and in that of some steps, stands still.
 _STALL_S, _STALL_STEPS = 1.0, 5

@@ -17,8 +17,8 @@ from typing import Literal, Self, assert_never
 import serial
 from serial.tools.list_ports import comports
 
+from uwlts.errors import HardwareError
 from uwlts.hardware.heartbeat import BEAT_S, GRACE_S, Heartbeat
-from uwlts.model.errors import HardwareError
 
 _NUMBER = r"-?\d+(?:\.\d+)?"
 _STATE = re.compile(r"(Idle|Run|Hold|Jog|Alarm|Door|Check|Home|Sleep)(?::(\d+))?")

@@ -12,8 +12,8 @@ import sys
 import time
 from typing import Literal
 
+from uwlts.errors import HardwareError
 from uwlts.hardware import laser_guard
-from uwlts.model.errors import HardwareError
 
 GRACE_S = 0.8
 """A program that makes no progress for this long, beyond the waits that it announces, is taken for hung. The laser has

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.hardware.camera import BUFFERS, CameraDevice, CameraInfo, CameraSettings, Delivered
-from uwlts.model.errors import HardwareError, ImageError
-from uwlts.model.input_file import is_regular_file
+from uwlts.errors import HardwareError, ImageError
+from uwlts.files.reading import is_regular_file
+from uwlts.hardware.camera_interface import BUFFERS, CameraDevice, CameraInfo, CameraSettings, Delivered
 from uwlts.model.stripe import Coordinates, Stripe
 from uwlts.storage.capture import Capture
 from uwlts.storage.image_file import read_image

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import JsonValue
 
-import uwlts
-from uwlts.hardware.camera import CameraDevice, GrabbedFrame
+from uwlts._version import __version__
+from uwlts.errors import HardwareError
+from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import Light, RigPlan, StageSettings
-from uwlts.model.errors import HardwareError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import CaptureHeader, Seen
 from uwlts.stripe import Stripe, StripeStatus, extract_stripe
@@ -151,7 +151,7 @@ def with_provenance(
         "stage": stage,
         **more,
         "laser_power": plan.laser_power,
-        "uwlts": uwlts.__version__,
+        "uwlts": __version__,
     }
     return header.model_copy(update={"provenance": provenance})
 

@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
+from uwlts.errors import DescriptionError, DesignError, RangeError
+from uwlts.files.reading import is_regular_file
 from uwlts.hardware.grbl import GrblStage
 from uwlts.model.artefacts import parse_artefact
-from uwlts.model.errors import DescriptionError, DesignError, RangeError
-from uwlts.model.input_file import is_regular_file
 from uwlts.model.library import load_sensor, read_table, validated
 from uwlts.model.placement import check_design
 from uwlts.model.sensor import Bracket, Description, NotNegative, Positive, Sensor, Table, Vector

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from uwlts.errors import HardwareError
+from uwlts.fitting.least_squares import MAD_TO_STD
 from uwlts.hardware.rig import Rig, not_few, stripe_of
-from uwlts.metrology.least_squares import MAD_TO_STD
-from uwlts.model.errors import HardwareError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Seen
 from uwlts.stripe import Stripe, StripeStatus

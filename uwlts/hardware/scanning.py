@@ -13,8 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.hardware.camera import CameraDevice
+from uwlts.errors import DescriptionError, HardwareError
+from uwlts.files.command_files import keeps_inputs
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.continuous import record_continuously, ways_of
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.page_beside import PageBeside
@@ -22,13 +25,10 @@ from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, stripe_of, with_provenance
 from uwlts.hardware.scan_plan import Light, ScanPlan, load_plan
 from uwlts.hardware.scan_watch import LOOKS, LaserWatch, LitPlace, Place, SlipWatch, centres_of, shows_laser, spread
-from uwlts.model.command_files import keeps_inputs
-from uwlts.model.errors import DescriptionError, HardwareError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.files import refuse_unsuitable
 from uwlts.storage.import_.images import without_background
 from uwlts.stripe import Stripe, StripeStatus
 

@@ -3,8 +3,8 @@
 import hashlib
 import weakref
 
+from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CalibrationError
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import CaptureHeader
 

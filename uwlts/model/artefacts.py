@@ -6,8 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from uwlts.model.errors import DescriptionError, EvaluationError, problems_of
-from uwlts.model.input_file import MOST_TOML_BYTES, parsed_toml, read_text
+from uwlts.errors import DescriptionError, EvaluationError, problems_of
+from uwlts.files.reading import MOST_TOML_BYTES, parsed_toml, read_text
 from uwlts.model.sensor import Description, NotNegative, Positive
 
 _MOST_SPHERES = 6

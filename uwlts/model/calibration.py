@@ -13,7 +13,7 @@ from pydantic import (
     model_validator,
 )
 
-from uwlts.model.errors import problems_of
+from uwlts.errors import problems_of
 from uwlts.model.joint_estimate import JointEstimate, Origin
 from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, Table, UnitVector, Vector, Window
 

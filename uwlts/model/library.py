@@ -11,8 +11,8 @@ from typing import TypeVar
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from uwlts.model.errors import DescriptionError, Error, first_problems
-from uwlts.model.input_file import MOST_TOML_BYTES, is_regular_file, parsed_toml, read_text, shortened
+from uwlts.errors import DescriptionError, Error, first_problems
+from uwlts.files.reading import MOST_TOML_BYTES, is_regular_file, parsed_toml, read_text, shortened
 from uwlts.model.sensor import Description, Sensor, Table
 
 AnyDescription = TypeVar("AnyDescription", bound=Description)

@@ -12,7 +12,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from uwlts.model.errors import DescriptionError, RangeError
+from uwlts.errors import DescriptionError, RangeError
 
 
 def check_range(name: str, value: float, lowest: float, highest: float, source: str) -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.model.errors import DesignError
+from uwlts.errors import DesignError
 from uwlts.model.sensor import Medium, Sensor, Window
 
 

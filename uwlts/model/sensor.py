@@ -21,9 +21,9 @@ from pydantic import (
 )
 from pydantic_core import to_jsonable_python
 
+from uwlts.errors import DescriptionError
+from uwlts.files.reading import require_plain
 from uwlts.model import media, phase_functions, waters
-from uwlts.model.errors import DescriptionError
-from uwlts.model.input_file import require_plain
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]

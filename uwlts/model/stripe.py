@@ -13,7 +13,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from uwlts.model.errors import ImageError
+from uwlts.errors import ImageError
 
 
 class StripeStatus(IntEnum):

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from uwlts.errors import DescriptionError
 from uwlts.model.calibration import is_rigid
-from uwlts.model.errors import DescriptionError
 
 _ROUNDED = 1e-6
 _LARGEST_DRIFT_PPM = 10_000.0

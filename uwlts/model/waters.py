@@ -21,7 +21,7 @@ from functools import partial
 
 import numpy as np
 
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.media import check_range, read_table, water_absorption_per_m, water_scattering_per_m
 
 _STATION_NM = 530.0

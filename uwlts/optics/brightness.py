@@ -22,11 +22,11 @@ from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Laser, Sensor, Uncertainty, Vector
 from uwlts.model.stripe import pixels_of
 from uwlts.optics.line_table import LineTable
-from uwlts.optics.reconstruction import MeasuredPoints, rays_on_sheet, to_object
+from uwlts.optics.triangulation import MeasuredPoints, rays_on_sheet, to_object
 from uwlts.optics.window import RayStatus
 from uwlts.runtime.compiled import compiled, compiled_with_arrays
+from uwlts.stripe.capture_stripes import FoundStripes
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
-from uwlts.stripe.recording import FoundStripes
 
 BLUR_STD = 1.0 / math.sqrt(3.0)
 """Standard uncertainty of what blur moves centres by, over the largest possible: that is left as it is, and anything

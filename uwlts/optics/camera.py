@@ -9,8 +9,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.polynomial import Polynomial
 
+from uwlts.errors import RangeError
 from uwlts.model.calibration import CameraModel, WindowModel
-from uwlts.model.errors import RangeError
 from uwlts.model.sensor import Distortion
 from uwlts.optics.window import check_index, tangent_ratio, window_normal
 

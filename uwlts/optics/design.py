@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uwlts.model.errors import DesignError, RangeError
+from uwlts.errors import DesignError, RangeError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics.window import tangent_ratio

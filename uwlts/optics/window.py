@@ -9,8 +9,8 @@ from enum import IntEnum
 
 import numpy as np
 
+from uwlts.errors import RangeError
 from uwlts.model.calibration import WindowModel
-from uwlts.model.errors import RangeError
 
 
 class RayStatus(IntEnum):

@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 from markupsafe import Markup
 
-import uwlts
-from uwlts.calibration.intrinsics import DISTORTION
-from uwlts.calibration.photographs import CameraCalibration, Photograph
-from uwlts.report.page_toolkit import BLUE, MISSING, RED, new_figure, plain_text, png_data_uri, render_page, svg_of
-from uwlts.report.page_toolkit import write_page as write_text
+from uwlts._version import __version__
+from uwlts.calibration.camera.camera_parameters import DISTORTION
+from uwlts.calibration.camera.photographs import CameraCalibration, Photograph
+from uwlts.errors import Error
+from uwlts.pages.toolkit import BLUE, MISSING, RED, new_figure, plain_text, png_data_uri, render_page, svg_of
+from uwlts.pages.toolkit import write_page as write_text
 from uwlts.storage.image_file import read_image
 
 _THUMBNAIL_PX = 420
@@ -37,7 +38,7 @@ def write_camera_page(path: str | Path, camera: CameraCalibration, *, overwrite:
         "uwlts.report",
         "camera.html.j2",
         name=camera.folder.resolve().name,
-        software=f"uwlts {uwlts.__version__}",
+        software=f"uwlts {__version__}",
         summary=_summary(camera),
         models=models,
         rows=rows,
@@ -107,7 +108,7 @@ def _thumbnail(camera: CameraCalibration, photograph: Photograph) -> str | None:
     """The image, brightened, with the points found; None where it cannot be read."""
     try:
         image = read_image(camera.folder / photograph.name)
-    except uwlts.Error:
+    except Error:
         return None
     grey = image if image.ndim == 2 else image.max(axis=2)
     factor = min(1.0, _THUMBNAIL_PX / grey.shape[1])

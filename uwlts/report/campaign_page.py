@@ -8,21 +8,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import uwlts
-from uwlts.measurement.evaluation import TruthComparisons
-from uwlts.model.command_files import keeps_inputs
-from uwlts.model.errors import OutputError, RangeError
-from uwlts.report import plot
-from uwlts.report.gather import (
-    GatheredCampaign,
-    GatheredCapture,
-    GatheredMeasurement,
-    Reference,
-    gather_campaign,
-    load_reference,
-)
-from uwlts.report.numbers import fixed, is_number, small_length, unit_of, words_of
-from uwlts.report.page_toolkit import (
+from uwlts._version import __version__
+from uwlts.errors import OutputError, RangeError
+from uwlts.evaluation.evaluate import TruthComparisons
+from uwlts.files.command_files import keeps_inputs
+from uwlts.files.writing import refuse_unsuitable
+from uwlts.pages.numbers import fixed, is_number, small_length, unit_of, words_of
+from uwlts.pages.toolkit import (
     MISSING,
     ComparisonTable,
     FigureCollector,
@@ -32,10 +24,18 @@ from uwlts.report.page_toolkit import (
     svg_of,
     write_page,
 )
+from uwlts.report import plot
+from uwlts.report.campaign_tables import Row, parameter_table, residual_table, summary_table
+from uwlts.report.gather import (
+    GatheredCampaign,
+    GatheredCapture,
+    GatheredMeasurement,
+    Reference,
+    gather_campaign,
+    load_reference,
+)
 from uwlts.report.pictures import MeasurementPictures, draw_pictures, svg_if_any, write_pictures
 from uwlts.report.summary_file import KEY_FIGURES, summary, write_summary
-from uwlts.report.tables import Row, parameter_table, residual_table, summary_table
-from uwlts.storage.files import refuse_unsuitable
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "scipy", "h5py", "matplotlib", "plotly")
 _CAPTIONS = {
@@ -267,7 +267,7 @@ def _grouped(rows: list[Row]) -> list[tuple[str, list[tuple[str, ...]]]]:
 
 def _provenance(campaign: GatheredCampaign) -> list[tuple[str, str]]:
     libraries = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
-    entries = [("report", f"uwlts {uwlts.__version__}, Python {platform.python_version()}, {libraries}")]
+    entries = [("report", f"uwlts {__version__}, Python {platform.python_version()}, {libraries}")]
     for found in campaign.calibrations:
         entries.append((f"calibration {found.name}", f"digest {found.digest}; {_pairs(found.calibration.provenance)}"))
     for capture in campaign.captures:

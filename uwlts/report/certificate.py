@@ -9,20 +9,20 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, JsonValue, PlainSerializer
 
-import uwlts
+from uwlts._version import __version__
 from uwlts.calibration.joint.next_shot import Outlook, next_shots
 from uwlts.calibration.joint.observability import Weakness, format_weaknesses, lengths_over, regions, weaknesses
 from uwlts.calibration.joint.stored_estimate import require_joint
+from uwlts.errors import CaptureError
+from uwlts.files.json_files import read_json
+from uwlts.files.writing import sha256_of
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CaptureError
 from uwlts.model.joint_estimate import ImageFit
 from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parameter_of
 from uwlts.model.sensor import Medium
+from uwlts.pages.numbers import numbers_in
 from uwlts.report.certificate_volume import InUse, LengthUncertainty, in_use, index_key, length_uncertainties
-from uwlts.report.numbers import numbers_in
-from uwlts.storage.files import sha256_of
-from uwlts.storage.json_files import read_json
 
 FORMAT = "uwlts-certificate"
 VERSION = 1
@@ -199,7 +199,7 @@ def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -
         version=VERSION,
         sensor=calibration.sensor_name,
         issued=issued,
-        software=f"uwlts {uwlts.__version__}",
+        software=f"uwlts {__version__}",
         calibration=CertifiedFile(
             file=Path(path).name,
             sha256=sha256_of(path),

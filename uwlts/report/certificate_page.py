@@ -13,20 +13,12 @@ from markupsafe import Markup
 
 from uwlts.calibration.joint.observability import regions
 from uwlts.calibration.joint.stored_estimate import require_joint
+from uwlts.files.command_files import keeps_inputs
 from uwlts.model.calibration import Calibration
-from uwlts.model.command_files import keeps_inputs
 from uwlts.model.joint_estimate import ImageFit, Origin
 from uwlts.model.parameter_keys import ParameterKey
-from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, certificate_of, parameter_rows
-from uwlts.report.certificate_volume import (
-    LengthUncertainty,
-    change_from,
-    in_use,
-    require_same_sensor,
-    uncertainty_maps,
-)
-from uwlts.report.numbers import as_fine_as, fixed
-from uwlts.report.page_toolkit import (
+from uwlts.pages.numbers import as_fine_as, fixed
+from uwlts.pages.toolkit import (
     COLOURS,
     INK,
     MISSING,
@@ -36,6 +28,14 @@ from uwlts.report.page_toolkit import (
     render_page,
     svg_of,
     write_page,
+)
+from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, certificate_of, parameter_rows
+from uwlts.report.certificate_volume import (
+    LengthUncertainty,
+    change_from,
+    in_use,
+    require_same_sensor,
+    uncertainty_maps,
 )
 from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import read_calibration

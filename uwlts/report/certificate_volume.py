@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.calibration.joint.evidence import STEP, STRIPE
 from uwlts.calibration.joint.observability import (
     Lengths,
     SheetRegion,
@@ -13,13 +12,14 @@ from uwlts.calibration.joint.observability import (
     pixels_at,
     points_at,
 )
+from uwlts.calibration.joint.residuals import STEP, STRIPE
 from uwlts.calibration.joint.scanned_surfaces import SCANNED
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint
+from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import MediumIndex
 from uwlts.model.sensor import Uncertainty
-from uwlts.optics.reconstruction import points_on_sheet
+from uwlts.optics.triangulation import points_on_sheet
 
 LENGTHS_MM = (10.0, 20.0, 50.0, 100.0, 150.0, 200.0, 300.0, 500.0)
 # Places tried along each axis for the largest uncertainty, which changes slowly over the volume.

@@ -6,13 +6,13 @@ import numpy as np
 from markupsafe import Markup
 from plyfile import PlyData, PlyElement
 
-import uwlts
-from uwlts.metrology.change import SurfaceChange
-from uwlts.model.errors import OutputError
-from uwlts.report.page_toolkit import BLUE, INK, RED, new_figure, png_data_uri, render_page, svg_of, write_page
+from uwlts._version import __version__
+from uwlts.comparison.change import SurfaceChange
+from uwlts.errors import OutputError
+from uwlts.files.json_files import json_text
+from uwlts.files.writing import written_aside
+from uwlts.pages.toolkit import BLUE, INK, RED, new_figure, png_data_uri, render_page, svg_of, write_page
 from uwlts.storage.export_ import laz_content
-from uwlts.storage.files import written_aside
-from uwlts.storage.json_files import json_text
 
 _NOT_SIGNIFICANT = "#cccccc"
 _INK = 60_000
@@ -49,7 +49,7 @@ def write_change(
         "uwlts.report",
         "change.html.j2",
         title=title,
-        software=f"uwlts {uwlts.__version__}",
+        software=f"uwlts {__version__}",
         summary=change.lines(),
         columns=_COLUMNS,
         regions=_rows(change),

@@ -11,9 +11,13 @@ from typing import Any
 
 import numpy as np
 
-import uwlts
-from uwlts.measurement.evaluation import read_evaluation
-from uwlts.metrology.features import (
+from uwlts._version import __version__
+from uwlts.errors import EvaluationError
+from uwlts.evaluation.evaluate import read_evaluation
+from uwlts.files.command_files import keeps_inputs
+from uwlts.files.json_files import json_text
+from uwlts.files.writing import refuse_unsuitable, sha256_of
+from uwlts.inspection.features import (
     COVERAGE,
     COVERAGE_FACTOR,
     DEFINITIONS,
@@ -22,15 +26,13 @@ from uwlts.metrology.features import (
     FeatureValue,
     Inspection,
 )
-from uwlts.metrology.inspection import InspectionKind, inspect
-from uwlts.metrology.pipe_form import LARGEST_OVALITY
+from uwlts.inspection.inspect import InspectionKind, inspect
+from uwlts.inspection.pipe_form import LARGEST_OVALITY
 from uwlts.model.any_calibration import calibration_digest
-from uwlts.model.command_files import keeps_inputs
-from uwlts.model.errors import EvaluationError
 from uwlts.model.sensor import Table
-from uwlts.report.certificate import check_certificate
-from uwlts.report.numbers import as_fine_as
-from uwlts.report.page_toolkit import (
+from uwlts.pages.numbers import as_fine_as
+from uwlts.pages.pdf import print_pdf, refuse_unsuitable_pdf
+from uwlts.pages.toolkit import (
     INK,
     MISSING,
     RED,
@@ -41,13 +43,11 @@ from uwlts.report.page_toolkit import (
     render_page,
     write_page,
 )
-from uwlts.report.pdf import print_pdf, refuse_unsuitable_pdf
+from uwlts.report.certificate import check_certificate
 from uwlts.report.plot import DEVIATIONS
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_cloud
-from uwlts.storage.files import refuse_unsuitable, sha256_of
-from uwlts.storage.json_files import json_text
 
 _BLEMISHES = (FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
 _FIRST = ("depth", "height", "remaining wall")
@@ -169,7 +169,7 @@ def write_findings(
     record: Table = {
         "title": title or f"Inspection of {path.name}",
         "made": made,
-        "software": f"uwlts {uwlts.__version__}",
+        "software": f"uwlts {__version__}",
         "sources": [vars(source) for source in sources],
         "verification": [
             {"artefact": check.artefact, "figures": [vars(figure) for figure in check.figures]} for check in checks
@@ -255,7 +255,7 @@ def _page(
         "findings.html.j2",
         title=title,
         made=made,
-        software=f"uwlts {uwlts.__version__}",
+        software=f"uwlts {__version__}",
         tiles=_tiles(whole, parts),
         findings=_rows(parts),
         whole=[(each.name, [_value_row(value) for value in each.values]) for each in whole],

@@ -9,18 +9,18 @@ from typing import Annotated
 import numpy as np
 from pydantic import BeforeValidator, Field, FiniteFloat, Strict, TypeAdapter, ValidationError
 
-from uwlts.measurement.evaluation import EvaluationRecord, read_evaluation
+from uwlts.errors import CaptureError, problems_of
+from uwlts.evaluation.evaluate import EvaluationRecord, read_evaluation
+from uwlts.files.json_files import read_json
+from uwlts.files.reading import is_regular_file
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CaptureError, problems_of
-from uwlts.model.input_file import is_regular_file
 from uwlts.model.library import find, read_table, validated
 from uwlts.model.sensor import Description, Sensor
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, CaptureHeader
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import is_cloud, read_cloud
-from uwlts.storage.json_files import read_json
 from uwlts.storage.truth import read_truth
 
 _EVALUATION, _TRUTH = ".evaluation.json", ".truth.h5"

@@ -9,24 +9,24 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import JsonValue
 
-from uwlts.measurement.evaluation import FORMAT as EVALUATION_FORMAT
-from uwlts.measurement.evaluation import EvaluationRecord, TruthComparisons, read_evaluation
+from uwlts.errors import CaptureError, DescriptionError
+from uwlts.evaluation.evaluate import FORMAT as EVALUATION_FORMAT
+from uwlts.evaluation.evaluate import EvaluationRecord, TruthComparisons, read_evaluation
+from uwlts.files.json_files import read_json
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CaptureError, DescriptionError
 from uwlts.model.library import load_sensor
 from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics import design as formulas
+from uwlts.pages.numbers import numbers_in
 from uwlts.report.mount_lines import mount_lines
-from uwlts.report.numbers import numbers_in
 from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT
 from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
 from uwlts.storage.calibration_file import read_calibration, read_polynomials
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import is_cloud, read_cloud
-from uwlts.storage.json_files import read_json
 from uwlts.storage.mount_files import FORMAT as MOUNT_FORMAT
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth

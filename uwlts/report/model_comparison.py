@@ -9,7 +9,7 @@ from typing import Literal
 from markupsafe import Markup
 from pydantic import BaseModel, ConfigDict
 
-import uwlts
+from uwlts._version import __version__
 from uwlts.calibration.model_comparison.comparison import (
     POINTS,
     STRIPES,
@@ -27,9 +27,9 @@ from uwlts.calibration.model_comparison.held_out import (
     Candidate,
     distortion_words,
 )
-from uwlts.report.numbers import fixed, small_length
-from uwlts.report.page_toolkit import MISSING, legend_below, new_figure, render_page, svg_of, write_page
-from uwlts.storage.json_files import json_text
+from uwlts.files.json_files import json_text
+from uwlts.pages.numbers import fixed, small_length
+from uwlts.pages.toolkit import MISSING, legend_below, new_figure, render_page, svg_of, write_page
 
 _WAYS = (INSIDE, OUTSIDE)
 
@@ -93,7 +93,7 @@ def content_of(comparison: Comparison) -> ModelComparisonContent:
         version=1,
         sensor=comparison.sensor,
         captures=comparison.captures,
-        software=f"uwlts {uwlts.__version__}",
+        software=f"uwlts {__version__}",
         date=datetime.now(UTC).isoformat(timespec="seconds"),
         held_out={where: len(held) for where, held in choice.ways.items()},
         models=[_row(choice, judged) for judged in choice.judged],

@@ -11,12 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from uwlts.files.writing import written_aside
+from uwlts.pages.toolkit import new_figure, png_of, svg_of
 from uwlts.report import plot
 from uwlts.report.gather import GatheredCampaign, GatheredMeasurement
-from uwlts.report.page_toolkit import new_figure, png_of, svg_of
 from uwlts.runtime.workers import Send, work_through
 from uwlts.storage.capture import Capture, picture_of
-from uwlts.storage.files import written_aside
 from uwlts.stripe import Stripe, stripe_in
 
 _WIDTH_IN, _TALLEST_IN = 11.2, 4.4

@@ -18,8 +18,8 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d import Axes3D, proj3d
 
 from uwlts.model.calibration import Calibration
-from uwlts.report.numbers import as_fine_as, entries_of, number_list, unit_for, unit_of, words_of
-from uwlts.report.page_toolkit import BLUE, COLOURS, FAINT, INK, RED, figure_of, new_figure, plain_text, typographic
+from uwlts.pages.numbers import as_fine_as, entries_of, number_list, unit_for, unit_of, words_of
+from uwlts.pages.toolkit import BLUE, COLOURS, FAINT, INK, RED, figure_of, new_figure, plain_text, typographic
 from uwlts.storage.capture import Frame
 from uwlts.storage.cloud import PointCloud
 from uwlts.stripe import Stripe

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-import uwlts
-from uwlts.metrology.scan_registration import RegisteredScans
-from uwlts.report.page_toolkit import BLUE, COLOURS, RED, new_figure, png_data_uri, render_page, svg_of, write_page
-from uwlts.storage.json_files import json_text
+from uwlts._version import __version__
+from uwlts.files.json_files import json_text
+from uwlts.pages.toolkit import BLUE, COLOURS, RED, new_figure, png_data_uri, render_page, svg_of, write_page
+from uwlts.registration.register import RegisteredScans
 
 _SHOWN = 30_000
 """Points of all scans in a picture: more cover each other."""
@@ -30,7 +30,7 @@ def write_registration(
         "uwlts.report",
         "registration.html.j2",
         title=title,
-        software=f"uwlts {uwlts.__version__}",
+        software=f"uwlts {__version__}",
         first=registered.names[0],
         summary=[line for line in registered.lines() if not line.startswith("  open")],
         open_movements=[(registered.names[each.scan], each.words()) for each in registered.open_movements],

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from uwlts.measurement.evaluation import TruthComparisons, TruthFigures
-from uwlts.metrology.evaluation import Quantity
+from uwlts.evaluation.evaluate import TruthComparisons, TruthFigures
+from uwlts.evaluation.figures import Quantity
+from uwlts.files.writing import written_aside
 from uwlts.report.gather import CALIBRATION, GatheredCampaign, GatheredMeasurement, Reference
-from uwlts.storage.files import written_aside
 
 KEY_FIGURES = {
     "sphere_spacing_error_mm": ("Sphere spacing error", "spheres", Quantity.SPACING_ERROR),

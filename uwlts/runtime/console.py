@@ -10,8 +10,8 @@ from cyclopts import App, CycloptsError
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from uwlts.model.command_files import command_files
-from uwlts.model.errors import Error
+from uwlts.errors import Error
+from uwlts.files.command_files import command_files
 from uwlts.runtime.interrupts import interrupts_kept
 
 USER_ERROR, INTERRUPTED = 2, 130

@@ -6,7 +6,7 @@ import re
 from functools import cache
 from pathlib import Path
 
-from uwlts.model.errors import SetupError
+from uwlts.errors import SetupError
 
 ARAVIS_VARIABLE = "UWLTS_LIBARAVIS"
 ARAVIS = "libaravis-0.8.so.0"

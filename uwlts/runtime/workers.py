@@ -27,9 +27,9 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Literal, TypeVar, assert_never
 
-from uwlts.model.errors import Error, SetupError
+from uwlts.errors import Error, SetupError
+from uwlts.files.unfinished import remove_unfinished
 from uwlts.runtime.interrupts import interrupts_kept
-from uwlts.runtime.unfinished import remove_unfinished
 
 Item = TypeVar("Item")
 Job = TypeVar("Job")

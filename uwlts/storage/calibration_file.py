@@ -4,11 +4,11 @@ import json
 from pathlib import Path
 from typing import TypedDict, assert_never
 
+from uwlts.files.json_files import model_in, read_json, read_model, write_model
+from uwlts.files.writing import written_aside
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.calibration import Calibration
 from uwlts.model.polynomial_calibration import PolynomialCalibration
-from uwlts.storage.files import written_aside
-from uwlts.storage.json_files import model_in, read_json, read_model, write_model
 
 FORMAT, POLYNOMIALS_FORMAT, VERSION = "uwlts-calibration", "uwlts-polynomials", 1
 

@@ -28,13 +28,13 @@ import h5py
 import hdf5plugin  # noqa: F401, gives HDF5 the filter by which frames are read
 import numpy as np
 
+from uwlts.errors import CaptureError, ImageError
+from uwlts.files.reading import require_regular_file
+from uwlts.files.writing import sha256_of
 from uwlts.model.calibration import is_rigid
-from uwlts.model.errors import CaptureError, ImageError
-from uwlts.model.input_file import require_regular_file
 from uwlts.model.joint_estimate import CaptureSource
 from uwlts.model.sensor import Camera, CaptureHeader, Table
 from uwlts.model.stripe import ROWS, Stripe, StripeStatus
-from uwlts.storage.files import sha256_of
 from uwlts.storage.hdf5_file import (
     UnfinishedFile,
     find_dataset,

@@ -11,9 +11,12 @@ import h5py
 import hdf5plugin
 import numpy as np
 
+from uwlts.errors import CaptureError, ImageError, OutputError
+from uwlts.files.command_files import note_made, refuse_input
+from uwlts.files.json_files import differences
+from uwlts.files.one_writer import one_writer
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.calibration import is_rigid
-from uwlts.model.command_files import note_made, refuse_input
-from uwlts.model.errors import CaptureError, ImageError, OutputError
 from uwlts.model.sensor import CaptureHeader, Table
 from uwlts.model.stripe import ROWS, Stripe, rows_of
 from uwlts.storage.capture import (
@@ -28,10 +31,7 @@ from uwlts.storage.capture import (
     part_path,
     require_covariances,
 )
-from uwlts.storage.files import refuse_unsuitable
 from uwlts.storage.hdf5_file import forget_plan, write_label, write_plan
-from uwlts.storage.json_files import differences
-from uwlts.storage.one_writer import one_writer
 
 # Room for HDF5's own bookkeeping when a frame is added: its index and the chunks of the other datasets.
 _MARGIN_BYTES = 2**18

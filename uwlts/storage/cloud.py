@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.model.errors import CaptureError
-from uwlts.model.input_file import require_plain
+from uwlts.errors import CaptureError
+from uwlts.files.reading import require_plain
 from uwlts.model.sensor import Table
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from uwlts.model.errors import CaptureError
-from uwlts.model.input_file import opened, parsed_json, require_regular_file, shortened
+from uwlts.errors import CaptureError
+from uwlts.files.reading import opened, parsed_json, require_regular_file, shortened
+from uwlts.files.writing import written_aside
 from uwlts.model.sensor import Description, Table
 from uwlts.storage.cloud import KINDS, NO_INDEX, PAIRS, PER_POINT, PointCloud, PointUncertainty, joined, metadata_json
 from uwlts.storage.copc_file import is_copc, read_copc
-from uwlts.storage.files import written_aside
 from uwlts.storage.foreign_clouds import FOREIGN_FORMATS, read_foreign
 from uwlts.storage.hdf5_file import find_dataset, format_of, read_array, read_label, write_label
 

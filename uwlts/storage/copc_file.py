@@ -15,9 +15,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from uwlts.model.errors import CaptureError, OutputError
-from uwlts.model.input_file import opened
-from uwlts.storage.files import written_aside
+from uwlts.errors import CaptureError, OutputError
+from uwlts.files.reading import opened
+from uwlts.files.writing import written_aside
 from uwlts.storage.las_file import INTENSITY_LIMITS, LAZ_STEP_M, brief, las_middle, library
 
 SUFFIX = ".copc.laz"

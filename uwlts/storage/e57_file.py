@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from uwlts.model.errors import CaptureError, OutputError
+from uwlts.errors import CaptureError, OutputError
 from uwlts.storage.las_file import brief, library
 
 PREFIX, EXTENSION = "uwlts", "urn:uwlts:point-fields"

@@ -12,16 +12,16 @@ import cv2
 import numpy as np
 import tomli_w
 
-from uwlts.model.command_files import keeps_inputs
-from uwlts.model.errors import CaptureError, OutputError
+from uwlts.errors import CaptureError, OutputError
+from uwlts.files.command_files import keeps_inputs
+from uwlts.files.writing import refuse_unsuitable, require_possible_name, written_aside
 from uwlts.model.stripe import rows_of
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import cloud_parts, is_cloud, read_cloud, read_region, read_thinned_cloud, write_cloud
 from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.e57_file import write_e57
-from uwlts.storage.files import refuse_unsuitable, require_possible_name, written_aside
-from uwlts.storage.import_.description import NAME
+from uwlts.storage.import_.folder_description import NAME
 from uwlts.storage.import_.matching import POSE_COLUMNS
 from uwlts.storage.las_file import laz_content
 from uwlts.storage.mcap_clouds import covariance_columns, mcap_of

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwlts.model.errors import CaptureError, DescriptionError
-from uwlts.model.input_file import opened
+from uwlts.errors import CaptureError, DescriptionError
+from uwlts.files.reading import opened
 from uwlts.storage.e57_file import read_e57
 from uwlts.storage.las_file import brief, library
 from uwlts.storage.pose_files import read_columns

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, TypeVar
 import h5py
 import numpy as np
 
-from uwlts.model.errors import CaptureError, Error
-from uwlts.model.input_file import MOST_JSON_BYTES, is_regular_file, parsed_json
+from uwlts.errors import CaptureError, Error
+from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parsed_json
 from uwlts.model.library import validated
 from uwlts.model.sensor import Description, Table
 

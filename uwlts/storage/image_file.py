@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from uwlts.model.errors import ImageError
+from uwlts.errors import ImageError
 from uwlts.storage.image_header import ImageHeader, png_damage, read_header, read_image_file
 
 _STANDARD_ERROR = 2

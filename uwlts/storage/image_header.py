@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from uwlts.model.errors import ImageError
-from uwlts.model.input_file import read_bytes
+from uwlts.errors import ImageError
+from uwlts.files.reading import read_bytes
 
 SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".jpg", ".jpeg")
 

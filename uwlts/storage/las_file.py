@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from uwlts.model.errors import OutputError, SetupError
+from uwlts.errors import OutputError, SetupError
 
 LAZ_STEP_M = 1e-7
 """Coordinates in LAZ are whole multiples of it from the middle of the cloud: 0.1 um, over 214 m to either side."""

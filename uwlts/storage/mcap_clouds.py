@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.model.errors import OutputError, SetupError
+from uwlts.errors import OutputError, SetupError
 from uwlts.storage.cloud import PAIRS, PointCloud
 
 TOPIC, FRAME_ID = "/points", "base"

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from uwlts.model.errors import OutputError
+from uwlts.errors import OutputError
+from uwlts.files.writing import written_aside
 from uwlts.model.sensor import Table
-from uwlts.storage.files import written_aside
 
 MESH_FORMATS = (".stl", ".ply", ".glb")
 

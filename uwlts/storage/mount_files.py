@@ -7,14 +7,14 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
+from uwlts.files.json_files import read_model, write_model
+from uwlts.files.writing import sha256_of
 from uwlts.model.library import read_table, validated
 from uwlts.model.mount import Mount
 from uwlts.model.sensor import Description, Positive
 from uwlts.storage.cloud_files import is_cloud, read_cloud
-from uwlts.storage.files import sha256_of
 from uwlts.storage.import_.matching import natural_key
-from uwlts.storage.json_files import read_model, write_model
 from uwlts.storage.pose_files import (
     FARTHEST_MM,
     MM_PER_UNIT,

@@ -10,11 +10,11 @@ import pyarrow as pa
 from pyarrow import csv
 from scipy.spatial.transform import Rotation
 
+from uwlts.errors import DescriptionError
+from uwlts.files.reading import read_bytes
+from uwlts.files.writing import sha256_of, written_aside
 from uwlts.model.calibration import is_rigid
-from uwlts.model.errors import DescriptionError
-from uwlts.model.input_file import read_bytes
 from uwlts.model.trajectory import Trajectory
-from uwlts.storage.files import sha256_of, written_aside
 from uwlts.storage.ros_bags import read_bag_poses
 
 Unit = Literal["mm", "m"]

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.model.errors import DescriptionError, SetupError
-from uwlts.model.input_file import require_regular_file
+from uwlts.errors import DescriptionError, SetupError
+from uwlts.files.reading import require_regular_file
 
 _POSES = {
     "nav_msgs/msg/Odometry": lambda message: message.pose.pose,

@@ -7,10 +7,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from uwlts.model.errors import CaptureError
-from uwlts.model.input_file import require_regular_file
+from uwlts.errors import CaptureError
+from uwlts.files.reading import require_regular_file
+from uwlts.files.writing import written_aside
 from uwlts.model.sensor import Description, Medium, Sensor, Table
-from uwlts.storage.files import written_aside
 from uwlts.storage.hdf5_file import read_array, read_label, write_label
 
 FORMAT = "uwlts-truth"

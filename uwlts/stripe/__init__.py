@@ -8,9 +8,9 @@ and says why there is no stripe.
 """
 
 from uwlts.model.stripe import Stripe, StripeStatus
+from uwlts.stripe.capture_stripes import FoundStripes, find_stripes, why_no_stripe
 from uwlts.stripe.extract import extract_candidates, extract_stripe, stripe_in, warm_up
 from uwlts.stripe.methods import method_names
-from uwlts.stripe.recording import FoundStripes, find_stripes, why_no_stripe
 from uwlts.stripe.result import PeakRule, StripeCandidates, StripeOptions, StripeSettings
 
 __all__ = [

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from uwlts.model.errors import ImageError
+from uwlts.errors import ImageError
 from uwlts.model.stripe import Stripe, StripeStatus
 from uwlts.stripe.candidates import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
 from uwlts.stripe.direct import SeenStripes, direct_stripes

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.model.errors import DescriptionError, SetupError
-from uwlts.model.input_file import require_regular_file
+from uwlts.errors import DescriptionError, SetupError
+from uwlts.files.reading import require_regular_file
 from uwlts.model.stripe import StripeStatus
 
 PIXELS_MULTIPLE = 16

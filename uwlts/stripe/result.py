@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.model.errors import DescriptionError, RangeError
+from uwlts.errors import DescriptionError, RangeError
 from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import Stripe, StripeStatus, pixels_of
 from uwlts.stripe.methods import method_names

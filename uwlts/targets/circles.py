@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from uwlts.model.errors import TargetError
+from uwlts.errors import TargetError
 from uwlts.model.sensor import Positive
 from uwlts.targets.target import Patch, Target, TargetView, lattice_indices
 

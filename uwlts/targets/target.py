@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Description, NotNegative
 
 # A target seen in part is found from about a dozen points, or from this share of a larger one: fewer are too likely to

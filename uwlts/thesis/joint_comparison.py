@@ -17,27 +17,27 @@ from typing import NamedTuple, get_args
 import numpy as np
 from matplotlib.figure import Figure
 
-import uwlts
+from uwlts._version import __version__
 from uwlts.calibration.joint.gathering import gather_jointly
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.measurement.evaluation import compared_with_truth
-from uwlts.measurement.figure_uncertainty import figure_uncertainties, shift_std_mm
-from uwlts.measurement.reconstruction import reconstruct_stripes
-from uwlts.metrology.artefacts import evaluate_cloud
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.evaluation.artefact_figures import evaluate_cloud
+from uwlts.evaluation.evaluate import compared_with_truth
+from uwlts.evaluation.figure_uncertainty import figure_uncertainties, shift_std_mm
+from uwlts.files.json_files import json_text
+from uwlts.files.writing import written_aside
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import Calibration
 from uwlts.optics.design import nominal_setup, speckle_limit_um
-from uwlts.report.page_toolkit import COLOURS, legend_below, new_figure, render_page, svg_of
+from uwlts.pages.toolkit import COLOURS, legend_below, new_figure, render_page, svg_of
+from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.runtime.workers import Send, work_through
 from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.capture import Capture
-from uwlts.storage.files import written_aside
-from uwlts.storage.json_files import json_text
 from uwlts.storage.truth import read_truth, truth_path
 from uwlts.stripe import find_stripes
-from uwlts.thesis.campaign import CampaignFolder, ScanFile, up_to_date
+from uwlts.thesis.campaign_folder import CampaignFolder, ScanFile, up_to_date
 from uwlts.thesis.measurements import PROPOSED, TWO, calibrations
 from uwlts.thesis.results import (
     JointMethod,
@@ -266,7 +266,7 @@ def write_joint_comparison(folder: Path, results: Sequence[JointResults], *, ove
     media = [
         (medium, part, _rows(part), svg_of(_errors_figure(results, medium))) for medium, part in summary.media().items()
     ]
-    software = f"uwlts {uwlts.__version__}"
+    software = f"uwlts {__version__}"
     text = render_page("uwlts.thesis", "joint.html.j2", software=software, summary=summary, media=media, words=_WORDS)
     with (
         written_aside(folder / "report.html", overwrite=overwrite) as page,

@@ -15,23 +15,23 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from uwlts.calibration.polynomial import calibrate_polynomials
-from uwlts.calibration.sequential import CalibrationOptions, calibrate_sequentially
-from uwlts.measurement.evaluation import Evaluation, evaluate
-from uwlts.measurement.reconstruction import reconstruct_stripes
-from uwlts.metrology.least_squares import VDI_OUTLIER_SHARE
+from uwlts.calibration.polynomial.polynomial_calibration_fit import calibrate_polynomials
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
+from uwlts.errors import CalibrationError, CaptureError, EvaluationError
+from uwlts.evaluation.evaluate import Evaluation, evaluate
+from uwlts.fitting.least_squares import VDI_OUTLIER_SHARE
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CalibrationError, CaptureError, EvaluationError
 from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.calibration_file import load_calibration, write_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import write_cloud
 from uwlts.storage.truth import read_truth, truth_path
 from uwlts.stripe import FoundStripes, find_stripes
-from uwlts.thesis.campaign import CampaignFolder, ScanFile
+from uwlts.thesis.campaign_folder import CampaignFolder, ScanFile
 from uwlts.thesis.results import Measurement
 
 PROPOSED, TWO, POLYNOMIALS, SINGLE = "proposed", "two refractions", "polynomials", "single viewpoint"

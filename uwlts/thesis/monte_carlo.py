@@ -13,9 +13,9 @@ from itertools import count
 
 import numpy as np
 
-from uwlts.calibration.evidence import AirEvidence, StepEvidence
-from uwlts.calibration.sequential import CalibrationOptions, CalibrationResult, Evidence, solve
-from uwlts.model.errors import CalibrationError, EvaluationError, RangeError
+from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, CalibrationResult, Evidence, solve
+from uwlts.errors import CalibrationError, EvaluationError, RangeError
 from uwlts.model.sensor import Medium
 from uwlts.optics.camera import project
 from uwlts.runtime.workers import work_through

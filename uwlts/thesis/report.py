@@ -13,10 +13,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-import uwlts
-from uwlts.model.errors import DescriptionError
-from uwlts.report import plot
-from uwlts.report.page_toolkit import (
+from uwlts._version import __version__
+from uwlts.errors import DescriptionError
+from uwlts.files.writing import refuse_unsuitable, written_aside
+from uwlts.pages.toolkit import (
     BLUE,
     COLOURS,
     INK,
@@ -28,17 +28,25 @@ from uwlts.report.page_toolkit import (
     render_page,
     svg_of,
 )
+from uwlts.report import plot
 from uwlts.report.pictures import stripe_picture, stripe_view
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud
-from uwlts.storage.files import refuse_unsuitable, written_aside
-from uwlts.thesis.campaign import campaign_folders
-from uwlts.thesis.evaluation import TRIALS, evaluate_campaign
+from uwlts.thesis.campaign_folder import campaign_folders
+from uwlts.thesis.evaluate_campaign import TRIALS, evaluate_campaign
 from uwlts.thesis.joint_comparison import compare_campaigns, summary_lines, write_joint_comparison
 from uwlts.thesis.measurements import FORGOTTEN, POLYNOMIALS, PROPOSED
 from uwlts.thesis.monte_carlo import LEAST_TRIALS
+from uwlts.thesis.published_tables import (
+    LARGEST_RATIO,
+    MEAN,
+    Published,
+    TableRow,
+    all_rows,
+    headline_rows,
+    load_published,
+)
 from uwlts.thesis.results import CampaignResults, Points
-from uwlts.thesis.tables import LARGEST_RATIO, MEAN, Published, TableRow, all_rows, headline_rows, load_published
 
 _TEXTS = tomllib.loads(Path(__file__).with_name("texts.toml").read_text(encoding="utf-8"))
 # A table with more quantities has one value to a line.
@@ -214,7 +222,7 @@ def report_page(
         held_by_budget=sum(abs(each.observed_mm) <= results[n].budget.get("expanded", -1.0) for n, each in intervals),
         failures=[(number, m) for number, result in enumerate(results) for m in result.measurements if m.failure],
         pictures=_pictures(folder),
-        version=uwlts.__version__,
+        version=__version__,
     )
 
 

@@ -6,9 +6,9 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict
 
-from uwlts.model.errors import CaptureError
-from uwlts.storage.files import written_aside
-from uwlts.storage.json_files import json_text, read_json, validated_content
+from uwlts.errors import CaptureError
+from uwlts.files.json_files import json_text, read_json, validated_content
+from uwlts.files.writing import written_aside
 
 Points = list[tuple[float, float]]
 """Y and Z of points on a profile, mm."""

@@ -5,24 +5,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.calibration.evidence import step_evidence
-from uwlts.calibration.step_images import StepImage, label_step, step_profile
-from uwlts.calibration.window import solve_window
-from uwlts.measurement.reconstruction import reconstruct_stripes
-from uwlts.metrology.fits import fit_sphere
-from uwlts.metrology.spheres import evaluate_spheres
-from uwlts.metrology.uncertainty_budget import UncertaintySource, combine, thermal_expansion_mm
+from uwlts.calibration.capture_evidence import step_evidence
+from uwlts.calibration.sequential.step_images import StepImage, label_step, step_profile
+from uwlts.calibration.sequential.window_distance import solve_window
+from uwlts.errors import CalibrationError
+from uwlts.evaluation.spheres import evaluate_spheres
+from uwlts.fitting.shapes import fit_sphere
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.artefacts import SphereStandard
 from uwlts.model.calibration import Calibration, WindowModel
-from uwlts.model.errors import CalibrationError
 from uwlts.model.sensor import Medium
 from uwlts.model.stripe import pixels_of
-from uwlts.optics.reconstruction import reconstruct_pixels
+from uwlts.optics.triangulation import reconstruct_pixels
+from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
-from uwlts.thesis.campaign import STEP_PLACES, CampaignFolder
+from uwlts.thesis.campaign_folder import STEP_PLACES, CampaignFolder
 from uwlts.thesis.results import WindowChoice, WindowProfile
+from uwlts.thesis.uncertainty_budget import UncertaintySource, combine, thermal_expansion_mm
 
 
 @dataclass(frozen=True, eq=False)

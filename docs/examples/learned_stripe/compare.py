@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 import twin
-from twin.datasets.description import LineStatus
+from twin.datasets.data_set import LineStatus
 from uwlts.stripe import StripeOptions, extract_stripe, method_names
 
 NEAR_PX = 3.0

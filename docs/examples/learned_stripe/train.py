@@ -18,7 +18,7 @@ import optax
 from network import NEAR_PX, Weights, centres, logits, new_weights, write_onnx
 
 import twin
-from twin.datasets.description import LineStatus
+from twin.datasets.data_set import LineStatus
 
 CROP_PX, BATCH = 256, 256
 SPREAD_PX = 0.8

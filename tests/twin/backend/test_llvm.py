@@ -17,7 +17,7 @@ import pytest
 
 from twin.backend import llvm, packages
 from twin.backend.llvm import LlvmLibrary, examine, find_llvm, install_llvm, list_candidates, main, named_version
-from uwlts.model.errors import SetupError
+from uwlts.errors import SetupError
 from uwlts.runtime.shared_library import own_folders
 
 NEEDED, ABSENT = b"libm.so.6\0", b"libQ.so.6\0"

@@ -3,7 +3,7 @@
 import pytest
 
 from twin.backend import packages
-from uwlts.model.errors import SetupError
+from uwlts.errors import SetupError
 
 
 def unpack(folder, text):

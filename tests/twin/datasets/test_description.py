@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.datasets.description import SPLITS, DataSetDescription, LogUniform, Normal, OneOf, Uniform, load_description
+from twin.datasets.data_set import SPLITS, DataSetDescription, LogUniform, Normal, OneOf, Uniform, load_description
 from twin.datasets.draws import draw_scene, split_of
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.library import names
 
 TINY = {"title": "tiny", "scene": "plane", "sensor": "thesis-small"}

@@ -17,11 +17,11 @@ import webdataset
 
 import twin
 from tests.virtual_sensors import altered
-from twin.datasets.description import SPLITS, DataSetDescription
+from twin.datasets.data_set import SPLITS, DataSetDescription
 from twin.datasets.draws import draw_scene
-from uwlts.model.errors import CaptureError, DescriptionError, DesignError, OutputError
+from uwlts.errors import CaptureError, DescriptionError, DesignError, OutputError
+from uwlts.files.writing import sha256_of
 from uwlts.model.library import load_sensor
-from uwlts.storage.files import sha256_of
 
 SMALL = {"camera": {"width_px": 160, "height_px": 128, "pixel_size_um": 42.4}}
 LABELS = ("centre", "quality", "points", "masks", "light", "depth", "sensor")
@@ -284,7 +284,7 @@ def test_shards_that_another_run_holds_are_left_to_it_and_then_waited_for(folder
     held = sorted(made)[-1]
     # Another machine's run that takes a shard, and dies before it is written.
     program = (
-        "import sys, time, pathlib\nfrom uwlts.storage.one_writer import one_writer\n"
+        "import sys, time, pathlib\nfrom uwlts.files.one_writer import one_writer\n"
         "with one_writer(pathlib.Path(sys.argv[1])):\n"
         "    print('held', flush=True)\n"
         "    while len(list(pathlib.Path(sys.argv[1]).parent.glob('*.tar'))) < int(sys.argv[2]):\n"

@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 from scipy.special import erf
 
 from tests.virtual_sensors import altered, block, clear, plate, scene_of, stripe_on_plate
-from twin.datasets.description import FAINT_BELOW, LineStatus, Mask
+from twin.datasets.data_set import FAINT_BELOW, LineStatus, Mask
 from twin.datasets.labels import labelled, noise_std_e, stripe_quality
 from twin.options import Effects, Options
 from twin.recording.studio import Exposed, Studio

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from twin.design.description import Study, load_study
 from twin.design.designs import Design, built, described, designs_of, judged, number_of_designs, row_of, sensor_of
-from twin.design.figures import FIGURES
+from twin.design.figures_of_merit import FIGURES
 from twin.design.screening import as_part, read_parts, write_csv, write_part
-from uwlts.model.errors import CaptureError, DescriptionError, DesignError
+from twin.design.study import Study, load_study
+from uwlts.errors import CaptureError, DescriptionError, DesignError
 from uwlts.model.library import load_sensor, names
 
 BASELINE, ANGLE = "laser.baseline_mm", "laser.triangulation_angle_deg"

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 
 from tests.virtual_sensors import altered
-from twin.design.figures import CLASS_NAMES, Figures, figures_of
+from twin.design.figures_of_merit import CLASS_NAMES, Figures, figures_of
 from twin.design.parameters import followed, parameters_of
 from uwlts.model.media import water_absorption_per_m, water_scattering_per_m
 from uwlts.model.placement import view_of_sheet

@@ -9,7 +9,7 @@ import pytest
 from tests.oracles import fermat
 from tests.virtual_sensors import altered
 from twin.design import geometry as g
-from twin.design.figures import FIGURES, figures_of, scatter_at
+from twin.design.figures_of_merit import FIGURES, figures_of, scatter_at
 from twin.design.parameters import followed, parameters_of
 from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
 from uwlts.model.sensor import Sensor

@@ -12,14 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from twin.design.choice import Judged, pareto
-from twin.design.description import Study, load_study
 from twin.design.designs import Design, EvaluatedDesign, Marked, built, described, judged, row_of
-from twin.design.figures import FIGURES, figures_of
+from twin.design.figures_of_merit import FIGURES, figures_of
 from twin.design.parameters import parameters_of
 from twin.design.report.charts import bars, curves, map_of, parallel_chart, pareto_chart, sample, trade_off
 from twin.design.report.drawing import views_of
-from twin.design.report.page import page_text
-from twin.design.report.tables import (
+from twin.design.report.study_page import page_text
+from twin.design.report.study_tables import (
     agreement_text,
     label_of,
     misses,
@@ -29,10 +28,11 @@ from twin.design.report.tables import (
     without_numbers,
     words_of,
 )
+from twin.design.study import Study, load_study
 from twin.design.verification import Agreement
-from uwlts.model.errors import DesignError, EvaluationError, RangeError
+from uwlts.errors import DesignError, EvaluationError, RangeError
 from uwlts.model.sensor import Sensor
-from uwlts.report.page_toolkit import write_page
+from uwlts.pages.toolkit import write_page
 
 STUDY = load_study("baseline-angle")
 BASE = STUDY.sensor

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from twin.design.choice import SMOOTH, DerivedFigures, refined
-from twin.design.description import Study
 from twin.design.designs import Design, judged
 from twin.design.parameters import PARAMETER_OF
+from twin.design.study import Study
 
 VALUES = {
     "laser.baseline_mm": 265.0,

@@ -13,7 +13,7 @@ from genicam import genapi
 
 from twin.devices.gige_camera import ENCODER_CHUNK, TIME_CHUNK, GigeCamera, image_packets
 from twin.sensor.peak_finder import INVALID, PeakFinder
-from uwlts.hardware.camera import CameraInfo, CameraSettings, Delivered, Region
+from uwlts.hardware.camera_interface import CameraInfo, CameraSettings, Delivered, Region
 from uwlts.hardware.genicam import GenicamCamera
 from uwlts.model.library import load_sensor
 from uwlts.model.stripe import Coordinates

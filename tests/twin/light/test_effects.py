@@ -9,7 +9,7 @@ from tests.virtual_sensors import altered, plate, scene_of, sensor_at
 from twin.light.renderer import Renderer
 from twin.options import ALL, NONE, Effects, Options
 from twin.recording.studio import Studio
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Sensor
 
 NAMES = [field.name for field in fields(Effects)]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
-from twin.datasets.description import DataSetDescription, load_description
+from twin.datasets.data_set import DataSetDescription, load_description
 from twin.datasets.draws import draw_scene
 from twin.datasets.labels import labelled
 from twin.light.pose import SensorPose

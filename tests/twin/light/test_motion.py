@@ -12,7 +12,7 @@ from twin.light.renderer import Renderer
 from twin.options import NONE, Options
 from twin.recording.frame_truth import true_stripe
 from twin.recording.studio import Studio
-from uwlts.model.errors import DesignError
+from uwlts.errors import DesignError
 
 ALONG_X = np.array([1.0, 0.0, 0.0])
 SPEED = 50.0

@@ -13,7 +13,7 @@ from tests.oracles import fermat
 from tests.virtual_sensors import altered, clear, laser_origin, oracle_fan, oracle_window, window_transmittance
 from twin.backend.arrays import to_jit, to_numpy
 from twin.light.sheet import PowerTable, Sheet
-from uwlts.model.errors import DescriptionError, DesignError
+from uwlts.errors import DescriptionError, DesignError
 from uwlts.model.library import validated
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Laser, Medium, Sensor

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from twin.recording.campaigns import PLAN, keep_to_plan
-from uwlts.model.command_files import command_files
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
+from uwlts.files.command_files import command_files
 
 
 def test_a_command_may_replace_the_plan_that_it_has_read(tmp_path):

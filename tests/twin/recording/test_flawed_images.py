@@ -10,7 +10,7 @@ from twin.light.renderer import Renderer
 from twin.options import NONE, Flaws, Options
 from twin.recording.studio import Studio, record_scene
 from twin.sensor.flaws import dirt
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 from uwlts.storage.truth import TruthStatus, read_truth, truth_path

@@ -9,10 +9,10 @@ import pytest
 import twin
 from tests.virtual_sensors import altered, plate, scene_of
 from twin.options import NONE, Options
-from twin.recording.recording import choose_scene
+from twin.recording.render import choose_scene
 from twin.recording.studio import record_scene
 from twin.scene.description import Scene
-from uwlts.model.errors import CaptureError, DescriptionError, OutputError
+from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
 from uwlts.storage.truth import TruthStatus, read_truth, truth_path

@@ -10,7 +10,7 @@ import pytest
 from tests.virtual_sensors import scene_of
 from twin.scene.campaign import Campaign, Imperfections, Take, _Drawn, load_campaign, takes
 from twin.scene.description import load_scene
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.library import load_sensor, names
 
 SIZES = {

@@ -12,7 +12,7 @@ from twin.scene.description import Scene, load_scene
 from twin.scene.motion import Motion
 from twin.scene.objects import Objects, build_objects
 from twin.scene.placed import Pose
-from uwlts.model.errors import DescriptionError, RangeError
+from uwlts.errors import DescriptionError, RangeError
 from uwlts.model.library import library_folder, load_sensor, names
 from uwlts.model.sensor import Sensor
 

@@ -10,7 +10,7 @@ from tests.virtual_sensors import altered, camera_axes, image_of, oracle_window,
 from twin.light.renderer import Renderer
 from twin.light.sheet import Sheet
 from twin.recording.studio import check_scene
-from uwlts.model.errors import DesignError
+from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object, check_design, laser_pose, view_of_sheet
 from uwlts.model.sensor import Sensor
 

@@ -11,7 +11,7 @@ from twin.backend.arrays import to_jit
 from twin.scene.description import Plate, Scene, load_scene
 from twin.scene.finish import directional_albedo, finish_bsdf, iron_index
 from twin.scene.objects import Objects, build_objects
-from uwlts.model.errors import DescriptionError, RangeError
+from uwlts.errors import DescriptionError, RangeError
 
 WATER = 1.3312
 OPTICS = {"medium_index": WATER, "wavelength_nm": 635.0}

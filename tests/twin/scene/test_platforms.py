@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from twin.scene.navigation import Navigation, Sea, drift_of, waves_of
 from twin.scene.placed import Pose
 from twin.scene.platforms import IdealPath, LinearGuide, Robot, RotaryTable, Vehicle
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.pose_files import read_trajectory, write_trajectory
 

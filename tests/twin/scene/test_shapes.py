@@ -11,7 +11,7 @@ from twin.scene.forms import Head, PittedPipe, Weld
 from twin.scene.forms.head import head_depth
 from twin.scene.forms.pitted_pipe import pit_places, pitted_radius
 from twin.scene.forms.weld import weld_height
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 
 HEIGHT = 160.0
 

@@ -10,7 +10,7 @@ from scipy import stats
 
 from twin.sensor import detector as detector_module
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
-from uwlts.model.errors import ImageError
+from uwlts.errors import ImageError
 from uwlts.model.sensor import Detector, Sensor
 
 SIDE = 320

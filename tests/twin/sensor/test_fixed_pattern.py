@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from twin.sensor.detector import FixedPattern, fixed_pattern, grey_values
-from uwlts.model.errors import ImageError
+from uwlts.errors import ImageError
 from uwlts.model.sensor import Detector
 
 SIDE = 300

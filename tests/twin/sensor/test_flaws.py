@@ -10,7 +10,7 @@ from PIL import Image
 from tests.virtual_sensors import altered
 from twin.options import Flaws
 from twin.sensor.flaws import GLARE_REACH, as_built, delivered, laser_shares, veiled, vignette
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 
 
 def test_glare_is_the_sum_over_all_pixels_of_light_that_falls_off_exponentially():

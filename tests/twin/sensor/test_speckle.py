@@ -13,7 +13,7 @@ from scipy import integrate, interpolate, special, stats
 
 from tests.virtual_sensors import altered
 from twin.sensor.speckle import Speckle, _third_of_pixel, coherence, pixel_contrast, renewal_correlation
-from uwlts.model.errors import DesignError, ImageError, RangeError
+from uwlts.errors import DesignError, ImageError, RangeError
 from uwlts.model.sensor import Camera, Sensor
 
 WAVELENGTH_NM = 635.0

@@ -8,6 +8,15 @@ import pytest
 
 from tests.uwlts.calibration_views import STEP_MM, WATER, inside, lens_of, step_profile, through_window
 from tests.uwlts.drawn_target import drawn_lamp, drawn_laser, target_pose
+from uwlts.calibration.camera.image_quality import (
+    QualityLimits,
+    judge_motion,
+    judge_novelty,
+    judge_stripe,
+    judge_target,
+    way_px,
+    why_not_found,
+)
 from uwlts.calibration.guidance.pose_advice import (
     RecordedPose,
     Setting,
@@ -28,18 +37,9 @@ from uwlts.calibration.guidance.pose_advice import (
     tilts_rad,
 )
 from uwlts.calibration.guidance.step import apart_mm, is_new, judge_step, next_depth_mm
-from uwlts.calibration.image_quality import (
-    QualityLimits,
-    judge_motion,
-    judge_novelty,
-    judge_stripe,
-    judge_target,
-    way_px,
-    why_not_found,
-)
+from uwlts.errors import TargetError
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import WindowModel
-from uwlts.model.errors import TargetError
 from uwlts.model.library import merged
 from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.sensor import Sensor

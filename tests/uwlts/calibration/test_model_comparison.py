@@ -8,8 +8,8 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
-from uwlts.calibration.joint.evidence import STRIPE, TARGET
 from uwlts.calibration.joint.procedure import joint_problem, solve_jointly
+from uwlts.calibration.joint.residuals import STRIPE, TARGET
 from uwlts.calibration.joint.stored_estimate import found_estimate
 from uwlts.calibration.model_comparison.comparison import Comparison, choice_of, choose, tally
 from uwlts.calibration.model_comparison.held_out import (
@@ -22,10 +22,10 @@ from uwlts.calibration.model_comparison.held_out import (
     recast,
     splits,
 )
-from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.model.errors import CalibrationError
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.errors import CalibrationError
+from uwlts.files.json_files import json_text
 from uwlts.report.model_comparison import ModelComparisonContent, adds, content_of, lines_of, models_page, verdicts
-from uwlts.storage.json_files import json_text
 
 pytestmark = pytest.mark.slow
 

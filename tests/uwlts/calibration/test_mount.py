@@ -23,7 +23,7 @@ from tests.uwlts.mount_views import (
     step_campaign,
 )
 from uwlts.cli import main
-from uwlts.model.errors import CalibrationError, DescriptionError
+from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import Mount, PlaneFound, RingFound, SphereFound, StepFound
 from uwlts.storage.mount_files import read_mount, read_profiles
 from uwlts.storage.pose_files import read_poses

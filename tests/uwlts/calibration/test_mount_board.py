@@ -11,8 +11,8 @@ from tests.virtual_sensors import scene_of
 from twin import render
 from uwlts.calibration.mount_board import _Problem
 from uwlts.calibration.mount_board_images import BoardImage, posed_board
+from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import KnownMedium
-from uwlts.model.errors import CalibrationError, DescriptionError
 from uwlts.model.mount import BoardFound
 from uwlts.optics.nominal import nominal
 from uwlts.storage.capture import Capture, CaptureHeader, Frame

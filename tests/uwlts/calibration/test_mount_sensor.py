@@ -15,9 +15,9 @@ from tests.uwlts.mount_views import errors_of
 from tests.uwlts.sensor_profiles import RADIUS_MM, captured_by, half_way, joint_estimate, largest_parts
 from uwlts.calibration.joint.stored_estimate import covariance_root
 from uwlts.calibration.mount_board import _Problem
-from uwlts.measurement.moving import Ride, with_platform
-from uwlts.measurement.point_uncertainty import point_uncertainty
 from uwlts.model.any_calibration import calibration_digest
+from uwlts.reconstruction.moving import Ride, with_platform
+from uwlts.reconstruction.point_uncertainty import point_uncertainty
 from uwlts.storage.capture import CaptureHeader, FrameTable
 
 

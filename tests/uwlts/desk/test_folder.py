@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from uwlts.desk.folder import file_in, interrupted, kind_of, listed, new_in
-from uwlts.model.errors import DescriptionError
+from uwlts.desk.desk_files import file_in, interrupted, kind_of, listed, new_in
+from uwlts.errors import DescriptionError
 from uwlts.optics.nominal import nominal
 from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.cloud import PointCloud

@@ -14,10 +14,10 @@ import genicam
 import numpy as np
 import pytest
 
-from uwlts.hardware.camera import CameraDevice, FrameCheck, FrameCounts, FrameStatus, Region
+from uwlts.errors import HardwareError, ImageError, SetupError
 from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.camera_interface import CameraDevice, FrameCheck, FrameCounts, FrameStatus, Region
 from uwlts.hardware.replay import ReplayCamera
-from uwlts.model.errors import HardwareError, ImageError, SetupError
 from uwlts.model.sensor import Sensor
 from uwlts.runtime import shared_library
 from uwlts.storage.capture import CaptureHeader, Frame

@@ -22,9 +22,9 @@ from tests.waiting import within
 from twin.devices.grbl_controller import GrblController
 from twin.devices.grbl_firmware import GrblError, parse_block
 from twin.devices.grbl_motion import Axis, Ramp
+from uwlts.errors import HardwareError, RangeError
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.grbl_line import Reply, Status, code_text, parse_reply, parse_settings
-from uwlts.model.errors import HardwareError, RangeError
 
 ROOT = Path(__file__).resolve().parents[3]
 FAST = {"speed_up": 100.0, "boot_s": 1.0, "position_mm": 30.0}

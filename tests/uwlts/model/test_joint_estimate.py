@@ -10,8 +10,8 @@ from tests.uwlts.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.next_shot import next_shots
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.stored_estimate import found_estimate
-from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.model.errors import CalibrationError, CaptureError
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.errors import CalibrationError, CaptureError
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Medium
 from uwlts.storage.calibration_file import read_calibration, write_calibration

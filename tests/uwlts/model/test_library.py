@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uwlts.model.errors import DescriptionError, RangeError
+from uwlts.errors import DescriptionError, RangeError
 from uwlts.model.library import find, library_folder, load_sensor, merged, names, read_table, validated
 from uwlts.model.sensor import Medium, Sensor
 

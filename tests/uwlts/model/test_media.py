@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import pytest
 
+from uwlts.errors import DescriptionError, RangeError
 from uwlts.model import media
-from uwlts.model.errors import DescriptionError, RangeError
 
 # Quan and Fry 1995, Eq. 3, evaluated independently to six decimals: nm, degC, g/kg, index relative to air.
 QUAN_FRY = [

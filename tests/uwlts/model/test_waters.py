@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from uwlts.errors import DescriptionError, RangeError
 from uwlts.model import waters
-from uwlts.model.errors import DescriptionError, RangeError
 from uwlts.model.phase_functions import (
     KINDS,
     FournierForand,

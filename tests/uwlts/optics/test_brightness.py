@@ -5,11 +5,11 @@ import pytest
 
 from tests.uwlts.calibration_views import WATER
 from tests.uwlts.joint_views import MEDIUM, seen
-from uwlts.measurement.reconstruction import reconstruct_stripes
 from uwlts.model.joint_estimate import JointEstimate
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.optics.brightness import LitSheet, moved_by_blur_px, sheet_sigma_mm, slopes_of_brightness
 from uwlts.optics.nominal import nominal_calibration
+from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import FoundStripes, extract_stripe

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests.oracles import fermat
 from tests.virtual_sensors import altered
 from uwlts import cli
-from uwlts.model.errors import DesignError, RangeError
+from uwlts.errors import DesignError, RangeError
 from uwlts.model.placement import view_of_sheet
 from uwlts.optics.design import (
     CLAMPED,

@@ -6,7 +6,7 @@ import pytest
 from uwlts.model.library import load_sensor
 from uwlts.optics.line_table import LineTable
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.optics.reconstruction import reconstruct_pixels, reconstruct_profile
+from uwlts.optics.triangulation import reconstruct_pixels, reconstruct_profile
 
 
 def waves(line, place):

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from tests.oracles import fermat
 from tests.uwlts.drawn_windows import faces_and_indices, indices, seeds, tilted, windows
+from uwlts.errors import RangeError
 from uwlts.model.calibration import Calibration, CameraModel, SheetModel, WindowModel
-from uwlts.model.errors import RangeError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Distortion, Sensor
 from uwlts.optics.camera import directions, project, project_through_window
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.optics.reconstruction import points_on_sheet, reconstruct_pixels, reconstruct_profile, to_object
+from uwlts.optics.triangulation import points_on_sheet, reconstruct_pixels, reconstruct_profile, to_object
 from uwlts.optics.window import RayStatus, trace_window
 
 WATER = 1.3312

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 
 from tests.oracles import fermat, optics
 from tests.uwlts.drawn_windows import faces_and_indices, indices, seeds, tilted, tilts, windows
+from uwlts.errors import RangeError
 from uwlts.model.calibration import WindowModel
-from uwlts.model.errors import RangeError
 from uwlts.optics.window import RayStatus, refract, trace_window
 
 AXIS = np.array([0.0, 0.0, 1.0])

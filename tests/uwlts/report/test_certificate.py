@@ -11,11 +11,11 @@ from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
 from uwlts.calibration.joint.observability import SheetRegion, estimate_in, pixels_at, regions
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.errors import CalibrationError, CaptureError, OutputError
 from uwlts.model.calibration import KnownMedium
-from uwlts.model.errors import CalibrationError, CaptureError, OutputError
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.optics.reconstruction import reconstruct_pixels
+from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.report.certificate import (
     NOT_JOINT,
     JointCertificate,

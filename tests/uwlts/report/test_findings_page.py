@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import uwlts
-from tests.uwlts.metrology.test_surface_mesh import NOISE_MM
+from tests.uwlts.comparison.test_surface_mesh import NOISE_MM
 from uwlts.cli import app
+from uwlts.errors import EvaluationError, OutputError, SetupError
+from uwlts.files.writing import sha256_of
 from uwlts.model.artefacts import SphereStandard
-from uwlts.model.errors import EvaluationError, OutputError, SetupError
-from uwlts.report import pdf
+from uwlts.pages import pdf
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
-from uwlts.storage.files import sha256_of
 
 DEPTH_MM = 1.5
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwlts.calibration.joint.evidence import STRIPE
+from uwlts.calibration.joint.residuals import STRIPE
 from uwlts.calibration.model_comparison.comparison import Choice, Comparison, choice_of
 from uwlts.calibration.model_comparison.held_out import INSIDE, OUTSIDE, Candidate, Misses, Prediction
 from uwlts.report.model_comparison import content_of, models_page, verdicts

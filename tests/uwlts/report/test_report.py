@@ -15,21 +15,21 @@ from hypothesis import strategies as st
 from matplotlib.colors import to_hex
 from rich.console import Console
 
-from uwlts.measurement.evaluation import StoredUncertainty, evaluate, write_evaluation
+from uwlts.errors import CaptureError, DescriptionError, OutputError
+from uwlts.evaluation.evaluate import StoredUncertainty, evaluate, write_evaluation
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CaptureError, DescriptionError, OutputError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.optics.nominal import nominal_calibration
+from uwlts.pages.numbers import as_fine_as, fixed, small_length
+from uwlts.pages.toolkit import png_of, svg_of, write_page
 from uwlts.report import plot
 from uwlts.report.campaign_page import report_page
+from uwlts.report.campaign_tables import print_table, summary_table
 from uwlts.report.gather import gather_campaign, load_reference
-from uwlts.report.numbers import as_fine_as, fixed, small_length
-from uwlts.report.page_toolkit import png_of, svg_of, write_page
 from uwlts.report.pictures import StripeView, draw_pictures, stripe_picture, write_pictures
 from uwlts.report.summary_file import summary, write_summary
-from uwlts.report.tables import print_table, summary_table
 from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.capture import CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from uwlts.model.errors import SetupError
+from uwlts.errors import SetupError
 from uwlts.runtime.workers import Lost, open_workers
 
 GUILTY = 7

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from uwlts.model.errors import CaptureError, SetupError
+from uwlts.errors import CaptureError, SetupError
+from uwlts.files.writing import written_aside
 from uwlts.runtime import workers
 from uwlts.runtime.workers import work_through
-from uwlts.storage.files import written_aside
 
 ROOT = Path(__file__).resolve().parents[3]
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from uwlts.errors import CaptureError, Error, OutputError
 from uwlts.model.calibration import Calibration
-from uwlts.model.errors import CaptureError, Error, OutputError
 from uwlts.model.library import load_sensor
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.calibration_file import read_calibration, write_calibration

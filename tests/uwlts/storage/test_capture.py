@@ -17,7 +17,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from uwlts.model.errors import CaptureError, Error, ImageError, OutputError
+from uwlts.errors import CaptureError, Error, ImageError, OutputError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.storage import capture_writer
@@ -458,7 +458,7 @@ def test_storage_that_ends_stops_the_recording_and_keeps_its_frames(tmp_path: Pa
     process = child(path, 1000, before=before)
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 1, "HDF5 must not crash the process"
-    assert errors.strip().splitlines()[-1].startswith("uwlts.model.errors.OutputError: cannot write")
+    assert errors.strip().splitlines()[-1].startswith("uwlts.errors.OutputError: cannot write")
     assert "File too large; complete frames are kept in a.h5.part" in errors
     frames = [int(line) for line in output.split()]
     assert len(frames) > 10

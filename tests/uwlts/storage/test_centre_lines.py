@@ -9,7 +9,7 @@ import tomli_w
 
 import uwlts
 from tests.uwlts.storage.test_import import GIVEN, HEIGHT, WIDTH, lamp_image
-from uwlts.model.errors import CaptureError, DescriptionError, ImageError
+from uwlts.errors import CaptureError, DescriptionError, ImageError
 from uwlts.model.stripe import Coordinates
 from uwlts.report.pictures import stripe_picture, stripe_view
 from uwlts.storage.capture import Capture, Frame

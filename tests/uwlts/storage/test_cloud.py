@@ -17,11 +17,11 @@ from plyfile import PlyData, PlyElement
 
 from tests.system.in_process import uwlts
 from tests.uwlts import drawn_stripes
-from uwlts.model.errors import CaptureError, OutputError
+from uwlts.errors import CaptureError, OutputError
+from uwlts.files.writing import written_aside
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud, PointUncertainty
 from uwlts.storage.cloud_files import is_cloud, read_cloud, read_thinned_cloud, write_cloud
-from uwlts.storage.files import written_aside
 
 KINDS = pytest.mark.parametrize("name", ["a.ply", "a.h5"])
 

@@ -10,7 +10,7 @@ import pytest
 
 import uwlts
 from uwlts.cli import app
-from uwlts.model.errors import CaptureError, OutputError
+from uwlts.errors import CaptureError, OutputError
 from uwlts.storage import copc_file
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import cloud_parts, read_region, read_thinned_cloud

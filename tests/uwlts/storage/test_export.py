@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.uwlts.storage.test_capture import a_header, record, small_sensor
 from uwlts import cli
-from uwlts.model.errors import OutputError, SetupError
+from uwlts.errors import OutputError, SetupError
 from uwlts.runtime.console import run
 from uwlts.storage.capture import Capture, Frame
 from uwlts.storage.capture_writer import CaptureWriter

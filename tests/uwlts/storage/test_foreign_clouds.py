@@ -8,7 +8,7 @@ import pye57
 import pytest
 
 from tests.uwlts.storage.test_cloud import some_cloud
-from uwlts.model.errors import CaptureError
+from uwlts.errors import CaptureError
 from uwlts.storage.cloud_files import cloud_parts, is_cloud, read_cloud, read_thinned_cloud
 from uwlts.storage.export_ import export_cloud
 

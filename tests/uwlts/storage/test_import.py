@@ -9,7 +9,7 @@ import pytest
 import tomli_w
 
 from uwlts import cli
-from uwlts.model.errors import DescriptionError, ImageError, OutputError
+from uwlts.errors import DescriptionError, ImageError, OutputError
 from uwlts.runtime.console import run
 from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.image_file import read_image

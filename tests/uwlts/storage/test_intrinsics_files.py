@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Distortion
 from uwlts.storage.import_ import KnownCamera, read_intrinsics, with_intrinsics

@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 import uwlts
-from uwlts.model.errors import DescriptionError, SetupError
+from uwlts.errors import DescriptionError, SetupError
 
 TIMES = 1.7e9 + np.arange(6) * 0.1
 PLACES_M = np.column_stack([0.05 * np.arange(6), np.zeros(6), np.full(6, 0.4)])

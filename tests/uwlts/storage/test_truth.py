@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from uwlts.model.errors import CaptureError, Error, OutputError
+from uwlts.errors import CaptureError, Error, OutputError
 from uwlts.model.library import load_sensor
 from uwlts.storage.hdf5_file import write_label
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth, truth_path, write_truth

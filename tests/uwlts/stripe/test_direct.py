@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwlts.model.errors import RangeError
+from uwlts.errors import RangeError
 from uwlts.model.library import load_sensor
 from uwlts.stripe import StripeOptions, StripeStatus, extract_candidates, extract_stripe, find_stripes
 from uwlts.stripe.direct import farther

@@ -7,7 +7,7 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from uwlts.model.errors import CaptureError, DescriptionError, RangeError, SetupError
+from uwlts.errors import CaptureError, DescriptionError, RangeError, SetupError
 from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
 
 LINES, LENGTH = 300, 170

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import erf
 
-from uwlts.model.errors import DescriptionError, ImageError, RangeError
+from uwlts.errors import DescriptionError, ImageError, RangeError
 from uwlts.model.library import load_sensor
 from uwlts.stripe import PeakRule, StripeOptions, StripeStatus, extract_stripe, method_names
 

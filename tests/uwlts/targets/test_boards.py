@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from uwlts.model.errors import TargetError
+from uwlts.errors import TargetError
 from uwlts.targets import CharucoTarget, ChessboardTarget, parse_target
 from uwlts.targets.detection import refined, why_no_chessboard
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.model.errors import RangeError
+from uwlts.errors import RangeError
 from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
 FOCAL, CENTRE = 2450.0, (639.5, 511.5)

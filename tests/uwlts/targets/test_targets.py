@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from uwlts.model.errors import DescriptionError, ImageError, TargetError
+from uwlts.errors import DescriptionError, ImageError, TargetError
 from uwlts.targets import CharucoTarget, ChessboardTarget, CircleTarget, parse_target
 from uwlts.targets.detection import detect_lattice, find_circles, label_lattice
 from uwlts.targets.detection.blobs import _ellipse_like

@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 
-from uwlts.model.errors import OutputError
+from uwlts.errors import OutputError
 from uwlts.thesis.joint_comparison import JOINT, SHIFTS, summary_lines, write_joint_comparison
 from uwlts.thesis.results import JointResults, PlaneScatter, SphereErrors
 

@@ -16,13 +16,13 @@ from tests.uwlts.drawn_stripes import (
     stripe_image,
     write,
 )
-from uwlts.measurement.evaluation import evaluate
-from uwlts.model.errors import EvaluationError
+from uwlts.errors import EvaluationError
+from uwlts.evaluation.evaluate import evaluate
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_cloud
-from uwlts.thesis.campaign import ScanFile
+from uwlts.thesis.campaign_folder import ScanFile
 from uwlts.thesis.measurements import METHODS, _figures, _line_length, _range_within, measure_scan
 from uwlts.thesis.sphere_spacing import sphere_scan
 

@@ -11,15 +11,16 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from uwlts.model.errors import CaptureError, DescriptionError, OutputError
+from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Medium
-from uwlts.report.page_toolkit import svg_of
+from uwlts.pages.toolkit import svg_of
 from uwlts.storage.capture import CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import write_cloud
-from uwlts.thesis.campaign import CampaignFolder, campaign_folders
+from uwlts.thesis.campaign_folder import CampaignFolder, campaign_folders
+from uwlts.thesis.published_tables import TableRow, all_rows, headline_rows, load_published
 from uwlts.thesis.report import (
     comparison_figure,
     differences,
@@ -31,7 +32,6 @@ from uwlts.thesis.report import (
     write_comparison,
 )
 from uwlts.thesis.results import CampaignResults, Measurement, WindowProfile
-from uwlts.thesis.tables import TableRow, all_rows, headline_rows, load_published
 
 PUBLISHED = load_published()
 FILES = ("summary.json", "tables.csv", "summary.md", "report.html")

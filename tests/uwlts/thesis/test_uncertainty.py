@@ -21,10 +21,10 @@ from tests.uwlts.calibration_views import (
     stripes_on_target,
     through_window,
 )
-from uwlts.calibration.evidence import AirEvidence, StepEvidence
-from uwlts.calibration.sequential import CalibrationOptions, Evidence, solve
+from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, Evidence, solve
+from uwlts.errors import CalibrationError
 from uwlts.model.artefacts import StepStandard
-from uwlts.model.errors import CalibrationError
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium
 from uwlts.targets import CircleTarget

@@ -5,9 +5,9 @@ import pytest
 
 from tests.uwlts.calibration_views import STEP_MM, WATER
 from tests.uwlts.drawn_stripes import SENSOR, SPACING_MM, STAGE_MM, sphere_profiles, step_image, write
-from uwlts.model.errors import CaptureError
+from uwlts.errors import CaptureError
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.thesis.campaign import CampaignFolder
+from uwlts.thesis.campaign_folder import CampaignFolder
 from uwlts.thesis.results import WindowChoice
 from uwlts.thesis.sphere_spacing import SphereScan, mean_spacing_error, spacing_error, window_choices
 

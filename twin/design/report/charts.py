@@ -20,12 +20,12 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay, KDTree, QhullError
 
 from twin.design.choice import Judged, pareto
-from twin.design.description import Variable
 from twin.design.designs import Marked
-from twin.design.figures import CLASS_NAMES
-from twin.design.report import tables
+from twin.design.figures_of_merit import CLASS_NAMES
+from twin.design.report import study_tables as tables
+from twin.design.study import Variable
 from twin.design.verification import Agreement
-from uwlts.report.page_toolkit import BLUE, COLOURS, FAINT, INK, legend_below, new_figure
+from uwlts.pages.toolkit import BLUE, COLOURS, FAINT, INK, legend_below, new_figure
 
 Static = tuple[Figure, str]
 Interactive = tuple[go.Figure, str]

@@ -15,14 +15,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from twin.design.figures import depths_in_view, field_of
+from twin.design.figures_of_merit import depths_in_view, field_of
 from twin.design.geometry import Lens, WindowGeometry, directions_of, traced
 from twin.design.parameters import SensorArrays, parameters_of
-from twin.design.report.tables import number_text
-from uwlts.model.errors import DesignError
+from twin.design.report.study_tables import number_text
+from uwlts.errors import DesignError
 from uwlts.model.placement import LaserPose, laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
-from uwlts.report.page_toolkit import INK, SOFT, new_figure
+from uwlts.pages.toolkit import INK, SOFT, new_figure
 
 _BEYOND = 1.06
 """Rays and sheet are drawn so much farther than the volume's far end."""

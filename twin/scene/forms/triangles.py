@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from uwlts.model.errors import DescriptionError
+from uwlts.errors import DescriptionError
 
 _MOST_VERTICES = 4_000_000
 

@@ -7,12 +7,12 @@ from itertools import product
 import cv2
 import numpy as np
 
-from uwlts.calibration.camera import CameraSolution, Poses, solve_camera
-from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
-from uwlts.calibration.sheet import fit_sheet, points_on_target
-from uwlts.calibration.target_images import Placement, TargetImage, observe, pose_values
+from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
+from uwlts.calibration.camera.target_images import Placement, TargetImage, observe, pose_values
+from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
+from uwlts.calibration.sequential.sheet_fit import fit_sheet, points_on_target
+from uwlts.errors import CalibrationError, RangeError
 from uwlts.model.calibration import CameraModel
-from uwlts.model.errors import CalibrationError, RangeError
 from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Medium, Sensor

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.calibration.evidence import StepEvidence
-from uwlts.calibration.image_quality import LaserFault
-from uwlts.calibration.step_images import label_step
+from uwlts.calibration.camera.image_quality import LaserFault
+from uwlts.calibration.capture_evidence import StepEvidence
+from uwlts.calibration.sequential.step_images import label_step
+from uwlts.errors import EvaluationError, ImageError
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.calibration import Calibration, WindowModel
-from uwlts.model.errors import EvaluationError, ImageError
 from uwlts.model.sensor import Sensor
-from uwlts.optics.reconstruction import points_on_sheet
+from uwlts.optics.triangulation import points_on_sheet
 from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
 
 PLACES = 3

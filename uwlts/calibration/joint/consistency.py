@@ -8,10 +8,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence
-from uwlts.calibration.joint.evidence import SHIFT, TARGET, Residuals, TargetEvidence
 from uwlts.calibration.joint.noise import outliers
+from uwlts.calibration.joint.residuals import SHIFT, TARGET, Residuals, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
-from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import MAD_TO_STD
 from uwlts.model.parameter_keys import (
     LensParameter,
     MediumIndex,

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.calibration.joint.evidence import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
+from uwlts.calibration.joint.earlier_estimate import Parameters
 from uwlts.calibration.joint.noise import Noise, judged, outliers, with_common_error, with_misfit
-from uwlts.calibration.joint.parameters import Parameters
+from uwlts.calibration.joint.residuals import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SCANNED, SurfaceScanEvidence
-from uwlts.calibration.schur_least_squares import Observation, SchurFit, schur_least_squares
-from uwlts.model.errors import CalibrationError
+from uwlts.errors import CalibrationError
+from uwlts.fitting.schur_least_squares import Observation, SchurFit, schur_least_squares
 from uwlts.model.parameter_keys import ParameterKey
 from uwlts.model.sensor import Uncertainty
 

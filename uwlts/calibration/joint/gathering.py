@@ -6,17 +6,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import JsonValue
 
-from uwlts.calibration.evidence import AirEvidence, Progress, StepEvidence, air_evidence, no_stripe_in, step_evidence
-from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.camera.camera_parameters import CameraOptions
+from uwlts.calibration.camera.target_images import Placement, placements
+from uwlts.calibration.capture_evidence import (
+    AirEvidence,
+    Progress,
+    StepEvidence,
+    air_evidence,
+    no_stripe_in,
+    step_evidence,
+)
 from uwlts.calibration.joint.derivatives import SHEET
-from uwlts.calibration.joint.evidence import BENDS, SHIFT, STRETCH
-from uwlts.calibration.joint.parameters import Prior, ViewMedium, window_values
+from uwlts.calibration.joint.earlier_estimate import Prior, ViewMedium, window_values
+from uwlts.calibration.joint.residuals import BENDS, SHIFT, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
-from uwlts.calibration.sequential import CalibrationOptions, common_sensor, sources_of
-from uwlts.calibration.target_images import Placement, placements
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, common_sensor, sources_of
+from uwlts.errors import CalibrationError, DescriptionError, EvaluationError
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard, parse_artefact
 from uwlts.model.calibration import WindowModel
-from uwlts.model.errors import CalibrationError, DescriptionError, EvaluationError
 from uwlts.model.parameter_keys import (
     LensParameter,
     MediumIndex,

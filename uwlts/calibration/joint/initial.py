@@ -7,13 +7,14 @@ from typing import assert_never
 import cv2
 import numpy as np
 
-from uwlts.calibration.camera import placement_pose, solve_camera, stage_direction
-from uwlts.calibration.image_turns import refuse_turned_travel
-from uwlts.calibration.intrinsics import DISTORTION, Intrinsics
+from uwlts.calibration.camera.camera_parameters import DISTORTION, Intrinsics
+from uwlts.calibration.camera.image_turns import refuse_turned_travel
+from uwlts.calibration.camera.target_images import Placement
+from uwlts.calibration.camera.target_poses import placement_pose, solve_camera, stage_direction
 from uwlts.calibration.joint.derivatives import DescribedSheet
-from uwlts.calibration.joint.evidence import StepProfileEvidence, TargetEvidence
+from uwlts.calibration.joint.earlier_estimate import Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series, added_tangential
-from uwlts.calibration.joint.parameters import Parameters, Prior, ViewMedium
+from uwlts.calibration.joint.residuals import StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import (
     LEAST_SHARE,
     Cylinder,
@@ -23,23 +24,22 @@ from uwlts.calibration.joint.scanned_surfaces import (
     SurfaceScanEvidence,
     across_of,
 )
-from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.calibration.sheet import fit_sheet, object_frame
-from uwlts.calibration.step_images import label_steps
-from uwlts.calibration.target_images import Placement
-from uwlts.metrology.artefacts import evaluate_pipe, evaluate_plane
-from uwlts.metrology.spheres import evaluate_spheres
-from uwlts.metrology.step_faces import StepFace
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.calibration.sequential.sheet_fit import fit_sheet, object_frame
+from uwlts.calibration.sequential.step_images import label_steps
+from uwlts.errors import CalibrationError, EvaluationError
+from uwlts.evaluation.artefact_figures import evaluate_pipe, evaluate_plane
+from uwlts.evaluation.spheres import evaluate_spheres
+from uwlts.evaluation.step_faces import StepFace
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard
 from uwlts.model.calibration import Calibration, CameraModel, SheetModel, WindowModel
-from uwlts.model.errors import CalibrationError, EvaluationError
 from uwlts.model.parameter_keys import StepHeight
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
 from uwlts.model.stripe import pixels_of
 from uwlts.optics.brightness import BLUR_STD, LitSheet, beside_std
 from uwlts.optics.camera import directions
-from uwlts.optics.reconstruction import reconstruct_pixels
+from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.optics.window import trace_window
 
 _LARGEST_MISFIT_PX, _LARGEST_MISFIT = 1.5, 1e-3

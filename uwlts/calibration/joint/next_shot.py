@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwlts.calibration.camera.target_images import Placement, pose_values
+from uwlts.calibration.joint.earlier_estimate import Prior, ViewMedium
 from uwlts.calibration.joint.estimate import Evidence
-from uwlts.calibration.joint.evidence import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.noise import Noise, with_common_error
 from uwlts.calibration.joint.observability import (
     estimate_in,
@@ -17,10 +18,9 @@ from uwlts.calibration.joint.observability import (
     regions,
     weaknesses,
 )
-from uwlts.calibration.joint.parameters import Prior, ViewMedium
+from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Spheres, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, with_independent
-from uwlts.calibration.target_images import Placement, pose_values
 from uwlts.model.calibration import Calibration
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight
 from uwlts.model.sensor import Uncertainty

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwlts.calibration.joint.evidence import TARGET, Residuals
-from uwlts.metrology.least_squares import MAD_TO_STD
+from uwlts.calibration.joint.residuals import TARGET, Residuals
+from uwlts.fitting.least_squares import MAD_TO_STD
 
 _OUTLIER = 5.0  # standard deviations; of a million normal values one is farther
 _LAGS = 100  # lines; filters and speckle join a few, wrong models some tens

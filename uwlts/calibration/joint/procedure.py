@@ -7,8 +7,9 @@ from typing import Self
 import numpy as np
 from pydantic import JsonValue
 
-from uwlts.calibration.evidence import Progress
-from uwlts.calibration.intrinsics import CameraOptions
+from uwlts.calibration.camera.camera_parameters import CameraOptions
+from uwlts.calibration.camera.lens import BESIDES, RATIONAL_BESIDES
+from uwlts.calibration.capture_evidence import Progress
 from uwlts.calibration.joint.consistency import (
     Findings,
     deviations,
@@ -17,17 +18,16 @@ from uwlts.calibration.joint.consistency import (
     understated,
     wrong_sizes,
 )
+from uwlts.calibration.joint.earlier_estimate import Parameters
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
-from uwlts.calibration.joint.evidence import BENDS, STRETCH
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
 from uwlts.calibration.joint.initial import line_start, series_start, step_profiles, surface_scans
-from uwlts.calibration.joint.parameters import Parameters
+from uwlts.calibration.joint.residuals import BENDS, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import Plane, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import calibration_of
-from uwlts.calibration.lens import BESIDES, RATIONAL_BESIDES
-from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownStage, WindowModel
-from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import LensParameter, TargetParameter
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture

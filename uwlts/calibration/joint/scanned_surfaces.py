@@ -6,8 +6,8 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from uwlts.calibration.joint.evidence import Distances, Residuals, StripeEvidence
-from uwlts.calibration.joint.parameters import Parameters
+from uwlts.calibration.joint.earlier_estimate import Parameters
+from uwlts.calibration.joint.residuals import Distances, Residuals, StripeEvidence
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.window import leaning

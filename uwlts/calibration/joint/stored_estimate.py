@@ -8,15 +8,15 @@ from pydantic import JsonValue
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.intrinsics import DISTORTION, CameraOptions, Intrinsics
+from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics
 from uwlts.calibration.joint.derivatives import DescribedSheet
+from uwlts.calibration.joint.earlier_estimate import Parameters, Prior, ViewMedium, window_values
 from uwlts.calibration.joint.estimate import Estimate, Evidence
-from uwlts.calibration.joint.evidence import TARGET, SeenSheet
 from uwlts.calibration.joint.noise import outliers
-from uwlts.calibration.joint.parameters import Parameters, Prior, ViewMedium, window_values
-from uwlts.calibration.sheet import object_frame
+from uwlts.calibration.joint.residuals import TARGET, SeenSheet
+from uwlts.calibration.sequential.sheet_fit import object_frame
+from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownMedium
-from uwlts.model.errors import CalibrationError
 from uwlts.model.joint_estimate import CoveredRegion, ImageFit, JointEstimate
 from uwlts.model.parameter_keys import LensParameter, MediumIndex, SheetParameter, WindowParameter, parameter_of
 from uwlts.model.sensor import Medium, Sensor, Table, Uncertainty

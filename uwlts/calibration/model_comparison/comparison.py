@@ -9,11 +9,11 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.polynomial import legendre
 
-from uwlts.calibration.evidence import Progress as Searched
-from uwlts.calibration.joint.evidence import STRIPE, TARGET, TargetEvidence
+from uwlts.calibration.capture_evidence import Progress as Searched
 from uwlts.calibration.joint.gathering import Gathered, Series, gather_jointly
 from uwlts.calibration.joint.noise import outlier_limit
 from uwlts.calibration.joint.procedure import JointProblem, joint_problem
+from uwlts.calibration.joint.residuals import STRIPE, TARGET, TargetEvidence
 from uwlts.calibration.model_comparison.held_out import (
     FEWEST_HELD,
     INSIDE,
@@ -24,10 +24,10 @@ from uwlts.calibration.model_comparison.held_out import (
     predict,
     splits,
 )
-from uwlts.calibration.polynomial import fit_line_polynomials
-from uwlts.calibration.polynomial_evidence import common_header, object_coordinates, stripes_on_plate
-from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.model.errors import CalibrationError, DescriptionError
+from uwlts.calibration.polynomial.polynomial_calibration_fit import fit_line_polynomials
+from uwlts.calibration.polynomial.polynomial_evidence import common_header, object_coordinates, stripes_on_plate
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.optics.window import require_index
 from uwlts.runtime.workers import Send, work_through
 from uwlts.storage.capture import Capture, CaptureHeader, opened_captures

@@ -10,6 +10,20 @@ from pathlib import Path
 
 import numpy as np
 
+from uwlts.calibration.camera.image_quality import (
+    LampFault,
+    LaserFault,
+    MotionFault,
+    QualityLimits,
+    StripeQuality,
+    TargetQuality,
+    judge_motion,
+    judge_novelty,
+    judge_stripe,
+    judge_target,
+    way_px,
+    why_not_found,
+)
 from uwlts.calibration.guidance.pose_advice import (
     PoseAdvice,
     RecordedPose,
@@ -26,26 +40,12 @@ from uwlts.calibration.guidance.pose_advice import (
     state_of,
 )
 from uwlts.calibration.guidance.step import StepQuality, is_new, judge_step, least_apart_mm, next_depth_mm
-from uwlts.calibration.image_quality import (
-    LampFault,
-    LaserFault,
-    MotionFault,
-    QualityLimits,
-    StripeQuality,
-    TargetQuality,
-    judge_motion,
-    judge_novelty,
-    judge_stripe,
-    judge_target,
-    way_px,
-    why_not_found,
-)
+from uwlts.errors import CalibrationError, TargetError
 from uwlts.hardware.guided.operator import Operator, Screen
 from uwlts.hardware.guided.plan import GuidedPlan, GuidedStep
 from uwlts.hardware.rig import START_MS, Rig
 from uwlts.hardware.scan_plan import Light, RigPlan
 from uwlts.model.calibration import Calibration, WindowModel
-from uwlts.model.errors import CalibrationError, TargetError
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, Frame
 from uwlts.storage.capture_writer import CaptureWriter

@@ -8,11 +8,11 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from uwlts.calibration.camera import Poses
+from uwlts.calibration.camera.target_poses import Poses
 from uwlts.calibration.guidance.pose_advice import RecordedPose, Setting, Wanted, without_window
+from uwlts.errors import DescriptionError
 from uwlts.hardware.scan_plan import Direction, RigPlan, StageSettings, Table, plan_table
 from uwlts.model.artefacts import StepStandard
-from uwlts.model.errors import DescriptionError
 from uwlts.model.library import validated
 from uwlts.model.sensor import Description, NotNegative, Positive
 from uwlts.storage.capture import CaptureHeader

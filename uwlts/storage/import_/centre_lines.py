@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.model.errors import DescriptionError, ImageError
-from uwlts.model.input_file import read_bytes, read_text
+from uwlts.errors import DescriptionError, ImageError
+from uwlts.files.reading import read_bytes, read_text
 from uwlts.model.sensor import Camera
 from uwlts.model.stripe import ROWS, Coordinates
 from uwlts.storage.image_file import read_image
-from uwlts.storage.import_.description import CentreLines
+from uwlts.storage.import_.folder_description import CentreLines
 from uwlts.storage.import_.matching import ImageRow
 
 _MOST_BYTES = 2**28

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from pydantic import AfterValidator
 
-from uwlts.model.errors import ImageError
+from uwlts.errors import ImageError
 
 # OpenCV's order of colours.
 _COLOURS = {"blue": 0, "green": 1, "red": 2}

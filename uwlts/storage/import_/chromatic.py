@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.model.errors import ImageError
+from uwlts.errors import ImageError
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_.channels import one_channel
 from uwlts.targets import Target

@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-import uwlts
-from uwlts.model.command_files import keeps_inputs
-from uwlts.model.errors import DescriptionError, ImageError
+from uwlts._version import __version__
+from uwlts.errors import DescriptionError, ImageError
+from uwlts.files.command_files import keeps_inputs
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.sensor import Sensor, Table
 from uwlts.storage.capture import Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.files import refuse_unsuitable
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import ImageHeader
 from uwlts.storage.import_.centre_lines import profile_rows
 from uwlts.storage.import_.channels import is_formula, one_channel
 from uwlts.storage.import_.chromatic import chromatic_warnings
-from uwlts.storage.import_.description import (
+from uwlts.storage.import_.folder_description import (
     NAME,
     ImportDescription,
     capture_header,
@@ -30,7 +30,7 @@ from uwlts.storage.import_.description import (
 from uwlts.storage.import_.images import bits_of, grey_values, without_background
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
 from uwlts.stripe import Stripe
-from uwlts.stripe.recording import BLACK, FEWEST_LINES, WHITE, is_black, shown_stripe, white_share
+from uwlts.stripe.capture_stripes import BLACK, FEWEST_LINES, WHITE, is_black, shown_stripe, white_share
 from uwlts.targets import parse_target
 
 _SIZE_ADVICE = {
@@ -294,7 +294,7 @@ class _Reader:
 
 def _remarks(given: ImportDescription, frames: list[ImageRow], folder: Path, *, bits: int, zero_dn: int) -> Table:
     """Provenance of the capture."""
-    remarks: Table = {"source": "imported images", "uwlts": uwlts.__version__, "folder": folder.resolve().name}
+    remarks: Table = {"source": "imported images", "uwlts": __version__, "folder": folder.resolve().name}
     remarks |= {"bits": bits, "stage": stage_remark(given)}
     remarks |= {key: getattr(given, key) for key in ("channel", "lamp_channel", "intrinsics") if getattr(given, key)}
     if zero_dn:

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from uwlts.model.errors import ImageError
+from uwlts.errors import ImageError
 
 
 def bits_of(image: np.ndarray, bits: int | None, *, name: str) -> int:

@@ -11,13 +11,13 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from uwlts.errors import DescriptionError, ImageError
+from uwlts.files.command_files import note_input
+from uwlts.files.reading import is_regular_file, read_text
 from uwlts.model.calibration import is_rigid
-from uwlts.model.command_files import note_input
-from uwlts.model.errors import DescriptionError, ImageError
-from uwlts.model.input_file import is_regular_file, read_text
 from uwlts.storage.capture import POSE_ROUNDED
 from uwlts.storage.image_header import SUFFIXES
-from uwlts.storage.import_.description import ImportDescription, Patterns
+from uwlts.storage.import_.folder_description import ImportDescription, Patterns
 from uwlts.stripe import Stripe
 
 POSE_COLUMNS = tuple(f"pose_{row}{column}" for row in range(4) for column in range(4))

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from uwlts.model.errors import ImageError
+from uwlts.errors import ImageError
 from uwlts.runtime.compiled import compiled, compiled_part
 
 # Sides of the square window over which the two local grey levels are taken. A window serves blobs from about a tenth

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwlts.model.errors import RangeError
+from uwlts.errors import RangeError
 
 RIM_POINTS = 16
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from uwlts.model.errors import TargetError
+from uwlts.errors import TargetError
 from uwlts.targets.detection.ellipses import Ellipses, find_circles
 
 # Half the side of the square of neighbours: 24 of them determine the six terms of a quadratic with room for gaps.

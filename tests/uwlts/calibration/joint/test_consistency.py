@@ -8,13 +8,13 @@ import pytest
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
 from tests.virtual_sensors import altered
+from uwlts.calibration.camera.lens import LensChoice
 from uwlts.calibration.joint.consistency import format_deviation
-from uwlts.calibration.joint.parameters import ViewMedium
+from uwlts.calibration.joint.earlier_estimate import ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.lens import LensChoice
-from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.errors import CalibrationError
 from uwlts.model.calibration import CameraModel
-from uwlts.model.errors import CalibrationError
 from uwlts.model.parameter_keys import LensParameter, WindowParameter, parameter_of
 from uwlts.model.sensor import Medium, Uncertainty
 

@@ -5,9 +5,9 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
-from uwlts.calibration.joint.evidence import SeenSheet
 from uwlts.calibration.joint.procedure import joint_problem
-from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.calibration.joint.residuals import SeenSheet
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 
 FEWEST = 5000
 """Pixels from which there is a table."""

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from uwlts.calibration.joint.evidence import TARGET, Residuals
 from uwlts.calibration.joint.noise import judged
+from uwlts.calibration.joint.residuals import TARGET, Residuals
 
 IMAGES = 9
 

@@ -7,7 +7,8 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor, inside, lattice
 from tests.uwlts.joint_views import TARGET, Noise, gathered, lit_points, seen, step_views, target_series
-from uwlts.calibration.evidence import AirEvidence
+from uwlts.calibration.camera.target_images import TargetImage
+from uwlts.calibration.capture_evidence import AirEvidence
 from uwlts.calibration.joint.gathering import Series
 from uwlts.calibration.joint.next_shot import advice_lines, next_shots
 from uwlts.calibration.joint.observability import (
@@ -19,8 +20,7 @@ from uwlts.calibration.joint.observability import (
     weaknesses,
 )
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.sequential import CalibrationOptions
-from uwlts.calibration.target_images import TargetImage
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.model.parameter_keys import SheetParameter, StepHeight, WindowParameter, parameter_of
 from uwlts.targets import parse_target
 

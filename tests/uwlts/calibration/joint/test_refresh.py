@@ -12,22 +12,22 @@ from tests.system.in_process import uwlts
 from tests.uwlts import drawn_stripes
 from tests.uwlts.calibration_views import STEP_MM, built_sensor
 from tests.uwlts.joint_views import Noise, gathered, lit_points, seen, target_series
-from uwlts.calibration.evidence import StepEvidence
+from uwlts.calibration.capture_evidence import StepEvidence
+from uwlts.calibration.joint.earlier_estimate import EarlierEstimate, Prior, ViewMedium
 from uwlts.calibration.joint.estimate import estimate
-from uwlts.calibration.joint.evidence import StepProfileEvidence
 from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
-from uwlts.calibration.joint.parameters import EarlierEstimate, Prior, ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.refresh import refresh, solve_refreshed
+from uwlts.calibration.joint.residuals import StepProfileEvidence
 from uwlts.calibration.joint.stored_estimate import found_estimate, stored_estimate
-from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.errors import CalibrationError, DescriptionError, RangeError
 from uwlts.model.artefacts import StepStandard
-from uwlts.model.errors import CalibrationError, DescriptionError, RangeError
 from uwlts.model.parameter_keys import MediumIndex, SheetParameter, StepHeight, parameter_of
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.optics.reconstruction import reconstruct_pixels
+from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.report.certificate import certificate_of
 from uwlts.storage.calibration_file import read_calibration, write_calibration
 from uwlts.storage.capture import Capture

@@ -9,23 +9,23 @@ import pytest
 from tests.uwlts.calibration_views import WATER
 from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, target_series
 from tests.uwlts.scan_views import NONE, SLOPE, VIEW, Body, scan_of, square_sensor, stage_direction
-from uwlts.calibration.intrinsics import CameraOptions, Intrinsics
+from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
 from uwlts.calibration.joint.derivatives import DescribedSheet
+from uwlts.calibration.joint.earlier_estimate import Parameters, Prior
 from uwlts.calibration.joint.estimate import estimate
-from uwlts.calibration.joint.evidence import STEP, Residuals
 from uwlts.calibration.joint.gathering import scan_stripes
 from uwlts.calibration.joint.initial import surface_scan, surface_scans
-from uwlts.calibration.joint.parameters import Parameters, Prior
 from uwlts.calibration.joint.procedure import JointProblem, solve_jointly
+from uwlts.calibration.joint.residuals import STEP, Residuals
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Cylinder, Plane, Spheres
-from uwlts.calibration.sequential import CalibrationOptions
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.errors import CalibrationError, CaptureError, DescriptionError
 from uwlts.model.artefacts import PipeStandard, PlaneStandard, SphereStandard
-from uwlts.model.errors import CalibrationError, CaptureError, DescriptionError
 from uwlts.model.parameter_keys import parameter_of
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.optics.reconstruction import reconstruct_profile
+from uwlts.optics.triangulation import reconstruct_profile
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 

@@ -1,0 +1,189 @@
+"""Alignment of a trajectory by its crossings: against the true path of a simulated vehicle over a sea bed."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import uwlts
+from tests.uwlts.path_views import ride
+from uwlts.alignment.height_correlation import shifts_of_heights
+from uwlts.cli import app
+from uwlts.model.trajectory import Trajectory
+from uwlts.storage.cloud import PointCloud
+
+SEED = 5
+LOOP_MM = np.array([[0, 0], [1100, 0], [1100, 700], [450, 700], [450, -500]], float)
+"""Of 4 m, with one crossing at (450, 0)."""
+
+RACE_MM = np.array([[-200, 0], [700, 0], [700, 600], [-200, 600], [-200, 0], [500, 0]], float)
+"""Ends where it began, in the same direction."""
+
+
+def position_errors(found: Trajectory, true: Trajectory) -> float:
+    """Root mean square distance of the positions from the true ones."""
+    return float(np.sqrt(np.mean(np.sum((found.poses[:, :3, 3] - true.poses[:, :3, 3]) ** 2, axis=1))))
+
+
+def crossing_errors(found: Trajectory, true: Trajectory, times: tuple[float, float], points: np.ndarray) -> np.ndarray:
+    """By how much two passes place the same points (N, 3) apart, mm."""
+    moved = []
+    for time in times:
+        k = int(np.argmin(np.abs(true.times_s - time)))
+        wrong = found.poses[k] @ np.linalg.inv(true.poses[k])
+        moved.append(points @ wrong[:3, :3].T + wrong[:3, 3])
+    return np.linalg.norm(moved[1] - moved[0], axis=1)
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return ride(np.random.default_rng(SEED), LOOP_MM, drift_mm=60.0, drift_deg=0.3)
+
+
+@pytest.fixture(scope="module")
+def closed(loop):
+    cloud, reported, _ = loop
+    return uwlts.align_trajectory(cloud, reported, drift_mm=60.0, drift_deg=0.3)
+
+
+def test_shifts_are_found_in_heights_with_gaps():
+    rng = np.random.default_rng(SEED)
+    x, y = rng.uniform(0, 300, (2, 40_000))
+    z = sum(6 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / 200) for u, v in rng.uniform(0, 300, (40, 2)))
+    surface = np.column_stack([x, y, z])
+    first, second = surface[x < 220], surface[(x > 90) & (np.hypot(x - 180, y - 100) > 25)]
+    found = shifts_of_heights(first - [37.0, -52.0, 11.0], second, pixel_mm=4.0, reach_mm=np.full(3, 100.0))
+    np.testing.assert_allclose(found[0], [37.0, -52.0, 11.0], atol=4.0)
+
+
+def test_a_loop_is_closed(loop, closed):
+    (_, reported, true), found = loop, closed
+    assert found.crossings
+    for each in found.crossings:
+        assert each.held_out_after_mm < 0.02 * each.held_out_before_mm
+        assert abs(each.times_s[0] - each.times_s[1]) > 5
+    best = max(found.crossings, key=lambda each: each.patches)
+    k = int(np.argmin(np.abs(true.times_s - best.times_s[0])))
+    places = true.poses[k, :3, 3] + [[-50, -50, -400], [50, -50, -400], [0, 50, -400]]
+    before = crossing_errors(reported, true, best.times_s, places)
+    after = crossing_errors(found.trajectory, true, best.times_s, places)
+    assert before.min() > 10 and after.max() < 1.0
+    assert position_errors(found.trajectory, true) < position_errors(reported, true) / 3
+    for time in best.times_s:
+        # Five standard deviations: a component of a pass fails once in two million rides.
+        k = int(np.argmin(np.abs(true.times_s - time)))
+        error = (found.trajectory.poses - true.poses)[k, :3, 3]
+        assert (np.abs(error) < 5 * np.sqrt(np.diag(found.trajectory.covariance[k])[:3])).all()
+    # The start is the frame's, and what a crossing tells lowers the uncertainty of what came before it.
+    std = np.sqrt(np.einsum("nii->ni", found.trajectory.covariance))
+    assert std[0, :3].max() < 0.1 and (std[:, :3] < 60).all()
+
+
+@pytest.mark.slow
+def test_a_surface_that_fits_in_many_places_is_refused():
+    # Equal stones each 60 mm; the navigation is off by about 40 mm where the path crosses itself.
+    def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 8 * np.cos(2 * np.pi * x / 60) * np.cos(2 * np.pi * y / 60)
+
+    drift = {"drift_mm": 60.0, "drift_deg": 0.3}
+    cloud, reported, _ = ride(np.random.default_rng(SEED), LOOP_MM, ground=ground, **drift)
+    with pytest.raises(uwlts.Error, match="fits in several places"):
+        uwlts.align_trajectory(cloud, reported, **drift)
+
+
+def apart(cloud: PointCloud, true_points: np.ndarray, crossed: tuple[float, float]) -> np.ndarray:
+    """By how much two passes place the same squares of 30 mm apart, (K, 3) mm, in an overlap about a place."""
+    assert cloud.time_s is not None
+    inside = np.all(np.abs(true_points[:, :2] - crossed) < 90, axis=1)
+    errors, late = (cloud.points_mm - true_points)[inside], cloud.time_s[inside] > np.median(cloud.time_s)
+    square = np.floor(true_points[inside, :2] / 30).astype(int) @ [1, 1000]
+    return np.array(
+        [
+            errors[late & (square == each)].mean(axis=0) - errors[~late & (square == each)].mean(axis=0)
+            for each in np.unique(square)
+        ]
+    )
+
+
+@pytest.mark.slow
+def test_a_random_walk_is_followed_within_a_crossing():
+    cloud, reported, true = ride(np.random.default_rng(SEED), LOOP_MM, walk=0.1, drift_mm=60.0, drift_deg=0.3)
+    assert cloud.time_s is not None
+    local = np.einsum(
+        "nij,nj->ni", np.linalg.inv(reported.poses_at(cloud.time_s)), np.c_[cloud.points_mm, np.ones(len(cloud))]
+    )
+    points = np.einsum("nij,nj->ni", true.poses_at(cloud.time_s), local)[:, :3]
+    sizes = np.array([60.0] * 3 + [np.radians(0.3)] * 3)
+    grown = np.square((true.times_s / true.times_s[-1])[:, None] * sizes)
+    found = uwlts.align_trajectory(cloud, replace(reported, covariance=grown[:, :, None] * np.eye(6)))
+    before, after = (apart(each, points, (450, 0)) for each in (cloud, found.cloud))
+    # The walk goes 60 mm x 0.1 x sqrt(1.5 s / 20 s) = 1.6 mm while a pass is over the crossing.
+    assert len(after) >= 30 and (before.std(axis=0) > 1.0).all()
+    # The goal for lengths within a crossing; along the normal the surface tells more than across it.
+    assert (np.sqrt(np.mean(after**2, axis=0)) < [1.0, 1.0, 0.2]).all()
+    assert position_errors(found.trajectory, true) < position_errors(reported, true) / 3
+    # Errors along the path are alike: few independent numbers of standard deviation one, so that three is one in 300.
+    assert found.trajectory.covariance is not None
+    std = np.sqrt(np.einsum("nii->ni", found.trajectory.covariance))[1:, :3]
+    off = (found.trajectory.poses - true.poses)[1:, :3, 3] / std
+    assert np.sqrt(np.mean(off**2)) < 3
+
+
+@pytest.mark.slow
+def test_along_a_ridge_the_navigation_is_all_that_is_known():
+    def ground(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return 60 * np.exp(-(y**2) / (2 * 60**2)) + 0 * x
+
+    drift = {"drift_mm": 4.0, "drift_deg": 0.05}
+    cloud, reported, true = ride(np.random.default_rng(SEED), RACE_MM, ground=ground, **drift)
+    found = uwlts.align_trajectory(cloud, reported, **drift).trajectory
+    std = np.sqrt(np.einsum("ii->i", found.covariance[-1]))
+    # Over the start again: along the ridge the navigation's 4 mm stay, less what the kind of drift tells.
+    assert std[0] > 3.0 and (std[1:3] < 0.5).all()
+    error = (found.poses - true.poses)[-1, :3, 3]
+    assert (np.abs(error) < 5 * std[:3]).all()
+    assert np.abs((reported.poses - true.poses)[-1, :3, 3]).min() > 1.0
+
+
+def test_the_corrected_cloud_is_that_of_the_corrected_trajectory(loop, closed):
+    (cloud, reported, _), found = loop, closed
+    local = np.einsum(
+        "nij,nj->ni", np.linalg.inv(reported.poses_at(cloud.time_s)), np.c_[cloud.points_mm, np.ones(len(cloud))]
+    )
+    again = np.einsum("nij,nj->ni", found.trajectory.poses_at(cloud.time_s), local)[:, :3]
+    np.testing.assert_allclose(found.cloud.points_mm, again, atol=1e-3)
+
+
+def test_wrong_input_is_refused(loop):
+    cloud, reported, _ = loop
+    with pytest.raises(uwlts.Error, match="states no covariance: give drift_mm"):
+        uwlts.align_trajectory(cloud, reported)
+    with pytest.raises(uwlts.Error, match="both parts"):
+        uwlts.align_trajectory(cloud, reported, drift_mm=1.0)
+    with pytest.raises(uwlts.Error, match="expected positive"):
+        uwlts.align_trajectory(cloud, reported, drift_mm=-1.0, drift_deg=1.0)
+    without = PointCloud(cloud.points_mm, cloud.intensity, cloud.frame, cloud.line)
+    with pytest.raises(uwlts.Error, match="no times of its points"):
+        uwlts.align_trajectory(without, reported, drift_mm=1.0, drift_deg=0.1)
+    early = cloud.time_s < 5.0
+    straight = PointCloud(
+        *(each[early] for each in (cloud.points_mm, cloud.intensity, cloud.frame, cloud.line)),
+        time_s=cloud.time_s[early],
+    )
+    with pytest.raises(uwlts.Error, match="shows no surface twice"):
+        uwlts.align_trajectory(straight, reported, drift_mm=60.0, drift_deg=0.3)
+
+
+def test_the_command_writes_a_trajectory_with_covariance(loop, tmp_path, monkeypatch):
+    cloud, reported, _ = loop
+    monkeypatch.chdir(tmp_path)
+    uwlts.write_cloud("pass.h5", cloud)
+    uwlts.write_trajectory("pass.csv", reported)
+    words = ["align", "pass.h5", "--trajectory", "pass.csv", "--drift-mm", "60", "--drift-deg", "0.3"]
+    app([*words, "--out", "corrected.csv", "--aligned", "aligned.h5"], result_action="return_value")
+    corrected = uwlts.read_trajectory("corrected.csv", pose_format="quaternion-xyzw")
+    assert corrected.covariance is not None and len(corrected.times_s) == len(reported.times_s)
+    record = json.loads((tmp_path / "corrected.json").read_text())
+    assert record["crossings"] and record["largest_shift_mm"] > 10
+    assert len(uwlts.read_cloud("aligned.h5")) == len(cloud)

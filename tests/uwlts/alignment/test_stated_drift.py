@@ -1,0 +1,68 @@
+"""Size and kind of a drift by the covariance that a navigation states, propagated here step by step."""
+
+import numpy as np
+import pytest
+
+from uwlts.alignment.stated_drift import stated_drift
+from uwlts.errors import EvaluationError
+from uwlts.model.trajectory import Trajectory
+
+SECONDS, BEFORE_S, STEP_S = 100.0, 2.0, 0.05
+BIAS_MM_S, NOISE, GYRO, HEADING_NOISE = 3.0, 2.0, 2e-4, 1e-4
+"""Velocity: mm/s, mm/s per root Hz; heading: rad/s, rad/s per root Hz."""
+DEPTH_MM, TILT = 3.0, 2e-3
+
+
+def navigated(*, by_heading: bool) -> Trajectory:
+    """Along X, then along Y, from 2 s after the navigation's start on.
+
+    The state is the error of x, y and heading, and their biases.
+    """
+    times = np.arange(-BEFORE_S, SECONDS + STEP_S / 2, STEP_S)
+    velocity = np.where(times[:, None] < SECONDS / 3, (200.0, 0.0), (0.0, 150.0))
+    spread = np.diag([0, 0, 0, BIAS_MM_S**2, BIAS_MM_S**2, GYRO**2])
+    noise = np.diag([NOISE**2, NOISE**2, HEADING_NOISE**2, 0, 0, 0]) * STEP_S
+    covariance = np.zeros((len(times), 6, 6))
+    for number, (x, y) in enumerate(velocity):
+        rows = np.array([0, 1, 5])
+        covariance[number][np.ix_(rows, rows)] = spread[:3, :3]
+        covariance[number, [2, 3, 4], [2, 3, 4]] = DEPTH_MM**2, TILT**2, TILT**2
+        step = np.eye(6)
+        step[[0, 1, 2], [3, 4, 5]] = STEP_S
+        if by_heading:
+            step[:2, 2] = -y * STEP_S, x * STEP_S
+        spread = step @ spread @ step.T + noise
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[1:, :2, 3] = np.cumsum(velocity * STEP_S, axis=0)[:-1]
+    used = times >= 0
+    return Trajectory(times[used], poses[used], covariance[used])
+
+
+@pytest.mark.parametrize("by_heading", [True, False])
+def test_rates_walks_and_dead_reckoning_are_found_from_the_covariance(by_heading: bool):
+    found = stated_drift(navigated(by_heading=by_heading), None, None)
+    assert found.kind is not None
+    assert found.kind.by_heading == by_heading
+    assert found.measured.tolist() == [False, False, True, True, True, False]
+    # The part that the heading causes is taken off; its random walk leaves some of it.
+    np.testing.assert_allclose(found.size[[0, 1, 5]], np.array([BIAS_MM_S, BIAS_MM_S, GYRO]) * SECONDS, rtol=0.05)
+    np.testing.assert_allclose(found.size[2:5] ** 2, 2 * np.array([DEPTH_MM, TILT, TILT]) ** 2)
+    # The rate has drifted for 2 s before: v(t) - v(0) is no square alone.
+    assert found.kind.walk == pytest.approx(NOISE**2 / (BIAS_MM_S**2 * SECONDS), rel=0.5)
+    assert found.kind.turn_walk == pytest.approx(HEADING_NOISE**2 / (GYRO**2 * SECONDS), rel=0.1)
+    assert found.kind.wandering < 0.01
+
+
+def test_a_drift_that_is_given_is_of_no_known_kind():
+    found = stated_drift(navigated(by_heading=True), 300.0, 1.0)
+    assert found.kind is None
+    np.testing.assert_allclose(found.size, np.repeat([300.0, np.radians(1.0)], 3))
+    assert not found.measured.any()
+
+
+def test_a_path_without_covariance_needs_the_size_of_its_drift():
+    path = navigated(by_heading=False)
+    with pytest.raises(EvaluationError, match="give drift_mm and drift_deg"):
+        stated_drift(Trajectory(path.times_s, path.poses), None, None)
+    with pytest.raises(EvaluationError, match="both parts"):
+        stated_drift(path, 300.0, None)

@@ -1,0 +1,329 @@
+"""Change between clouds: what is claimed where nothing changed, what is found, and what a registration leaves open."""
+
+import json
+from dataclasses import replace
+
+import laspy
+import numpy as np
+import pytest
+import trimesh
+from plyfile import PlyData
+from scipy.spatial.transform import Rotation
+
+import uwlts
+from uwlts.cli import app
+from uwlts.errors import CaptureError, DescriptionError, EvaluationError, OutputError
+from uwlts.registration.surface_registration import SampledSurface, register_to_surface
+from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty
+
+NOISE_MM, SHIFT_MM, TILT, STAGE_MM = 0.03, 0.04, 1e-3, 0.02
+SIDE_MM, STEP_MM = 60.0, 0.5
+
+
+def height(x, y):
+    """A surface that no movement leaves as it is."""
+    return 2.0 * np.sin(x / 9.0) + 1.5 * np.cos(y / 7.0) + 0.01 * x * y / 5
+
+
+def dent(x, y):
+    return 0.5 * (np.hypot(x - 10, y - 5) < 5)
+
+
+def scanned(rng, *, change=None, common=True, surface=height, calibration=None):
+    """A cloud taken in lines by a stage, whose errors are those that it states.
+
+    ``calibration`` are the errors (3,) of water, shift and tilt by one calibration, in standard deviations.
+    """
+    x, y = np.meshgrid(np.arange(-SIDE_MM / 2, SIDE_MM / 2, STEP_MM), np.arange(-SIDE_MM / 2, SIDE_MM / 2, STEP_MM))
+    image = np.repeat(np.arange(x.shape[1])[None], x.shape[0], axis=0).ravel()
+    x, y = (each.ravel() + rng.uniform(-0.2, 0.2, x.size) for each in (x, y))
+    points = np.column_stack([x, y, surface(x, y) + (0.0 if change is None else change(x, y))])
+    count = len(points)
+    patterns = np.zeros((2, count, 3), np.float32)
+    patterns[0, :, 2], patterns[1, :, 2] = SHIFT_MM, TILT * y
+    if not common:
+        patterns[:] = 0
+    position = np.zeros((count, 3), np.float32)
+    position[:, 2] = STAGE_MM
+    random = np.zeros((count, 6), np.float32)
+    random[:, 5] = NOISE_MM**2
+    seen = points.copy()
+    seen[:, 2] += NOISE_MM * rng.normal(size=count) + STAGE_MM * rng.normal(size=image.max() + 1)[image]
+    errors, shared = rng.normal(size=2), {}
+    if calibration is not None:
+        # The patterns are any independent ones: here shift and tilt, each partly by the water.
+        shares = np.array([[0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+        errors, shared = shares @ calibration, {f"{WATER} 1": shares[:, :1], "sensor 1": shares[:, 1:]}
+    seen[:, 2] += np.tensordot(errors, patterns[:, :, 2], axes=1)
+    known = PointUncertainty(random, position, patterns, shared=shared)
+    return PointCloud(seen, np.ones(count), image, np.zeros(count, int), uncertainty=known)
+
+
+def test_nothing_is_claimed_where_nothing_changed():
+    rng = np.random.default_rng(2)
+    shares = []
+    for _ in range(8):
+        change = uwlts.compare_clouds(scanned(rng), scanned(rng))
+        assert change.compared.mean() > 0.95
+        shares.append(change.significant[change.compared].mean())
+    # What is common to all points makes the shares of single pairs scatter widely about 5 %.
+    assert np.mean(shares) < 0.12
+    quiet = [uwlts.compare_clouds(scanned(rng, common=False), scanned(rng, common=False)) for _ in range(3)]
+    claimed = np.mean([share(each) for each in quiet])
+    assert 0.005 < claimed < 0.08
+
+
+def test_the_level_is_that_of_the_distances():
+    """Over many pairs distances scatter by the level over 1.96, common errors included."""
+    rng = np.random.default_rng(3)
+    ratios = []
+    for _ in range(8):
+        change = uwlts.compare_clouds(scanned(rng), scanned(rng), disc_mm=6.0)
+        ratios.append(1.96 * change.distance_mm[change.compared] / change.level_mm[change.compared])
+    assert 0.6 < np.sqrt(np.mean(np.square(np.concatenate(ratios)))) < 1.5
+
+
+def test_what_one_calibration_shares_cancels():
+    """The levels are those by hand, within what the scatter in discs of 30 points leaves of their median."""
+    rng = np.random.default_rng(4)
+    calibration = rng.normal(size=3)
+    cloud, other = (scanned(rng, calibration=calibration) for _ in range(2))
+    renamed = {name.replace("1", "2"): parts for name, parts in other.uncertainty.shared.items()}
+    foreign = replace(other, uncertainty=replace(other.uncertainty, shared=renamed))
+    quiet = uwlts.compare_clouds(*(scanned(rng, common=False) for _ in range(2)))
+    found = [
+        uwlts.compare_clouds(cloud, *pair, same_water=same)
+        for pair, same in (((other,), True), ((other,), False), ((foreign,), True))
+    ]
+    random = np.median(quiet.level_mm[quiet.compared]) / 1.96
+    tilted = 2 * (TILT * found[2].points_mm[:, 1]) ** 2
+    expected = [0.0, 2 * (0.6 * SHIFT_MM) ** 2, 2 * SHIFT_MM**2 + tilted]
+    for change, common in zip(found, expected, strict=True):
+        ratio = change.level_mm / 1.96 / np.sqrt(random**2 + common)
+        assert np.median(ratio[change.compared]) == pytest.approx(1.0, abs=0.05)
+    # A twentieth of the places and as much again for chance: a disc holds 30 points, so that places are a thousand.
+    assert share(found[0]) < 0.1
+    one = uwlts.compare_clouds(scanned(rng, calibration=calibration, change=shallow), other, same_water=True)
+    x, y = one.points_mm.T[:2]
+    assert one.significant[np.hypot(x - 10, y - 5) < 4].mean() > 0.8
+    assert found[2].significant.mean() < 0.02
+
+
+def shallow(x, y):
+    return 0.05 * (np.hypot(x - 10, y - 5) < 6)
+
+
+def share(change):
+    """Share of the area in which a change is claimed."""
+    return np.average(change.significant[change.compared], weights=change.area_mm2[change.compared])
+
+
+def test_a_registration_takes_up_what_looks_like_a_movement():
+    """Shift and tilt that all points share no longer count, and what is claimed stays at most the level's 5 %."""
+    rng = np.random.default_rng(12)
+    pairs = [(scanned(rng), scanned(rng)) for _ in range(4)]
+    found = [uwlts.compare_clouds(*pair, register=True) for pair in pairs]
+    plain = uwlts.compare_clouds(*pairs[0])
+    # Noise and images alone have 0.03 mm, shift and tilt of both clouds another 0.1 mm.
+    assert np.median(found[0].level_mm) < 0.5 * np.median(plain.level_mm)
+    # Neighbouring places share their images, so that the share of one pair has a standard deviation of 2 %.
+    assert np.mean([share(each) for each in found]) < 0.05 + 3 * 0.02 / np.sqrt(4)
+
+
+def tube(x, y):
+    """A pipe of 300 mm diameter, seen from outside."""
+    return 150.0 - np.sqrt(150.0**2 - x**2)
+
+
+@pytest.mark.parametrize(
+    ("reference", "surface"), [("plane", lambda x, y: 0 * x), ("cylinder", tube)], ids=["plane", "cylinder"]
+)
+def test_an_ideal_shape_is_fitted(reference, surface):
+    rng = np.random.default_rng(13)
+    quiet = uwlts.compare_clouds(scanned(rng, surface=surface), reference)
+    assert quiet.registration is None and share(quiet) < 0.05 + 3 * 0.02
+    dented = uwlts.compare_clouds(scanned(rng, surface=surface, change=dent), reference)
+    x, y, _ = dented.points_mm.T
+    inside = np.hypot(x - 10, y - 5) < 3
+    assert dented.significant[inside].mean() > 0.95
+    region = dented.regions()[0]
+    assert np.hypot(region.centre_mm[0] - 10, region.centre_mm[1] - 5) < 1
+    # 0.5 mm over a disc of 5 mm radius; the discs of 30 points blur its rim.
+    assert region.volume_mm3 == pytest.approx(-0.5 * np.pi * 5**2, rel=0.15)
+    assert reference in dented.reference
+
+
+def test_a_given_shape_is_taken_as_it_is(ball, tmp_path):
+    _, cloud = ball
+    (tmp_path / "ball.toml").write_text('kind = "sphere"\ndiameter_mm = 49.9\npoint_mm = [0, 0, 0.02]\n')
+    given = uwlts.compare_clouds(cloud, tmp_path / "ball.toml")
+    far = given.compared & (given.points_mm[:, 2] < -15) & (np.hypot(*given.points_mm[:, :2].T) > 6)
+    z = given.points_mm[far, 2] / 25.0
+    # The cloud's centre lies 0.02 mm before the sphere's, its radius is 0.05 mm larger; means of 30 points of 0.02 mm.
+    assert np.mean(given.distance_mm[far] - (0.05 - 0.02 * z)) == pytest.approx(0, abs=0.003)
+    (tmp_path / "ball.toml").write_text('kind = "sphere"\ndiameter_mm = 50.0\npoint_mm = [0, 0, 0.2]\n')
+    moved = uwlts.compare_clouds(cloud, tmp_path / "ball.toml", register=True)
+    # Turns about the sphere's centre are open; 10,000 points of 0.02 mm, the bump has no weight.
+    centre = moved.registration.transform[:3] @ [0, 0, 0, 1]
+    np.testing.assert_allclose(centre, [0, 0, 0.2], atol=0.005)
+    for text in ('kind = "sphere"\npoint_mm = [0, 0, 0]\n', 'kind = "cone"\n', "kind = \n"):
+        (tmp_path / "wrong.toml").write_text(text)
+        with pytest.raises(DescriptionError, match="wrong.toml"):
+            uwlts.compare_clouds(cloud, tmp_path / "wrong.toml")
+
+
+def test_datums_hold_the_registration(tmp_path):
+    """Half of the surface has moved up; datums on the other half keep that half where it was."""
+    rng = np.random.default_rng(14)
+    before = scanned(rng, common=False)
+    after = scanned(rng, common=False, change=lambda x, y: -0.4 * (x > 0))
+    datums = tmp_path / "datums.toml"
+    datums.write_text("".join(f"[[datum]]\ncentre_mm = [-16, {y}, 0]\nradius_mm = 12\n" for y in (-15, 15)))
+    held = uwlts.compare_clouds(after, before, register=True, datums=datums)
+    x = held.points_mm[:, 0]
+    assert np.nanmedian(held.distance_mm[x > 3]) == pytest.approx(0.4, abs=0.08)
+    assert abs(np.nanmedian(held.distance_mm[x < -3])) < 0.02
+    with pytest.raises(EvaluationError, match="--register"):
+        uwlts.compare_clouds(after, before, datums=datums)
+    datums.write_text("[[datum]]\ncentre_mm = [-16, 0, 0]\nradius_mm = -1\n")
+    with pytest.raises(DescriptionError, match="radius_mm"):
+        uwlts.compare_clouds(after, before, register=True, datums=datums)
+
+
+def test_a_dent_is_found():
+    rng = np.random.default_rng(4)
+    change = uwlts.compare_clouds(scanned(rng, change=dent), scanned(rng))
+    x, y, _ = change.points_mm.T
+    inside = np.hypot(x - 10, y - 5) < 3
+    assert change.significant[inside].mean() > 0.95
+    # Positive towards the sensor, so that a loss is negative.
+    assert np.median(change.distance_mm[inside]) == pytest.approx(-0.5, abs=0.2)
+    assert change.record()["largest_loss_mm"] < -0.4
+    assert change.regions()[0].largest_mm < -0.4
+
+
+def test_a_moved_cloud_is_registered():
+    rng = np.random.default_rng(5)
+    before, after = scanned(rng, common=False), scanned(rng, common=False, change=dent)
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.4], degrees=True).as_matrix()
+    moved = PointCloud(after.points_mm @ turn.T + [0.4, -0.3, 0.2], after.intensity, after.frame, after.line)
+    change = uwlts.compare_clouds(moved, before, register=True)
+    found = change.registration
+    assert found.open_directions == ()
+    back = found.transform @ np.block([[turn, np.array([[0.4], [-0.3], [0.2]])], [np.zeros((1, 3)), np.ones((1, 1))]])
+    assert np.linalg.norm(back[:3, 3]) < 0.1 and Rotation.from_matrix(back[:3, :3]).magnitude() < np.radians(0.1)
+    x, y, _ = change.points_mm.T
+    assert change.significant[np.hypot(x - 10, y - 5) < 3].mean() > 0.9
+    assert change.significant[change.compared & (np.hypot(x - 10, y - 5) > 8)].mean() < 0.12
+
+
+@pytest.mark.parametrize(
+    ("surface", "open_words"),
+    [
+        (lambda x, y: 0 * x, ("shift along x", "shift along y", "turn about z")),
+        (lambda x, y: np.sqrt(150.0**2 - x**2) - 150.0, ("shift along y",)),
+    ],
+    ids=["plane", "pipe"],
+)
+def test_what_a_shape_does_not_tell_is_left_as_it_was(surface, open_words):
+    rng = np.random.default_rng(6)
+    before, after = scanned(rng, common=False, surface=surface), scanned(rng, common=False, surface=surface)
+    shifted = PointCloud(after.points_mm + [0.0, 0.6, 0.2], after.intensity, after.frame, after.line)
+    found = uwlts.compare_clouds(shifted, before, register=True).registration
+    assert set(open_words) <= {name for words in found.open_directions for name in words.split(" with ")}
+    assert abs(found.transform[1, 3]) < 0.05 and found.transform[2, 3] == pytest.approx(-0.2, abs=0.05)
+
+
+def profiles(rng, ends):
+    """A curved surface in dense profiles 1 mm apart, whose noise three neighbours share."""
+    x, y = np.meshgrid(np.arange(*ends, 1.0), np.arange(-15, 15, 0.15), indexing="ij")
+    drawn = rng.standard_normal((x.shape[0], x.shape[1] + 2))
+    noise = NOISE_MM * (drawn[:, :-2] + drawn[:, 1:-1] + drawn[:, 2:]) / np.sqrt(3)
+    points = np.column_stack([x.ravel(), y.ravel(), (0.02 * y**2 + noise).ravel()])
+    return PointCloud(points, np.ones(x.size), np.repeat(np.arange(len(x)), x.shape[1]), np.arange(x.size))
+
+
+def test_nothing_is_claimed_beyond_the_reference_or_of_shared_noise():
+    """Beside the border of the reference its nearest points lie on a line, which has no normal."""
+    rng = np.random.default_rng(8)
+    change = uwlts.compare_clouds(profiles(rng, (-40, 40)), profiles(rng, (-20, 20)))
+    assert np.abs(change.points_mm[change.compared, 0]).max() < 24
+    assert np.abs(change.distance_mm[change.compared]).max() < 0.2
+    # Some 1,500 places, ten neighbours of which share their points: 5 % scatter by 2 %; without the factor it is 25 %.
+    assert change.significant[change.compared].mean() < 0.12
+
+
+def test_too_far_apart_is_refused():
+    points = np.random.default_rng(0).uniform(0, 10, (200, 3)) * [1, 1, 0]
+    with pytest.raises(EvaluationError, match="same frame and unit"):
+        register_to_surface(points + [0, 0, 50], SampledSurface(points, np.tile([0, 0, 1.0], (200, 1))), reach_mm=2)
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    """A sphere of 50 mm diameter as an STL file, and a cloud of its side before the sensor with a 0.3 mm bump."""
+    path = tmp_path_factory.mktemp("mesh") / "ball.stl"
+    trimesh.creation.icosphere(subdivisions=6, radius=25.0).export(path)
+    rng = np.random.default_rng(7)
+    direction = rng.normal(size=(40000, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction = direction[direction[:, 2] < -0.5]
+    bump = 0.3 * (np.degrees(np.arccos(-direction[:, 2])) < 8)
+    radius = 25.0 + bump + 0.02 * rng.normal(size=len(direction))
+    count = len(direction)
+    cloud = PointCloud(direction * radius[:, None], np.ones(count), np.zeros(count, int), np.arange(count))
+    return path, cloud
+
+
+def test_a_mesh_is_a_reference(ball):
+    path, cloud = ball
+    change = uwlts.compare_clouds(cloud, path)
+    angle = np.degrees(np.arccos(-change.points_mm[:, 2] / np.linalg.norm(change.points_mm, axis=1)))
+    assert np.median(change.distance_mm[angle < 5]) == pytest.approx(0.3, abs=0.03)
+    assert change.significant[angle < 5].mean() > 0.95
+    far = change.compared & (angle > 14) & (angle < 50)
+    assert abs(np.median(change.distance_mm[far])) < 0.01 and change.significant[far].mean() < 0.15
+
+
+def test_wrong_references_are_refused(ball, tmp_path):
+    path, cloud = ball
+    small = tmp_path / "metres.stl"
+    trimesh.load(path).apply_scale(0.001).export(small)
+    with pytest.raises(EvaluationError, match="--unit m"):
+        uwlts.compare_clouds(cloud, small)
+    assert uwlts.compare_clouds(cloud, small, unit="m").compared.any()
+    (tmp_path / "text.stl").write_text("no mesh")
+    with pytest.raises(CaptureError, match="text.stl"):
+        uwlts.compare_clouds(cloud, tmp_path / "text.stl")
+    away = PointCloud(cloud.points_mm + [0, 0, 200], cloud.intensity, cloud.frame, cloud.line)
+    with pytest.raises(EvaluationError, match="do not overlap"):
+        uwlts.compare_clouds(away, path)
+    with pytest.raises(EvaluationError, match="disc_mm is -1"):
+        uwlts.compare_clouds(cloud, path, disc_mm=-1.0)
+    few = PointCloud(cloud.points_mm[:9], cloud.intensity[:9], cloud.frame[:9], cloud.line[:9])
+    with pytest.raises(EvaluationError, match="the cloud has 9 points"):
+        uwlts.compare_clouds(few, path)
+
+
+def test_the_command_writes_page_figures_and_cloud(ball, tmp_path, monkeypatch):
+    path, cloud = ball
+    uwlts.write_cloud(tmp_path / "ball.ply", cloud)
+    monkeypatch.chdir(tmp_path)
+    words = ["compare", "ball.ply", str(path), "--out", "change.html", "--coloured", "change.ply"]
+    app(words, result_action="return_value")
+    app(
+        ["compare", "ball.ply", str(path), "--out", "again.html", "--coloured", "change.laz"],
+        result_action="return_value",
+    )
+    record = json.loads((tmp_path / "change.json").read_text())
+    assert record["largest_rise_mm"] == pytest.approx(0.3, abs=0.05) and record["registration"] is None
+    places = PlyData.read(tmp_path / "change.ply")["vertex"].data
+    assert set(places.dtype.names) >= {"x", "y", "z", "distance", "level", "significant"}
+    assert places["significant"].mean() == pytest.approx(record["significant_share"], abs=0.2)
+    table = laspy.read(tmp_path / "change.laz")
+    np.testing.assert_allclose(1e3 * np.column_stack([table.x, table.y, table.z])[:, 0], places["x"], atol=1e-3)
+    np.testing.assert_array_equal(table["significant"], places["significant"])
+    page = (tmp_path / "change.html").read_text()
+    assert "level of detection" in page and "ball.ply against ball.stl" in page
+    with pytest.raises(OutputError, match="exists already"):
+        uwlts.write_change("change.html", uwlts.compare_clouds(cloud, path))

@@ -1,0 +1,420 @@
+"""Inspections of simulated scans whose shape is known in closed form and whose errors are those that they state.
+
+Gates on values are 4.5 standard uncertainties, which a normal error exceeds 7 times in a million; gates on counts state
+their probability of a false alarm.
+"""
+
+import json
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import uwlts
+from uwlts.cli import app
+from uwlts.errors import EvaluationError
+from uwlts.inspection.blemish_search import UnrolledSurface, search_blemishes
+from uwlts.inspection.features import DEFINITIONS, FeatureKind
+from uwlts.inspection.pipe_form import fit_pipe, pipe_features
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty
+
+NOISE_MM, IMAGE_MM = 0.02, 0.004
+RADIUS_MM = 150.0
+GATE = 4.5
+
+
+def cloud_of(rng, points, normals, frame, line, *, patterns=(), stated=True, correlated=False):
+    """A cloud with noise along the normals, offsets of images and common patterns (N, 3), all drawn as stated."""
+    count = len(points)
+    noise = NOISE_MM * rng.standard_normal(count)
+    if correlated:
+        # Neighbours along the stripe share a third of their noise's variance each.
+        drawn = rng.standard_normal(count + 2)
+        noise = NOISE_MM * (drawn[:-2] + drawn[1:-1] + drawn[2:]) / np.sqrt(3)
+    position = np.zeros((count, 3))
+    position[:, 2] = IMAGE_MM
+    common = np.array(patterns) if len(patterns) else np.zeros((1, count, 3))
+    moves = noise[:, None] * normals + rng.standard_normal(frame.max() + 1)[frame][:, None] * position
+    moves = moves + np.tensordot(rng.standard_normal(len(common)), common, axes=1)
+    random = NOISE_MM**2 * np.stack([normals[:, i] * normals[:, j] for i, j in PAIRS], axis=1)
+    known = PointUncertainty(*(each.astype(np.float32) for each in (random, position, common))) if stated else None
+    return PointCloud(points + moves, np.ones(count), frame, line, uncertainty=known)
+
+
+def pipe_scan(rng, *, half_arc=np.pi, along=(-20, 20.5, 1.0), around_mm=0.8, radius=None, **options):
+    """A pipe along x about the origin, of a radius (N,) as a function of place along and angle from -z towards y."""
+    x = np.arange(*along)
+    angle = np.linspace(-half_arc, half_arc, int(2 * half_arc * RADIUS_MM / around_mm), endpoint=False)
+    at, turn = (each.ravel() for each in np.meshgrid(x, angle, indexing="ij"))
+    frame, line = (each.ravel() for each in np.meshgrid(np.arange(len(x)), np.arange(len(angle)), indexing="ij"))
+    normals = np.column_stack([np.zeros(len(at)), np.sin(turn), -np.cos(turn)])
+    size = np.full(len(at), RADIUS_MM) if radius is None else radius(at, turn)
+    points = size[:, None] * normals
+    points[:, 0] = at
+    points[:, 2] += 0.002 * np.square(at) * options.pop("bow", 0.0)
+    # Scale, and a shift that depends on the place along the stripe: what a calibration leaves open.
+    patterns = [2e-5 * points, 0.01 * np.sin(turn / 2)[:, None] * normals]
+    return cloud_of(rng, points, normals, frame, line, patterns=patterns, **options)
+
+
+def test_the_form_of_a_pipe_is_within_its_intervals():
+    """20 pipes; fewer than 14 of 20 intervals of 95 % hold the truth 3 times in 100,000."""
+
+    def oval(x, angle):
+        return RADIUS_MM * (1 + 0.0025 * np.cos(2 * (angle - 0.3))) + 0.05 * np.cos(3 * angle)
+
+    rng = np.random.default_rng(1)
+    truth = {"diameter": 300.0, "ovality": 1.5, "ovality share": 0.5, "straightness": 0.002 * 0.5 * 20.0**2}
+    truth |= {"axis slope 1": 0.0, "axis slope 2": 0.0}
+    inside = dict.fromkeys(truth, 0)
+    for _ in range(20):
+        cloud = pipe_scan(rng, radius=oval, bow=0.5, around_mm=3.0, correlated=True)
+        pipe, *sections = pipe_features(cloud, fit_pipe(cloud))
+        for name, value in truth.items():
+            inside[name] += pipe[name].low <= value <= pipe[name].high
+        assert pipe["ovality"].uncertainty < 0.03
+    assert min(inside.values()) >= 14, inside
+    assert len(sections) == 12
+    for section in sections:
+        assert section["ovality"].value == pytest.approx(1.5, abs=GATE * section["ovality"].uncertainty + 0.05)
+
+
+def test_the_diameter_of_an_arc_may_be_that_of_an_oval():
+    """Any ovality up to 2 %; fewer than 14 of 20 intervals of 95 % hold the truth 3 times in 100,000.
+
+    Sections of a pipe share its ovality, so that one counts.
+    """
+    rng = np.random.default_rng(14)
+    inside = np.zeros(2, int)
+    for _ in range(20):
+        amplitude, turn = rng.uniform(0, 0.02) * RADIUS_MM / 2, rng.uniform(0, np.pi)
+
+        def oval(x, angle, amplitude=amplitude, turn=turn):
+            return RADIUS_MM + amplitude * np.cos(2 * (angle - turn))
+
+        cloud = pipe_scan(rng, half_arc=np.pi / 4, along=(-20, 20.5, 2.0), around_mm=3.0, radius=oval)
+        pipe, section, *_ = pipe_features(cloud, fit_pipe(cloud))
+        values = pipe["diameter"], section["diameter"]
+        assert values[0].uncertainty < 4.0
+        inside += [value.low <= 300.0 <= value.high for value in values]
+    assert inside.min() >= 14, inside
+    # Of a pipe that is known to be round only the points' own uncertainty is left.
+    round_one = pipe_features(cloud, fit_pipe(cloud, largest_ovality=0.0))[0]["diameter"]
+    assert round_one.uncertainty < 0.1 * values[0].uncertainty
+
+
+@pytest.mark.slow
+def test_a_round_pipe_may_be_round():
+    """The interval of the ovality reaches down to zero; nine in ten of 20 intervals do (13 or fewer: 3 in 100,000)."""
+    rng = np.random.default_rng(2)
+    lows = []
+    for _ in range(20):
+        cloud = pipe_scan(rng, around_mm=3.0)
+        lows.append(pipe_features(cloud, fit_pipe(cloud))[0]["ovality"].low)
+    assert np.count_nonzero(np.array(lows) == 0) >= 14
+
+
+def field(rng, *, side=50.0, step=0.5, heights=None, correlated=True):
+    """An unrolled surface with noise that neighbours along the second axis share."""
+    u, v = np.meshgrid(np.arange(0, side, step), np.arange(0, side, 0.25), indexing="ij")
+    drawn = rng.standard_normal((u.shape[0], u.shape[1] + 2))
+    noise = (drawn[:, :-2] + drawn[:, 1:-1] + drawn[:, 2:]) / np.sqrt(3) if correlated else drawn[:, 2:]
+    shape = 0.0 if heights is None else heights(u, v)
+    values = (shape + NOISE_MM * noise).ravel()
+    return UnrolledSurface(
+        np.column_stack([u.ravel(), v.ravel()]), values, np.full(u.size, NOISE_MM), np.zeros((u.size, 2))
+    )
+
+
+@pytest.mark.slow
+def test_false_alarms_are_as_rare_as_stated():
+    """Of 20 plain surfaces at a probability of 0.2 each, 12 or more indicate something once in 10,000 times."""
+    rng = np.random.default_rng(3)
+    alarms = [len(search_blemishes(field(rng, correlated=k % 2 == 0), false_alarm=0.2).indications) for k in range(20)]
+    assert np.count_nonzero(alarms) < 12
+
+
+def test_outliers_and_holes_are_no_blemishes():
+    rng = np.random.default_rng(4)
+    surface = field(rng)
+    spoilt = surface.heights.copy()
+    wild = rng.choice(len(spoilt), 150, replace=False)
+    spoilt[wild] -= rng.uniform(0.5, 5, 150)
+    seen = np.hypot(*(surface.places - 25).T) > 6
+    search = search_blemishes(
+        UnrolledSurface(surface.places[seen], spoilt[seen], surface.std[seen], surface.footprint_mm[seen]),
+        false_alarm=1e-3,
+    )
+    assert not search.indications
+    kept = np.isin(np.flatnonzero(seen), wild)
+    # Two wild neighbours in ten thousand points hide each other now and then.
+    assert search.outliers[kept].mean() > 0.9 and search.outliers[~kept].mean() < 0.02
+
+
+def bell(u, v, at, diameter, depth):
+    return -depth * np.square(np.maximum(1 - ((u - at[0]) ** 2 + (v - at[1]) ** 2) / (diameter / 2) ** 2, 0))
+
+
+def test_pits_are_found_and_measured():
+    """Pits, one beside a much larger one, and a protrusion, on an oval pipe of which a fifth was seen."""
+    places = {(-10.0, -40.0): (3.0, 0.3), (0.0, 5.0): (18.0, 3.0), (8.0, -20.0): (8.0, 0.8), (-9.0, 40.0): (6.0, -0.5)}
+    places[(-12.0, 9.0)] = (4.0, 0.4)
+
+    def radius(x, angle):
+        shape = RADIUS_MM * (1 + 0.0025 * np.cos(2 * angle))
+        return shape + sum(bell(x, RADIUS_MM * angle, at, *size) for at, size in places.items())
+
+    rng = np.random.default_rng(5)
+    cloud = pipe_scan(rng, half_arc=0.5, along=(-24, 24, 0.5), around_mm=0.3, radius=radius, correlated=True)
+    found = uwlts.inspect(cloud, wall_mm=9.0)
+    assert any("deg of the circumference" in note for note in found.notes)
+    assert not any("no uncertainty" in note for note in found.notes)
+    blemishes = found.of(FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
+    assert len(blemishes) == len(places)
+    for feature in blemishes:
+        x, y, z = feature.place_mm
+        at = min(places, key=lambda place: np.hypot(place[0] - x, place[1] - RADIUS_MM * np.arctan2(y, -z)))
+        diameter, depth = places.pop(at)
+        assert np.hypot(at[0] - x, at[1] - RADIUS_MM * np.arctan2(y, -z)) < 0.5 + 0.05 * diameter
+        value = feature.values[0]
+        assert feature.kind == (FeatureKind.PIT if depth > 0 else FeatureKind.PROTRUSION)
+        assert value.value == pytest.approx(abs(depth), abs=GATE * value.uncertainty)
+        assert value.uncertainty < 0.05 and feature.false_alarm < 0.05
+        edge = feature["edge depth"].value / abs(depth)
+        across = diameter * np.sqrt(1 - np.sqrt(edge))
+        for name in ("length", "width"):
+            # The local quadratic blurs the contour by a part of the points' spacing.
+            assert feature[name].value == pytest.approx(across, abs=GATE * feature[name].uncertainty + 0.25)
+        if depth > 0:
+            assert feature["remaining wall"].value == pytest.approx(9.0 - value.value)
+        towards = feature.axes @ [0.0, y, z] / np.hypot(y, z)
+        assert towards == pytest.approx([0, 0, 1], abs=0.01)
+    deepest = cloud.points_mm[np.nanargmin(found.deviation_mm)]
+    assert np.hypot(deepest[0], deepest[1] - 5) < 3
+
+
+def test_a_pit_where_a_whole_pipe_is_cut_open_is_found_once():
+    """Pits at eight angles around, so that wherever the cut is one lies near it."""
+    turns = np.linspace(-np.pi, np.pi, 8, endpoint=False)
+
+    def radius(x, angle):
+        away = [np.mod(angle - turn + np.pi, 2 * np.pi) - np.pi for turn in turns]
+        return RADIUS_MM + sum(bell(x, RADIUS_MM * each, (0.0, 0.0), 20.0, 1.0) for each in away)
+
+    cloud = pipe_scan(np.random.default_rng(13), radius=radius, along=(-30, 30.5, 1.5), around_mm=1.5)
+    pits = uwlts.inspect(cloud).of(FeatureKind.PIT)
+    angles = np.sort([np.arctan2(pit.place_mm[1], -pit.place_mm[2]) for pit in pits])
+    assert len(pits) == 8
+    assert np.diff(angles) == pytest.approx(np.full(7, np.pi / 4), abs=0.02)
+    for pit in pits:
+        within(pit, {"depth": 1.0})
+
+
+@pytest.mark.slow
+def test_depths_are_within_their_intervals():
+    """36 pits of 1 mm depth; fewer than 27 of 36 intervals of 95 % hold the truth once in 100,000 times."""
+    places = list(product(np.arange(-20, 21, 8.0), np.arange(-20, 21, 8.0)))
+
+    def radius(x, angle):
+        return RADIUS_MM + sum(bell(x, RADIUS_MM * angle, at, 5.0, 1.0) for at in places)
+
+    cloud = pipe_scan(np.random.default_rng(6), half_arc=0.2, along=(-25, 25, 0.5), around_mm=0.25, radius=radius)
+    pits = uwlts.inspect(cloud).of(FeatureKind.PIT)
+    assert len(pits) == len(places)
+    assert np.count_nonzero([pit["depth"].low <= 1.0 <= pit["depth"].high for pit in pits]) >= 27
+    # What all points share is common to a pit and its surroundings.
+    assert all(pit["depth"].systematic < 0.2 * pit["depth"].random for pit in pits)
+
+
+def test_what_the_footprint_of_points_smooths_is_put_back():
+    """25 pits of 2.5 mm diameter and 0.5 mm depth; as if points had no footprint they are a tenth too shallow."""
+    sizes, places = (0.22, 0.2), list(product(np.arange(-12, 13, 6.0), np.arange(-12, 13, 6.0)))
+    nodes, weights = np.polynomial.hermite_e.hermegauss(7)
+
+    def radius(x, angle):
+        result = np.full(np.shape(x), RADIUS_MM)
+        for (a, wa), (b, wb) in product(zip(nodes, weights, strict=True), repeat=2):
+            seen = x + a * sizes[0], RADIUS_MM * angle + b * sizes[1]
+            result = result + wa * wb / (2 * np.pi) * sum(bell(*seen, at, 2.5, 0.5) for at in places)
+        return result
+
+    cloud = pipe_scan(np.random.default_rng(15), half_arc=0.12, along=(-16, 16, 0.4), around_mm=0.15, radius=radius)
+    known = replace(cloud, metadata={FOOTPRINT: list(sizes), FOOTPRINT_STD: 0.2})
+    means = []
+    for each in (cloud, known):
+        pits = uwlts.inspect(each).of(FeatureKind.PIT)
+        assert len(pits) == len(places)
+        means.append(np.mean([pit["depth"].value for pit in pits]))
+    inside = [pit["depth"].low <= 0.5 <= pit["depth"].high for pit in pits]
+    # Fewer than 18 of 25 intervals of 95 % hold the truth once in 10,000 times.
+    assert np.count_nonzero(inside) >= 18
+    assert means[0] < 0.475 < 0.485 < means[1] < 0.515
+
+
+def flat_scan(rng, height, kept, *, along=(-30, 30, 0.5), across=(-60, 60, 900), **options):
+    """A flat thing that faces -z, scanned along x in profiles across it; ``kept`` says where there is something."""
+    x, y = np.arange(*along), np.linspace(*across)
+    at, over = np.meshgrid(x, y, indexing="ij")
+    frame, line = np.meshgrid(np.arange(len(x)), np.arange(len(y)), indexing="ij")
+    seen = kept(at, over)
+    at, over, frame, line = at[seen], over[seen], frame[seen], line[seen]
+    points = np.column_stack([at, over, -height(at, over)])
+    normals = np.broadcast_to([0.0, 0.0, -1.0], points.shape)
+    patterns = [1e-4 * points, 2e-4 * np.column_stack([0 * at, 0 * at, over])]
+    return cloud_of(rng, points, normals, frame, line, patterns=patterns, **options)
+
+
+def everywhere(x, y):
+    return np.ones(np.shape(x), bool)
+
+
+def within(feature, truth):
+    """Whether each value of a feature is within the gate of the truth."""
+    for name, value in truth.items():
+        assert feature[name].value == pytest.approx(value, abs=GATE * feature[name].uncertainty), name
+
+
+def test_a_step_is_measured():
+    cloud = flat_scan(np.random.default_rng(7), lambda x, y: np.where(y > 10, 12.34, 0.0) + 0.01 * x, everywhere)
+    step = uwlts.inspect(cloud, "step").features[0]
+    # The height is across the faces, which lean by 0.01.
+    within(step, {"height": 12.34 * np.cos(np.arctan(0.01))})
+    assert step["height"].uncertainty < 0.02 and step["parallelism"].low < 0.01
+
+
+def test_a_flange_is_measured():
+    angles = 2 * np.pi * np.arange(6) / 6 + 0.2
+
+    def face(x, y):
+        inside = (np.hypot(x, y) < 55) & (np.hypot(x, y) > 18)
+        for angle in angles:
+            inside &= np.hypot(x - 38 * np.cos(angle), y - 38 * np.sin(angle)) > 6
+        return inside
+
+    rng = np.random.default_rng(8)
+    cloud = flat_scan(rng, lambda x, y: 0.1 * np.square(x / 55), face, along=(-60, 60, 0.5))
+    datum = flat_scan(rng, lambda x, y: 30 + 0.005 * x, everywhere)
+    found = uwlts.inspect(cloud, "flange", datum=datum)
+    flange = found.features[0]
+    within(flange, {"bore": 36.0, "bolt circle": 76.0, "parallelism": np.degrees(np.arctan(0.005))})
+    holes = found.of(FeatureKind.HOLE)
+    assert len(holes) == 6
+    for hole in holes:
+        within(hole, {"diameter": 12.0})
+        assert hole["position"].low < 0.01
+    # A parabola over the face; its outermost cells average over a twenty-fourth of it.
+    assert flange["flatness"].value == pytest.approx(0.1, abs=0.015)
+    plain = flat_scan(rng, lambda x, y: 0 * x, face, along=(-60, 60, 0.5))
+    assert uwlts.inspect(plain, "flange").features[0]["flatness"].value < 0.02
+
+
+def test_a_gap_is_measured():
+    def apart(x, y):
+        return np.abs(y - 0.02 * x) > 1.5 + 0.004 * x
+
+    cloud = flat_scan(np.random.default_rng(9), lambda x, y: np.where(y > 0, 0.3, 0.0), apart)
+    gap = uwlts.inspect(cloud, "gap").features[0]
+    # Square to the middle line, which leans by 0.02.
+    within(gap, {"width": 3.0 * np.cos(0.02), "parallelism": np.degrees(0.008), "flush": 0.3})
+    assert gap["width"].random < 0.03 and gap["width"].uncertainty < 0.2
+
+
+def test_blur_beyond_an_edge_shows_in_the_brightness():
+    """A gap of 3 mm whose edges are blurred, and seen down to a fourth of the brightness: 0.13 mm beyond each."""
+    blur = 0.2
+
+    def brightness(y):
+        return norm.cdf((np.abs(y) - 1.5) / blur)
+
+    cloud = flat_scan(
+        np.random.default_rng(16), lambda x, y: 0 * y, lambda x, y: brightness(y) > 0.25, across=(-15, 15, 250)
+    )
+    stripes = replace(cloud, intensity=100 * brightness(cloud.points_mm[:, 1]))
+    known = replace(stripes, metadata={FOOTPRINT: [0.15, blur], FOOTPRINT_STD: 0.2})
+    narrow, right = (uwlts.inspect(each, "gap").features[0]["width"].value for each in (stripes, known))
+    # Half of a line's spacing of 0.12 mm on either side is all that is known without.
+    assert narrow < 2.93 and right == pytest.approx(3.0, abs=0.03)
+
+
+def weld_height(x, y, *, undercut, offset):
+    """A bead (1 - t^2)^2 of 2 mm and 12 mm on plates that are offset, with grooves of 2.4 mm at its toes."""
+    t = np.abs(y) / 6
+    bead = 2.0 * np.square(np.maximum(1 - np.square(t), 0))
+    groove = undercut * np.square(np.maximum(1 - np.square((t - 1) * 6 / 1.2), 0))
+    return bead - groove + offset * np.clip(y / 12 + 0.5, 0, 1)
+
+
+@pytest.mark.parametrize(("undercut", "offset"), [(0.4, 0.0), (0.0, 0.6)], ids=["undercut", "misaligned"])
+def test_a_weld_is_measured(undercut, offset):
+    def height(x, y):
+        return weld_height(x, y, undercut=undercut, offset=offset)
+
+    cloud = flat_scan(np.random.default_rng(10), height, everywhere, along=(-15, 15, 1.0), across=(-40, 40, 400))
+    weld = uwlts.inspect(cloud, "weld").features[0]
+    within(weld, {"height": 2.0, "misalignment": offset})
+    if undercut:
+        within(weld, dict.fromkeys(("undercut left", "undercut right", "largest undercut"), undercut))
+    else:
+        assert max(weld["undercut left"].value, weld["undercut right"].value) < 2 * NOISE_MM
+        # From 10 to 50 % of the height the flank's slope is 0.8 mm over (0.827 - 0.541) of 6 mm.
+        angle = 180 - np.degrees(np.arctan(0.8 / (6 * (np.sqrt(1 - np.sqrt(0.1)) - np.sqrt(1 - np.sqrt(0.5))))))
+        assert weld["toe angle left"].value == pytest.approx(angle, abs=1.0)
+        assert weld["toe angle right"].value == pytest.approx(angle, abs=1.0)
+    assert np.abs(weld.axes[0]) == pytest.approx([1, 0, 0], abs=0.02)
+
+
+def test_clouds_without_covariance_say_so(tmp_path, monkeypatch, capsys):
+    rng = np.random.default_rng(11)
+    options = {"half_arc": 0.3, "along": (-12, 12, 0.5), "around_mm": 0.4, "stated": False}
+    cloud = pipe_scan(rng, radius=lambda x, a: RADIUS_MM + bell(x, RADIUS_MM * a, (0, 0), 6.0, 0.6), **options)
+    uwlts.write_cloud(tmp_path / "pipe.ply", cloud)
+    monkeypatch.chdir(tmp_path)
+    app(
+        ["inspect", "pipe.ply", "--wall-mm", "9", "--out", "pipe.json", "--coloured", "c.ply"],
+        result_action="return_value",
+    )
+    record = json.loads((tmp_path / "pipe.json").read_text())
+    assert any("states no uncertainty" in note for note in record["notes"])
+    pit = next(each for each in record["features"] if each["kind"] == "pit")
+    assert pit["values"]["depth"]["systematic"] is None and pit["values"]["depth"]["random"] > 0
+    assert pit["values"]["depth"]["source"].startswith("ASME B31G")
+    assert "pit 1" in capsys.readouterr().out
+    deviation = uwlts.read_cloud("c.ply").deviation_mm
+    assert np.nanmin(deviation) == pytest.approx(-0.6, abs=0.15)
+
+
+def test_every_value_has_a_definition_with_a_source():
+    assert set(DEFINITIONS) == set(FeatureKind)
+    for values in DEFINITIONS.values():
+        for definition in values.values():
+            assert definition.text and definition.source and definition.unit in ("mm", "mm2", "deg", "%")
+
+
+def test_the_guide_has_all_definitions():
+    page = (Path(__file__).resolve().parents[3] / "docs" / "how-to" / "inspect-a-pipe.md").read_text(encoding="utf-8")
+    for kind, values in DEFINITIONS.items():
+        for name, definition in values.items():
+            assert f"| {kind} | {name} | {definition.unit} | {definition.text} | {definition.source} |" in page
+
+
+def test_wrong_input_is_refused():
+    rng = np.random.default_rng(12)
+    cloud = flat_scan(rng, lambda x, y: 0 * x, everywhere, along=(-5, 5, 1.0), across=(-20, 20, 100))
+    for words, options in (
+        ("a weld has no wall_mm", {"kind": "weld", "wall_mm": 9.0}),
+        ("a pipe has no datum", {"datum": cloud}),
+        ("a step has no section_mm", {"kind": "step", "section_mm": 1.0}),
+        ("wall_mm is -1", {"wall_mm": -1.0}),
+        ("false_alarm is 2", {"false_alarm": 2.0}),
+        ("no bead stands out", {"kind": "weld"}),
+        ("no gap goes through", {"kind": "gap"}),
+    ):
+        with pytest.raises(EvaluationError, match=words):
+            uwlts.inspect(cloud, **options)
+    few = PointCloud(cloud.points_mm[:50], cloud.intensity[:50], cloud.frame[:50], cloud.line[:50])
+    for kind in ("pipe", "weld", "step", "flange", "gap"):
+        with pytest.raises(EvaluationError, match="at least"):
+            uwlts.inspect(few, kind)

@@ -1,0 +1,43 @@
+"""Largest means of noisy profiles of known shape."""
+
+import numpy as np
+import pytest
+
+from uwlts.inspection.noisy_extremes import largest_mean
+
+NOISE, COUNT, TOGETHER, PAIRS = 0.08, 36, 5, 40
+
+SHAPES = {
+    "level": np.zeros(COUNT),
+    "rising": np.linspace(0, 0.4, COUNT),
+    "one deep place": 0.3 * (np.abs(np.arange(COUNT) - 12) < 3),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_the_largest_of_noisy_values_is_not_too_large(shape):
+    """The plain maximum is 0.07 too large where all are alike: two standard deviations of a mean.
+
+    Fewer than 31 of 40 intervals of 95 % hold the truth once in 80,000 times; the mean error of 40 is within four of
+    its standard deviations of 0.05 / sqrt(40), and a fourth of a mean's standard deviation that extrapolation leaves.
+    """
+    rng, truth = np.random.default_rng(7), SHAPES[shape]
+    largest = np.convolve(truth, np.full(TOGETHER, 1 / TOGETHER), "valid").max()
+    errors, inside, plain = [], 0, []
+    for _ in range(PAIRS):
+        profiles = truth + NOISE * rng.standard_normal((2, COUNT))
+        profiles[1, 20:24] = np.nan
+        found = largest_mean(list(profiles), TOGETHER)
+        errors.append(found.value - largest)
+        inside += found.low <= largest <= found.high
+        plain.append(np.convolve(profiles[0], np.full(TOGETHER, 1 / TOGETHER), "valid").max() - largest)
+        assert sum(each.sum() for each in found.weights) == pytest.approx(1)
+    assert inside >= 31
+    assert abs(np.mean(errors)) < 4 * 0.05 / np.sqrt(PAIRS) + 0.25 * NOISE / np.sqrt(TOGETHER)
+    assert shape != "level" or np.mean(plain) > 2 * abs(np.mean(errors))
+
+
+def test_what_is_not_known_has_no_largest():
+    found = largest_mean([np.full(6, np.nan), np.zeros(0)], 3)
+    assert np.isnan(found.value)
+    assert largest_mean([np.array([0.5])], 3)[:3] == (0.5, 0.5, 0.5)

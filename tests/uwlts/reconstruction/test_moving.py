@@ -1,0 +1,252 @@
+"""Reconstruction of scans by a platform: by its poses, a mount and a trajectory."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import uwlts
+from tests.uwlts.mount_views import MOUNT, MOUNT_STD, known_mount
+from tests.uwlts.reconstruction.test_reconstruct import CALIBRATION, FRESH, HEIGHT, WIDTH, small_sensor, stripe_image
+from uwlts.evaluation.figure_uncertainty import shift_std_mm
+from uwlts.reconstruction.moving import Ride, with_platform
+from uwlts.storage.capture import CaptureHeader
+from uwlts.storage.capture_writer import CaptureWriter
+from uwlts.storage.cloud import PointUncertainty
+
+START = np.eye(4)
+START[:3, :3] = Rotation.from_euler("ZYX", [70, 20, -35], degrees=True).as_matrix()
+START[:3, 3] = (900.0, -340.0, 610.0)
+STEP_MM = 2.0
+
+
+def platform_at(stage_mm):
+    """The platform's pose where the sensor went by ``stage_mm`` along its x axis from the start."""
+    moved = np.eye(4)
+    moved[0, 3] = stage_mm
+    return START @ moved @ np.linalg.inv(MOUNT)
+
+
+def record(path, *, stage=False, poses=False, mount=None):
+    """Five images, one without laser, taken each second and each 2 mm: by the stage, or by the platform."""
+    header = CaptureHeader(
+        name="scan",
+        sensor=small_sensor(),
+        medium_name="water",
+        medium=FRESH,
+        stage_direction=(1, 0, 0),
+        saturation_dn=255,
+        T_platform_sensor=None if mount is None else tuple(map(tuple, mount.tolist())),
+    )
+    with CaptureWriter(path, header, dtype=np.uint8) as writer:
+        for number in range(5):
+            at = STEP_MM * number
+            image = stripe_image(number) if number != 3 else np.zeros((HEIGHT, WIDTH), np.uint8)
+            pose = platform_at(at) if poses else None
+            frame = uwlts.Frame(image, at if stage else 0.0, number != 3, 1.0, float(number), pose)
+            writer.append(frame)
+    return path
+
+
+@pytest.fixture
+def expected(tmp_path):
+    """Points of the scan by the stage, in the base frame."""
+    cloud = uwlts.reconstruct(record(tmp_path / "stage.h5", stage=True), CALIBRATION)
+    return cloud.points_mm @ START[:3, :3].T + START[:3, 3]
+
+
+def test_poses_in_the_capture_are_the_platform_s_with_a_mount(tmp_path, expected):
+    path = record(tmp_path / "posed.h5", poses=True)
+    uwlts.write_mount(tmp_path / "mount.json", known_mount(MOUNT))
+    cloud = uwlts.reconstruct(path, CALIBRATION, mount=tmp_path / "mount.json")
+    np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("with_offset", [False, True])
+def test_images_are_placed_along_the_trajectory_at_their_times(tmp_path, expected, with_offset):
+    """The clock of the platform is 100 s ahead, as the mount or the caller says."""
+    path = record(tmp_path / "moving.h5")
+    times = np.array([99.5, 100.3, 101.0, 102.9, 104.2])
+    trajectory = uwlts.Trajectory(times, np.array([platform_at(STEP_MM * (time - 100)) for time in times]))
+    known = known_mount(MOUNT) if with_offset else known_mount(MOUNT, time_offset_s=100.0, time_offset_std_s=1e-4)
+    offset = 100.0 if with_offset else None
+    cloud = uwlts.reconstruct(path, CALIBRATION, mount=known, trajectory=trajectory, clock_offset_s=offset)
+    np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
+
+
+def test_a_clock_may_run_faster_than_the_camera_s(tmp_path, expected):
+    path, ppm = record(tmp_path / "moving.h5"), 2000.0
+    times = 50.0 + (1 + 1e-6 * ppm) * np.array([-0.5, 0.3, 1.0, 2.9, 4.2])
+    poses = np.array([platform_at(STEP_MM * time) for time in (-0.5, 0.3, 1.0, 2.9, 4.2)])
+    clock = {"clock_offset_s": 50.0, "clock_drift_ppm": ppm}
+    cloud = uwlts.reconstruct(
+        path, CALIBRATION, mount=known_mount(MOUNT), trajectory=uwlts.Trajectory(times, poses), **clock
+    )
+    np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
+    with pytest.raises(uwlts.Error, match="drifts by 1e[+]06 ppm"):
+        uwlts.reconstruct(
+            path, CALIBRATION, trajectory=uwlts.Trajectory(times, poses), clock_offset_s=50.0, clock_drift_ppm=1e6
+        )
+    with pytest.raises(uwlts.Error, match="without a trajectory"):
+        uwlts.reconstruct(path, CALIBRATION, mount=known_mount(MOUNT), clock_drift_ppm=ppm)
+
+
+def test_a_trajectory_without_a_mount_is_the_sensor_s(tmp_path, expected):
+    poses = np.array([platform_at(STEP_MM * time) for time in (0.0, 4.0)]) @ MOUNT
+    trajectory = uwlts.Trajectory(np.array([0.0, 4.0]), poses)
+    cloud = uwlts.reconstruct(record(tmp_path / "moving.h5"), CALIBRATION, trajectory=trajectory)
+    np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
+
+
+def test_the_robot_s_scale_stretches_its_positions(tmp_path, expected):
+    scale, path = 1.0005, tmp_path / "moving.h5"
+    record(path)
+    poses = np.array([platform_at(STEP_MM * time) for time in (0.0, 4.0)])
+    poses[:, :3, 3] /= scale
+    trajectory, known = uwlts.Trajectory(np.array([0.0, 4.0]), poses), known_mount(MOUNT, robot_scale=scale)
+    cloud = uwlts.reconstruct(path, CALIBRATION, mount=known, trajectory=trajectory)
+    np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
+
+
+def test_a_mount_without_poses_is_refused(tmp_path):
+    with pytest.raises(uwlts.Error, match="4 of 4 laser images have no pose.*trajectory"):
+        uwlts.reconstruct(record(tmp_path / "stage.h5", stage=True), CALIBRATION, mount=known_mount(MOUNT))
+
+
+def test_images_outside_the_trajectory_are_refused(tmp_path):
+    trajectory = uwlts.Trajectory(np.array([1.0, 9.0]), np.array([platform_at(0.0), platform_at(8.0)]))
+    with pytest.raises(uwlts.Error, match="1 of 4 times"):
+        uwlts.reconstruct(record(tmp_path / "moving.h5"), CALIBRATION, trajectory=trajectory)
+
+
+def test_the_mount_s_uncertainty_moves_points_as_other_mounts_do():
+    """Against points that were calculated with 4000 mounts drawn by the covariance."""
+    rng = np.random.default_rng(1)
+    seen = rng.uniform([-40, -1, 150], [40, 1, 300], size=(30, 3))
+    poses = np.array([platform_at(stage) for stage in rng.uniform(0, 500, 30)])
+    poses[:, :3, :3] = Rotation.random(30, rng=rng).as_matrix()
+
+    def points(transform):
+        on_platform = seen @ transform[:3, :3].T + transform[:3, 3]
+        return np.einsum("nij,nj->ni", poses[:, :3, :3], on_platform) + poses[:, :3, 3]
+
+    drawn = []
+    for step in rng.standard_normal((4000, 6)) * MOUNT_STD:
+        other = MOUNT.copy()
+        other[:3, 3] += step[:3]
+        other[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ MOUNT[:3, :3]
+        drawn.append(points(other))
+    none = PointUncertainty(np.zeros((30, 6)), np.zeros((30, 3)), np.zeros((1, 30, 3)))
+    ride = Ride(poses, None, np.arange(30.0))
+    found = with_platform(none, points(MOUNT), np.arange(30), ride, known_mount(MOUNT)).covariance_mm2()
+    # The standard deviation of 4000 is right to 1.1 %; 90 of them stay within five of those.
+    np.testing.assert_allclose(np.sqrt(np.einsum("nii->ni", found)), np.std(drawn, axis=0), rtol=0.056)
+
+
+def drawn_points(seen, poses, errors):
+    """Points in the base frame of ``seen`` (n, 3) from poses (F, 4, 4) with errors (F, 6), (F, n, 3)."""
+    turned = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
+    return np.einsum("fij,nj->fni", turned, seen) + (poses[:, :3, 3] + errors[:, :3])[:, None]
+
+
+def test_errors_of_each_pose_move_its_image_s_points_together():
+    """Against 4000 draws of the poses' errors, each image's on its own; means over images average them."""
+    rng = np.random.default_rng(2)
+    seen, images = rng.uniform([-40, -1, 150], [40, 1, 300], size=(5, 3)), 6
+    poses = np.array([platform_at(20.0 * number) for number in range(images)])
+    root = np.tril(rng.normal(size=(6, 6))) * np.array([0.1, 0.1, 0.1, 4e-4, 4e-4, 4e-4])[:, None]
+    covariance = np.tile(root @ root.T, (images, 1, 1))
+    points, frame = drawn_points(seen, poses, np.zeros((images, 6))).reshape(-1, 3), np.repeat(range(images), 5)
+    none = PointUncertainty(np.zeros((30, 6)), np.zeros((30, 3)), np.zeros((1, 30, 3)))
+    ride = Ride(poses, covariance, np.arange(6.0))
+    found = with_platform(none, points, frame, ride, None)
+    errors = rng.standard_normal((4000, images, 6)) @ root.T
+    drawn = np.array([drawn_points(seen, poses, each).reshape(-1, 3) for each in errors])
+    # The standard deviation of 4000 is right to 1.1 %; 90 of them stay within five of those.
+    np.testing.assert_allclose(found.std_mm(), drawn.std(axis=0), rtol=0.056)
+    cloud = uwlts.PointCloud(points, np.ones(30), frame, np.arange(30), uncertainty=found)
+    mean = shift_std_mm(cloud, np.ones(30, dtype=bool))
+    np.testing.assert_allclose(mean, drawn.mean(axis=1).std(axis=0), rtol=0.056)
+    assert (mean < 0.6 * found.std_mm().mean(axis=0)).all()
+
+
+@pytest.mark.parametrize("kind", ["random walk", "common", "Gauss-Markov"])
+def test_errors_along_a_path_are_as_alike_as_its_covariances_say(kind):
+    """The length between the first and the last images, against 4000 draws of errors along the path.
+
+    A random walk is what variances that grow with time mean. Shapes in time hold 99 % of its variance, and what is left
+    counts as independent, which changes the distance of two images' points by 1 % at most.
+    """
+    rng = np.random.default_rng(3)
+    count, seen, std = 40, np.array([[10.0, 0.0, 200.0]]), np.array([0.5, 0.7, 0.3, 1e-4, 2e-4, 3e-4])
+    poses = np.array([platform_at(10.0 * number) for number in range(count)])
+    times = np.arange(count, dtype=float)
+    if kind == "random walk":
+        steps = rng.standard_normal((4000, count, 6)) * std / np.sqrt(count)
+        errors, correlation_s = np.cumsum(steps, axis=1), None
+        covariance = np.diag(std**2) * ((times + 1) / count)[:, None, None]
+    elif kind == "common":
+        errors = np.repeat(rng.standard_normal((4000, 1, 6)) * std, count, axis=1)
+        covariance, correlation_s = np.tile(np.diag(std**2), (count, 1, 1)), np.inf
+    else:
+        covariance, correlation_s = np.tile(np.diag(std**2), (count, 1, 1)), 30.0
+        alike = np.linalg.cholesky(np.exp(-np.abs(times[:, None] - times) / 30.0))
+        errors = np.einsum("fg,mgk->mfk", alike, rng.standard_normal((4000, count, 6)) * std)
+    points = drawn_points(seen, poses, np.zeros((count, 6)))[:, 0]
+    none = PointUncertainty(np.zeros((count, 6)), np.zeros((count, 3)), np.zeros((1, count, 3)))
+    ride = Ride(poses, covariance, times, rates=np.zeros((count, 6)))
+    found = with_platform(none, points, np.arange(count), ride, None, correlation_s=correlation_s)
+    drawn = np.array([drawn_points(seen, poses, each)[:, 0] for each in errors])
+    # 1.1 % of 4000 draws five times, and 1 % of the variance.
+    np.testing.assert_allclose(found.std_mm(), drawn.std(axis=0), rtol=0.065, atol=1e-3)
+    together = found.patterns_mm
+    apart = np.sqrt(np.sum(found.poses_mm**2, axis=0))
+    for first, last in ((0, count - 1), (count // 2, count - 1)):
+        common = np.sqrt(np.sum((together[:, last] - together[:, first]) ** 2, axis=0))
+        total = np.sqrt(common**2 + apart[first] ** 2 + apart[last] ** 2)
+        np.testing.assert_allclose(total, (drawn[:, last] - drawn[:, first]).std(axis=0), rtol=0.08, atol=2e-3)
+
+
+def test_many_images_have_the_uncertainty_of_few():
+    """Of a random walk at 1200 images, by 400 moments, against a tenth of them."""
+    count, seen = 1200, np.array([[10.0, 0.0, 200.0]])
+    poses = np.array([platform_at(0.5 * number) for number in range(count)])
+    points = drawn_points(seen, poses, np.zeros((count, 6)))[:, 0]
+    variance = np.square([0.5, 0.7, 0.3, 1e-4, 2e-4, 3e-4])
+    covariance = np.diag(variance) * ((np.arange(count) + 1.0) / count)[:, None, None]
+    found = []
+    for images in (np.arange(count), np.arange(0, count, 10)):
+        none = PointUncertainty(np.zeros((len(images), 6)), np.zeros((len(images), 3)), np.zeros((1, len(images), 3)))
+        ride = Ride(poses[images], covariance[images], images * 1.0, rates=np.zeros((len(images), 6)))
+        found.append(with_platform(none, points[images], np.arange(len(images)), ride, None))
+    many, few = found[0][::10], found[1]
+    np.testing.assert_allclose(many.std_mm(), few.std_mm(), rtol=1e-5)
+    for first, last in ((0, 119), (60, 119), (60, 70)):
+        apart = [np.linalg.norm(each.patterns_mm[:, last] - each.patterns_mm[:, first], axis=0) for each in (many, few)]
+        np.testing.assert_allclose(*apart, rtol=0.05)
+
+
+def test_the_time_offset_s_uncertainty_moves_points_along_the_path():
+    poses = np.array([platform_at(10.0 * number) for number in range(4)])
+    rates = np.tile([100.0, 0.0, 0.0, 0.0, 0.0, 0.1], (4, 1))
+    points = poses[:, :3, 3] + np.array([0.0, 200.0, 0.0])
+    none = PointUncertainty(np.zeros((4, 6)), np.zeros((4, 3)), np.zeros((1, 4, 3)))
+    mount = known_mount(
+        MOUNT, time_offset_s=0.0, time_offset_std_s=2e-4, covariance=tuple(map(tuple, np.eye(6) * 1e-20))
+    )
+    found = with_platform(none, points, np.arange(4), Ride(poses, None, np.arange(4.0), rates), mount)
+    # 100 mm/s along x, less 0.1 rad/s about z at 200 mm along y: 80 mm/s in 0.2 ms.
+    np.testing.assert_allclose(found.std_mm(), np.tile([0.016, 0.0, 0.0], (4, 1)), atol=1e-6)
+
+
+def test_a_mount_of_the_drawing_is_used_with_a_warning(tmp_path, expected):
+    path = record(tmp_path / "posed.h5", poses=True, mount=MOUNT)
+    cloud = uwlts.reconstruct(path, CALIBRATION)
+    np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
+    np.testing.assert_array_equal(cloud.time_s, cloud.frame)
+    assert "calibrate it" in cloud.warnings[-1]
+    turned = MOUNT.copy()
+    turned[0, 3] += 5.0
+    calibrated = uwlts.reconstruct(path, CALIBRATION, mount=known_mount(turned))
+    shift = np.linalg.norm(calibrated.points_mm - expected, axis=1)
+    np.testing.assert_allclose(shift, 5.0, atol=1e-8)
+    assert not calibrated.warnings

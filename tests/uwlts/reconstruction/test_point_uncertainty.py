@@ -1,0 +1,420 @@
+"""What clouds say of their points' uncertainty, against Monte Carlo through the reconstruction itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.uwlts.calibration_views import built_sensor
+from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
+from uwlts.calibration.joint.earlier_estimate import Prior
+from uwlts.calibration.joint.procedure import solve_jointly
+from uwlts.calibration.joint.scanned_surfaces import SLOPES
+from uwlts.calibration.joint.stored_estimate import stored_estimate
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
+from uwlts.errors import CalibrationError
+from uwlts.evaluation.artefact_figures import evaluate_cloud
+from uwlts.evaluation.figure_uncertainty import MovedSpheres, figure_uncertainties, noise_mm, shift_std_mm
+from uwlts.fitting.shapes import fit_sphere
+from uwlts.model.artefacts import PlaneStandard, SphereStandard
+from uwlts.model.calibration import KnownMedium, KnownStage
+from uwlts.model.parameter_keys import MediumIndex, StageParameter
+from uwlts.model.sensor import Medium
+from uwlts.optics.triangulation import reconstruct_pixels
+from uwlts.reconstruction.point_uncertainty import point_uncertainty, stage_root, stripe_noise_px
+from uwlts.storage.capture import Capture, CaptureHeader, Frame, source_of
+from uwlts.storage.capture_writer import CaptureWriter
+from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.cloud_files import read_cloud, write_cloud
+
+BUILT = built_sensor()
+DRAWS = 400
+DUMBBELL = SphereStandard(diameters_mm=(50.12, 50.14), spacings_mm=(99.18,))
+LINES = np.arange(100, 1180, 12)
+
+
+@pytest.fixture(scope="module")
+def calibration(thesis):
+    noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(4))
+    series = target_series(BUILT, medium=0, positions=np.arange(6) * 36.0 - 120.0, noise=noise)
+    options = CalibrationOptions(poses="stage", correct_circles=False)
+    return solve_jointly(gathered(thesis, [series]), options=options).calibration
+
+
+def header_of(sensor, medium) -> CaptureHeader:
+    return CaptureHeader(
+        name="scan",
+        sensor=sensor,
+        medium_name="water",
+        medium=medium,
+        stage_direction=(1.0, 0.0, 0.0),
+        saturation_dn=255,
+    )
+
+
+def capture_of(folder, sensor, medium, frames=2) -> Capture:
+    header = header_of(sensor, medium)
+    path = folder / "scan.h5"
+    image = np.zeros((sensor.camera.height_px, sensor.camera.width_px), np.uint8)
+    with CaptureWriter(path, header, dtype=np.uint8) as writer:
+        for number in range(frames):
+            writer.append(Frame(image, 20.0 * number, True, 1.0, float(number)))
+    return Capture(path)
+
+
+@pytest.fixture(scope="module")
+def stripes():
+    """Stripes (frame, line, centre) of two images: near and far, with 0.1 px and 0.3 px of noise."""
+    rng = np.random.default_rng(7)
+    line = np.tile(np.arange(100, 1180), 2)
+    frame = np.repeat([0, 1], len(line) // 2)
+    smooth = np.where(frame == 0, 300.0, 700.0) + 20 * np.sin(line / 200)
+    return frame, line, smooth + rng.normal(0, np.where(frame == 0, 0.1, 0.3))
+
+
+def full(matrix6):
+    result = np.zeros((len(matrix6), 3, 3))
+    for column, (i, j) in enumerate(PAIRS):
+        result[:, i, j] = result[:, j, i] = matrix6[:, column]
+    return result
+
+
+def test_the_stripes_noise_is_that_of_its_image(stripes):
+    """The median of 1078 differences is right to 2 % (one standard deviation); a step between treads does not count."""
+    frame, line, centre = stripes
+    centre = centre + 40.0 * ((line > 500) & (line < 700))
+    noise = stripe_noise_px(frame, line, centre)
+    assert noise[frame == 0] == pytest.approx(0.1, rel=0.08)
+    assert noise[frame == 1] == pytest.approx(0.3, rel=0.08)
+
+
+def test_covariances_are_those_of_monte_carlo(calibration, stripes, thesis, tmp_path):
+    """By drawing parameters from the estimate's covariance, and the stage's lean, and reconstructing with each."""
+    frame, line, centre = stripes
+    with capture_of(tmp_path, thesis, MEDIUM) as capture:
+        known = point_uncertainty(capture, calibration, frame, line, centre)
+        stored = stored_estimate(calibration, thesis, MEDIUM)
+        stage = capture.stage_mm[frame] - capture.stage_mm[:].mean()
+    pick = np.arange(0, len(line), 120)
+    rng = np.random.default_rng(3)
+    drawn = rng.multivariate_normal(stored.values, stored.covariance, DRAWS, method="svd")
+    leans = np.tan(np.radians(thesis.uncertainty.stage_alignment_deg)) * rng.standard_normal((DRAWS, 2))
+    pixels = np.column_stack([line, centre])[pick]
+    points = []
+    for values, lean in zip(drawn, leans, strict=True):
+        along = np.array([1.0, *lean])
+        scale = 1.0 + stored.parameters.value(values, StageParameter.SCALE)
+        changed = calibration.model_copy(
+            update={
+                "camera": stored.parameters.camera(values),
+                "window": stored.parameters.window_model(values),
+                "sheet": stored.parameters.sheet_model(values),
+                "media": (KnownMedium(medium=MEDIUM, index=stored.parameters.medium_index(values, stored.view)),),
+            }
+        )
+        points.append(
+            reconstruct_pixels(
+                changed,
+                pixels,
+                medium_index=changed.index_of(MEDIUM),
+                stage_mm=scale * stage[pick],
+                stage_direction=along / np.linalg.norm(along),
+            ).points_mm
+        )
+    points = np.array(points)
+    # Correlations between different points included: of the differences to the first point.
+    for seen, patterns in (
+        (points, known.patterns_mm[:, pick]),
+        (points[:, 1:] - points[:, :1], known.patterns_mm[:, pick[1:]] - known.patterns_mm[:, pick[:1]]),
+    ):
+        by_draws = np.std(seen, axis=0)
+        by_patterns = np.sqrt(np.sum(patterns.astype(float) ** 2, axis=0))
+        # A standard deviation of 400 draws is right to 3.5 % (one sigma): 5 sigma, and 0.1 um for what is left out.
+        np.testing.assert_allclose(by_patterns, by_draws, rtol=0.18, atol=1e-4)
+    systematic = full(known.systematic_mm2()[pick])
+    cov = np.einsum("dni,dnj->nij", points - points.mean(0), points - points.mean(0)) / (DRAWS - 1)
+    size = np.sqrt(np.einsum("nii->n", systematic))[:, None, None] ** 2
+    assert (np.abs(systematic - cov) / size).max() < 0.3
+
+
+def test_many_points_by_a_table_have_the_covariance_of_few_by_themselves(calibration, thesis, tmp_path):
+    line, frame = np.tile(np.arange(100, 1180), 6), np.repeat(np.arange(6), 1080)
+    rng = np.random.default_rng(8)
+    centre = 300.0 + 80.0 * frame + 20 * np.sin(line / 200) + rng.normal(0, 0.1, len(line))
+    whole = np.flatnonzero(frame == 2)
+    with capture_of(tmp_path, thesis, MEDIUM, frames=6) as capture:
+        many = point_uncertainty(capture, calibration, frame, line, centre)
+        few = point_uncertainty(capture, calibration, frame[whole], line[whole], centre[whole])
+    assert len(line) >= 5000 > len(whole)
+    # Left out of either is what moves points by 5e-5 mm (root mean square), at most three times that at one of them.
+    found, expected = many.systematic_mm2()[whole], few.systematic_mm2()
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2 * (1.5e-4) ** 2)
+    np.testing.assert_allclose(many.random_mm2[whole], few.random_mm2, rtol=1e-5)
+
+
+def test_random_covariance_is_the_stripes_noise_on_the_object(calibration, stripes, thesis, tmp_path):
+    frame, line, centre = stripes
+    with capture_of(tmp_path, thesis, MEDIUM) as capture:
+        known = point_uncertainty(capture, calibration, frame, line, centre)
+
+    def points(shift):
+        pixels = np.column_stack([line, centre + shift])
+        return reconstruct_pixels(
+            calibration,
+            pixels,
+            medium_index=calibration.index_of(MEDIUM),
+            stage_mm=0.0,
+            stage_direction=np.array([1.0, 0, 0]),
+        ).points_mm
+
+    shared = np.sqrt(calibration.joint.shared_variance["stripe on the target"])
+    expected = (points(0.5) - points(-0.5)) * (stripe_noise_px(frame, line, centre) * shared)[:, None]
+    np.testing.assert_allclose(
+        full(known.random_mm2), np.einsum("ni,nj->nij", expected, expected), rtol=1e-3, atol=1e-3 * np.max(expected**2)
+    )
+    along = noise_mm(known)
+    assert np.allclose(np.abs(along), np.abs(expected), rtol=1e-2, atol=1e-5)
+
+
+def test_another_water_is_known_by_its_temperature_only(calibration, stripes, thesis, tmp_path):
+    frame, line, centre = stripes
+    other = Medium(kind="fresh", temperature_c=12.0)
+    stored = stored_estimate(calibration, thesis, other)
+    assert stored.parameters.keys[-1] == MediumIndex("the scan")
+    std = other.index_uncertainty(calibration.wavelength_nm, thesis.uncertainty)
+    assert np.sqrt(stored.covariance[-1, -1]) == pytest.approx(std)
+    assert not stored.covariance[-1, :-1].any()
+    warm = thesis.model_copy(update={"uncertainty": thesis.uncertainty.model_copy(update={"temperature_k": 20.0})})
+    sizes = []
+    for number, sensor in enumerate((thesis, warm)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        with capture_of(folder, sensor, other) as capture:
+            known = point_uncertainty(capture, calibration, frame, line, centre)
+            width = known.patterns_mm[:, 1079, 1] - known.patterns_mm[:, 0, 1]
+            sizes.append(np.linalg.norm(width))
+    # 20 K change the index by some 1e-3, and widths as much.
+    assert 1.5 * sizes[0] < sizes[1] < 0.3
+
+
+def test_a_cloud_keeps_it_in_its_file(calibration, stripes, thesis, tmp_path):
+    frame, line, centre = stripes
+    with capture_of(tmp_path, thesis, MEDIUM) as capture:
+        known = point_uncertainty(capture, calibration, frame, line, centre)
+    cloud = PointCloud(np.zeros((len(line), 3)), np.ones(len(line)), frame, line, uncertainty=known)
+    write_cloud(tmp_path / "a.ply", cloud)
+    again = read_cloud(tmp_path / "a.ply").uncertainty
+    np.testing.assert_array_equal(again.random_mm2, known.random_mm2)
+    np.testing.assert_array_equal(again.position_mm, known.position_mm)
+    np.testing.assert_array_equal(again.patterns_mm, known.patterns_mm)
+    assert again.std_mm().shape == (len(line), 3)
+
+
+def test_figures_have_the_uncertainty_of_monte_carlo(calibration, stripes, thesis, tmp_path):
+    """A plane's flatness figures by patterns and draws, against 200 draws of both together."""
+    frame, line, centre = stripes
+    near = frame == 0
+    with capture_of(tmp_path, thesis, MEDIUM) as capture:
+        known = point_uncertainty(capture, calibration, frame[near], line[near], centre[near])
+    rng = np.random.default_rng(0)
+    grid = np.column_stack([rng.uniform(-20, 20, near.sum()), np.linspace(-60, 60, near.sum()), np.zeros(near.sum())])
+    cloud = PointCloud(grid, np.ones(len(grid)), frame[near], line[near], uncertainty=known)
+    artefact = PlaneStandard(kind="plane")
+    found = figure_uncertainties(cloud, evaluate_cloud(cloud, artefact))
+    along, patterns = noise_mm(known), known.patterns_mm.astype(float)
+    spread = []
+    for _ in range(200):
+        moved = grid + rng.standard_normal((len(grid), 1)) * along
+        moved = moved + np.einsum("m,mni->ni", rng.standard_normal(len(patterns)), patterns)
+        spread.append(evaluate_cloud(replace(cloud, points_mm=moved), artefact).figures_mm["STD"])
+    total = np.hypot(found["STD"].random_mm, found["STD"].systematic_mm)
+    # STD adds squares, so that it is not linear in the patterns: the same size is what can be asked.
+    assert 0.3 * np.std(spread) < total < 3 * np.std(spread)
+
+
+@pytest.fixture(scope="module")
+def spheres():
+    """Two caps with what moves their points: noise, the positions of 20 images, and smooth patterns."""
+    rng = np.random.default_rng(5)
+    points, frame = [], []
+    for y, diameter in zip((-49.59, 49.59), DUMBBELL.diameters_mm, strict=True):
+        x, across = rng.uniform(-16, 16, (2, 1500))
+        inside = np.hypot(x, across) < 20
+        x, across = x[inside], across[inside]
+        points.append(np.column_stack([x, across + y, -np.sqrt(diameter**2 / 4 - x**2 - across**2)]))
+        frame.append(((x + 16) / 1.6).astype(int))
+    points = np.vstack(points)
+    ray = np.array([0.0, 0.004, 0.01])
+    random = np.tile([ray[i] * ray[j] for i, j in PAIRS], (len(points), 1)).astype(np.float32)
+    position = np.tile(np.float32([0.004, 0.0, 0.0]), (len(points), 1))
+    patterns = np.stack(
+        [rng.normal(0, 0.02, 3) + points @ rng.normal(0, 1e-4, (3, 3)) + 1e-6 * points**2 for _ in range(4)]
+    ).astype(np.float32)
+    known = PointUncertainty(random, position, patterns)
+    points = points + rng.standard_normal((len(points), 1)) * ray
+    return PointCloud(points, np.ones(len(points)), np.concatenate(frame), np.arange(len(points)), uncertainty=known)
+
+
+def test_spheres_follow_their_points_as_when_searched_for_again(spheres):
+    """To the second order of moves by 0.05 mm and residuals by 0.05 mm over the radius of 25 mm."""
+    evaluation = evaluate_cloud(spheres, DUMBBELL)
+    moved = MovedSpheres(spheres.points_mm, evaluation)
+    for move in spheres.uncertainty.patterns_mm[:2].astype(float):
+        again = evaluate_cloud(replace(spheres, points_mm=spheres.points_mm + move), DUMBBELL).figures_mm
+        change = np.array(list(again.values())) - list(evaluation.figures_mm.values())
+        assert np.abs(change).max() > 1e-3
+        followed = np.array(list(moved.figures_mm(move).values())) - list(evaluation.figures_mm.values())
+        np.testing.assert_allclose(followed, change, atol=2e-4)
+
+
+def test_figures_of_spheres_have_the_uncertainty_of_monte_carlo(spheres):
+    """Of 200 draws a standard deviation is right to 5 %, of 50 for the noise to 10 %: 4 sigma."""
+    evaluation, known = evaluate_cloud(spheres, DUMBBELL), spheres.uncertainty
+    found = figure_uncertainties(spheres, evaluation)
+    rng, along = np.random.default_rng(1), noise_mm(known)
+    drawn = []
+    for _ in range(200):
+        move = rng.standard_normal((len(spheres), 1)) * along
+        move = move + rng.standard_normal((20, 1))[spheres.frame] * known.position_mm
+        move = move + np.einsum("m,mni->ni", rng.standard_normal(len(known.patterns_mm)), known.patterns_mm)
+        first, second = (fit_sphere((spheres.points_mm + move)[spheres.points_mm[:, 1] * side > 0]) for side in (-1, 1))
+        drawn.append((np.linalg.norm(second.centre_mm - first.centre_mm), 2 * first.radius_mm, 2 * second.radius_mm))
+    names = ("SSE", "diameter error sphere 1", "diameter error sphere 2")
+    for name, std in zip(names, np.std(drawn, axis=0), strict=True):
+        assert np.hypot(found[name].random_mm, found[name].systematic_mm) == pytest.approx(std, rel=0.45), name
+    still = replace(spheres, uncertainty=replace(known, position_mm=np.zeros_like(known.position_mm)))
+    name = "diameter error sphere 1"
+    assert figure_uncertainties(still, evaluation)[name].random_mm < 0.7 * found[name].random_mm
+
+
+@pytest.mark.parametrize("part", ["patterns_mm", "position_mm", "random_mm2"])
+def test_a_clouds_place_has_the_uncertainty_of_monte_carlo(spheres, part):
+    """Of each kind of error alone; of 400 draws a standard deviation is right to 3.5 %: 4 sigma."""
+    stated = {name: each for name, each in vars(spheres.uncertainty).items() if isinstance(each, np.ndarray)}
+    others = {name: np.float32(1e-12) * values for name, values in stated.items() if name != part}
+    known = replace(spheres.uncertainty, **others)
+    cloud, used = replace(spheres, uncertainty=known), spheres.points_mm[:, 1] > 0
+    rng, drawn = np.random.default_rng(2), []
+    for _ in range(DRAWS):
+        move = rng.standard_normal((len(cloud), 1)) * noise_mm(known)
+        move = move + rng.standard_normal((20, 1))[cloud.frame] * known.position_mm
+        move = move + np.einsum("m,mni->ni", rng.standard_normal(len(known.patterns_mm)), known.patterns_mm)
+        drawn.append(move[used].mean(axis=0))
+    np.testing.assert_allclose(shift_std_mm(cloud, used), np.std(drawn, axis=0), rtol=0.15, atol=1e-7)
+
+
+@pytest.mark.parametrize(("calibrated", "way"), [(True, 1.0), (True, -1.0), (False, 1.0)])
+def test_the_stage_of_a_scan_is_as_well_known_as_its_calibration(calibration, thesis, calibrated, way):
+    """Its direction by the estimate where that has found it, also for the way back, else by the description."""
+    stored = stored_estimate(calibration, thesis, MEDIUM)
+    priors = stored.parameters.priors | dict.fromkeys(SLOPES, Prior(0.0, 1.0))
+    parameters = replace(stored.parameters, priors=priors)
+    covariance = np.zeros((len(parameters.keys), len(parameters.keys)))
+    covariance[: len(stored.values), : len(stored.values)] = stored.covariance
+    covariance[-2:, -2:] = [[4e-8, 1e-8], [1e-8, 9e-8]]
+    known = replace(stored, parameters=parameters, values=np.append(stored.values, [0.0, 0.0]), covariance=covariance)
+    stages = (KnownStage(described=(1.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0)),) if calibrated else ()
+    header = header_of(thesis, MEDIUM).model_copy(update={"stage_direction": (way, 0.0, 0.0)})
+    found = stage_root(
+        known,
+        calibration.model_copy(update={"stages": stages}),
+        header,
+        np.linalg.cholesky(covariance + 1e-24 * np.eye(len(covariance))),
+    )
+    place = parameters.keys.index(StageParameter.SCALE)
+    lean = np.tan(np.radians(thesis.uncertainty.stage_alignment_deg))
+    expected = np.zeros((3, 3))
+    expected[0, 0] = covariance[place, place] + known.values[place] ** 2
+    expected[1:, 1:] = covariance[-2:, -2:] if calibrated else lean**2 * np.eye(2)
+    np.testing.assert_allclose(found.T @ found, expected, rtol=1e-6, atol=1e-15)
+
+
+def test_a_sequential_calibration_has_none(calibration, thesis):
+    without = calibration.model_copy(update={"joint": None})
+    with pytest.raises(CalibrationError, match="calibrate jointly"):
+        stored_estimate(without, thesis, MEDIUM)
+
+
+def test_what_blur_and_light_beside_the_sheet_leave_moves_all_points_together(calibration, stripes, thesis, tmp_path):
+    frame, line, centre = stripes
+    rng = np.random.default_rng(2)
+    blur, beside = rng.normal(0, 0.05, len(line)), rng.normal(0, 0.01, (len(line), 3))
+    with capture_of(tmp_path, thesis, MEDIUM) as capture:
+        plain = point_uncertainty(capture, calibration, frame, line, centre)
+        known = point_uncertainty(capture, calibration, frame, line, centre, blur_px=blur, beside_mm=beside)
+    per_px = (
+        noise_mm(plain)
+        / (stripe_noise_px(frame, line, centre) * np.sqrt(calibration.joint.shared_variance["stripe on the target"]))[
+            :, None
+        ]
+    )
+    # Any part of what blur may do is as likely; the sheet's thickness, known to 10 %, counts by its square.
+    added = [per_px * blur[:, None] / np.sqrt(3), 0.2 * beside]
+    expected = sum(np.stack([each[:, i] * each[:, j] for i, j in PAIRS], axis=1) for each in added)
+    # Patterns that move the points by less than 0.05 um together are left out.
+    np.testing.assert_allclose(known.systematic_mm2() - plain.systematic_mm2(), expected, atol=1e-7, rtol=1e-2)
+
+
+def test_water_does_not_drift_before_its_own_scan(calibration, stripes, thesis, tmp_path):
+    frame, line, centre = stripes
+    drifting = thesis.model_copy(update={"uncertainty": thesis.uncertainty.model_copy(update={"drift_k": 30.0})})
+    water = thesis.media["water"]
+    known = calibration.model_copy(update={"media": (calibration.media[0].model_copy(update={"medium": water}),)})
+    with capture_of(tmp_path, drifting, water) as capture:
+        own = known.model_copy(
+            update={"provenance": known.provenance | {"scan_captures": [source_of(capture).model_dump(mode="json")]}}
+        )
+        free, tied = (
+            point_uncertainty(capture, each, frame, line, centre).systematic_mm2()[:, 5] for each in (known, own)
+        )
+    # 30 K are 3e-3 of the index: along Z, 0.07 mm or more.
+    assert (free - tied > 0.06**2).all()
+
+
+def test_clouds_of_one_calibration_say_what_they_share(calibration, stripes, thesis, tmp_path):
+    """Covariance between points of two scans, by the parts that their patterns share, against drawn parameters.
+
+    A covariance of 400 draws is right to 5 % of both standard deviations (one sigma): five of these.
+    """
+    frame, line, centre = stripes
+    moved = centre + np.where(line > 600, 90.0, -60.0)
+    with capture_of(tmp_path, thesis, MEDIUM) as capture:
+        first, second = (point_uncertainty(capture, calibration, frame, line, each) for each in (centre, moved))
+        other = point_uncertainty(
+            capture, calibration.model_copy(update={"joint": changed_joint(calibration)}), *stripes
+        )
+    assert first.shared.keys() == second.shared.keys() != other.shared.keys()
+    ours, theirs = (np.hstack([known.shared[name] for name in first.shared]) for known in (first, second))
+    pick = np.arange(0, len(line), 300)
+    between = np.einsum(
+        "mni,mk,knj->nij",
+        first.patterns_mm[:, pick].astype(float),
+        ours @ theirs.T,
+        second.patterns_mm[:, pick].astype(float),
+    )
+    stored = stored_estimate(calibration, thesis, MEDIUM)
+    drawn = np.random.default_rng(3).multivariate_normal(stored.values, stored.covariance, DRAWS, method="svd")
+    image = frame[pick] == frame[0]
+    off = []
+    for values in drawn:
+        now = replace(stored, values=values)
+        off.append([now.points_by(line[pick], each[pick])[0] for each in (centre, moved)])
+    off = np.array(off) - np.mean(off, axis=0)
+    # The stage, whose scale is among the parameters, moves points of both images along X alone.
+    assert image.any() and not image.all()
+    expected = np.einsum("dni,dnj->nij", off[:, 0], off[:, 1])[:, 1:, 1:] / (DRAWS - 1)
+    size = np.sqrt(
+        np.einsum("dni->ni", off[:, 0] ** 2)[:, 1:, None] * np.einsum("dni->ni", off[:, 1] ** 2)[:, None, 1:]
+    )
+    assert (np.abs(between[:, 1:, 1:] - expected) / (size / DRAWS)).max() < 0.25
+
+
+def changed_joint(calibration):
+    """The joint estimate with twice the covariance."""
+    joint = calibration.joint
+    return joint.model_copy(
+        update={
+            "covariance": tuple(tuple(4 * each for each in row) for row in joint.covariance),
+            "std": tuple(2 * each for each in joint.std),
+        }
+    )

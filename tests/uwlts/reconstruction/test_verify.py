@@ -1,0 +1,18 @@
+"""Warnings and limits that a verification reports beside its verdicts."""
+
+import numpy as np
+
+from uwlts.reconstruction.verify import not_shown_by
+
+
+def test_a_reversed_stage_that_sizes_cannot_show_is_named():
+    """Moved square to the sheet, a reversed stage turns the cloud into its mirror image, in which lengths are the same.
+
+    Moved 30 deg beside that, it shears it by 2 tan 30 deg.
+    """
+    positions = np.arange(5.0)
+    for direction in ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)):
+        (said,) = not_shown_by("spheres", positions, direction)
+        assert "spheres" in said and "mirror image" in said
+    assert not_shown_by("spheres", positions, (0.866, 0.0, 0.5)) == ()
+    assert not_shown_by("step", np.zeros(3), (1.0, 0.0, 0.0)) == (), "nothing moved"

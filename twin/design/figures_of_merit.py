@@ -1,0 +1,580 @@
+"""Figures of merit of designs by formulas, for many designs at once, from the stripe at points of the sheet."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cache, partial
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from twin.backend.llvm import prepare_llvm, threads_kept
+from twin.design.geometry import (
+    Array,
+    ImagePoints,
+    LaserFan,
+    Vector,
+    WindowGeometry,
+    across_mm,
+    added,
+    direction_outside,
+    dot,
+    length_outside_mm,
+    path_to,
+    pixels_per_mm,
+    scaled,
+    seen,
+    slopes_per_mm,
+    snell_root,
+    standoff_mm,
+    where,
+)
+from twin.design.parameters import Follow, SensorArrays, following
+from twin.sensor.detector import PLANCK_TIMES_LIGHT
+from uwlts.errors import RangeError
+
+DEPTHS, PLACES = 5, 7
+"""Points of the measuring volume: so many depths, evenly from end to end of what the camera sees of it, and so many
+places along the stripe at each."""
+_EDGE_STEPS = 5
+_MANY = 200
+"""Designs from which the time to compile the formulas for them comes back."""
+_BLOCK = 1000
+"""Designs that compiled formulas take at once."""
+_NEAREST_MM, _FARTHEST_MM = 1.0, 1e6
+"""Largest distances at which the sheet leaves the image: from the window's outer face, and from the pupil."""
+_BRIGHT_LINES = 2.05
+"""Automatic exposure lets 2 % of the profile lines be brighter: standard deviations of speckle above the mean."""
+_UNMODELLED = 0.02
+"""Part of the height by which stripes differ from the Gaussian that is fitted to them; it limits the flanks' weight."""
+_FLANK, _NODES = 4.0, 16
+"""The profile is summed up to so many standard deviations, at so many places."""
+_DIFFRACTION = 0.42
+"""Standard deviation of the Gaussian that is closest to an Airy pattern, in wavelengths times f-number."""
+
+
+# --- the stripe -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StripeModel:
+    """The stripe on a diffuse plate square to the laser's axis.
+
+    ``sigma_px`` is the image's standard deviation across, ``blur_px`` the lens's part of it; ``rate_e_per_ms`` is the
+    brightest pixel's, ``background_e_per_ms`` what other light adds to it.
+    """
+
+    sigma_px: Array
+    blur_px: Array
+    rate_e_per_ms: Array
+    background_e_per_ms: Array
+
+
+def stripe_at(
+    xp: ModuleType,
+    p: SensorArrays,
+    pose: LaserFan,
+    window: WindowGeometry,
+    point: Vector,
+    view: ImagePoints,
+    *,
+    reflectance: float,
+) -> StripeModel:
+    """The stripe at points of the sheet.
+
+    Across the sheet the light is a Gaussian of standard deviation w / 2 with w^2 = w0^2 (1 + ((s - s0) / zR)^2)
+    (Siegman, Lasers, Eqs. 17.5 and 17.6). The lens's pupil of radius R blurs what is out of focus evenly over a disc,
+    whose standard deviation in one direction is R / 2; a pupil offset b shifts the image by b / a - ds/dP b, a being
+    the focus distance and ds/dP how the image moves with the point. Light that the medium scatters counts as lost.
+    """
+    xa, xb, ya, yb = view.jacobian
+    across = p.across((xa, ya)), p.across((xb, yb))
+    from_laser = added(point, scaled(pose.origin, -1.0))
+    away = xp.sqrt(dot(from_laser, from_laser))
+    rayleigh = math.pi * p.waist_mm * p.waist_mm * p.medium_index / (p.beam_quality * p.wavelength_mm)
+    sheet = 0.5 * p.waist_mm * xp.sqrt(1 + ((away - p.waist_distance_mm) / rayleigh) ** 2)
+    # On a profile line, where the pixel along the stripe is given.
+    by_x, by_y = (pixels_per_mm(view, window, direction) for direction in (pose.normal, pose.fan))
+    thick = abs(p.across(by_x) - p.across(by_y) * p.along(by_x) / p.along(by_y)) * sheet
+
+    number = p.working_f_number()
+    radius = 0.5 * p.focal_mm / number
+    shifts = []
+    for axis in range(2):
+        unit = tuple(1.0 + 0.0 * radius if k == axis else 0.0 * radius for k in range(3))
+        change = slopes_per_mm(view, window, unit)
+        shifts.append(sum(a * ((1 / p.focus_mm if k == axis else 0.0) - change[k]) for k, a in enumerate(across)))
+    defocus = 0.5 * radius * xp.sqrt(shifts[0] ** 2 + shifts[1] ** 2 + 1e-24)
+    diffraction = _DIFFRACTION * p.wavelength_mm * number / p.pixel_mm
+    blur = xp.sqrt(defocus * defocus + diffraction * diffraction)
+    sigma = xp.sqrt(thick * thick + blur * blur + 1 / 12)
+
+    laser_window = p.laser_window(pose.axis)
+    fan = path_to(xp, laser_window, from_laser)
+    side = dot(from_laser, pose.fan)
+    angle = xp.atan(fan.slope) * side / xp.sqrt(side * side + 1e-18)
+    lit = _lit(xp, p, angle)
+    per_mm = p.power_w * lit / (2 * p.fan_half_rad) / ((1 + fan.slope * fan.slope) * fan.growth_mm)
+    back = length_outside_mm(xp, window, view.path)
+    passed = xp.exp(-p.extinction_per_mm * (length_outside_mm(xp, laser_window, fan) + back))
+    on_surface = per_mm / (math.sqrt(2 * math.pi) * sheet) * p.laser_window_passes(xp) * passed
+    a, b = view.slopes
+    cosine_squared = 1 / (1 + a * a + b * b)
+    lens = math.pi / 4 / (number * number) * cosine_squared * cosine_squared
+    per_radiance = lens * p.window_passes(xp) / (p.medium_index * p.medium_index)
+    pixel_area = p.pixel_mm * p.pixel_mm / p.pixel_aspect
+    electrons = 1e-3 * pixel_area * 1e-3 * p.wavelength_mm / PLANCK_TIMES_LIGHT * p.quantum_efficiency
+    rate = on_surface * reflectance / math.pi * per_radiance * electrons * thick / sigma
+    ambient = p.ambient_w_per_mm2 * reflectance / math.pi * per_radiance * electrons
+    ambient = ambient * xp.exp(-p.extinction_per_mm * back)
+    return StripeModel(sigma, blur, rate, ambient)
+
+
+def centre_noise_px(xp: ModuleType, p: SensorArrays, stripe: StripeModel, exposure_ms: Array) -> Array:
+    """Standard uncertainty of the stripe's centre in px, found by a fit that weighs pixels by their noise.
+
+    With the mean signal m = A exp(-x^2 / 2 s^2), its derivative m' and weights m' / W the fit's variance is
+    sum(m'^2 V / W^2) / sum(m'^2 / W)^2. V is the pixels' variance, m + (C m)^2 + read, dark, background and rounding
+    noise: photons and speckle, whose contrast C allows for what neighbours have in common. W is what the fit takes for
+    V: it knows of no neighbours, and adds how far real profiles may be from Gaussian ones, without which the dark
+    flanks of a stripe under pure speckle would count ever more.
+    """
+    height = stripe.rate_e_per_ms * exposure_ms
+    true, taken = p.centre_contrast(xp, stripe.sigma_px) ** 2 + p.prnu**2, p.pixel_contrast(xp) ** 2 + p.prnu**2
+    floor = p.read_noise_e**2 + p.offset_e**2 + p.step_e**2 / 12
+    floor = floor + (p.dark_e_per_ms + stripe.background_e_per_ms) * exposure_ms
+    information, noise = 0.0 * height, 0.0 * height
+    width = _FLANK / _NODES
+    for node in range(_NODES):
+        t = (node + 0.5) * width
+        signal = height * math.exp(-0.5 * t * t)
+        weight = 1 / (floor + (_UNMODELLED * height) ** 2 + signal + taken * signal**2)
+        slope = t * t * signal * signal
+        information = information + slope * weight
+        noise = noise + slope * weight * weight * (floor + signal + true * signal**2)
+    return xp.sqrt(stripe.sigma_px * noise / (2 * width * information * information + 1e-30))
+
+
+def exposure_ms(xp: ModuleType, p: SensorArrays, brightest_e_per_ms: Array) -> tuple[Array, Array]:
+    """Exposure that brings the brightest light to the wanted level, and the exposure that the sensor then uses."""
+    level = p.exposure_level * p.full_well_e / (1 + _BRIGHT_LINES * p.pixel_contrast(xp))
+    required = level / brightest_e_per_ms
+    automatic = xp.minimum(required, p.longest_ms)
+    return required, where(xp, xp.isnan(p.exposure_ms), automatic, p.exposure_ms)
+
+
+def _lit(xp: ModuleType, p: SensorArrays, angle: Array) -> Array:
+    """Power per angle over the mean one; 0 outside the fan where that is not needed smooth."""
+    gauss = xp.exp(-2 * (angle / p.fan_half_rad) ** 2) * 2 / (math.sqrt(math.pi / 2) * math.erf(math.sqrt(2)))
+    lit = p.gaussian_fan * gauss + (1 - p.gaussian_fan) * (1 - p.tabulated_fan)
+    nodes, powers = p.fan_nodes_rad, p.fan_powers
+    if len(nodes) > 1:
+        # Between the nodes of a table: a sum of ramps that begin at the nodes.
+        total, slope_before = powers[0] + 0.0 * angle, 0.0
+        for k in range(len(nodes) - 1):
+            slope = (powers[k + 1] - powers[k]) / xp.maximum(nodes[k + 1] - nodes[k], 1e-12)
+            total = total + (slope - slope_before) * xp.maximum(angle - nodes[k], 0.0)
+            slope_before = slope
+        lit = lit + p.tabulated_fan * 2 * p.fan_half_rad * xp.maximum(total, 0.0)
+    return lit
+
+
+# --- the measuring volume ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Field:
+    """Quantities over the measuring volume, arrays that go with (N, DEPTHS, PLACES).
+
+    ``y_mm`` and ``z_mm`` are coordinates in the sheet about the stand-off. The sigmas are standard uncertainties by the
+    stripe's noise. ``lit`` is where the fan has a line in view of the image's other sides, ``in_view`` where the
+    camera sees it.
+    """
+
+    y_mm: Array
+    z_mm: Array
+    half_line_mm: Array
+    sigma_y_mm: Array
+    sigma_z_mm: Array
+    depth_per_px_mm: Array
+    along_per_px_mm: Array
+    centre_px: Array
+    stripe_px: Array
+    blur_px: Array
+    signal_e: Array
+    occlusion_rad: Array
+    lit: Array
+    in_view: Array
+    exposure_ms: Array
+    required_ms: Array
+
+
+def depths_in_view(xp: ModuleType, p: SensorArrays) -> tuple[Array, Array]:
+    """Beginning and end of the part of the measuring volume that the camera sees, in the middle of the line.
+
+    Depths from the window's outer face. Where the sheet leaves the image follows from Newton's method in the inverse of
+    the depth, in which the pixel is nearly linear (exactly so without a window).
+    """
+    pose, window, lens = p.pose(xp), p.window(xp), p.lens()
+    standoff, outer = standoff_mm(pose), p.outer_mm(xp)
+    ends = []
+    for edge in (-0.5, p.across((p.width_px, p.height_px)) - 0.5):
+        inverse = 1 / standoff
+        for _ in range(_EDGE_STEPS):
+            depth = 1 / inverse
+            middle = scaled(pose.axis, (depth - standoff) / pose.axis[2])
+            view = seen(xp, lens, window, added((0.0 * standoff, 0.0 * standoff, standoff), middle))
+            by_z = pixels_per_mm(view, window, pose.axis)
+            change = -(depth**2) / pose.axis[2] * p.across(by_z)
+            inverse = inverse + (edge - p.across((view.x, view.y))) / change
+            inverse = xp.minimum(xp.maximum(inverse, 1 / _FARTHEST_MM), 1 / (outer + _NEAREST_MM))
+        ends.append(1 / inverse - outer)
+    near, far = xp.minimum(ends[0], ends[1]), xp.maximum(ends[0], ends[1])
+    return xp.maximum(p.near_mm, near), xp.minimum(p.far_mm, far)
+
+
+def field_of(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Array, *, reflectance: float) -> Field:
+    """Designs' sheets at depths from the window's outer face and ``places`` (-1 to 1) along the stripe.
+
+    A stripe's centre that is off by d px on its profile line is a point of the sheet that is off by (dY, dZ) =
+    J^-1 (d, 0), J being how the pixel across and along the stripe changes with Y and Z.
+    """
+    pose, window, lens = p.pose(xp), p.window(xp), p.lens()
+    standoff = standoff_mm(pose)
+    z = (p.outer_mm(xp) + depth_mm - standoff) / pose.axis[2]
+    middle = added((0.0 * standoff, 0.0 * standoff, standoff), scaled(pose.axis, z))
+
+    def at(y: Array) -> Vector:
+        return added(middle, scaled(pose.fan, y))
+
+    ends = []
+    for edge in (-0.5, p.along((p.width_px, p.height_px)) - 0.5):
+        y = 0.0 * z
+        for _ in range(_EDGE_STEPS):
+            view = seen(xp, lens, window, at(y))
+            y = y + (edge - p.along((view.x, view.y))) / p.along(pixels_per_mm(view, window, pose.fan))
+        ends.append(y)
+    laser_window = p.laser_window(pose.axis)
+    from_origin = added(middle, scaled(pose.origin, -1.0))
+    offset, height = dot(from_origin, pose.fan), dot(from_origin, pose.axis)
+    edges = [across_mm(xp, laser_window, height, xp.tan(angle)) - offset for angle in (p.lit_from_rad, p.lit_to_rad)]
+    low = xp.maximum(xp.minimum(ends[0], ends[1]), edges[0])
+    high = xp.minimum(xp.maximum(ends[0], ends[1]), edges[1])
+    half = 0.5 * (high - low)
+    y = 0.5 * (high + low) + half * places
+
+    point = at(y)
+    view = seen(xp, lens, window, point)
+    by_y, by_z = pixels_per_mm(view, window, pose.fan), pixels_per_mm(view, window, pose.axis)
+    determinant = p.across(by_y) * p.along(by_z) - p.across(by_z) * p.along(by_y)
+    stripe = stripe_at(xp, p, pose, window, point, view, reflectance=reflectance)
+    u = p.across((view.x, view.y))
+    lit = (half > 0) & (height > laser_window.outer_mm) & xp.isfinite(u)
+    inside = lit & (u >= -0.5) & (u <= p.across((p.width_px, p.height_px)) - 0.5)
+    rate = where(xp, lit, stripe.rate_e_per_ms, 0.0)
+    # Of one design, as it is derived, all points stand in one row.
+    brightest = xp.max(rate, axis=(1, 2))[:, None, None] if len(rate.shape) == 3 else xp.max(rate)
+    brightest = where(xp, brightest > 0, brightest, math.nan)
+    required, used = exposure_ms(xp, p, brightest)
+    noise = centre_noise_px(xp, p, stripe, used)
+    from_laser = direction_outside(xp, laser_window, path_to(xp, laser_window, added(point, scaled(pose.origin, -1.0))))
+    chord = added(direction_outside(xp, window, view.path), scaled(from_laser, -1.0))  # of unit vectors
+    return Field(
+        y_mm=y,
+        z_mm=z,
+        half_line_mm=half,
+        sigma_y_mm=noise * abs(p.along(by_z) / determinant),
+        sigma_z_mm=noise * abs(p.along(by_y) / determinant),
+        depth_per_px_mm=abs(p.along(by_y) / determinant),
+        along_per_px_mm=1 / abs(p.along(by_y)),
+        centre_px=noise,
+        stripe_px=stripe.sigma_px,
+        blur_px=stripe.blur_px,
+        signal_e=stripe.rate_e_per_ms * used,
+        occlusion_rad=2 * xp.asin(xp.minimum(0.5 * xp.sqrt(dot(chord, chord) + 1e-24), 1.0)),
+        lit=lit,
+        in_view=inside,
+        exposure_ms=used,
+        required_ms=required,
+    )
+
+
+def _figure(words: str, unit: str = "mm") -> Any:
+    """A field of `Figures`, with its words and its unit on pages."""
+    return field(metadata={"words": words, "unit": unit})
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Figures of merit of N designs, one array (N,) each.
+
+    Depths are counted along the camera's axis from the window's outer face. Sigmas are standard uncertainties: the
+    largest in the part of the measuring volume that the camera sees, and ``sigma_z_rms_mm`` the root mean square over
+    it; near, middle and far are the ends and the middle of that part. Z runs along the laser's axis, Y along the
+    stripe, X across the sheet, along the stage. Sigma X comes from the stage's resolution alone, the others from the
+    stripe's noise; what is given per pixel holds in the middle of the volume.
+    """
+
+    sigma_x_mm: np.ndarray = _figure("σ X, by the stage")
+    sigma_y_mm: np.ndarray = _figure("σ Y, largest in the volume")
+    sigma_z_mm: np.ndarray = _figure("σ Z, largest in the volume")
+    sigma_z_rms_mm: np.ndarray = _figure("σ Z, rms over the volume")
+    sigma_z_near_mm: np.ndarray = _figure("σ Z at the near end")  # root mean squares along the stripe
+    sigma_z_middle_mm: np.ndarray = _figure("σ Z in the middle")
+    sigma_z_far_mm: np.ndarray = _figure("σ Z at the far end")
+    depth_per_px_mm: np.ndarray = _figure("depth per pixel", "mm/px")
+    along_per_px_mm: np.ndarray = _figure("length along the stripe per pixel", "mm/px")
+    coverage: np.ndarray = _figure("share of the volume in reach", "")  # of camera and laser
+    standoff_mm: np.ndarray = _figure("stand-off")  # where the sheet crosses the camera's axis
+    near_mm: np.ndarray = _figure("near end of the volume")
+    far_mm: np.ndarray = _figure("far end of the volume")
+    depth_mm: np.ndarray = _figure("depth of the volume")
+    line_near_mm: np.ndarray = _figure("line length at the near end")
+    line_mm: np.ndarray = _figure("line length in the middle")
+    line_far_mm: np.ndarray = _figure("line length at the far end")
+    section_cm2: np.ndarray = _figure("area of the sheet in the volume", "cm²")  # that the camera sees
+    # Largest angle between laser's and camera's rays: steeper walls hide one from the other.
+    occlusion_deg: np.ndarray = _figure("occlusion angle, largest", "°")
+    signal_e: np.ndarray = _figure("faintest signal", "e⁻")
+    exposure_ms: np.ndarray = _figure("exposure", "ms")  # as used
+    required_ms: np.ndarray = _figure("exposure required", "ms")  # that the wanted brightness takes
+    stripe_px: np.ndarray = _figure("width of the stripe's image (σ)", "px")  # largest in the volume, as the next two
+    blur_px: np.ndarray = _figure("the lens's blur (σ)", "px")
+    centre_px: np.ndarray = _figure("σ of the stripe's centre", "px")
+    speckle_limit_mm: np.ndarray = _figure("speckle limit of Z")  # Dorsch's, in the middle, for depolarised light
+    laser_class: np.ndarray = _figure("laser class", "")  # number after IEC 60825-1, see `CLASS_NAMES`, `laser_class`
+    window_mm: np.ndarray = _figure("window thickness needed")  # for the pressure at the study's depth
+    baseline_mm: np.ndarray = _figure("width of the sensor")
+
+
+FIGURES: dict[str, tuple[str, str]] = {
+    one.name: (one.metadata["words"], one.metadata["unit"]) for one in fields(Figures)
+}
+"""Words and unit of every figure of merit, by its name."""
+
+
+def scatter_at(p: SensorArrays, z_mm: np.ndarray, half_line_mm: np.ndarray, *, reflectance: float) -> np.ndarray:
+    """Root mean square of sigma Z (K,) along the stripe of one design, where Z is ``z_mm`` (K,), from the stand-off on.
+    The stripe is counted up to ``half_line_mm`` (K,) on both sides, or as far as it is in view."""
+    with np.errstate(all="ignore"):
+        pose = p.pose(np)
+        depth = standoff_mm(pose) - p.outer_mm(np) + pose.axis[2] * z_mm.reshape(1, -1, 1)
+        places = np.linspace(-1, 1, 2 * PLACES + 1).reshape(1, 1, -1) * (1 - 1e-9)
+        f = field_of(np, p, depth, places, reflectance=reflectance)
+    counts = f.in_view & (np.abs(f.y_mm) <= half_line_mm.reshape(1, -1, 1) + 1e-9)
+    squares = np.where(counts, f.sigma_z_mm**2, 0.0)
+    return np.sqrt(squares.sum(axis=2) / np.maximum(counts.sum(axis=2), 1))[0]
+
+
+def figures_of(
+    p: SensorArrays, *, reflectance: float, water_depth_m: float, follow: Sequence[Follow] = ()
+) -> tuple[Figures, list[str]]:
+    """Figures of N designs, and why each of those fails that cannot work ("" for the others, whose figures hold)."""
+    if not 0 < reflectance <= 1:
+        raise RangeError(f"reflectance is {reflectance:g}; expected a number above 0, up to 1")
+    with np.errstate(all="ignore"):
+        over_volume = _over_volume if p.baseline_mm.size < _MANY else _compiled_over_volume
+        followers, near, far, field = over_volume(np, p, tuple(follow), reflectance)
+        p, f = replace(p, **followers), Field(**field)
+        shape = np.broadcast_shapes(f.sigma_z_mm.shape, (p.near_mm.size, DEPTHS, PLACES))
+        full = {name: np.broadcast_to(np.asarray(values, dtype=float), shape) for name, values in vars(f).items()}
+        figures = _reduced(p, full, (far - near) / (p.far_mm - p.near_mm), water_depth_m=water_depth_m)
+        reasons = _reasons(p, figures, full)
+    return figures, reasons
+
+
+_SHARES = np.linspace(0, 1, DEPTHS).reshape(1, -1, 1)
+_PLACES = np.linspace(-1, 1, PLACES).reshape(1, 1, -1) * (1 - 1e-9)
+
+
+def _over_volume(
+    xp: ModuleType,
+    p: SensorArrays,
+    follow: tuple[Follow, ...],
+    reflectance: float,
+    shares: Array = _SHARES,
+    places: Array = _PLACES,
+) -> tuple[dict[str, Array], Array, Array, dict[str, Array]]:
+    """What follows the stand-off, the ends of the volume in view, and the `Field` over it; tables of arrays by name."""
+    followers = following(xp, p, follow)
+    p = replace(p, **followers)
+    near, far = depths_in_view(xp, p)
+    field = field_of(xp, p, near + (far - near) * shares, places, reflectance=reflectance)
+    return followers, near, far, vars(field)
+
+
+def _compiled_over_volume(
+    xp: ModuleType, p: SensorArrays, follow: tuple[Follow, ...], reflectance: float
+) -> tuple[dict[str, Array], Array, Array, dict[str, Array]]:
+    """The same by Dr.Jit in a fifth of the time, for two designs or more, in one thread: sweeps have one per core.
+
+    What Dr.Jit records holds for one number of designs and none else, so that they go in blocks of one size, the last
+    one filled up with the last design.
+    """
+    prepare_llvm()
+    import drjit as dr
+    from drjit.llvm import TensorXf64
+
+    def converted(values: Array) -> Array:
+        return tuple(map(converted, values)) if isinstance(values, tuple) else TensorXf64(_aligned(values))
+
+    designs = p.baseline_mm.size
+    over_volume, at = _frozen(follow, reflectance), (converted(_SHARES), converted(_PLACES))
+    blocks: list[tuple[dict[str, Array], ...]] = []
+    with threads_kept():
+        dr.set_thread_count(1)
+        for first in range(0, designs, _BLOCK):
+            block = p.at(np.minimum(np.arange(first, first + _BLOCK), designs - 1))
+            followers, near, far, field = over_volume({n: converted(values) for n, values in vars(block).items()}, *at)
+            tables = followers, {"near": near, "far": far}, field
+            blocks.append(tuple({name: array.numpy() for name, array in table.items()} for table in tables))
+    followers, ends, field = (
+        {name: np.concatenate([table[name] for table in parts])[:designs] for name in parts[0]}
+        for parts in zip(*blocks, strict=True)
+    )
+    return followers, ends["near"], ends["far"], field
+
+
+def _aligned(values: np.ndarray) -> np.ndarray:
+    """A copy at a multiple of 64 bytes: for every other mix of aligned arrays Dr.Jit would compile its kernels anew."""
+    room = np.empty(values.size + 8)
+    first = -room.ctypes.data % 64 // 8
+    copy = room[first : first + values.size].reshape(values.shape)
+    copy[...] = values
+    return copy
+
+
+@cache
+def _frozen(follow: tuple[Follow, ...], reflectance: float) -> Callable[..., Any]:
+    """`_over_volume`, whose operations Dr.Jit records at the first call and replays for other numbers."""
+    import drjit as dr
+
+    return dr.freeze(lambda given, *at: _over_volume(dr, SensorArrays(**given), follow, reflectance, *at))
+
+
+def _each(values: Array, designs: int) -> np.ndarray:
+    """One number (N,) per design."""
+    return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (designs,)).copy()
+
+
+def _reduced(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray, *, water_depth_m: float) -> Figures:
+    """Figures of N designs from their fields (N, DEPTHS, PLACES) and the share of the volume's depth in view."""
+    n, middle, inside = len(f["z_mm"]), DEPTHS // 2, f["lit"] > 0
+    one = partial(_each, designs=n)
+
+    def worst(name: str) -> np.ndarray:
+        return np.where(inside, f[name], -np.inf).max(axis=(1, 2))
+
+    def rms(values: np.ndarray, where: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.where(where, values**2, 0.0).sum(axis=-1) / where.sum(axis=-1))
+
+    per_depth = rms(f["sigma_z_mm"], inside)
+    line = np.where(inside.any(axis=2), 2 * f["half_line_mm"][:, :, 0], 0.0)
+    at, pose = (slice(None), middle, PLACES // 2), p.pose(np)
+    speckle_px = p.speckle_coherence / math.sqrt(2) * p.wavelength_mm * p.working_f_number() / math.pi / p.pixel_mm
+    return Figures(
+        **{name: worst(name) for name in ("sigma_y_mm", "sigma_z_mm", "stripe_px", "blur_px", "centre_px")},
+        **{name: f[name][at] for name in ("depth_per_px_mm", "along_per_px_mm")},
+        **{name: f[name][:, 0, 0] for name in ("exposure_ms", "required_ms")},
+        sigma_x_mm=one(p.stage_resolution_mm / math.sqrt(12)),
+        sigma_z_rms_mm=rms(f["sigma_z_mm"].reshape(n, -1), inside.reshape(n, -1)),
+        sigma_z_near_mm=per_depth[:, 0],
+        sigma_z_middle_mm=per_depth[:, middle],
+        sigma_z_far_mm=per_depth[:, -1],
+        coverage=one(np.maximum(share, 0.0)) * inside.mean(axis=(1, 2)),
+        standoff_mm=one(standoff_mm(pose) - p.outer_mm(np)),
+        near_mm=one(p.near_mm),
+        far_mm=one(p.far_mm),
+        depth_mm=one(p.far_mm - p.near_mm),
+        line_near_mm=line[:, 0],
+        line_mm=line[:, middle],
+        line_far_mm=line[:, -1],
+        section_cm2=0.01 * np.trapezoid(line, f["z_mm"][:, :, 0], axis=1),
+        occlusion_deg=np.degrees(worst("occlusion_rad")),
+        signal_e=np.where(inside, f["signal_e"], np.inf).min(axis=(1, 2)),
+        speckle_limit_mm=one(speckle_px) * f["depth_per_px_mm"][at],
+        laser_class=one(laser_class(p)),
+        window_mm=one(window_needed_mm(p, water_depth_m=water_depth_m)),
+        baseline_mm=one(np.hypot(*pose.origin[:2])),
+    )
+
+
+def _reasons(p: SensorArrays, figures: Figures, f: dict[str, np.ndarray]) -> list[str]:
+    """The first reason why each of N designs cannot work, "" for those that can."""
+    n = len(figures.coverage)
+    one = partial(_each, designs=n)
+    corner = np.hypot(p.width_px, p.height_px / p.pixel_aspect) / 2 * p.pixel_mm / p.focal_mm
+    glass = corner / snell_root(np, p.window_index, corner)
+    cone = one(2 * (corner * p.window_distance_mm + p.window_thickness_mm * glass) + p.focal_mm / p.f_number)
+    spread = np.tan(p.fan_half_rad)
+    inside = spread / snell_root(np, p.laser_window_index, spread)
+    fan = one(2 * (spread * p.laser_window_distance_mm + inside * p.laser_window_thickness_mm))
+    fullest = np.where(f["lit"] > 0, f["signal_e"], 0.0).max(axis=(1, 2)) / one(p.full_well_e)
+    numbers = {
+        "crossing": -figures.standoff_mm,
+        "begins": -figures.near_mm,
+        "cone": cone,
+        "fan": fan,
+        "fullest": fullest,
+    }
+    flat = np.fmax(figures.depth_per_px_mm, figures.along_per_px_mm)
+    checks = {
+        "the lens would be focused within its focal length": one(p.focus_mm - p.focal_mm) <= 0,
+        "the sheet crosses the camera's axis {crossing:.0f} mm behind the window's outer face, not in front of it": (
+            ~(figures.standoff_mm > 0) | ~(figures.standoff_mm < 1e5)
+        ),
+        "the measuring volume would begin {begins:.0f} mm behind the window's outer face": ~(figures.near_mm > 0),
+        "the cone of view is {cone:.0f} mm wide at the window's outer face, wider than its opening": (
+            cone > one(p.window_aperture_mm)
+        ),
+        "the laser's fan is {fan:.0f} mm wide at its window, wider than its opening": (
+            fan > one(p.laser_window_aperture_mm)
+        ),
+        "camera and laser reach no point of the measuring volume": ~(figures.coverage > 0),
+        "the stripe saturates: at the given exposure it has {fullest:.1f} times the full well": fullest > 1,
+        "the stripe hardly moves with depth, or runs along the image's other side: turn the camera or the laser": (
+            ~(flat < 0.5 * figures.standoff_mm)
+        ),
+    }
+    reasons = [""] * n
+    for text, failed in checks.items():
+        for i in np.flatnonzero(failed):
+            reasons[i] = reasons[i] or text.format(**{name: values[i] for name, values in numbers.items()})
+    return reasons
+
+
+CLASS_NAMES = {1: "1", 2: "2", 3: "3R", 4: "3B", 5: "4"}
+_PUPIL_MM, _AWAY_MM = 7.0, 100.0
+_CLASS_2_W, _CLASS_3R_W, _CLASS_3B_W = 1e-3, 5e-3, 0.5
+
+_GRAVITY, _WATER_KG_PER_M3 = 9.81, 1030.0
+_SILICA_STRENGTH_MPA, _CLAMPED, _SAFETY = 60.0, 0.75, 4.0
+
+
+def laser_class(p: SensorArrays) -> np.ndarray:
+    """Class after IEC 60825-1:2014 as a number, see `CLASS_NAMES`: an estimate for a design, not a classification.
+
+    Limits for continuous visible light from a point source (Tables 3 to 8): class 1 up to 0.39 mW above 500 nm,
+    0.039 mW below 450 nm and C3 = 10^(0.02 (nm - 450)) times that between; class 2 up to 1 mW, 3R up to 5 mW, 3B up to
+    500 mW. What counts is the power through 7 mm at 100 mm from the line optics (condition 3), of a line that is
+    spread by its fan in air, where the fan is brightest per angle. Every laser counts alone.
+    """
+    seen = 2 * math.atan(0.5 * _PUPIL_MM / _AWAY_MM) / (2 * p.fan_half_rad)
+    gaussian = 2 / (math.sqrt(math.pi / 2) * math.erf(math.sqrt(2)))
+    tabulated = 2 * p.fan_half_rad * np.maximum.reduce(p.fan_powers)
+    peak = np.where(p.gaussian_fan > 0, gaussian, np.where(p.tabulated_fan > 0, tabulated, 1.0))
+    power = p.power_w * np.minimum(1.0, peak * seen)
+    nm = 1e6 * p.wavelength_mm
+    class_1 = 3.9e-5 * 10 ** (0.02 * (np.clip(nm, 450, 500) - 450))
+    limits = (class_1, _CLASS_2_W, _CLASS_3R_W, _CLASS_3B_W)
+    return np.sum([power > limit for limit in limits], axis=0) + 1
+
+
+def window_needed_mm(p: SensorArrays, *, water_depth_m: float) -> np.ndarray:
+    """Thickness of a clamped round window of fused silica, t = A / 2 sqrt(K f P / S) (Harris 1999, thesis Eq. 3.2)."""
+    pressure_mpa = 1e-6 * _GRAVITY * _WATER_KG_PER_M3 * water_depth_m
+    opening = np.where(np.isfinite(p.window_aperture_mm), p.window_aperture_mm, 0.0)
+    return 0.5 * opening * math.sqrt(_CLAMPED * _SAFETY * pressure_mpa / _SILICA_STRENGTH_MPA)

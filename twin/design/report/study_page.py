@@ -1,0 +1,126 @@
+"""Page of a study: what was asked, and which design to build; one HTML file that loads nothing from the network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+
+from markupsafe import Markup
+
+from twin.design.choice import Judged
+from twin.design.designs import Columns, Marked
+from twin.design.report import charts, drawing
+from twin.design.report import study_tables as tables
+from twin.design.study import Study
+from twin.design.verification import Agreement
+from uwlts._version import __version__
+from uwlts.errors import Error
+from uwlts.pages.toolkit import FigureCollector, render_page, svg_of
+
+_BEST = 20
+"""Designs in the table of the best."""
+_DRAWN = (
+    "Lengths in mm, both views at one scale. Left: along the sheet; the camera's view in blue, the sheet in red, thick "
+    "where the camera sees it within the measuring volume (tinted). Right: onto the sheet; the laser's fan, the "
+    "image's border in blue, and the line's length. Windows and rays are to scale, the housings only hint at where "
+    "they are."
+)
+
+
+def page_text(
+    study: Study,
+    columns: Columns,
+    *,
+    marked: Sequence[Marked],
+    agreements: Sequence[Agreement],
+    notes: Sequence[str] = (),
+) -> str:
+    """The page of a study as HTML, from all its judged designs (none where ``columns`` is empty).
+
+    ``marked`` are designs to point out, the chosen one last; ``agreements`` compare formulas and rendering of each
+    rendered design, ``notes`` are sentences for the page's head. EvaluationError where the columns are of another
+    study.
+    """
+    judged, collected = Judged(study, columns), FigureCollector()
+    over_free_title, over_free = _over_what_is_free(judged, marked)
+    nothing = "" if judged.works.any() else "None of the designs works: see the reasons below."
+    pareto, parallel = charts.pareto_chart(judged, marked), charts.parallel_chart(judged)
+    return render_page(
+        "twin.design.report",
+        "template.html.j2",
+        interactive=collected,
+        title=study.title,
+        introduction=tables.introduction(judged),
+        notes=list(notes),
+        label=marked[-1].label if marked else "",
+        chosen=tables.tiles(study, marked[-1], marked[0] if len(marked) > 1 else None) if marked else None,
+        drawing=_drawing(study, marked),
+        over_free=over_free,
+        over_free_title=over_free_title,
+        pareto=pareto and collected.add(*pareto),
+        parallel=parallel and collected.add(*parallel),
+        nothing=nothing if len(judged) else "No design has been judged.",
+        number=tables.number_text,
+        value=tables.value_text,
+        verdicts=[
+            (found, tables.agreement_text(study, found), _shown(charts.verification_chart(found)))
+            for found in agreements
+        ],
+        best=_best(judged),
+        failures=tables.failure_counts(judged),
+        misses=tables.miss_counts(judged),
+        working=int(judged.works.sum()),
+        version=__version__,
+    )
+
+
+def _shown(drawn: charts.Static | None) -> tuple[Markup, str] | None:
+    return drawn and (svg_of(drawn[0]), drawn[1])
+
+
+def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Markup | None, str]:
+    """The chosen design's drawing and what it shows, or why there is none."""
+    if not marked:
+        return None, "There is no design to draw."
+    chosen, base = marked[-1], marked[0]
+    try:
+        views = drawing.views_of(chosen.sensor, study.medium_of(chosen.sensor))
+    except Error as error:
+        return None, f"The design cannot be drawn: {error}."
+    other = None
+    if base is not chosen:
+        with suppress(Error):
+            other = drawing.views_of(base.sensor, study.medium_of(base.sensor))
+    figure, with_other = drawing.draw(*views, other)
+    return svg_of(figure), _DRAWN + (f" Dashed grey behind: {base.label}." if with_other else "")
+
+
+def _over_what_is_free(judged: Judged, marked: Sequence[Marked]) -> tuple[str, tuple[Markup, str] | None]:
+    """Title of the chart that suits what is free, and the chart; None where no design works."""
+    ranges = [name for name, variable in judged.study.variables.items() if variable.values is None][:2]
+    title = f"Figures over {' and '.join(map(tables.words_of, ranges))}" if ranges else "Figures of the choices"
+    if not judged.works.any():
+        return title, None
+    match ranges:
+        case [x, y]:
+            return title, _shown(charts.contours(judged, marked, x, y))
+        case [x]:
+            return title, _shown(charts.curves(judged, marked, x))
+        case _:
+            return title, _shown(charts.bars(judged))
+
+
+def _best(judged: Judged) -> tuple[list[str], list[list[str]]]:
+    """Head and rows of the table of the best designs."""
+    study = judged.study
+    more = ("sigma_z_rms_mm", "line_mm", "depth_mm", "standoff_mm", "required_ms", "laser_class")
+    figures = dict.fromkeys([*study.wanted(), *more])
+    names = list(dict.fromkeys([*study.free(), *(name for name in figures if name in judged.columns)]))
+    missed = not judged.feasible.any()
+    rows = [
+        [str(judged.columns["design"][place])]
+        + [tables.text_at(judged, name, place, unit=False) for name in names]
+        + ([f"{judged.figure('violation')[place]:.3g}"] if missed else [])
+        for place in (judged.best_first[:_BEST] if len(judged) else [])
+    ]
+    return ["design", *map(tables.label_of, names), *(["constraints missed by"] if missed else [])], rows

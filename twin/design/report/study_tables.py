@@ -1,0 +1,255 @@
+"""Texts, numbers and tables of a study's page: names, tiles, judged designs, and verdicts of the verification."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from twin.design.choice import Judged
+from twin.design.designs import Marked
+from twin.design.figures_of_merit import CLASS_NAMES, FIGURES
+from twin.design.study import Study, Variable
+from twin.design.verification import Agreement
+from twin.scene.paths import Value
+from uwlts.pages.toolkit import Tile
+
+MISSING = "\N{EN DASH}"
+
+_WHOLE = {
+    "width_px": ("image width", "px"),
+    "height_px": ("image height", "px"),
+    "f_number": ("f-number", ""),
+    "beam_quality_m2": ("beam quality M²", ""),
+    "quantum_efficiency": ("quantum efficiency", ""),
+    "prnu": ("PRNU", ""),
+    "bow_deg": ("bow", "°"),
+}
+_UNITS = {
+    "_w_per_m2": "W/m²",
+    "_e_per_s": "e⁻/s",
+    "_per_million": "per million",
+    "_per_m": "1/m",
+    "_g_kg": "g/kg",
+    "_um": "µm",
+    "_mw": "mW",
+    "_deg": "°",
+    "_us": "µs",
+    "_hz": "Hz",
+    "_dn": "DN",
+    "_e": "e⁻",
+    "_c": "°C",
+    "_k": "K",
+} | {f"_{unit}": unit for unit in ("mm", "nm", "px", "ms", "s", "m")}
+"""Units by the ends of names; the first that fits counts."""
+
+
+def words_and_unit(name: str) -> tuple[str, str]:
+    """A figure's, a path's or a choice's name in words, and its unit ("" if it has none)."""
+    if name in FIGURES:
+        return FIGURES[name]
+    *parents, key = name.split(".")
+    if not parents:
+        return key.replace("_", " "), ""
+    ending = next((ending for ending in _UNITS if key.endswith(ending)), "")
+    words, unit = _WHOLE.get(key, (key.removesuffix(ending), _UNITS.get(ending, "")))
+    return " ".join([*parents, words]).replace("_", " "), unit
+
+
+def words_of(name: str) -> str:
+    """A name in words, without its unit."""
+    return words_and_unit(name)[0]
+
+
+def label_of(name: str) -> str:
+    """A name in words with its unit, as an axis has it."""
+    words, unit = words_and_unit(name)
+    return f"{words} ({unit})" if unit else words
+
+
+def number_text(value: float | None, digits: int = 4) -> str:
+    """A number with some significant digits and a proper minus sign; a dash for what is missing or not finite."""
+    if value is None or not math.isfinite(value):
+        return MISSING
+    if float(value).is_integer() and abs(value) < 1e6:
+        text = f"{value:.0f}"
+    else:
+        text = f"{value:.{digits}g}"
+        # Scientific notation is for what no sensor has.
+        if "e" in text and 1e-6 < abs(value) < 1e9:
+            text = f"{value:.0f}" if abs(value) >= 1 else f"{value:.{digits + 5}f}".rstrip("0")
+    return text.replace("-", "\N{MINUS SIGN}")
+
+
+def value_text(name: str, value: Value | None, *, unit: bool = True) -> str:
+    """A value of a figure or of something free, with its unit."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        return MISSING
+    if isinstance(value, str):
+        return value
+    if name == "laser_class" and math.isfinite(value):
+        return CLASS_NAMES.get(round(value), MISSING)
+    if name == "coverage" and math.isfinite(value):
+        return f"{100 * value:.0f} %"
+    text, of = number_text(value), words_and_unit(name)[1]
+    if not unit or not of or text == MISSING:
+        return text
+    return text + (of if of == "°" else "\N{NO-BREAK SPACE}" + of)
+
+
+def listed(words: Sequence[str]) -> str:
+    """Words in a row: "a, b and c"."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def rounded(values: Iterable[float]) -> list[float | None]:
+    """Numbers to five significant digits, as JSON holds them: None for what is not finite."""
+    numbers = np.asarray(values, dtype=float).tolist()
+    return [float(f"{value:.5g}") if math.isfinite(value) else None for value in numbers]
+
+
+def without_numbers(text: str) -> str:
+    """A text with its numbers left out, so that reasons of the same kind are the same."""
+    return re.sub(r"(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "…", text)
+
+
+def text_at(judged: Judged, name: str, place: int, *, unit: bool = True) -> str:
+    """A design's value in words, with its unit."""
+    return value_text(name, judged.columns[name][place : place + 1].tolist()[0], unit=unit)
+
+
+def failure_counts(judged: Judged) -> list[tuple[str, str]]:
+    """Reasons why designs cannot work, without the numbers, and how many; the most frequent first."""
+    counts = Counter(without_numbers(text) for text in judged.failures if text)
+    return [(text, f"{count:,}") for text, count in counts.most_common()]
+
+
+def miss_counts(judged: Judged) -> list[tuple[str, str]]:
+    """Constraints in words, and how many of the working designs miss each."""
+    return [
+        (bound_text(name, sign, bound), f"{(sign * (judged.figure(name)[judged.works] - bound) > 0).sum():,}")
+        for name, sign, bound in judged.study.bounds()
+    ]
+
+
+def bound_text(name: str, sign: int, bound: float) -> str:
+    """A bound in words."""
+    return f"{words_of(name)} {_limit(name, sign, bound)}"
+
+
+def _limit(name: str, sign: int, bound: float) -> str:
+    return f"{'at most' if sign > 0 else 'at least'} {value_text(name, bound)}"
+
+
+def misses(study: Study, row: Mapping[str, Value | None]) -> dict[str, tuple[str, str]]:
+    """Figures of which a design misses a bound, each with the miss in words and with the bound alone."""
+    found = {}
+    for name, sign, bound in study.bounds():
+        value = row.get(name)
+        if isinstance(value, int | float) and sign * (value - bound) > 0:
+            asked = f"{_limit(name, sign, bound)} is asked"
+            found[name] = f"{words_of(name)} is {value_text(name, value)}, {asked}", asked
+    return found
+
+
+_CHOSEN = {
+    "grid": "all of a grid",
+    "random": "drawn at random",
+    "sobol": "by a Sobol sequence",
+    "optimise": "proposed by an optimiser (NSGA-II)",
+}
+_GOALS = {"minimise": "smallest", "maximise": "largest"}
+_FOLLOW = {
+    "focus": "the lens is focused on it",
+    "waist": "the laser is focused on it",
+    "volume": "the volume lies about it",
+}
+
+
+def introduction(judged: Judged) -> list[tuple[str, str]]:
+    """The question and the number of designs judged, by key words."""
+    study, bounds = judged.study, judged.study.bounds()
+    facts = [
+        ("base sensor", f"{study.sensor.name}, in {study.medium}, on surfaces of reflectance {study.reflectance:g}"),
+        ("free", "; ".join(_range_text(name, variable) for name, variable in study.free().items())),
+        ("wanted", "; ".join(f"{_GOALS[wanted.goal]} {words_of(wanted.figure)}" for wanted in study.objectives)),
+    ]
+    if bounds:
+        facts.append(("constraints", "; ".join(bound_text(*bound) for bound in bounds)))
+    if study.follow:
+        facts.append(("at each stand-off", listed([_FOLLOW[name] for name in study.follow])))
+    counted = f"{len(judged):,} judged, {_CHOSEN[study.sampling.kind]}; {judged.works.sum():,} work"
+    facts.append(("designs", counted + (f", {judged.feasible.sum():,} meet all constraints" if bounds else "")))
+    return facts
+
+
+def _range_text(name: str, variable: Variable) -> str:
+    if variable.values is not None:
+        return f"{words_of(name)} ({', '.join(value_text(name, value) for value in variable.values)})"
+    scale = ", logarithmic" if variable.scale == "log" else ""
+    return f"{words_of(name)} from {value_text(name, variable.least)} to {value_text(name, variable.most)}{scale}"
+
+
+_ALWAYS_SHOWN = ("sigma_z_near_mm", "sigma_z_middle_mm", "sigma_z_far_mm", "line_mm", "depth_mm", "standoff_mm")
+
+
+def tiles(study: Study, chosen: Marked, compared: Marked | None) -> list[Tile]:
+    """Everything free, wanted and otherwise decisive of the chosen design, beside the values of another one."""
+    row, missed = chosen.design.table(), misses(study, chosen.design.table())
+    label, other = ("", {}) if compared is None else (compared.label, compared.design.table())
+    window, needed = chosen.sensor.camera.window, chosen.design.number_of("window_mm")
+
+    def tile(name: str, *, accent: bool = False, note: str = "") -> Tile:
+        text, beside = value_text(name, row.get(name)), value_text(name, other.get(name))
+        notes = (
+            note,
+            f"misses its bound: {missed[name][1]}" if name in missed else "",
+            "camera or laser do not reach it" if name.startswith("sigma_z_") and text == MISSING else "",
+            f"{label}: {beside}" if beside not in (MISSING, label, "base") else "",
+        )
+        return Tile(words_of(name), text, "\n".join(filter(None, notes)), accent)
+
+    objectives = [objective.figure for objective in study.objectives]
+    others = [name for name in dict.fromkeys([*_ALWAYS_SHOWN, *study.constraints]) if name not in objectives]
+    found = [tile(name, accent=True) for name in study.free()]
+    found += [tile(name, accent=True, note="an objective") for name in objectives]
+    found += [tile(name) for name in others]
+    required, used = (chosen.design.number_of(name) for name in ("required_ms", "exposure_ms"))
+    darker = f"the wanted brightness takes {value_text('required_ms', required)}" if required > 1.001 * used else ""
+    last = (("exposure_ms", darker), ("laser_class", "estimate, IEC 60825-1"))
+    found += [tile(name, note=note) for name, note in last if name not in (*objectives, *others)]
+    if "window_mm" not in objectives:
+        thin = " – too thin" if needed > window.thickness_mm else ""
+        note = f"{value_text('window_mm', needed)} needed at {study.water_depth_m:g} m{thin}" if window.mounted else ""
+        text = value_text("window_mm", window.thickness_mm) if window.mounted else "none"
+        found.append(Tile("camera's window", text, note))
+    return found
+
+
+def agreement_text(study: Study, found: Agreement) -> str:
+    """Whether formulas and rendering agree on a design, in a sentence."""
+    if found.failure:
+        return f"It could not be verified: {found.failure}."
+    factor = number_text(found.ratio, 3)
+    if found.agrees:
+        return (
+            f"Formulas and rendering agree: their scatters differ by a factor {factor}, up to "
+            f"{number_text(study.verify_tolerance, 3)} is allowed."
+        )
+    predicted, rendered = np.array(found.predicted_mm, float), np.array(found.rendered_mm, float)
+    with np.errstate(all="ignore"):
+        off = np.abs(np.log(rendered / predicted))
+    if factor == MISSING or not np.isfinite(off).any():
+        return "Formulas and rendering could not be compared: rendering found no scatter at any depth."
+    worst = int(np.argmax(np.where(np.isfinite(off), off, -1.0)))
+    return (
+        f"Formulas and rendering disagree by a factor {factor}, more than the {number_text(study.verify_tolerance, 3)} "
+        f"allowed: most at Z = {number_text(found.z_mm[worst])} mm, where "
+        f"{number_text(1e3 * predicted[worst])} µm were predicted and {number_text(1e3 * rendered[worst])} µm "
+        "rendered. Do not rely on the formulas for designs like this one."
+    )

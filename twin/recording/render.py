@@ -1,0 +1,238 @@
+"""Renders scenes by name or description: into arrays (`render`) or into capture and truth files (`simulate`).
+
+Mitsuba is imported when the first scene is rendered, after its variant and libLLVM are chosen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from twin.options import CPU, Options, Variant, use_variant
+from twin.scene.description import Scene, load_scene
+from uwlts.errors import DescriptionError
+from uwlts.files.command_files import keeps_inputs
+from uwlts.model.library import load_sensor, validated
+from uwlts.model.sensor import Medium, Sensor
+from uwlts.runtime.console import progress_bar
+from uwlts.storage.truth import Truth
+
+AnyScene = str | Path | Scene
+AnySensor = str | Path | Sensor
+FRAME_DATA = ("stage_mm", "laser_on", "exposure_ms", "time_s")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Images of a scan with what truly is to be seen in them; F images of H x W pixels.
+
+    Attributes
+    ----------
+    images
+        Grey values (F, H, W), uint8 or uint16.
+    stage_mm
+        Recorded stage positions (F,).
+    laser_on
+        Whether the laser (True) or the lamp (False) lights an image, (F,).
+    exposure_ms, time_s
+        Exposure and time since the first image of the scan, (F,).
+    truth
+        What every profile line truly shows; its depth map is that of the first image here.
+    sensor, medium, scene
+        The sensor as rendered, the medium before it, and the scene in use.
+    """
+
+    images: np.ndarray
+    stage_mm: np.ndarray
+    laser_on: np.ndarray
+    exposure_ms: np.ndarray
+    time_s: np.ndarray
+    truth: Truth
+    sensor: Sensor
+    medium: Medium
+    scene: Scene
+
+
+def render(
+    scene: AnyScene,
+    *,
+    sensor: AnySensor = "thesis",
+    as_built: AnySensor | None = None,
+    placement: str | None = None,
+    medium: str | None = None,
+    spp: int = 16,
+    seed: int = 0,
+    water: float | str | None = None,
+    effects: Sequence[str] = (),
+    without: Sequence[str] = (),
+    ideal: bool = False,
+    frames: Sequence[int] | None = None,
+    variant: Variant = CPU,
+) -> Recording:
+    """Render a scene into arrays; the images are those that `simulate` writes with the same arguments.
+
+    Parameters
+    ----------
+    frames
+        Numbers of the scan's images to render, from 0 on; all of them unless given.
+    effects
+        As for `simulate`; with camera-3d the images in which the camera would look for the stripe.
+    scene, sensor, as_built, placement, medium, spp, seed, water, without, ideal, variant
+        As for `simulate`; scene and sensors may also be descriptions, and there is one placement.
+
+    Raises
+    ------
+    DescriptionError, DesignError, SetupError
+        As for `simulate`.
+    """
+    described = choose_scene(scene, placement=placement, medium=medium, water=water)
+    _, built = choose_sensors(sensor, as_built)
+    options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
+    # The images in which a 3D camera looks for the stripe.
+    options = replace(options, flaws=replace(options.flaws, camera_3d=0))
+    shots = list(enumerate(described.motion.shots()))
+    if frames is not None:
+        if not frames or not all(0 <= number < len(shots) for number in frames):
+            raise DescriptionError(f"frames is {list(frames)}; give numbers from 0 to {len(shots) - 1}")
+        shots = [shots[number] for number in frames]
+    use_variant(variant)
+    from twin.recording.studio import Studio, truth_of_recording
+
+    studio = Studio(built, described, options)
+    taken = [studio.frame(shot, number) for number, shot in shots]
+    truths = [studio.truth(shot) for _, shot in shots]
+    return Recording(
+        np.stack([frame.image for frame in taken]),
+        *(np.array([getattr(frame, name) for frame in taken]) for name in FRAME_DATA),
+        truth=truth_of_recording(studio, truths, shots=[shot for _, shot in shots]),
+        sensor=studio.sensor,
+        medium=studio.medium,
+        scene=described,
+    )
+
+
+@keeps_inputs
+def simulate(
+    scene: AnyScene,
+    *,
+    out: str | Path,
+    sensor: AnySensor = "thesis",
+    as_built: AnySensor | None = None,
+    placement: str | Sequence[str] = (),
+    medium: str | None = None,
+    spp: int = 16,
+    seed: int = 0,
+    water: float | str | None = None,
+    effects: Sequence[str] = (),
+    without: Sequence[str] = (),
+    ideal: bool = False,
+    resume: bool = False,
+    overwrite: bool = False,
+    variant: Variant = CPU,
+    show_progress: bool = False,
+    report: Callable[[str], object] = lambda line: None,
+) -> list[Path]:
+    """Render a scene into a capture, with the ground truth in a file beside it.
+
+    Parameters
+    ----------
+    scene
+        Name of a scene (see: twin scenes) or path of its TOML file.
+    out
+        Capture to write, such as capture.h5; the truth goes to capture.truth.h5. With several placements the name
+        holds {placement}.
+    sensor
+        Name or path of the sensor description that the capture states.
+    as_built
+        Name or path of the sensor that is really rendered, if it differs from the description.
+    placement
+        Named place of the objects, such as near, standoff or far; several are recorded one after the other.
+    medium
+        Name of one of the sensor's media, in place of the scene's.
+    spp
+        Samples per lit pixel.
+    seed
+        Seed of all noise; the same seed gives the same capture.
+    water
+        What floats in the water, in place of the medium's own: pure, clear, coastal, harbour, jerlov-I to jerlov-9C,
+        or a turbidity from 0 (pure) over 1 (clear) and 2 (coastal) to 3 (harbour).
+    effects
+        Effects of real images to add, NAME of typical strength or NAME=STRENGTH: glare=0.02, vignetting=0.4,
+        uneven-lamp=0.6, particles=1000 and bubbles=200 (per litre), caustics=0.3, dirt=0.1, lamp-and-laser,
+        pixel-aspect=1.002, tangential=0.001, rolling-shutter=10 (us per row),
+        jpeg=90, colour-filter, camera-3d=16 (steps per px; laser images become centre lines).
+    without
+        Effects to leave out: defocus, haze, multiple-scattering, secondary-light, gloss, motion, ambient, speckle,
+        fixed-pattern, noise.
+    ideal
+        Leave out all of these: a pinhole's sharp image without noise.
+    resume
+        Go on with an interrupted run.
+    overwrite
+        Replace existing files.
+    variant
+        Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
+    show_progress
+        Draw a progress bar on the terminal.
+    report
+        Called with a line of text for each file that is written.
+
+    Returns
+    -------
+    list of Path
+        The captures.
+
+    Raises
+    ------
+    DescriptionError
+        A description, name or option is wrong.
+    DesignError
+        The sensor cannot measure the scene.
+    SetupError
+        Mitsuba cannot use the variant on this machine.
+    OutputError
+        A file exists already, or cannot be written.
+    """
+    out = Path(out)
+    places = (placement,) if isinstance(placement, str) else tuple(placement) or (None,)
+    if len(places) > 1 and "{placement}" not in out.name:
+        raise DescriptionError(f"several placements would all be written to {out}: put {{placement}} into its name")
+    described = [choose_scene(scene, placement=place, medium=medium, water=water) for place in places]
+    nominal, built = choose_sensors(sensor, as_built)
+    options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
+    use_variant(variant)
+    from twin.recording.studio import record_scene
+
+    files, paths = {"overwrite": overwrite, "resume": resume}, []
+    for each in described:
+        path = out.with_name(out.name.replace("{placement}", each.placement))
+        with progress_bar(f"{each.title}, {each.placement}", shown=show_progress) as progress:
+            record_scene(each, nominal, path, as_built=built, options=options, progress=progress, **files)
+        report(f"wrote {path}")
+        paths.append(path)
+    return paths
+
+
+def choose_scene(scene: AnyScene, *, placement: str | None, medium: str | None, water: float | str | None) -> Scene:
+    """The scene with what is given in place of its own placement, medium and water."""
+    if not isinstance(scene, Scene):
+        return load_scene(scene, placement=placement, medium=medium, water=water)
+    given = {"placement": placement, "medium": medium, "water": water}
+    changes = {key: value for key, value in given.items() if value is not None}
+    return validated(Scene, scene.model_dump() | changes, scene.title)
+
+
+def choose_sensors(sensor: AnySensor, as_built: AnySensor | None) -> tuple[Sensor, Sensor]:
+    """The sensor as described and as built, whose images must fit each other; DescriptionError where they do not."""
+    nominal = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
+    if as_built is None:
+        return nominal, nominal
+    built = as_built if isinstance(as_built, Sensor) else load_sensor(as_built)
+    shared = {"width_px", "height_px", "stripe_along"}
+    if built.camera.model_dump(include=shared) != nominal.camera.model_dump(include=shared):
+        names = [each.name if isinstance(each, Sensor) else str(each) for each in (as_built, sensor)]
+        raise DescriptionError(f"'{names[0]}' has another image size or stripe orientation than '{names[1]}'")
+    return nominal, built

@@ -1,0 +1,3 @@
+"""Version of both packages."""
+
+__version__ = "0.2.0"

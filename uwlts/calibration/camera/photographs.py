@@ -1,0 +1,206 @@
+"""A camera calibrated from a folder of photographs of a target, without a laser."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from uwlts.calibration.camera.lens import Distortion, LensCalibration, LensChoice, Pixels, calibrate_lens
+from uwlts.calibration.camera.target_images import TargetImage
+from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError
+from uwlts.files.reading import is_regular_file
+from uwlts.files.writing import written_aside
+from uwlts.model.library import read_table
+from uwlts.storage.image_file import read_image
+from uwlts.storage.import_ import DESCRIPTION_NAME, checked_channel, image_files, one_channel
+from uwlts.targets import Target, parse_target
+
+_FEWEST_IMAGES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """One image file: the points (N, 2) of the target found, or the reason why it was left out.
+
+    Of images used, ``misses_px`` (N, 2) are found minus calculated pixels, and ``moved`` is how far leaving it out
+    moves a parameter at most, in standard uncertainties.
+    """
+
+    name: str
+    pixels: np.ndarray
+    reason: str | None
+    misses_px: np.ndarray = field(default_factory=lambda: np.empty((0, 2)))
+    moved: float = np.nan
+
+    def rms_px(self) -> float:
+        """Root mean square distance between found and calculated pixels."""
+        return float(np.sqrt(np.mean(np.sum(self.misses_px**2, axis=1))))
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCalibration:
+    """A camera calibrated from photographs.
+
+    Attributes
+    ----------
+    folder : where the photographs lie
+    lens : the lens and what it rests on
+    photographs : all image files in natural order
+    warnings : what may be wrong
+    """
+
+    folder: Path
+    target: Target
+    lens: LensCalibration
+    photographs: list[Photograph]
+    warnings: list[str]
+
+
+def calibrate_camera(
+    folder: str | Path,
+    *,
+    target: str | Path | None = None,
+    channel: str | None = None,
+    distortion: Distortion = "auto",
+    pixels: Pixels = "auto",
+    progress: Callable[[str, int, int], None] | None = None,
+) -> CameraCalibration:
+    """Calibrate a camera from photographs of a target, held differently in each.
+
+    Parameters
+    ----------
+    folder : str or Path
+        PNG, TIFF, BMP or JPEG images, in it or in folders below it. Those that do not show the target are named with
+        the reason.
+    target : str or Path, optional
+        TOML file of the target's description, or with a table [target]; target.toml or import.toml in the folder
+        unless given.
+    channel : str, optional
+        Channel of colour images, or a formula of channels; their luminance unless given.
+    distortion : "auto" or tuple of str
+        Coefficients among k1 to k6, p1 and p2 to estimate; auto: those that predict images left out best.
+    pixels : {"auto", "square", "free"}
+        Whether one focal length or two are estimated.
+    progress : callable, optional
+        Called with the name of the stage, the number of images or models done, and the number in all.
+
+    Returns
+    -------
+    CameraCalibration
+        Its uncertainties take the misses of one image to go together.
+
+    Raises
+    ------
+    DescriptionError
+        No target is described, or wrongly, or ``channel`` is none.
+    ImageError
+        The folder holds no images.
+    CalibrationError
+        The target is found in fewer than four images, or these do not determine a camera.
+    """
+    folder = Path(folder)
+    described = _described_target(folder, target)
+    report = progress or (lambda stage, done, total: None)
+    names = image_files(folder)
+    try:
+        wanted = checked_channel(channel or "grey")
+    except ValueError as error:
+        raise DescriptionError(f"channel is {channel!r}: {error}") from error
+    seen: dict[int, tuple[tuple[int, int], TargetImage]] = {}
+    reasons = dict.fromkeys(names, "")
+    for number, name in enumerate(names):
+        try:
+            raw = read_image(folder / name)
+            grey = one_channel(raw, wanted, name=name)
+            view = described.detect(np.clip(grey, 0, None).astype(raw.dtype))
+            seen[number] = (raw.shape[1], raw.shape[0]), TargetImage(view.points_mm, view.pixels)
+        except (ImageError, TargetError, CalibrationError) as error:
+            reasons[name] = str(error).replace(f"{folder / name}", "it").removeprefix(f"{name} ")
+        report("target", number + 1, len(names))
+    # An image of another camera is the odd one out.
+    size = Counter(own for own, _ in seen.values()).most_common(1)[0][0] if seen else (0, 0)
+    for number, ((width, height), _) in list(seen.items()):
+        if (width, height) != size:
+            reasons[names[number]] = f"it has {width} x {height} pixels, most images have {size[0]} x {size[1]}"
+            del seen[number]
+    found, places = [image for _, image in seen.values()], list(seen)
+    photographs = [Photograph(name, np.empty((0, 2)), reason) for name, reason in reasons.items()]
+    if len(found) < _FEWEST_IMAGES:
+        said = "; ".join(f"{name}: {reason}" for name, reason in reasons.items() if reason)
+        raise CalibrationError(
+            f"the target was found in {len(found)} of {len(names)} images, at least {_FEWEST_IMAGES} are needed"
+            + (f": {said[:600]}" if said else "")
+        )
+    lens = calibrate_lens(
+        found,
+        width_px=size[0],
+        height_px=size[1],
+        choice=LensChoice(distortion, pixels),
+        circle_diameter_mm=described.circle_diameter_mm,
+        progress=lambda done, total: report("lens", done, total),
+    )
+    for place, image, misses, moved in zip(lens.used, lens.images, lens.solution.residuals_px, lens.moved, strict=True):
+        number = places[place]
+        photographs[number] = Photograph(names[number], image.pixels, None, misses, float(moved))
+    warnings = []
+    for place, reason in lens.left_out.items():
+        name = names[places[place]]
+        photographs[places[place]] = Photograph(name, found[place].pixels, reason)
+        warnings.append(f"{name}: left out, {reason}")
+    warnings += [f"{each.name}: {each.reason}" for each in photographs if not len(each.pixels)]
+    return CameraCalibration(folder, described, lens, photographs, warnings + lens.half_doubts())
+
+
+def _described_target(folder: Path, path: str | Path | None) -> Target:
+    """The target in a file, or in one of the folder's own."""
+    if not folder.is_dir():
+        raise ImageError(f"no folder at {folder}")
+    known = [folder / "target.toml", folder / DESCRIPTION_NAME] if path is None else [Path(path)]
+    there = next((each for each in known if is_regular_file(each)), None)
+    if there is None:
+        raise DescriptionError(
+            f"no description of the target at {' or '.join(map(str, known))}: write one, such as "
+            'kind = "chessboard", columns = 9, rows = 6 (inner corners), square_mm = 15.0, each on a line'
+        )
+    table = read_table(there)
+    inner = table.get("target", table)
+    if not isinstance(inner, dict):
+        raise DescriptionError(f"{there}: target is {inner!r}; expected a table")
+    return parse_target(inner)
+
+
+def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool = False) -> None:
+    """Write a camera as YAML in the form of ROS CameraInfo, which `uwlts import` reads as ``intrinsics``.
+
+    Raises OutputError: the file exists and ``overwrite`` is not given, or cannot be written.
+    """
+    lens, model = camera.lens, camera.lens.solution.model
+
+    def matrix(rows: list[list[float]]) -> dict[str, object]:
+        return {"rows": len(rows), "cols": len(rows[0]), "data": [float(value) for row in rows for value in row]}
+
+    known = model.distortion
+    projection = np.column_stack([model.matrix(), np.zeros(3)]).tolist()
+    content = {
+        "image_width": model.width_px,
+        "image_height": model.height_px,
+        "camera_name": camera.folder.resolve().name,
+        "camera_matrix": matrix(model.matrix().tolist()),
+        "distortion_model": "rational_polynomial" if known.is_rational() else "plumb_bob",
+        "distortion_coefficients": matrix([list(known.used().values())]),
+        "rectification_matrix": matrix(np.eye(3).tolist()),
+        "projection_matrix": matrix(projection),
+        "estimated": {
+            "parameters": list(lens.solution.parameters),
+            "standard_uncertainties": [float(value) for value in lens.std().values()],
+            "covariance": lens.covariance.tolist(),
+            "rms_px": lens.solution.rms_px(),
+            "images": [each.name for each in camera.photographs if each.reason is None],
+            "left_out": {each.name: each.reason for each in camera.photographs if each.reason is not None},
+        },
+    }
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")

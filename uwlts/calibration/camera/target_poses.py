@@ -1,0 +1,382 @@
+"""Camera parameters and target poses from images of a flat target, by the stage's displacements or by free poses."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
+from uwlts.calibration.camera.target_images import Placement, TargetImage, observe, placements, pose_values
+from uwlts.errors import CalibrationError
+from uwlts.fitting.schur_least_squares import Observation, SchurFit, schur_least_squares
+from uwlts.model.calibration import CameraModel
+from uwlts.optics.camera import project
+from uwlts.targets.detection.ellipse_bias import circle_centre_bias
+
+# Coordinates of size one: a direction in which points extend less than this share of the widest one, or a null vector
+# of the equations that is not alone by this share, cannot be separated from rounding and lens distortion.
+_FLAT = 1e-4
+_AMBIGUOUS = 1e-9
+
+
+def direct_linear(points_mm: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pinhole camera from at least six points in space, by the normalised linear method without lens distortion.
+
+    Hartley and Zisserman, Multiple View Geometry, 2nd ed., algorithm 7.1 (linear part) and section 6.2.4 (RQ). From
+    points (N, 3) in mm, in any frame, and pixels (N, 2): camera matrix K (3, 3), rotation (3, 3) and translation (3,)
+    in mm from the points' frame to the camera's.
+
+    Raises CalibrationError: the points lie in one plane or are too few, or the image is mirrored against them.
+    """
+    if len(points_mm) < 6:
+        raise CalibrationError(f"the linear start needs at least 6 target points; there are {len(points_mm)}")
+    to_unit, unit = _normalised(points_mm)
+    pixel_to_unit, unit_pixels = _normalised(pixels)
+    extents = np.linalg.svd(unit[:, :3], compute_uv=False)
+    if extents[2] < _FLAT * extents[0]:
+        raise CalibrationError(
+            "all target points lie in one plane: move the stage between the target images, or use poses='free' with a "
+            "tilted target"
+        )
+    nothing = np.zeros_like(unit)
+    u, v = unit_pixels[:, :1], unit_pixels[:, 1:2]
+    equations = np.vstack([np.hstack([unit, nothing, -u * unit]), np.hstack([nothing, unit, -v * unit])])
+    # The triangular factor has the equations' singular values and is only 12 x 12.
+    _, singular, rows = np.linalg.svd(np.linalg.qr(equations, mode="r"))
+    if singular[10] < _AMBIGUOUS * singular[0]:
+        raise CalibrationError("the target points do not determine the camera: use more points, spread over the image")
+    projection = np.linalg.solve(pixel_to_unit, rows[11].reshape(3, 4)) @ to_unit
+    if np.median(points_mm @ projection[2, :3] + projection[2, 3]) < 0:
+        projection = -projection
+    if np.linalg.det(projection[:, :3]) < 0:
+        raise CalibrationError(
+            "the target images are mirrored against the stage positions: the stage moved the other way than "
+            "stage_direction says, or the target's columns or rows are numbered the wrong way round"
+        )
+    # RQ from QR of the rows in reverse order; the signs make the camera matrix's diagonal positive.
+    orthogonal, triangular = np.linalg.qr(projection[::-1, :3].T)
+    matrix, rotation = triangular.T[::-1, ::-1], orthogonal.T[::-1]
+    signs = np.sign(np.diag(matrix))
+    matrix, rotation = matrix * signs, signs[:, None] * rotation
+    return matrix / matrix[2, 2], rotation, np.linalg.solve(matrix, projection[:, 3])
+
+
+def _normalised(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Similarity (D + 1, D + 1) to centroid zero and rms distance sqrt(D), and the homogeneous result (N, D + 1)."""
+    dimension = coordinates.shape[1]
+    centroid = coordinates.mean(axis=0)
+    spread = np.sqrt(np.mean(np.sum((coordinates - centroid) ** 2, axis=1)))
+    if not spread > 0:
+        raise CalibrationError("all target points fall on one place: is the target detected at all?")
+    similarity = np.eye(dimension + 1) * np.sqrt(dimension) / spread
+    similarity[:-1, -1] = -centroid * np.sqrt(dimension) / spread
+    similarity[-1, -1] = 1.0
+    return similarity, np.column_stack([coordinates, np.ones(len(coordinates))]) @ similarity.T
+
+
+def _linear_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Camera parameters (P,) and poses (6,) of a target that the stage displaces along its normal.
+
+    The placement that reaches farthest gives both by the linear method, the others then have their poses found.
+    """
+    farthest = int(np.argmax([np.ptp(view.shifts_mm) for view in views]))
+    matrix, rotation, translation = direct_linear(views[farthest].displaced(), views[farthest].pixels)
+    global_values = intrinsics.from_matrix(matrix)
+    poses = [placement_pose(view, intrinsics.matrix(global_values)) for view in views]
+    poses[farthest] = np.r_[cv2.Rodrigues(rotation)[0].ravel(), translation]
+    return global_values, poses
+
+
+def _planar_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Camera parameters (P,) and poses (6,) of single images: f from homographies, the principal point in the middle.
+
+    `cv2.initCameraMatrix2D`, after Zhang, A flexible new technique for camera calibration, PAMI 2000.
+    """
+    size = (intrinsics.width_px, intrinsics.height_px)
+    points, pixels = ([getattr(v, name).astype(np.float32) for v in views] for name in ("points_mm", "pixels"))
+    matrix = cv2.initCameraMatrix2D(points, pixels, size, 1.0)
+    if not (np.isfinite(matrix).all() and 0.1 < matrix[0, 0] / max(size) < 100):
+        raise CalibrationError(
+            "the target images do not show the focal length: tilt the target against the camera's axis, differently "
+            "from image to image"
+        )
+    global_values = intrinsics.from_matrix(matrix)
+    return global_values, [placement_pose(view, intrinsics.matrix(global_values)) for view in views]
+
+
+def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
+    """Rotation vector and shift (6,) of a placement seen by a camera without distortion."""
+    found, rotation, translation = cv2.solvePnP(placement.displaced(), placement.pixels, matrix, None)
+    if not found:
+        raise CalibrationError("no pose of the target explains one of its images: is it the right target?")
+    return np.r_[rotation.ravel(), translation.ravel()]
+
+
+Poses = Literal["stage-normal", "stage", "free"]
+
+# Beyond these shares of f and of the image's side a camera counts as not determined: lengths would be wrong as much.
+_LARGEST_FOCAL_STD = 0.02
+_LARGEST_CENTRE_STD = 0.05
+# Offsets of circles' images are calculated again until they change by less; a few rounds settle, unless the diameter
+# is wrong.
+_SETTLED_PX = 1e-4
+_BIAS_ROUNDS = 10
+_X, _Y = np.eye(3)[:2]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraSolution:
+    """A calibrated camera and how well it was determined.
+
+    Attributes
+    ----------
+    target_poses : (F, 4, 4); ``T_camera_target`` of every image
+    residuals_px : list of (N, 2); found minus calculated pixel, for every image
+    parameters : names of the camera parameters that were estimated
+    covariance : (P, P); of these parameters
+    sigma_px : standard deviation of one coordinate, with the degrees of freedom counted
+    stage_direction : (3,) or None; unit direction in which the stage moves the sensor, camera frame; None where free
+        poses do not follow a stage
+    stage_tilt_rad, stage_tilt_std_rad : angle between that direction and the target's normal and its standard
+        deviation, for poses "stage"; the largest of all placements
+    stopped : why the iteration ended
+    bias_px : list of (N, 2) or None; offsets taken out of the centres of the circles' images
+    """
+
+    model: CameraModel
+    target_poses: np.ndarray
+    residuals_px: list[np.ndarray]
+    parameters: tuple[str, ...]
+    covariance: np.ndarray
+    sigma_px: float
+    stage_direction: np.ndarray | None
+    stage_tilt_rad: float | None
+    stage_tilt_std_rad: float | None
+    rounds: int
+    stopped: str
+    bias_px: list[np.ndarray] | None = None
+
+    def values(self) -> dict[str, float]:
+        """Every estimated parameter."""
+        known = self.model.parameters()
+        return {name: known[name] for name in self.parameters}
+
+    def std(self) -> dict[str, float]:
+        """Standard deviation of every estimated parameter."""
+        return dict(zip(self.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    def image_rms_px(self) -> np.ndarray:
+        """Root mean square distance (F,) between found and calculated pixels of every image."""
+        return np.array([np.sqrt(np.mean(np.sum(r**2, axis=1))) for r in self.residuals_px])
+
+    def rms_px(self) -> float:
+        """Root mean square distance between found and calculated pixels over all images."""
+        return float(np.sqrt(np.mean(np.sum(np.vstack(self.residuals_px) ** 2, axis=1))))
+
+    def largest_bias_px(self) -> float | None:
+        """Longest offset taken out, over all circles."""
+        return None if self.bias_px is None else float(np.max(np.linalg.norm(np.vstack(self.bias_px), axis=1)))
+
+
+def solve_camera(
+    images: Sequence[TargetImage],
+    *,
+    width_px: int,
+    height_px: int,
+    poses: Poses = "stage-normal",
+    approaching: bool = True,
+    options: CameraOptions | None = None,
+    start: CameraSolution | None = None,
+    circle_diameter_mm: float | None = None,
+) -> CameraSolution:
+    """Calibrate the camera by least squares of the pixel distances.
+
+    The stage moves the sensor by s along d, so that the target moves by -s d as the sensor sees it: a point x of the
+    target is at R (x - (s - s0) d) + t in the camera frame, with d in the target's frame.
+
+    Parameters
+    ----------
+    width_px, height_px : size of the images
+    poses : {"stage-normal", "stage", "free"}; "stage-normal" (the thesis): one pose per placement of the target, d is
+        the target's normal. "stage": d is estimated too, for each placement; needs pixels of known shape. "free": one
+        pose per image, stage positions unused
+    approaching : whether growing stage positions bring the sensor nearer to the target; unused by "free"
+    start : a solution for nearly the same pixels, with the same options and poses
+    circle_diameter_mm : the pixels are centres of the images of circles of this diameter; their offsets from the images
+        of the circles' centres are calculated, taken out, and calculated again until they stay
+
+    Raises
+    ------
+    CalibrationError
+        There are too few images, the stage did not move, the target is mirrored against the stage, the parameters are
+        not determined, or the offsets do not settle.
+    RangeError
+        A circle's image is no ellipse.
+    """
+    options = CameraOptions() if options is None else options
+    intrinsics = Intrinsics(options, width_px=width_px, height_px=height_px)
+
+    def solved(images: Sequence[TargetImage], start: CameraSolution | None) -> CameraSolution:
+        views = _accepted(images, poses, approaching, options)
+        if start is not None:
+            global_values, local = intrinsics.from_model(start.model), [_restart(view, start, poses) for view in views]
+        else:
+            found = _planar_start if poses == "free" else _linear_start
+            global_values, local = found(views, intrinsics)
+            local = [np.r_[pose, 0.0, 0.0] if poses == "stage" else pose for pose in local]
+
+        def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Observation | None:
+            if group == len(views):
+                return _known_before(intrinsics, global_values)
+            return observe(views[group], intrinsics, global_values, local)
+
+        if options.tangential is not None:
+            local = [*local, np.empty(0)]
+        fit = schur_least_squares(model, global_values, local, soft_limit=options.soft_limit_px)
+        _refuse_undetermined(fit, intrinsics)
+        return _solution(images, views, fit, intrinsics, poses)
+
+    if circle_diameter_mm is None:
+        return solved(images, start)
+    bias = [np.zeros_like(image.pixels) for image in images]
+    for _ in range(_BIAS_ROUNDS):
+        centred = [replace(i, pixels=i.pixels - offset) for i, offset in zip(images, bias, strict=True)]
+        start, before = solved(centred, start), bias
+        seen_by = partial(project, start.model)
+        bias = [
+            centre_offsets(seen_by, pose, image.points_mm, diameter_mm=circle_diameter_mm)
+            for image, pose in zip(images, start.target_poses, strict=True)
+        ]
+        if max(np.max(np.abs(b - a)) for a, b in zip(before, bias, strict=True)) <= _SETTLED_PX:
+            return replace(start, bias_px=before)
+    raise CalibrationError(
+        f"the offsets of the circles' images did not settle in {_BIAS_ROUNDS} rounds: is the circles' diameter "
+        f"{circle_diameter_mm:g} mm?"
+    )
+
+
+def _known_before(intrinsics: Intrinsics, global_values: np.ndarray) -> Observation:
+    """What is known of p1 and p2 before, as residuals in px."""
+    std, sigma_px = intrinsics.options.tangential or (math.inf, 0.0)
+    by_global = np.array([[float(name == own) for name in intrinsics.names] for own in ("p1", "p2")]) * (sigma_px / std)
+    return Observation(by_global @ global_values[:, None], by_global, np.empty((2, 0)))
+
+
+def centre_offsets(
+    project: Callable[[np.ndarray], np.ndarray], pose: np.ndarray, points_mm: np.ndarray, *, diameter_mm: float
+) -> np.ndarray:
+    """Offsets (N, 2) in px of the centres of circles' images from the images of the circles' centres.
+
+    The circles lie in the plane of a target at ``T_camera_target`` (4, 4); ``project`` maps points (M, 3) of the camera
+    frame to pixels (M, 2).
+
+    Raises RangeError: a circle's image is no ellipse.
+    """
+
+    def seen(points: np.ndarray) -> np.ndarray:
+        return project(points @ pose[:3, :3].T + pose[:3, 3])
+
+    return circle_centre_bias(seen, points_mm, diameter_mm=diameter_mm, axis_u=_X, axis_v=_Y)
+
+
+def _accepted(
+    images: Sequence[TargetImage], poses: Poses, approaching: bool, options: CameraOptions
+) -> list[Placement]:
+    if poses == "free":
+        if len(images) < 3:
+            raise CalibrationError(f"free poses need at least 3 target images; there are {len(images)}")
+        return placements(images, approaching=None)
+    if poses == "stage" and options.pixel_aspect is None:
+        raise CalibrationError(
+            "a free stage direction and the pixels' shape cannot be separated: give square pixels, or "
+            "poses='stage-normal' or 'free'"
+        )
+    views = placements(images, approaching=approaching)
+    if not any(np.any(view.shifts_mm) for view in views):
+        raise CalibrationError(
+            f"{len(images)} target images, but the stage did not move: move it between them, or use poses='free' with "
+            f"a tilted target"
+        )
+    return views
+
+
+def _restart(view: Placement, start: CameraSolution, poses: Poses) -> np.ndarray:
+    pose = start.target_poses[view.image[0]]
+    if poses != "stage":
+        return pose_values(pose)
+    direction = pose[:3, :3].T @ start.stage_direction
+    return np.r_[pose_values(pose), direction[:2] / abs(direction[2])]
+
+
+def _refuse_undetermined(fit: SchurFit, intrinsics: Intrinsics) -> None:
+    values = dict(zip(intrinsics.names, fit.global_values, strict=True))
+    limits = {name: _LARGEST_FOCAL_STD * values[name] for name in ("f", "fx", "fy") if name in values}
+    limits |= {"cx": _LARGEST_CENTRE_STD * intrinsics.width_px, "cy": _LARGEST_CENTRE_STD * intrinsics.height_px}
+    for name, std in zip(intrinsics.names, np.sqrt(np.diag(fit.covariance)), strict=True):
+        if name in limits and not std <= limits[name]:
+            raise CalibrationError(
+                f"the target images determine {name} with a standard deviation of {std:.3g} px; more than "
+                f"{limits[name]:.3g} px is of no use: take more images, tilted differently, or fix some parameters"
+            )
+
+
+def _solution(
+    images: Sequence[TargetImage], views: list[Placement], fit: SchurFit, intrinsics: Intrinsics, poses: Poses
+) -> CameraSolution:
+    target_poses, directions, tilts = np.tile(np.eye(4), (len(images), 1, 1)), [], []
+    residuals = [np.empty((0, 2))] * len(images)
+    # What is known before is a group of its own, behind those of the views.
+    own = (each[: len(views)] for each in (fit.local, fit.local_covariances, fit.residuals))
+    for view, local, covariance, misses in zip(views, *own, strict=True):
+        rotation = cv2.Rodrigues(local[:3])[0]
+        directions.append(rotation @ view.direction(local[6:]))
+        for index in np.unique(view.image):
+            here = view.image == index
+            target_poses[index, :3, :3] = rotation
+            target_poses[index, :3, 3] = local[3:6] - view.shifts_mm[here][0] * directions[-1]
+            residuals[index] = misses[here]
+        if poses == "stage":
+            tilts.append(_tilt(local[6:], covariance[6:, 6:]))
+    if poses == "free":
+        stage = stage_direction(target_poses, np.array([image.stage_mm for image in images]))
+    else:
+        stage = np.mean(directions, axis=0) / np.linalg.norm(np.mean(directions, axis=0))
+    tilt, tilt_std = max(tilts, default=(None, None))
+    return CameraSolution(
+        model=intrinsics.model(fit.global_values),
+        target_poses=target_poses,
+        residuals_px=residuals,
+        parameters=intrinsics.names,
+        covariance=fit.covariance,
+        sigma_px=fit.sigma,
+        stage_direction=stage,
+        stage_tilt_rad=tilt,
+        stage_tilt_std_rad=tilt_std,
+        rounds=fit.rounds,
+        stopped=fit.stopped,
+    )
+
+
+def _tilt(tilt: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+    """Angle in rad between the stage's direction and the normal, and its standard deviation."""
+    size = float(np.hypot(*tilt))
+    outward = tilt / size if size > 0 else np.array([1.0, 0.0])
+    return float(np.arctan(size)), float(np.sqrt(outward @ covariance @ outward)) / (1 + size**2)
+
+
+def stage_direction(target_poses: np.ndarray, stage_mm: np.ndarray) -> np.ndarray | None:
+    """Unit direction (3,) in the camera frame in which the stage moves the sensor, from poses of a fixed target.
+
+    ``target_poses`` (F, 4, 4) are ``T_camera_target``; the target's origin moves against the sensor. None where the
+    stage stood still, or the poses do not move as far as it did: then the target was moved by other means.
+    """
+    moved = stage_mm - stage_mm.mean()
+    if not np.any(moved):
+        return None
+    velocity = -(moved @ target_poses[:, :3, 3]) / (moved @ moved)
+    speed = float(np.linalg.norm(velocity))
+    return velocity / speed if abs(speed - 1) < 0.05 else None  # scales of stage and target agree better than that

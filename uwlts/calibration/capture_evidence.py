@@ -1,0 +1,294 @@
+"""Evidence of captures for a calibration: target points, stripes on the target, stripes on the step standard."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+from pydantic import ValidationError
+
+from uwlts.calibration.camera.image_quality import why_not_found
+from uwlts.calibration.camera.target_images import TargetImage
+from uwlts.calibration.target_stripes import TargetStripe, stripe_on_target
+from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError, problems_of
+from uwlts.model.artefacts import StepStandard
+from uwlts.runtime.workers import in_threads
+from uwlts.storage.capture import Capture
+from uwlts.stripe import Stripe, StripeOptions, StripeSettings, stripe_in, why_no_stripe
+from uwlts.stripe.capture_stripes import shown_stripe
+from uwlts.targets import Target, TargetView, parse_target
+
+Progress = Callable[[str, int, int], None]
+"""Called with the name of the step, the number of images done and the number of all."""
+
+_SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
+_FEWEST_LINES = 20  # fewer are reflections or specks rather than the stripe
+_MANY_OUTLIERS = 0.05  # share of a capture's stripe points from which those left out are worth a warning
+_LOOKED_AT = 15  # images of a capture in which the reason for a missing stripe is sought
+
+
+@dataclass(frozen=True, eq=False)
+class AirEvidence:
+    """Target points and stripes in the captures in air."""
+
+    target: Target
+    images: list[TargetImage]  # images in which the target was found, one placement per capture
+    frames: list[tuple[int, int]]  # capture and frame that each of them comes from
+    stripes: list[np.ndarray]  # (N, 2) each; stripe pixels on the target at the position of the image; may be empty
+    warnings: list[str]  # images left out, and why
+    no_stripe: str = ""  # why there is no stripe at all; empty where there is one
+    outliers: list[int] = field(default_factory=list)  # stripe pixels of each that lie beside its curve; left out
+    captures: list[str] = field(default_factory=list)  # their names
+
+    def names(self) -> list[str]:
+        """The images, as captures and frames."""
+        return [f"{self.captures[capture]}, frame {frame}" for capture, frame in self.frames]
+
+    def only(self, chosen: np.ndarray, images: list[TargetImage]) -> "AirEvidence":
+        """The images of some numbers, with their points replaced."""
+        some = chosen.tolist()
+        return replace(
+            self,
+            images=images,
+            frames=[self.frames[n] for n in some],
+            stripes=[self.stripes[n] for n in some],
+            outliers=[self.outliers[n] for n in some],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class StepEvidence:
+    """A stripe (N, 2) on a step standard, with the standard, the medium's index and where it comes from.
+
+    ``index_std`` is the index's standard uncertainty, ``travel_mm`` where the stage has moved the sensor, along the
+    axes of the OCS.
+    """
+
+    pixels: np.ndarray
+    standard: StepStandard
+    medium_index: float
+    source: str
+    travel_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    index_std: float = 0.0
+
+    def capture(self) -> str:
+        """The capture it comes from."""
+        return self.source.rsplit(", frame ", 1)[0]
+
+
+def air_evidence(
+    captures: Sequence[Capture], *, stripe: StripeSettings = None, progress: Progress | None = None
+) -> AirEvidence:
+    """Find the target in the images with the laser off, and the stripe in those with it on at the same positions.
+
+    Raises
+    ------
+    CalibrationError
+        The captures describe no target, or different ones, or it was found in none of their images.
+    DescriptionError
+        A target's description cannot be read.
+    """
+    targets = [parse_target(capture.header.target) for capture in captures if capture.header.target is not None]
+    if len(targets) < len(captures) or not captures:
+        raise CalibrationError("a capture for the calibration in air must describe its target: its header has none")
+    if any(target != targets[0] for target in targets):
+        raise CalibrationError("the captures in air show different targets: calibrate with one target at a time")
+    total, done = sum(map(len, captures)), 0
+    images, frames, views, stripes, outliers, warnings = [], [], [], [], [], []
+    reasons: Counter[str] = Counter()
+    for number, capture in enumerate(captures):
+        first = len(images)
+        detect = partial(_target_in, capture, targets[0], number)
+        for (frame, _), found in in_threads(detect, capture.frames(laser_on=False)):
+            if isinstance(found, str):
+                reasons[found] += 1
+                warnings.append(f"{capture.path.name}, frame {frame}: left out, {found}")
+            else:
+                view, target_image = found
+                images.append(target_image)
+                frames.append((number, frame))
+                views.append(view)
+                stripes.append(np.empty((0, 2)))
+                outliers.append(0)
+            done = _report(progress, "target", done, total)
+        positions = np.array([image.stage_mm for image in images[first:]])
+        on_target = partial(_stripe_beside, capture, stripe, first, views[first:], positions, targets[0])
+        for (frame, _), found in in_threads(on_target, _laser_frames(capture)):
+            if isinstance(found, str):
+                warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {found}")
+            else:
+                place, on = found
+                stripes[place] = np.vstack([stripes[place], on.pixels])
+                outliers[place] += on.outliers
+            done = _report(progress, "target", done, total)
+        rejected, kept = sum(outliers[first:]), sum(map(len, stripes[first:]))
+        if rejected > _MANY_OUTLIERS * (rejected + kept):
+            share = 100 * rejected / (rejected + kept)
+            warnings.append(
+                f"{capture.path.name}: {share:.0f} % of the stripe on the target was left out, for it lies beside the "
+                "curve of the rest: reflections, a second line, or a plate that is not flat"
+            )
+    if not images:
+        raise CalibrationError(
+            f"the target was found in no image of {_names(captures)}: {_why_no_target(captures, targets[0], reasons)}"
+        )
+    no_stripe = "" if any(map(len, stripes)) else no_stripe_in(captures)
+    return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, outliers, _file_names(captures))
+
+
+def step_evidence(
+    captures: Sequence[Capture],
+    *,
+    medium_index: float | None = None,
+    stripe: StripeSettings = None,
+    progress: Progress | None = None,
+) -> tuple[list[StepEvidence], list[str]]:
+    """Stripes on the step standard in all images with the laser on, and warnings about images left out.
+
+    Parameters
+    ----------
+    medium_index : replaces the index of the captures' medium at the laser's wavelength
+
+    Raises DescriptionError: a capture does not say which step standard it shows.
+    """
+    total, done = sum(int(np.count_nonzero(capture.laser_on)) for capture in captures), 0
+    found, warnings = [], []
+    for capture in captures:
+        try:
+            standard = StepStandard.model_validate(capture.header.artefact)
+        except ValidationError as error:
+            problems = problems_of(error).removeprefix(": ")
+            raise DescriptionError(f"{capture.path.name} does not describe its step standard: {problems}") from error
+        wavelength, known = capture.header.sensor.laser.wavelength_nm, capture.header.sensor.uncertainty
+        index, index_std = medium_index, known.index
+        if index is None:
+            index = capture.header.medium.refractive_index(wavelength)
+            index_std = capture.header.medium.index_uncertainty(wavelength, known)
+        for (frame, _), pixels in in_threads(partial(_stripe_in, capture, stripe), _laser_frames(capture)):
+            if isinstance(pixels, str):
+                warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {pixels}")
+            else:
+                x, y, z = (float(capture.stage_mm[frame]) * np.array(capture.header.stage_direction)).tolist()
+                source = f"{capture.path.name}, frame {frame}"
+                found.append(StepEvidence(pixels, standard, index, source, (x, y, z), index_std))
+            done = _report(progress, "step", done, total)
+    return found, warnings
+
+
+def no_stripe_in(captures: Sequence[Capture]) -> str:
+    """Reasons why no stripe was found in captures, in words; of a target, none where it was found."""
+    header, count = captures[0].header, sum(int(np.count_nonzero(capture.laser_on)) for capture in captures)
+    if not count:
+        return f"{_names(captures)}: no image with the laser on; take one at every position"
+    along, where = header.sensor.camera.stripe_along, f"laser images of {_names(captures)}"
+    lit = [image for capture in captures for image in _lit(capture, _LOOKED_AT)]
+    if not lit:
+        return f"no stripe in any of the {count} centre lines of {_names(captures)}: is the laser on?"
+    if any(shown_stripe(image, stripe_along=along) == "along" for image in lit):
+        return f"the {where} with a stripe were taken at other stage positions than those at which the target was found"
+    reason = why_no_stripe(lit, stripe_along=along, full_dn=header.saturation_dn)
+    return f"no stripe in any of the {count} {where}: {reason}"
+
+
+def _file_names(captures: Sequence[Capture]) -> list[str]:
+    return [capture.path.name for capture in captures]
+
+
+def _names(captures: Sequence[Capture]) -> str:
+    return ", ".join(_file_names(captures))
+
+
+def _why_no_target(captures: Sequence[Capture], target: Target, reasons: Counter[str]) -> str:
+    """Reason why none of the images shows the target; ``reasons`` count the faults of those with the laser off."""
+    if not any(map(len, captures)):
+        return "there are no images in it"
+    for image in [image for capture in captures for image in _lit(capture, 3)]:
+        with suppress(TargetError, CalibrationError):
+            target.detect(image)
+            return (
+                "images marked as taken with the laser on show it instead: lamp and laser images are exchanged, or "
+                "none is marked as a lamp image"
+            )
+    count = reasons.total()
+    if not count:
+        return "all of them were taken with the laser on; take one under the lamp at every position too"
+    return "; ".join(f"{reason} ({times} of {count} images)" for reason, times in reasons.most_common(2))
+
+
+def _lit(capture: Capture, most: int) -> Iterator[np.ndarray]:
+    """At most so many of the images with the laser on, from the first to the last; no centre lines."""
+    lit = np.flatnonzero(capture.laser_on & capture.has_image)
+    for place in np.unique(np.linspace(0, len(lit) - 1, most).astype(int)) if len(lit) else ():
+        yield capture.image(int(lit[place]))
+
+
+_Seen = tuple[int, np.ndarray | Stripe]
+"""A laser frame's number and its image, or its stripe where a 3D camera has found that."""
+
+
+def _laser_frames(capture: Capture) -> Iterator[_Seen]:
+    for frame in np.flatnonzero(capture.laser_on).tolist():
+        yield frame, capture.seen(frame)
+
+
+def _target_in(
+    capture: Capture, target: Target, placement: int, numbered: tuple[int, np.ndarray]
+) -> tuple[TargetView, TargetImage] | str:
+    """The target in an image with the laser off, or why it is of no use."""
+    frame, image = numbered
+    try:
+        view = target.detect(image)
+        return view, TargetImage(view.points_mm, view.pixels, float(capture.stage_mm[frame]), placement)
+    except (TargetError, CalibrationError) as error:
+        return why_not_found(image, str(error), full_dn=capture.header.saturation_dn)
+
+
+def _stripe_beside(
+    capture: Capture,
+    settings: StripeSettings,
+    first: int,
+    views: Sequence[TargetView],
+    positions_mm: np.ndarray,
+    target: Target,
+    numbered: _Seen,
+) -> tuple[int, TargetStripe] | str:
+    """The stripe on the target, and the place from ``first`` on of the target's image at this position, or why none."""
+    frame, seen = numbered
+    here = np.flatnonzero(np.abs(positions_mm - capture.stage_mm[frame]) <= _SAME_POSITION_MM)
+    if not len(here):
+        return f"no target was found at {capture.stage_mm[frame]:g} mm"
+    place = int(here[0])
+    along, options, clip = _how_to_find(capture, settings)
+    try:
+        found = stripe_on_target(seen, views[place], target, stripe_along=along, options=options, saturation=clip)
+    except ImageError as error:
+        return str(error)
+    return _too_short(found.pixels) or (first + place, found)
+
+
+def _stripe_in(capture: Capture, settings: StripeSettings, numbered: _Seen) -> np.ndarray | str:
+    """The stripe (N, 2) of a laser frame, or why it is of no use."""
+    along, options, clip = _how_to_find(capture, settings)
+    try:
+        pixels = stripe_in(numbered[1], stripe_along=along, options=options, saturation=clip).pixels()
+    except ImageError as error:
+        return str(error)
+    return _too_short(pixels) or pixels
+
+
+def _how_to_find(capture: Capture, settings: StripeSettings) -> tuple[str, StripeOptions, float]:
+    sensor = capture.header.sensor
+    return sensor.camera.stripe_along, StripeOptions.of(sensor, settings), capture.header.saturation_dn
+
+
+def _too_short(pixels: np.ndarray) -> str:
+    enough = len(pixels) >= _FEWEST_LINES
+    return "" if enough else f"found on {len(pixels)} lines only, at least {_FEWEST_LINES} are of use"
+
+
+def _report(progress: Progress | None, name: str, done: int, total: int) -> int:
+    if progress is not None:
+        progress(name, done + 1, total)
+    return done + 1

@@ -1,0 +1,462 @@
+"""Residuals in pixels of target points, stripes on the target and stripes on steps, with their derivatives."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Self
+
+import cv2
+import numpy as np
+
+from uwlts.calibration.camera.target_images import Placement
+from uwlts.calibration.camera.target_poses import centre_offsets
+from uwlts.calibration.joint.earlier_estimate import Parameters, SheetPoints, ViewMedium
+from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight, TargetParameter
+from uwlts.model.sensor import Uncertainty
+from uwlts.optics.line_table import LineTable, sum_series
+from uwlts.optics.window import leaning
+
+TARGET, STRIPE, STEP = "target", "stripe on the target", "stripe on the step"
+BENDS = (TargetParameter.BOW, TargetParameter.SADDLE)
+STRETCH = (TargetParameter.STRETCH_X, TargetParameter.STRETCH_Y)
+SHIFT = TargetParameter.STRIPE
+_TABLE_MM, _TABLE_SHARE = 1e-7, 1e-7
+"""Error of tabulated points of the sheet, and that of their derivatives as a share of the largest."""
+
+_TOGETHER = 2000
+"""Pixels whose residuals are computed together: fewer take longer each, and those of more leave the cache."""
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Residuals ``values`` (n,) in px of one kind from one image; of the target's points both coordinates in turn.
+
+    ``by_global`` (n, P) are the derivatives by the global parameters, ``by_local`` (n, c) those by the evidence's local
+    parameters that matter in this image, of the numbers ``local_columns`` (c,).
+    """
+
+    kind: str
+    values: np.ndarray
+    by_global: np.ndarray
+    by_local: np.ndarray
+    local_columns: np.ndarray
+    image: int
+
+
+@dataclass(frozen=True, eq=False)
+class Distances:
+    """Signed distances ``values_mm`` (N,) of points from a surface, positive on the side of its normals.
+
+    ``outward`` (3, N) are the derivatives by the points, the unit normals; ``by_local`` (N, k) those by local
+    parameters, ``by_global`` (N,) each those by global parameters other than of the camera's rays and the sheet.
+    """
+
+    values_mm: np.ndarray
+    outward: np.ndarray
+    by_local: np.ndarray
+    by_global: Mapping[ParameterKey, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StripeEvidence(ABC):
+    """Stripe ``pixels`` (N, 2) on something, with local parameters of its own.
+
+    ``across``, 0 or 1, is the coordinate of the pixel that runs across the stripe; ``sources`` names capture and frame
+    of the images by their numbers. Rays are taken at the pixels, or at ``predicted`` ones (N, 2) near them.
+    """
+
+    view: ViewMedium
+    pixels: np.ndarray
+    across: int
+    sources: Mapping[int, str] = field(default_factory=dict)
+    predicted: np.ndarray | None = None
+
+    @abstractmethod
+    def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
+        """Those of each image; None where a ray meets nothing."""
+
+    @abstractmethod
+    def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
+        """Standard uncertainty (b,) of the local parameters before; infinite where nothing is known."""
+
+    def known_before(self, local: np.ndarray, uncertainty: Uncertainty) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (c,) of local parameters against prior knowledge, in standard uncertainties; derivatives (c, b)."""
+        std = self.local_std(uncertainty)
+        known = np.isfinite(std)
+        return local[known] / std[known], np.diag(1.0 / std)[known]
+
+    def lit(self, image: int) -> np.ndarray:
+        """The stripe pixels (N,) of an image."""
+        return np.ones(len(self.pixels), dtype=bool)
+
+    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
+        """The same with rays taken at the pixels that these residuals predict, but as found where not ``used`` (n,)."""
+        predicted = self.pixels.copy()
+        for part, kept in zip(residuals, used, strict=True):
+            if part.kind != TARGET:
+                predicted[self.lit(part.image), self.across] -= np.where(kept, part.values, 0.0)
+        return replace(self, predicted=predicted)
+
+    def on_sheet(self, parameters: Parameters, global_values: np.ndarray, *, shifted_px: float = 0.0) -> "SeenSheet":
+        """Points of the sheet that the pixels show, of a stripe shifted across itself."""
+        at_px = self.pixels if self.predicted is None else self.predicted
+        at_px = at_px - shifted_px * np.eye(2)[self.across]
+        return SeenSheet.of(parameters, global_values, self.view, at_px, across=self.across)
+
+    def stripe_residuals(
+        self,
+        parameters: Parameters,
+        points: SheetPoints,
+        off: Distances,
+        *,
+        kind: str,
+        local_columns: np.ndarray,
+        image: int,
+        here: np.ndarray | slice = slice(None),
+        least_share: float = 0.0,
+    ) -> Residuals:
+        """Distances of points of the sheet from a surface as pixels across the stripe.
+
+        Where a pixel moves the distance by less than ``least_share`` of how far it moves the point, that share counts.
+        """
+        by = points.along(off.outward)
+        by_px, by_global = by[:, 0], by[:, 1:]
+        for key, column in off.by_global.items():
+            parameters.add(by_global, key, column)
+        per_px, found_px = by_px, self.pixels[here, self.across]
+        at_px = found_px if self.predicted is None else self.predicted[here, self.across]
+        if least_share:
+            least = least_share * np.linalg.norm(points.by[:, :, 0], axis=1)
+            per_px = np.copysign(np.maximum(np.abs(per_px), least), per_px)
+        return Residuals(
+            kind,
+            (found_px - at_px) * (by_px / per_px) + off.values_mm / per_px,
+            by_global / per_px[:, None],
+            off.by_local / per_px[:, None],
+            local_columns,
+            image,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSheet:
+    """Points of the sheet that stripe pixels (N, 2) show: calculated one by one, or by a table where there are many.
+
+    ``table`` are the series of lines, and the row and the argument (N,) of each pixel, as of `LineTable.series`.
+    """
+
+    exact: Callable[[np.ndarray], SheetPoints | None]
+    pixels: np.ndarray
+    table: tuple[np.ndarray, np.ndarray, np.ndarray] | None
+
+    @classmethod
+    def of(
+        cls, parameters: Parameters, global_values: np.ndarray, view: ViewMedium, pixels: np.ndarray, *, across: int
+    ) -> "SeenSheet":
+        """That of a vector of the global parameters."""
+        exact = partial(parameters.stripe_points, global_values, view, across=across)
+        line, place = pixels[:, 1 - across].astype(np.intp), pixels[:, across]
+        if not (line == pixels[:, 1 - across]).all():
+            return cls(exact, pixels, None)
+
+        def values(line: np.ndarray, place: np.ndarray) -> np.ndarray:
+            found = exact(np.stack([line, place] if across else [place, line], axis=1))
+            if found is None:
+                return np.full((len(line), 1), np.nan)
+            return np.hstack([found.points.T, found.by.reshape(len(line), -1)])
+
+        table = LineTable.about(values, line, place, tolerance=_TABLE_MM, share=_TABLE_SHARE)
+        return cls(exact, pixels, None if table is None else table.series(line, place))
+
+    def places_mm(self) -> np.ndarray | None:
+        """The points (3, N) alone; None where the ray of one meets no sheet."""
+        if self.table is None:
+            found = self.exact(self.pixels)
+            return None if found is None else found.points
+        series, row, at = self.table
+        values = np.empty((len(row), 3))
+        sum_series(np.ascontiguousarray(series[:, :, :3]), row, at, values)
+        return values.T
+
+    def points(self, here: np.ndarray | slice = slice(None)) -> SheetPoints | None:
+        """Those of some of the pixels (n,); None where the ray of one meets no sheet."""
+        if self.table is None:
+            return self.exact(self.pixels[here])
+        series, row, at = self.table
+        values = np.empty((len(row[here]), series.shape[2]))
+        sum_series(series, row[here], at[here], values)
+        return SheetPoints(np.ascontiguousarray(values[:, :3].T), values[:, 3:].reshape(len(values), 3, -1))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TargetEvidence(StripeEvidence):
+    """Images of one placement of the target with the stripes on it; local parameters are its pose, and the stage's.
+
+    The local parameters are rotation vector and shift ``T_camera_target`` at the first image, and where the stage
+    moved: the tilt of its direction against the target's normal (2,) and an error in mm of all positions but the first.
+
+    Attributes
+    ----------
+    placement, predicted_points : the target's points as found; (M, 2), their pixels as ``predicted`` for the stripe
+    image : (N,); number of each stripe pixel's image
+    shifts_mm : (N,); stage position of each stripe pixel, from that of the first image
+    staged : whether the images are joined by the stage's motion
+    extent_mm : (K, 2); corners of the target, whose bow is given at the one farthest from the middle
+    """
+
+    placement: Placement
+    image: np.ndarray
+    shifts_mm: np.ndarray
+    staged: bool
+    extent_mm: np.ndarray
+    predicted_points: np.ndarray | None = None
+    middle_mm: np.ndarray = field(init=False)
+    radius_mm: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        middle = self.extent_mm.mean(axis=0)
+        object.__setattr__(self, "middle_mm", middle)
+        object.__setattr__(self, "radius_mm", float(np.linalg.norm(self.extent_mm - middle, axis=1).max()))
+
+    def images(self) -> np.ndarray:
+        """Numbers of the images whose stage positions have errors of their own."""
+        return np.unique(self.placement.image)[1:] if self.staged else np.empty(0, dtype=int)
+
+    def lit(self, image: int) -> np.ndarray:
+        return self.image == image
+
+    def with_stripes(self, chosen: np.ndarray | slice) -> Self:
+        """The same with some of the stripe pixels only."""
+        return replace(self, pixels=self.pixels[chosen], image=self.image[chosen], shifts_mm=self.shifts_mm[chosen])
+
+    def with_centres(
+        self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, diameter_mm: float
+    ) -> Self:
+        """The same with the images of the circles' centres instead of the centres of the circles' images."""
+        placement, seen_by = self.placement, partial(parameters.project, global_values, self.view)
+        pixels = placement.pixels.copy()
+        for image in np.unique(placement.image):
+            pose, here = self.pose(parameters, global_values, local, image), placement.image == image
+            pixels[here] -= centre_offsets(seen_by, pose, placement.points_mm[here], diameter_mm=diameter_mm)
+        return replace(self, placement=replace(placement, pixels=pixels))
+
+    def pose(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, image: int) -> np.ndarray:
+        """``T_camera_target`` (4, 4) of one of the images."""
+        pose = _Poses(self, parameters, global_values, local, np.array([image]))
+        result = np.eye(4)
+        result[:3, :3] = pose.rotation
+        result[:3, 3] = pose.shift - pose.rotation @ (pose.direction * pose.travel)
+        return result
+
+    def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
+        if not self.staged:
+            return np.full(6, np.inf)
+        tilt, position = uncertainty.stage_lean(), uncertainty.stage_position_mm
+        return np.array([*[np.inf] * 6, tilt, tilt, *[position] * len(self.images())])
+
+    def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
+        """Those of the target's points and of the stripe, image by image; None where a ray meets nothing."""
+        found: list[Residuals] = []
+        sheet = self.on_sheet(parameters, global_values, shifted_px=parameters.value(global_values, SHIFT))
+        of_stripe = partial(self._of_stripe, sheet)
+        for of_kind, image in ((self._of_points, self.placement.image), (of_stripe, self.image)):
+            for here in _batches(image):
+                pose = _Poses(self, parameters, global_values, local, image[here])
+                if (parts := of_kind(parameters, global_values, pose, here)) is None:
+                    return None
+                found += parts
+        return sorted(found, key=lambda part: part.image)
+
+    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
+        points = self.placement.pixels.copy()
+        for part, kept in zip(residuals, used, strict=True):
+            if part.kind == TARGET:
+                points[self.placement.image == part.image] -= np.where(kept, part.values, 0.0).reshape(-1, 2)
+        return replace(super().linearised(residuals, used), predicted_points=points)
+
+    def _of_points(
+        self, parameters: Parameters, global_values: np.ndarray, pose: "_Poses", here: np.ndarray
+    ) -> list[Residuals] | None:
+        """Those of some of the target's points (n,), image after image."""
+        found_px = self.placement.pixels[here]
+        at_px = found_px if self.predicted_points is None else self.predicted_points[here]
+        rays = parameters.rays(global_values, self.view, at_px)
+        if rays is None:
+            return None
+        start, along = pose.into_target(rays.origins), pose.rotation.T @ rays.directions
+        known = self.placement.points_mm[here]
+        bends = self._bends(known)
+        reach = (_values(parameters, global_values, BENDS) @ bends - start[2]) / along[2]
+        if not (reach > 0).all():
+            return None
+        at = rays.origins + reach * rays.directions
+        slope = along[:2] / along[2]
+
+        def flat(moved: np.ndarray) -> np.ndarray:
+            """From a change (..., 3, N) of the point to that (..., 2, N) of where the ray meets the target."""
+            return moved[..., :2, :] - slope * moved[..., 2:, :]
+
+        by_rays = flat(pose.rotation.T @ (rays.origins_by + reach * rays.directions_by))
+        stretch = 1.0 + _values(parameters, global_values, STRETCH)
+        found = (start + reach * along)[:2] - stretch[:, None] * known[:, :2].T
+        into = np.linalg.inv(by_rays[:2].transpose(2, 1, 0))  # (N, 2 pixel, 2 target), target mm to px
+
+        def to_pixels(moved: np.ndarray) -> np.ndarray:
+            """From (2, N, c) to rows (2 N, c)."""
+            return (into @ moved.transpose(1, 0, 2)).reshape(2 * len(known), -1)
+
+        by_scale = flat(pose.by_scale())
+        by_global = np.empty((2, len(known), len(parameters.keys)))
+        for axis in (0, 1):
+            by_global[axis] = parameters.by_global(by_rays[:, axis], self.view)
+            for key, bend in zip(BENDS, bends, strict=True):
+                parameters.add(by_global[axis], key, slope[axis] * bend)
+            parameters.add(by_global[axis], STRETCH[axis], -known[:, axis])
+            parameters.add(by_global[axis], StageParameter.SCALE, by_scale[axis])
+        values = (found_px - at_px).ravel() + to_pixels(found[:, :, None]).ravel()
+        by_local = to_pixels(flat(pose.by_local(at)).transpose(1, 2, 0))
+        return pose.by_image(TARGET, values, to_pixels(by_global), by_local)
+
+    def _of_stripe(
+        self, sheet: SeenSheet, parameters: Parameters, global_values: np.ndarray, pose: "_Poses", here: np.ndarray
+    ) -> list[Residuals] | None:
+        """Those of some of the stripe's pixels (n,), image after image."""
+        points = sheet.points(here)
+        if points is None:
+            return None
+        at = pose.into_target(points.points)
+        bends, (bow, saddle) = self._bends(at.T), _values(parameters, global_values, BENDS)
+        # Height above the bent target: its gradient by the point in the target's frame.
+        steep = -2.0 / self.radius_mm**2 * np.array([[bow + saddle], [bow - saddle]])
+        gradient = np.stack([*(steep * (at[:2] - self.middle_mm[:, None])), np.ones(at.shape[1])])
+        outward = pose.rotation @ gradient
+        by_stripe = -np.einsum("in,ni->n", outward, points.by[:, :, 0])
+        by_global = {SHIFT: by_stripe, StageParameter.SCALE: np.sum(pose.by_scale() * gradient, axis=0)}
+        off = Distances(
+            at[2] - bow * bends[0] - saddle * bends[1],
+            outward,
+            np.einsum("in,cin->nc", gradient, pose.by_local(points.points)),
+            dict(zip(BENDS, -bends, strict=True)) | by_global,
+        )
+        all_columns = np.empty(0, int)
+        every = self.stripe_residuals(
+            parameters, points, off, kind=STRIPE, local_columns=all_columns, image=-1, here=here
+        )
+        return pose.by_image(STRIPE, every.values, every.by_global, every.by_local)
+
+    def _bends(self, points: np.ndarray) -> np.ndarray:
+        """Heights (2, N) of the target's points (N, 2 or 3) for a bow of one, and for a saddle of one."""
+        x2, y2 = ((points[:, :2] - self.middle_mm) / self.radius_mm).T ** 2
+        return np.stack([x2 + y2, x2 - y2])
+
+
+def _values(parameters: Parameters, global_values: np.ndarray, keys: tuple[ParameterKey, ...]) -> np.ndarray:
+    return np.array([parameters.value(global_values, key) for key in keys])
+
+
+def _batches(image: np.ndarray) -> list[np.ndarray]:
+    """Numbers of pixels, image after image, of as many images at a time as stay in the processor's cache."""
+    order = np.argsort(image, kind="stable")
+    starts = np.flatnonzero(np.diff(image[order], prepend=-1))
+    return np.split(order, starts[1:][np.diff(starts // _TOGETHER) > 0]) if len(order) else []
+
+
+class _Poses:
+    """Pose of the target to the camera for pixels (n,) of several images, and its derivatives by local parameters.
+
+    ``image`` (n,) is each pixel's, ``travel`` (n,) how far, in mm, the stage has moved along ``direction`` in it.
+    """
+
+    def __init__(
+        self,
+        evidence: TargetEvidence,
+        parameters: Parameters,
+        global_values: np.ndarray,
+        local: np.ndarray,
+        image: np.ndarray,
+    ):
+        placement = evidence.placement
+        self.rotation, rotation_by = cv2.Rodrigues(local[:3])
+        self._rotation_by = rotation_by.reshape(3, 3, 3)
+        self.shift, self.image, self._staged = local[3:6], image, evidence.staged
+        tilt = local[6:8] if evidence.staged else np.zeros(2)
+        self.direction, self._direction_by = leaning(np.array([0.0, 0.0, placement.along_z]), np.eye(3)[:2], tilt)
+        self._nominal = self.travel = np.zeros(len(image))
+        if evidence.staged:
+            images, first = np.unique(placement.image, return_index=True)
+            # The first image has no error of its own position.
+            self._place = np.searchsorted(images, image)
+            self._nominal = placement.shifts_mm[first][self._place]
+            scale = 1.0 + parameters.value(global_values, StageParameter.SCALE)
+            self.travel = self._nominal * scale + np.append(0.0, local[8:])[self._place]
+
+    def into_target(self, points: np.ndarray) -> np.ndarray:
+        """Points (3, n) of the camera frame in the target's frame at the first image."""
+        return self.rotation.T @ (points - self.shift[:, None]) + self.direction[:, None] * self.travel
+
+    def by_scale(self) -> np.ndarray:
+        """Derivatives (3, n) of `into_target` by the stage's scale."""
+        return self.direction[:, None] * self._nominal
+
+    def by_local(self, points: np.ndarray) -> np.ndarray:
+        """Derivatives (c, 3, n) of `into_target` by the local parameters, the last one that of each pixel's image."""
+        result = np.empty((9 if self._staged else 6, 3, points.shape[1]))
+        result[:3] = self._rotation_by.transpose(0, 2, 1) @ (points - self.shift[:, None])
+        result[3:6] = -self.rotation[:, :, None]
+        if self._staged:
+            result[6:8] = self._direction_by[:, :, None] * self.travel
+            result[8] = self.direction[:, None]
+        return result
+
+    def by_image(self, kind: str, values: np.ndarray, by_global: np.ndarray, by_local: np.ndarray) -> list[Residuals]:
+        """Residuals of each image from those of all pixels, of one coordinate or two each."""
+        images, first = np.unique(self.image, return_index=True)
+        rows, found = len(values) // len(self.image), []
+        for image, start, end in zip(images, first, np.append(first[1:], len(self.image)), strict=True):
+            here = slice(rows * start, rows * end)
+            place = self._place[start] if self._staged else 0
+            columns = np.append(np.arange(8), 7 + place) if place else np.arange(min(8, by_local.shape[1]))
+            own = by_local[here, : len(columns)]
+            found.append(Residuals(kind, values[here], by_global[here], own, columns, int(image)))
+        return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StepProfileEvidence(StripeEvidence):
+    """Stripe pixels on both faces of a step standard in one image; local parameters are the lower face's line.
+
+    The faces are planes square to ``upward + slope * along``; the lower one lies at a distance of the local parameters
+    (slope, distance in mm), the upper one higher by the standard's height, which is the global parameter ``height``,
+    times ``lengthened``, as the sheet cuts the step at an angle to its normal.
+    ``upward``, from the lower face to the upper one, and ``along`` the stripe are unit vectors (3,), camera frame;
+    ``upper`` (N,) marks the pixels on the upper face. ``image`` is the number of the image among all of steps.
+    """
+
+    upper: np.ndarray
+    upward: np.ndarray
+    along: np.ndarray
+    height: StepHeight
+    image: int
+    lengthened: float = 1.0
+
+    def upper_mm(self, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
+        """How far (N,) the pixels' faces lie above the lower one within the sheet."""
+        return self.upper * (self.lengthened * parameters.value(global_values, self.height))
+
+    def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
+        return np.full(2, np.inf)
+
+    def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
+        points = self.on_sheet(parameters, global_values).points()
+        if points is None:
+            return None
+        normal, by_slope = leaning(self.upward, self.along[None], local[:1])
+        off = Distances(
+            normal @ points.points - local[1] - self.upper_mm(parameters, global_values),
+            np.broadcast_to(normal[:, None], points.points.shape),
+            np.column_stack([by_slope[0] @ points.points, np.full(len(self.pixels), -1.0)]),
+            {self.height: -self.lengthened * self.upper},
+        )
+        columns = np.arange(2)
+        return [self.stripe_residuals(parameters, points, off, kind=STEP, local_columns=columns, image=self.image)]

@@ -1,0 +1,1 @@
+"""Polynomial reference method of the thesis."""

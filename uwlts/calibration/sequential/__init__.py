@@ -1,0 +1,1 @@
+"""Sequential calibration of the thesis: camera, sheet, window distance, one after the other."""

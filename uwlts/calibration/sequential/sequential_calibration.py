@@ -1,0 +1,444 @@
+"""Sequential calibration: camera and sheet from captures in air, then the window's distance from a step."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from itertools import chain
+from typing import Literal
+
+import numpy as np
+from pydantic import JsonValue
+
+from uwlts._version import __version__
+from uwlts.calibration.camera.camera_parameters import CameraOptions
+from uwlts.calibration.camera.image_turns import refuse_turned_travel
+from uwlts.calibration.camera.lens import LensCalibration, LensChoice, calibrate_lens, half_doubt, jackknife
+from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
+from uwlts.calibration.capture_evidence import (
+    AirEvidence,
+    Progress,
+    StepEvidence,
+    air_evidence,
+    no_stripe_in,
+    step_evidence,
+)
+from uwlts.calibration.sequential.sheet_fit import (
+    SheetSolution,
+    StripePoints,
+    fit_sheet,
+    object_frame,
+    points_on_target,
+)
+from uwlts.calibration.sequential.step_figures import camera_figures, lens_figures, sheet_figures, window_figures
+from uwlts.calibration.sequential.step_images import label_steps
+from uwlts.calibration.sequential.window_distance import WindowSolution, solve_window
+from uwlts.errors import CalibrationError
+from uwlts.model.calibration import Calibration, WindowModel
+from uwlts.model.placement import camera_from_object, laser_pose
+from uwlts.model.sensor import Sensor, Window
+from uwlts.storage.capture import Capture, source_of
+from uwlts.stripe import StripeSettings
+
+_FEWEST_LEFT_OUT = 4  # images; of fewer the jackknife says little
+_CLEARLY_LESS = 0.7  # of the misses: so much less with a free direction of the stage is no chance
+_LARGEST_USUAL_TURN = np.radians(5)  # design values are rough, so only larger deviations are reported
+
+
+@dataclass(frozen=True)
+class CalibrationOptions:
+    """Settings of the calibration.
+
+    Attributes
+    ----------
+    refractions : 2: a pane of glass of known thickness and index; the images in air are taken without the window. 1: a
+        single interface; the images in air are taken with the window in place, whose effect goes into the distortion
+    poses : as for `solve_camera`
+    camera : camera parameters that are estimated
+    lens : in place of ``camera``: choose the lens from the images, and leave doubtful points and images out. The joint
+        calibration takes only coefficients from it
+    correct_circles : take out the offset between a circle's image and the image of its centre
+    medium_index : replaces the index of the medium of the step images
+    same_water : jointly: whether scans were taken in the same water as the target, not only in one described alike
+    sizes_known : jointly: whether diameters and spacings of what was scanned count as calibrated where their
+        uncertainty is stated; they are estimated otherwise
+    strict : jointly: refuse images that do not fit, in place of leaving them out or stating an error of the model
+    bounds_mm : (low, high), optional; window distances to search
+    """
+
+    refractions: Literal[1, 2] = 2
+    poses: Poses = "stage-normal"
+    camera: CameraOptions = CameraOptions()
+    lens: LensChoice | None = None
+    stripe: StripeSettings = None
+    correct_circles: bool = True
+    medium_index: float | None = None
+    same_water: bool = True
+    sizes_known: bool = True
+    strict: bool = False
+    bounds_mm: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """A calibration with everything a report shows of its making.
+
+    Attributes
+    ----------
+    steps : those used for the window, in the order of its figures
+    """
+
+    calibration: Calibration
+    air: AirEvidence
+    camera: CameraSolution
+    stripe_points: StripePoints
+    sheet: SheetSolution
+    steps: Sequence[StepEvidence]
+    window: WindowSolution | None
+    warnings: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """All that the captures of a calibration show.
+
+    Attributes
+    ----------
+    sensor : as the captures of the target describe it
+    medium_kind : kind of the medium in which the target was seen
+    stage_direction : (3,); nominal direction of the stage before the target, in the OCS
+    approaching : whether the stage moves the sensor towards the target; None where that does not matter
+    window : description of the camera's window before the step standard; None without step captures
+    sources : what the captures say of themselves, for the calibration's provenance
+    """
+
+    sensor: Sensor
+    medium_kind: Literal["air", "fresh", "sea", "custom"]
+    stage_direction: np.ndarray
+    approaching: bool | None
+    air: AirEvidence
+    window: Window | None
+    steps: list[StepEvidence]
+    sources: dict[str, JsonValue]
+    warnings: list[str]
+
+
+def calibrate_sequentially(
+    air: Sequence[Capture],
+    steps: Sequence[Capture] = (),
+    *,
+    options: CalibrationOptions | None = None,
+    progress: Progress | None = None,
+) -> CalibrationResult:
+    """Calibrate a sensor from its captures; without step captures for use in the medium of the target's images only.
+
+    Parameters
+    ----------
+    air : a target in air, moved along by the stage; each capture a placement of its own. Images with the laser off show
+        the target, those with the laser on, at the same stage positions, the stripe on it. Seen through the window in
+        another medium, and without step captures, they give the calibration of a single viewpoint: refraction goes into
+        focal length and distortion.
+    steps : a step standard in the medium of use
+
+    Raises
+    ------
+    CalibrationError
+        The evidence does not determine the calibration or contradicts it.
+    DescriptionError
+        A capture does not describe its target or its step standard.
+    """
+    options = CalibrationOptions() if options is None else options
+    return solve(gather(air, steps, options=options, progress=progress), options=options)
+
+
+def gather(
+    air: Sequence[Capture], steps: Sequence[Capture], *, options: CalibrationOptions, progress: Progress | None = None
+) -> Evidence:
+    """Find the target, the stripes on it and on the step standard in all images; errors as `calibrate_sequentially`.
+
+    CalibrationError also where a capture is given twice.
+    """
+    sensor = common_sensor([*air, *steps])
+    media = {capture.header.medium.kind for capture in air}
+    if len(media) > 1 or (steps and media != {"air"}):
+        raise CalibrationError(
+            f"the target was seen in {' and '.join(sorted(media))}: take all images of it in air if a step standard "
+            "is to find the window, else all in the medium of use"
+        )
+    sources = sources_of(air, steps)
+    found = air_evidence(air, stripe=options.stripe, progress=progress)
+    warnings = [*found.warnings, *_window_warnings(air, steps, options)]
+    on_steps: list[StepEvidence] = []
+    if steps:
+        on_steps, left_out = step_evidence(
+            steps, medium_index=options.medium_index, stripe=options.stripe, progress=progress
+        )
+        warnings += left_out
+        if not on_steps:
+            raise CalibrationError(no_stripe_in(steps))
+    return Evidence(
+        sensor=sensor,
+        medium_kind=air[0].header.medium.kind,
+        stage_direction=np.array(air[0].header.stage_direction),
+        approaching=None if options.poses == "free" else _approaching(air),
+        air=found,
+        window=steps[0].header.sensor.camera.window if steps else None,
+        steps=on_steps,
+        sources=sources,
+        warnings=warnings,
+    )
+
+
+def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
+    """Calibrate from what the captures show, near ``start`` if it is given; errors as `calibrate_sequentially`."""
+    sensor = evidence.sensor
+    seen = _camera_of(evidence, options, start)
+    camera, found = seen.camera, seen.air
+    if found.no_stripe:
+        raise CalibrationError(found.no_stripe)
+    stripe_points = points_on_target(camera.model, found.stripes, camera.target_poses, plate_mm=found.target.plate_mm)
+    pose = laser_pose(sensor)
+    sheet = fit_sheet(
+        stripe_points.points_mm, nominal_normal=pose.normal, nominal_offset_mm=float(pose.normal @ pose.origin_mm)
+    )
+    figures, apart = {"camera": camera_figures(camera)}, None
+    warnings = [*evidence.warnings, *seen.warnings]
+    if seen.lens is not None:
+        sheet, apart = _by_images(sheet, seen.lens, found), _halves_apart_rad(sheet, seen.lens, found)
+        figures["camera"] |= lens_figures(seen.lens, found)
+        warnings += seen.lens.half_doubts()
+        if apart is not None:
+            words = f"their sheets are {np.degrees(apart):.3f} deg apart"
+            warnings += half_doubt(words, apart=apart, std=sheet.normal_std_rad)
+    figures["sheet"] = sheet_figures(sheet, stripe_points, apart)
+    warnings += _turn_warnings(camera, sheet, evidence)
+    calibration = Calibration(
+        sensor_name=sensor.name,
+        stripe_along=sensor.camera.stripe_along,
+        wavelength_nm=sensor.laser.wavelength_nm,
+        medium_kind=evidence.medium_kind,
+        camera=camera.model,
+        window=None,
+        sheet=sheet.model,
+        camera_from_object=tuple(map(tuple, object_frame(sheet.model, laser_axis=pose.axis).tolist())),
+    )
+    used, on_steps, window = [], [], None
+    if evidence.window is not None:
+        described = WindowModel.described(evidence.window, sensor.laser.wavelength_nm, refractions=options.refractions)
+        labelled, on_steps = label_steps(calibration, described, evidence.steps, uncertainty=sensor.uncertainty)
+        used = [image for image in labelled if image is not None]
+        if not used:
+            why = "; ".join([*evidence.warnings, *on_steps][:3])
+            raise CalibrationError(f"no step image can be used for the window's distance; {why}")
+        window = solve_window(calibration, described, used, bounds_mm=options.bounds_mm, known=sensor.uncertainty)
+        figures["window"] = window_figures(window, used)
+    warnings += on_steps
+    how = {"refractions": options.refractions, "poses": options.poses, "medium_index": options.medium_index}
+    calibration = calibration.model_copy(
+        update={
+            "window": None if window is None else window.model,
+            "residuals": figures,
+            "provenance": evidence.sources | how | {"warnings": warnings},
+        }
+    )
+    return CalibrationResult(calibration, found, camera, stripe_points, sheet, used, window, warnings)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A camera, the lens it was chosen with or None, the images it rests on, and what speaks against it."""
+
+    camera: CameraSolution
+    lens: LensCalibration | None
+    air: AirEvidence
+    warnings: list[str]
+
+
+def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSolution | None) -> _Seen:
+    """The camera from the images of the target, near ``start`` if that is given, or with a lens that is chosen."""
+    air = evidence.air
+    width_px, height_px = evidence.sensor.camera.width_px, evidence.sensor.camera.height_px
+    approaching = evidence.approaching is not False
+    diameter_mm = air.target.circle_diameter_mm if options.correct_circles else None
+    solved = partial(
+        solve_camera, width_px=width_px, height_px=height_px, approaching=approaching, circle_diameter_mm=diameter_mm
+    )
+    if options.lens is None:
+        estimated = options.camera.described(evidence.sensor.camera)
+        return _Seen(solved(air.images, poses=options.poses, options=estimated, start=start), None, air, [])
+    lens = calibrate_lens(
+        air.images,
+        width_px=width_px,
+        height_px=height_px,
+        poses=options.poses,
+        approaching=approaching,
+        choice=replace(
+            options.lens,
+            tangential=evidence.sensor.uncertainty.tangential,
+            pixel_aspect=evidence.sensor.camera.pixel_aspect,
+        ),
+        circle_diameter_mm=diameter_mm,
+    )
+    camera, used, names = (
+        replace(lens.solution, covariance=lens.covariance),
+        air.only(lens.used, lens.images),
+        air.names(),
+    )
+    warnings = [f"{names[place]}: left out, {reason}" for place, reason in lens.left_out.items()]
+    if options.poses == "stage-normal" and lens.options.pixel_aspect is not None:
+        freer = solved(used.images, poses="stage", options=lens.options)
+        if freer.stage_tilt_rad is not None and freer.sigma_px <= _CLEARLY_LESS * camera.sigma_px:
+            unsquare = solved(used.images, poses=options.poses, options=replace(lens.options, pixel_aspect=None))
+            warnings.append(_leaning(camera, freer, unsquare, tilt_rad=freer.stage_tilt_rad))
+    return _Seen(camera, lens, used, warnings)
+
+
+def common_sensor(captures: Sequence[Capture]) -> Sensor:
+    """The first capture's sensor; CalibrationError where another has other optics, or there is none."""
+    if not captures:
+        raise CalibrationError("no capture is given: a calibration starts with one of a target")
+    sensor = captures[0].header.sensor
+
+    def optics(capture: Capture) -> dict[str, object]:
+        camera, laser = capture.header.sensor.camera, capture.header.sensor.laser
+        return {
+            "image size": f"{camera.width_px} x {camera.height_px} px",
+            "stripe_along": camera.stripe_along,
+            "wavelength": f"{laser.wavelength_nm:g} nm",
+        }
+
+    for capture in captures[1:]:
+        own, other = optics(capture), optics(captures[0])
+        differ = ", ".join(
+            f"its {name} is {own[name]} against {other[name]}" for name in own if own[name] != other[name]
+        )
+        if differ:
+            camera = capture.header.sensor.camera
+            turned = (camera.height_px, camera.width_px) == (sensor.camera.width_px, sensor.camera.height_px)
+            raise CalibrationError(
+                f"{capture.path.name} comes from another sensor than {captures[0].path.name}: {differ}"
+                + ("; the images of one are turned by a quarter turn" if turned and "size" in differ else "")
+            )
+    return sensor
+
+
+def _approaching(air: Sequence[Capture]) -> bool:
+    """Whether the stage moves the sensor towards the target, which stands square to the OCS's Z before the sensor."""
+    along = {capture.header.stage_direction[2] / np.linalg.norm(capture.header.stage_direction) for capture in air}
+    if min(map(abs, along)) < 0.9 or min(along) * max(along) < 0:
+        raise CalibrationError(
+            "the stage must move the sensor along the laser's axis (OCS Z), the same way in all captures; "
+            f"the captures' stage_direction has the Z component {', '.join(f'{z:.2f}' for z in sorted(along))}: use "
+            "poses='free' with a tilted target"
+        )
+    return bool(min(along) > 0)
+
+
+def _window_warnings(air: Sequence[Capture], steps: Sequence[Capture], options: CalibrationOptions) -> list[str]:
+    if not all(capture.header.sensor.camera.window.mounted for capture in steps):
+        raise CalibrationError("a step capture says its camera has no window: there is no distance to find")
+    if not steps:
+        return []
+    mounted = [capture.header.sensor.camera.window.mounted for capture in air]
+    if options.refractions == 2 and any(mounted):
+        return [
+            "the window stood before the camera in air, so its shift of the rays went into the camera's parameters: "
+            "with two refractions take the images in air without it, or use refractions=1"
+        ]
+    if options.refractions == 1 and not all(mounted):
+        return ["the window was removed in air and is one interface in the medium: its thickness appears nowhere"]
+    return []
+
+
+def _by_images(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> SheetSolution:
+    """The sheet with the uncertainty of its normal as it follows from leaving out one image after the other.
+
+    Camera and poses are those without the image, so that their errors, which the points of one image share, count.
+    """
+    normal = np.array(sheet.model.normal)
+    changes = [
+        other - normal
+        for number, solution in enumerate(lens.without)
+        if len(found.stripes[number])
+        and (other := _normal_by(solution, np.delete(np.arange(len(found.stripes)), number), normal, found)) is not None
+    ]
+    if len(changes) < _FEWEST_LEFT_OUT:
+        return sheet
+    std = float(np.sqrt(np.linalg.eigvalsh(jackknife(np.array(changes))).max()))
+    return replace(sheet, normal_std_rad=max(sheet.normal_std_rad, std))
+
+
+def _normal_by(
+    solution: CameraSolution | None, numbers: np.ndarray, near: np.ndarray, found: AirEvidence
+) -> np.ndarray | None:
+    """Normal (3,) of the sheet by a camera that was solved from some of the images; None where it determines none."""
+    if solution is None:
+        return None
+    stripes = [found.stripes[number] for number in numbers]
+    with suppress(CalibrationError):
+        points = points_on_target(solution.model, stripes, solution.target_poses, plate_mm=found.target.plate_mm)
+        return np.array(fit_sheet(points.points_mm, nominal_normal=near).model.normal)
+    return None
+
+
+def _halves_apart_rad(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> float | None:
+    """Angle between the normals of the sheets by two halves of the images, each with its own camera."""
+    numbers, near = np.arange(len(found.stripes)), np.array(sheet.model.normal)
+    one, two = (_normal_by(half, numbers[first::2], near, found) for first, half in enumerate(lens.halves))
+    return None if one is None or two is None else float(np.arccos(np.clip(one @ two, -1.0, 1.0)))
+
+
+def _leaning(camera: CameraSolution, freer: CameraSolution, unsquare: CameraSolution, *, tilt_rad: float) -> str:
+    """What speaks against a stage that moves along the target's normal: one that moves freely, or other pixels.
+
+    Images of one pose, moved along the stage, hardly tell the two apart.
+    """
+    tilt, f, other_f = np.degrees(tilt_rad), camera.model.fx_px, freer.model.fx_px
+    warning = (
+        f"the stage moves {tilt:.2f} deg beside the target's normal: with poses 'stage' the points miss by "
+        f"{freer.sigma_px:.3f} in place of {camera.sigma_px:.3f} px, and f is {other_f:.1f} in place of {f:.1f} px"
+    )
+    if unsquare.sigma_px <= _CLEARLY_LESS * camera.sigma_px:
+        model = unsquare.model
+        warning += (
+            f"; or pixels are not of the shape described: free, they miss by {unsquare.sigma_px:.3f} px, with fx "
+            f"{model.fx_px:.1f} and fy {model.fy_px:.1f} px. Views of the target turned by 20 deg and more would tell"
+        )
+    return warning
+
+
+def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evidence) -> list[str]:
+    warnings = []
+    if sheet.turn_rad > _LARGEST_USUAL_TURN:
+        warnings.append(f"the sheet's normal is {np.degrees(sheet.turn_rad):.1f} deg away from the description's")
+    if camera.stage_direction is not None:
+        nominal = camera_from_object(evidence.sensor)[:3, :3] @ evidence.stage_direction
+        refuse_turned_travel(camera.stage_direction, nominal)
+        cosine = camera.stage_direction @ nominal / np.linalg.norm(nominal)
+        turn = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+        if turn > np.degrees(_LARGEST_USUAL_TURN):
+            warnings.append(f"the stage's direction is {turn:.1f} deg away from the capture's stage_direction")
+    return warnings
+
+
+def sources_of(air: Sequence[Capture], steps: Sequence[Capture], scans: Sequence[Capture] = ()) -> dict[str, JsonValue]:
+    """Captures, software and date of a calibration, for its provenance.
+
+    CalibrationError where one is given twice, so that its noise would count as two independent ones.
+    """
+    kinds = {"air_captures": air, "step_captures": steps, "scan_captures": scans}
+    sources = {kind: [source_of(capture) for capture in captures] for kind, captures in kinds.items()}
+    names: dict[str, str] = {}
+    for source in chain.from_iterable(sources.values()):
+        if source.sha256 in names:
+            raise CalibrationError(f"{names[source.sha256]} and {source.file} are the same capture: give it once")
+        names[source.sha256] = source.file
+    origin: dict[str, JsonValue] = {
+        "source": "calibration from captures",
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "software": f"uwlts {__version__}",
+    }
+    for kind, each in sources.items():
+        origin[kind] = [source.in_file() for source in each]
+    return origin

@@ -1,0 +1,161 @@
+"""Images of a step standard: the faces in each, and how far the standard is turned from facing the laser."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+
+from uwlts.calibration.capture_evidence import StepEvidence
+from uwlts.errors import EvaluationError
+from uwlts.evaluation.step_faces import StepFace, label_step_faces
+from uwlts.fitting.shapes import fit_line, fit_plane
+from uwlts.model.calibration import Calibration, WindowModel
+from uwlts.model.sensor import Uncertainty
+from uwlts.optics.triangulation import points_on_sheet
+
+_FEWEST_PLACES, _LEAST_TRAVEL_MM = 3, 5.0  # images of a face; fewer and nearer ones do not show that it is a plane
+# The lower face counts as one plane in all images, so that the standard stood still, as long as points scatter about it
+# so many times as much as about their lines, and by a stage's errors.
+_STOOD_STILL, _STAGE_MM = 2.0, 0.05
+_SCALE_STD = 0.05  # relative, of profiles by a window that is only described
+_OF_SQUARE = np.sqrt(3) / 2
+"""Root mean square of a²/2 over the variance of a normally distributed angle a, as 1 / cos(a) is 1 + a²/2."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StepImage(StepEvidence):
+    """A stripe on a step standard with the `StepFace` (N,) of every pixel.
+
+    Within the sheet the step is ``lengthened`` times as high as along its normal, with the relative standard
+    uncertainty ``lengthened_std``: where the standard is turned by a about the stripe, 1 / cos(a) times.
+    """
+
+    labels: np.ndarray
+    lengthened: float = 1.0
+    lengthened_std: float = 0.0
+
+    def height_mm(self) -> float:
+        """The step's calibrated height within the sheet."""
+        return self.lengthened * self.standard.height_mm
+
+    def height_std_mm(self, known: Uncertainty) -> float:
+        """Standard uncertainty of that height: of the certificate, or as usually known, and of the turn."""
+        stated = self.standard.height_uncertainty_mm
+        return math.hypot(stated / 2 if stated else known.step_height_mm, self.standard.height_mm * self.lengthened_std)
+
+
+def step_profile(
+    calibration: Calibration, window: WindowModel | None, pixels: np.ndarray, *, medium_index: float
+) -> np.ndarray:
+    """Points (N, 2) of a profile, Y and Z of the OCS in mm, seen through a window; NaN where a ray has no point."""
+    seen = points_on_sheet(calibration.model_copy(update={"window": window}), pixels, medium_index=medium_index)
+    object_from_camera = np.linalg.inv(calibration.object_transform())
+    return seen.points_mm @ object_from_camera[1:3, :3].T + object_from_camera[1:3, 3]
+
+
+def label_step(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:
+    """Separate the faces at the window's nominal distance, where the profile is true to a few percent.
+
+    Raises EvaluationError: the profile does not show two faces.
+    """
+    points = step_profile(calibration, window, step.pixels, medium_index=step.medium_index)
+    found = np.isfinite(points).all(axis=1)
+    labels = np.full(len(points), int(StepFace.NEITHER), dtype=np.int8)
+    labels[found] = label_step_faces(points[found], height_mm=step.standard.height_mm, edge_mm=step.standard.edge_mm)
+    return StepImage(**vars(step), labels=labels)
+
+
+@dataclass(frozen=True)
+class StandardTurn:
+    """How far a step standard is turned from facing the laser, in rad.
+
+    ``aside`` (root mean square of the images) is about the sheet's normal, which profiles show, and which does not
+    change a height; ``about_stripe`` with its standard uncertainty ``std`` does. Where that does not show, it is None,
+    and ``std`` what it is taken to be: as large as the other.
+    """
+
+    aside: float
+    about_stripe: float | None
+    std: float
+
+    def lengthened(self) -> tuple[float, float]:
+        """Height within the sheet over that along the normal, and its standard uncertainty."""
+        turn = self.about_stripe or 0.0
+        return float(1 / np.cos(turn)), float(np.hypot(np.tan(turn) * self.std, _OF_SQUARE * self.std**2))
+
+    def doubt(self, *, height_mm: float, std_mm: float) -> str:
+        """What it may do to a height, in words; empty where that is less than the height's standard uncertainty."""
+        angle = self.aside if self.about_stripe is None else abs(self.about_stripe)
+        share = 1 / np.cos(angle) - 1
+        if share * height_mm <= std_mm:
+            return ""
+        higher = f"seems higher by {100 * share:.2f} % or {share * height_mm:.3f} mm"
+        said = "the standard does not face the laser: it is turned by"
+        if self.about_stripe is None:
+            return (
+                f"{said} {np.degrees(angle):.1f}° about the sheet's normal. That changes no height, but turned as "
+                f"much about the stripe, which these images do not show, it {higher}: let it face the laser, or let "
+                "the stage move the sensor across the stripe between three images or more"
+            )
+        return (
+            f"{said} {np.degrees(angle):.1f} +- {np.degrees(self.std):.1f}° about the stripe and so {higher}, which is "
+            "taken into account: let it face the laser"
+        )
+
+
+def label_steps(
+    calibration: Calibration, window: WindowModel | None, steps: Sequence[StepEvidence], *, uncertainty: Uncertainty
+) -> tuple[list[StepImage | None], list[str]]:
+    """Each image with its faces separated and its standard's turn, as far as that shows; None without two faces.
+
+    Where the stage moves the sensor across the stripe while the standard stands still, the images of a capture show its
+    turn about the stripe. Warnings tell which images are left out, and which standards do not face the laser.
+    """
+    found: list[StepImage | None] = []
+    warnings = []
+    for capture, images in groupby(steps, key=StepEvidence.capture):
+        labelled: list[StepImage | None] = []
+        for step in images:
+            try:
+                labelled.append(label_step(calibration, window, step))
+            except EvaluationError as error:
+                labelled.append(None)
+                warnings.append(f"{step.source}: left out, {error}")
+        seen = [image for image in labelled if image is not None]
+        if seen:
+            turn, standard = _turn(calibration, window, seen, uncertainty), seen[0].standard
+            stated = standard.height_uncertainty_mm
+            std_mm = stated / 2 if stated else uncertainty.step_height_mm
+            if doubt := turn.doubt(height_mm=standard.height_mm, std_mm=std_mm):
+                warnings.append(f"{capture}: {doubt}")
+            factor, std = turn.lengthened()
+            labelled = [
+                None if image is None else replace(image, lengthened=factor, lengthened_std=std) for image in labelled
+            ]
+        found += labelled
+    return found, warnings
+
+
+def _turn(
+    calibration: Calibration, window: WindowModel | None, images: Sequence[StepImage], uncertainty: Uncertainty
+) -> StandardTurn:
+    """Turn of a standard from the lower face in images of one capture: a line in each, a plane in all together."""
+    faces = []
+    for image in images:
+        pixels = image.pixels[image.labels == StepFace.LOWER]
+        faces.append(step_profile(calibration, window, pixels, medium_index=image.medium_index))
+    lines = [fit_line(face) for face in faces]
+    aside = float(np.sqrt(np.mean([np.arctan(line.direction[1] / line.direction[0]) ** 2 for line in lines])))
+    travel = np.array([image.travel_mm for image in images])
+    if len(images) >= _FEWEST_PLACES and np.ptp(travel[:, 0]) > _LEAST_TRAVEL_MM:
+        in_space = [np.pad(face, ((0, 0), (1, 0))) + moved for face, moved in zip(faces, travel, strict=True)]
+        plane = fit_plane(np.vstack(in_space))
+        scatter = float(np.sqrt(np.mean([line.std_mm**2 for line in lines])))
+        if plane.std_mm < np.hypot(_STOOD_STILL * scatter, _STAGE_MM):
+            about_stripe = float(np.arcsin(min(abs(plane.normal[0]), 1.0)))
+            slope = float(np.sqrt(np.diag(plane.covariance)[1:].max()))
+            std = float(np.linalg.norm([uncertainty.stage_lean(), _SCALE_STD * about_stripe, slope]))
+            return StandardTurn(aside, about_stripe, std)
+    return StandardTurn(aside, None, aside)

@@ -1,0 +1,199 @@
+"""Distance of the camera's window from images of a step standard in the medium (thesis, sections 3.2.2 and 4.8.1)."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares, root_scalar
+
+from uwlts.calibration.sequential.step_images import StepImage, step_profile
+from uwlts.errors import CalibrationError
+from uwlts.evaluation.step_faces import StepFace, step_height
+from uwlts.model.calibration import Calibration, WindowModel
+from uwlts.model.sensor import Uncertainty
+
+_CURVE_POINTS = 31  # the curve has one valley, several points wide
+_SEARCHED = (0.2, 2.5)  # shares of the described distance, which is measured to better than half
+# Over the whole range of distances the height must change by this many times its scatter, and by more than rounding.
+_LEAST_CHANGE = 10.0
+_ROUNDING_MM = 1e-6
+_INDEX_STEP = 1e-5  # for the derivative by the index
+_USUALLY_KNOWN = Uncertainty()
+_AT_BOUND = 1e-3  # share of the range; least squares within bounds stop as close to them
+
+
+@dataclass(frozen=True, eq=False)
+class WindowSolution:
+    """The window at the distance that explains the steps best.
+
+    Attributes
+    ----------
+    heights_mm, errors_mm, height_std_mm : (S,); height of the step in every image, its error, and its standard
+        deviation from the scatter of the points
+    slopes : (S,); change of each height with the distance
+    std_mm : standard deviation of the distance from the height errors left over; None with a single image
+    scatter_std_mm : standard deviation that the scatter of the points alone gives
+    per_height : shift of the distance per shift of the calibrated height, if all images use the same step
+    per_index : shift of the distance per shift of the index, if all images are taken in the same medium
+    uncertainty_mm : standard uncertainty of the distance, from the errors left over, or the scatter of a single image,
+        and those of the calibrated height and the medium's index, which all images share
+    image_distances_mm : (S,); distance that each image alone gives (thesis, Table 4); NaN where none within the bounds
+        does.
+    curve_mm : (C, 2); tried distances and root mean square height error, NaN where a point cannot be reconstructed
+    bounds_mm : (2,)
+    """
+
+    model: WindowModel
+    heights_mm: np.ndarray
+    errors_mm: np.ndarray
+    height_std_mm: np.ndarray
+    slopes: np.ndarray
+    std_mm: float | None
+    scatter_std_mm: float
+    per_height: float
+    per_index: float
+    uncertainty_mm: float
+    image_distances_mm: np.ndarray
+    curve_mm: np.ndarray
+    bounds_mm: tuple[float, float]
+
+
+def solve_window(
+    calibration: Calibration,
+    window: WindowModel,
+    steps: Sequence[StepImage],
+    *,
+    bounds_mm: tuple[float, float] | None = None,
+    known: Uncertainty = _USUALLY_KNOWN,
+) -> WindowSolution:
+    """Window distance that minimises the mean square height error over all step images.
+
+    A coarse scan finds the valley, Gauss-Newton within the bounds its bottom. The calibration's camera, sheet and OCS
+    are used, not its window; of ``window`` everything but the distance stays. ``bounds_mm`` (low, high) are the
+    distances to search, by default 0.2 to 2.5 times the nominal one. ``known`` says how well heights are known that
+    have no certificate.
+
+    Raises
+    ------
+    CalibrationError
+        No step image, a height that is not positive, the best distance lies at a bound, or the heights hardly depend
+        on the distance.
+    RangeError
+        A pixel or the medium's index is not finite.
+    """
+    if not steps:
+        raise CalibrationError("the window's distance needs at least one image of a step standard")
+    low, high = bounds_mm or tuple(share * window.distance_mm for share in _SEARCHED)
+    if not 0 < low < high < np.inf:
+        raise CalibrationError(f"the window's distance is searched from {low:g} to {high:g} mm; give 0 < low < high")
+    true = np.array([step.height_mm() for step in steps])
+    if not (np.isfinite(true) & (true > 0)).all():
+        raise CalibrationError(f"the heights of the steps must be positive lengths in mm, not {true.tolist()}")
+
+    def heights(distance: float) -> np.ndarray:
+        return _heights(calibration, window, steps, distance)[:, 0]
+
+    tried = np.linspace(low, high, _CURVE_POINTS)
+    scanned = np.array([heights(distance) for distance in tried])
+    mean_error = np.sqrt(np.mean((scanned - true) ** 2, axis=1))
+    usable = np.isfinite(mean_error)
+    if np.count_nonzero(usable) < 3:
+        raise CalibrationError(
+            f"the step cannot be reconstructed with a window {low:.1f} to {high:.1f} mm from the pinhole: it would lie "
+            f"behind the step"
+        )
+    # The points that can be reconstructed form one range: a window before the nearest point.
+    low, high = float(tried[usable][0]), float(tried[usable][-1])
+    margin = _AT_BOUND * (high - low)
+    best = least_squares(
+        lambda d: heights(d[0]) - true,
+        [np.clip(tried[np.nanargmin(mean_error)], low + margin, high - margin)],
+        bounds=(low, high),
+        xtol=1e-12,
+        ftol=1e-12,
+        gtol=1e-14,
+        x_scale=high - low,
+    )
+    distance, slopes = float(best.x[0]), best.jac[:, 0]
+    measured, height_std = _heights(calibration, window, steps, distance).T
+    errors = measured - true
+    change, scatter = (np.sqrt(np.mean(v**2)) for v in (np.ptp(scanned[usable], axis=0), height_std))
+    if change < max(_LEAST_CHANGE * scatter, _ROUNDING_MM):
+        raise CalibrationError(
+            f"the step's height hardly depends on the window's distance: it changes by {change:.3g} mm from {low:.1f} "
+            f"to {high:.1f} mm and scatters by {scatter:.3g} mm; take images in the medium, of a higher step"
+        )
+    if not low + margin < distance < high - margin:
+        raise CalibrationError(
+            f"the step's height fits best at the bound of the searched window distances, {low:.1f} to {high:.1f} mm: "
+            "check the medium's index and the step's height, and that the images are not turned or mirrored, or widen "
+            "the bounds"
+        )
+    own = zip(steps, scanned[usable].T - true[:, None], strict=True)
+    squares, freedom = float(slopes @ slopes), len(steps) - 1
+    std = float(np.sqrt(errors @ errors / freedom / squares)) if freedom else None
+    scatter_std = float(np.linalg.norm(slopes * height_std)) / squares
+    denser = [replace(step, medium_index=step.medium_index + _INDEX_STEP) for step in steps]
+    by_index = (_heights(calibration, window, denser, distance)[:, 0] - measured) / _INDEX_STEP
+    per_height, per_index = float(slopes.sum()) / squares, -float(slopes @ by_index) / squares
+    height_std_mm = max(step.height_std_mm(known) for step in steps)
+    index_std = max(step.index_std for step in steps)
+    return WindowSolution(
+        model=window.model_copy(update={"distance_mm": distance}),
+        heights_mm=measured,
+        errors_mm=errors,
+        height_std_mm=height_std,
+        slopes=slopes,
+        std_mm=std,
+        scatter_std_mm=scatter_std,
+        per_height=per_height,
+        per_index=per_index,
+        uncertainty_mm=math.hypot(
+            scatter_std if std is None else std, per_height * height_std_mm, per_index * index_std
+        ),
+        image_distances_mm=np.array(
+            [_own_distance(calibration, window, step, tried[usable], scan, distance) for step, scan in own]
+        ),
+        curve_mm=np.column_stack([tried, mean_error]),
+        bounds_mm=(low, high),
+    )
+
+
+def _heights(calibration: Calibration, window: WindowModel, steps: Sequence[StepImage], distance: float) -> np.ndarray:
+    """Height of the step in every image and its standard deviation, mm: (S, 2).
+
+    NaN where a point of a tread has no reconstruction.
+    """
+    at_distance = window.model_copy(update={"distance_mm": float(distance)})
+    heights = np.full((len(steps), 2), np.nan)
+    for index in {step.medium_index for step in steps}:
+        here = [number for number, step in enumerate(steps) if step.medium_index == index]
+        treads = [steps[number].labels != StepFace.NEITHER for number in here]
+        pixels = [steps[number].pixels[on_it] for number, on_it in zip(here, treads, strict=True)]
+        points = step_profile(calibration, at_distance, np.vstack(pixels), medium_index=index)
+        profiles = np.split(points, np.cumsum([len(part) for part in pixels])[:-1])
+        for number, on_it, profile in zip(here, treads, profiles, strict=True):
+            if np.isfinite(profile).all():
+                step = steps[number]
+                height = step_height(profile, step.labels[on_it], reference=step.standard.reference)
+                heights[number] = height.height_mm, height.std_mm
+    return heights
+
+
+def _own_distance(
+    calibration: Calibration, window: WindowModel, step: StepImage, tried: np.ndarray, errors: np.ndarray, near: float
+) -> float:
+    """Distance at which one image shows the true height, the one next to ``near``; NaN where there is none.
+
+    ``errors`` are those of the height at the distances tried.
+    """
+    changes = np.flatnonzero(errors[:-1] * errors[1:] <= 0)
+    if not len(changes):
+        return float("nan")
+    left = changes[np.argmin(np.abs(tried[changes] - near))]
+
+    def error(distance: float) -> float:
+        return float(_heights(calibration, window, [step], distance)[0, 0]) - step.height_mm()
+
+    return float(root_scalar(error, bracket=(tried[left], tried[left + 1]), method="brentq", xtol=1e-7).root)

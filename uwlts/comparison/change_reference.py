@@ -1,0 +1,184 @@
+"""References of a comparison: an earlier cloud, a mesh or an ideal shape; and the datums of a registration."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+from scipy.spatial import KDTree
+
+from uwlts.comparison.ideal_shapes import KINDS, IdealShape, read_shape
+from uwlts.errors import CaptureError, DescriptionError, EvaluationError, problems_of
+from uwlts.evaluation.figures import TOWARDS_SENSOR
+from uwlts.files.reading import MOST_TOML_BYTES, parsed_toml, read_text, require_regular_file
+from uwlts.fitting.point_spacing import POINTS_PER_DISC
+from uwlts.model.sensor import Description, Positive, Vector
+from uwlts.storage.cloud import PointCloud, PointUncertainty
+from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.pose_files import MM_PER_UNIT, Unit, checked_unit
+
+_SAMPLES_PER_DISC = 60
+_MOST_SAMPLES = 3_000_000
+_AT_A_TIME = 20_000
+_OTHER_UNIT = 50.0
+"""Ratio of sizes from which two things are given in other units; a metre is a thousand millimetres."""
+
+Reference = PointCloud | IdealShape | str | os.PathLike[str]
+
+
+@dataclass(frozen=True, eq=False)
+class ReferencePoints:
+    """Points (M, 3) of a cloud, or samples of a mesh with its normals, and how well they are known."""
+
+    points_mm: np.ndarray
+    normals: np.ndarray | None = None
+    uncertainty: PointUncertainty | None = None
+    frame: np.ndarray | None = None
+
+    @property
+    def meshed(self) -> bool:
+        """Whether these are samples of a mesh, between which nothing scatters."""
+        return self.normals is not None
+
+
+class Datum(Description):
+    """A sphere in the reference's frame: what lies in it has not changed, and holds the registration."""
+
+    centre_mm: Vector
+    radius_mm: Positive
+
+
+class _Datums(Description):
+    datum: tuple[Datum, ...]
+
+
+def read_datums(datums: np.ndarray | str | os.PathLike[str]) -> np.ndarray:
+    """Centres and radii (K, 4), mm, from a TOML file with tables [[datum]] (centre_mm, radius_mm), or an array of them.
+
+    CaptureError, DescriptionError or EvaluationError where it cannot be read or is none.
+    """
+    if isinstance(datums, str | os.PathLike):
+        text = read_text(Path(datums), most_bytes=MOST_TOML_BYTES, called="datums", foreign="is not valid TOML")
+        try:
+            known = _Datums.model_validate(parsed_toml(text)).datum
+        except ValidationError as error:
+            raise DescriptionError(f"{datums} holds no datums: {problems_of(error)}") from error
+        except ValueError as error:
+            raise DescriptionError(f"{datums} is not valid TOML: {error}") from error
+        datums = np.array([(*each.centre_mm, each.radius_mm) for each in known]).reshape(-1, 4)
+    given = np.asarray(datums, float)
+    if (
+        given.ndim != 2
+        or given.shape[1] != 4
+        or not len(given)
+        or not (np.isfinite(given).all() and (given[:, 3] > 0).all())
+    ):
+        raise EvaluationError(f"datums are rows of x, y, z and a positive radius in mm; found the shape {given.shape}")
+    return given
+
+
+def read_reference(reference: Reference, *, unit: Unit, disc_mm: float) -> ReferencePoints | IdealShape:
+    """The reference as points in mm, or an ideal shape by its name (plane, sphere, cylinder) or TOML file."""
+    scale = MM_PER_UNIT[checked_unit(unit)]
+    if isinstance(reference, str) and reference in KINDS:
+        reference = KINDS[reference]
+    if isinstance(reference, str | os.PathLike):
+        path = Path(reference)
+        if path.suffix.lower() == ".toml":
+            reference = read_shape(path)
+        elif (mesh := _mesh(path)) is not None:
+            return sampled(scale * mesh[0], mesh[1], disc_mm=disc_mm)
+        else:
+            reference = read_cloud(path)
+    if not isinstance(reference, PointCloud):
+        return reference
+    if scale != 1.0 and reference.uncertainty is not None:
+        raise EvaluationError("a cloud with uncertainties is in mm: its unit cannot be m")
+    return ReferencePoints(scale * reference.points_mm, None, reference.uncertainty, reference.frame)
+
+
+def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Vertices (V, 3) and triangles (F, 3) of a file; None where it is a cloud."""
+    if path.suffix.lower() == ".h5":
+        return None
+    import trimesh
+
+    require_regular_file(path, error=CaptureError, called="reference")
+    if path.suffix.lower() == ".ply":
+        with path.open("rb") as file:
+            header = file.read(1 << 20).partition(b"end_header")[0]
+        if b"element face" not in header or b"element face 0" in header:
+            return None
+    try:
+        loaded: Any = trimesh.load(path, force="mesh", process=False)
+    except Exception as error:
+        # Trimesh raises whatever its parsers do.
+        raise CaptureError(f"{path} is no mesh (.stl, .obj, .off, .ply) and no cloud: {error}") from error
+    vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces)
+    if not len(faces) or not np.isfinite(vertices).all():
+        raise CaptureError(f"{path} has no triangles, or vertices that are not finite")
+    return vertices, faces
+
+
+def sampled(vertices: np.ndarray, faces: np.ndarray, *, disc_mm: float) -> ReferencePoints:
+    """Points spread evenly over a mesh, with the normals of their triangles."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(across, axis=1) / 2
+    total = float(area.sum())
+    if total <= 0:
+        raise EvaluationError("the mesh has no area")
+    count = int(np.clip(total / (np.pi / 4 * disc_mm**2) * _SAMPLES_PER_DISC, 1000, _MOST_SAMPLES))
+    rng = np.random.default_rng(0)
+    # Equal shares of the area, so that no triangle is forgotten by chance.
+    chosen = np.searchsorted(np.cumsum(area) / total, (np.arange(count) + rng.random(count)) / count)
+    chosen = np.minimum(chosen, len(faces) - 1)
+    u, v = rng.random((2, count))
+    inside = u + v > 1
+    u[inside], v[inside] = 1 - u[inside], 1 - v[inside]
+    first, second, third = corners[chosen].transpose(1, 0, 2)
+    points = first + u[:, None] * (second - first) + v[:, None] * (third - first)
+    return ReferencePoints(points, across[chosen] / (2 * area[chosen, None] + 1e-300))
+
+
+def require_enough(points: np.ndarray, name: str) -> np.ndarray:
+    if len(points) < POINTS_PER_DISC:
+        raise EvaluationError(f"the {name} has {len(points)} points; at least {POINTS_PER_DISC} are needed")
+    return points
+
+
+def require_same_unit(cloud: np.ndarray, reference: np.ndarray) -> None:
+    sizes = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (cloud, reference)]
+    if sizes[0] > _OTHER_UNIT * sizes[1]:
+        raise EvaluationError(
+            f"the cloud is {sizes[0]:.4g} mm across and the reference {sizes[1]:.4g}: is that in metres? Give --unit m"
+        )
+    if sizes[1] > 1000 * _OTHER_UNIT * sizes[0]:
+        raise EvaluationError(f"the cloud is {sizes[0]:.4g} mm across, the reference {sizes[1]:.4g} mm: is it in mm?")
+
+
+def local_normals(
+    places: np.ndarray, surface: np.ndarray, *, disc_mm: float, given: np.ndarray | None = None
+) -> np.ndarray:
+    """Unit normals (P, 3) of a surface near places: of the nearest sample of a mesh, or of the plane through points.
+
+    Those of clouds look towards the sensor, to -Z. Points within one disc's diameter are taken, at least eight.
+    """
+    tree = KDTree(surface)
+    if given is not None:
+        return given[tree.query(places, workers=-1)[1]]
+    result = np.empty_like(places)
+    # About the nearest point: of a place beside the surface the nearest points would lie on a line, its border.
+    middles = surface[tree.query(places, workers=-1)[1]]
+    for start in range(0, len(places), _AT_A_TIME):
+        here = slice(start, start + _AT_A_TIME)
+        away, neighbours = tree.query(middles[here], k=min(2 * POINTS_PER_DISC, len(surface)), workers=-1)
+        kept = ((away <= np.maximum(disc_mm, away[:, 7:8])) | (np.arange(away.shape[1]) < 8))[..., None]
+        near = surface[neighbours]
+        about = kept * (near - (kept * near).sum(axis=1, keepdims=True) / kept.sum(axis=1, keepdims=True))
+        result[here] = np.linalg.eigh(np.einsum("pki,pkj->pij", about, about))[1][:, :, 0]
+    return np.where(result @ TOWARDS_SENSOR[:, None] < 0, -result, result)

@@ -1,0 +1,194 @@
+"""Planes, spheres and cylinders that a cloud is compared with: given by a description, or fitted to the cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, assert_never
+
+import numpy as np
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
+
+from uwlts.errors import DescriptionError, problems_of
+from uwlts.evaluation.figures import TOWARDS_SENSOR
+from uwlts.files.reading import MOST_TOML_BYTES, parsed_toml, read_text
+from uwlts.fitting.least_squares import evenly_thinned, fit_robustly
+from uwlts.fitting.shapes import fit_cylinder, fit_plane, fit_sphere
+from uwlts.model.sensor import Description, Positive, Vector
+from uwlts.registration.surface_registration import Nearest, Registration, fitted_shape
+from uwlts.storage.cloud import PointUncertainty
+
+_MOST_FITTED = 50_000
+"""Points of a fit; more add nothing but time."""
+
+
+class _Shape(Description):
+    """Base of ideal shapes; one without a place is fitted to the cloud."""
+
+    @property
+    def fitted(self) -> bool:
+        return getattr(self, "point_mm", None) is None
+
+
+class IdealPlane(_Shape):
+    """A plane through a point with a normal; distances are positive where the normal points."""
+
+    kind: Literal["plane"] = "plane"
+    point_mm: Vector | None = None
+    normal: Vector | None = None
+
+    @model_validator(mode="after")
+    def _placed_or_not(self) -> IdealPlane:
+        if (self.point_mm is None) != (self.normal is None):
+            raise ValueError("a plane has point_mm and normal, or neither and is fitted")
+        if self.normal is not None and not any(self.normal):
+            raise ValueError("the normal is a direction, not (0, 0, 0)")
+        return self
+
+
+class IdealSphere(_Shape):
+    """A sphere; fitted with a free or known diameter unless its centre ``point_mm`` is given, too."""
+
+    kind: Literal["sphere"] = "sphere"
+    diameter_mm: Positive | None = None
+    point_mm: Vector | None = None
+
+    @model_validator(mode="after")
+    def _placed_with_a_size(self) -> IdealSphere:
+        if self.point_mm is not None and self.diameter_mm is None:
+            raise ValueError("a sphere with a given centre needs its diameter_mm")
+        return self
+
+
+class IdealCylinder(_Shape):
+    """A cylinder; fitted with a free or known diameter unless ``point_mm`` on its axis and ``axis`` are given, too."""
+
+    kind: Literal["cylinder"] = "cylinder"
+    diameter_mm: Positive | None = None
+    point_mm: Vector | None = None
+    axis: Vector | None = None
+
+    @model_validator(mode="after")
+    def _placed_with_a_size(self) -> IdealCylinder:
+        if (self.point_mm is None) != (self.axis is None):
+            raise ValueError("a cylinder has point_mm and axis, or neither and is fitted")
+        if self.point_mm is not None and self.diameter_mm is None:
+            raise ValueError("a cylinder with a given axis needs its diameter_mm")
+        if self.axis is not None and not any(self.axis):
+            raise ValueError("the axis is a direction, not (0, 0, 0)")
+        return self
+
+
+IdealShape = IdealPlane | IdealSphere | IdealCylinder
+
+KINDS: dict[str, IdealShape] = {"plane": IdealPlane(), "sphere": IdealSphere(), "cylinder": IdealCylinder()}
+"""Shapes that are fitted with all their sizes, by name."""
+
+
+def read_shape(path: Path) -> IdealShape:
+    """An ideal shape from a TOML file; CaptureError or DescriptionError where it cannot be read or is none."""
+    text = read_text(path, most_bytes=MOST_TOML_BYTES, called="ideal shape", foreign="is not valid TOML")
+    try:
+        return TypeAdapter(Annotated[IdealShape, Field(discriminator="kind")]).validate_python(parsed_toml(text))
+    except ValidationError as error:
+        raise DescriptionError(f"{path} describes no ideal shape: {problems_of(error)}") from error
+    except ValueError as error:
+        raise DescriptionError(f"{path} is not valid TOML: {error}") from error
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedShape:
+    """A shape with its place: a point, a unit direction (normal or axis; None of a sphere), a radius (0 of a plane).
+
+    `registration` tells how well a fitted shape is known; None for one that was given.
+    """
+
+    kind: Literal["plane", "sphere", "cylinder"]
+    point_mm: np.ndarray
+    direction: np.ndarray | None
+    radius_mm: float
+    registration: Registration | None = None
+
+    @property
+    def uncertainty(self) -> None:
+        """A shape has no points of its own."""
+
+    @property
+    def frame(self) -> None:
+        """A shape has no images."""
+
+    def nearest(self, points_mm: np.ndarray, *, reach_mm: float = np.inf) -> Nearest:
+        """Signed distances of points (N, 3), outwards or where the normal points, and normals; see `Nearest`."""
+        away, direction = points_mm - self.point_mm, self.direction
+        if self.kind == "plane" and direction is not None:
+            normals, distance = np.broadcast_to(direction, away.shape), away @ direction
+        else:
+            if direction is not None:
+                away = away - np.outer(away @ direction, direction)
+            length = np.linalg.norm(away, axis=1)
+            normals, distance = away / np.maximum(length, 1e-300)[:, None], length - self.radius_mm
+        distance = np.where(np.abs(distance) <= reach_mm, distance, np.nan)
+        return Nearest(distance, normals, np.zeros(len(distance), np.intp))
+
+    def words(self) -> str:
+        """Kind, size and place as text."""
+        size = f" of {2 * self.radius_mm:.4f} mm diameter" if self.radius_mm else ""
+        place = ", ".join(f"{value:.3f}" for value in self.point_mm)
+        way = "" if self.direction is None else f", direction ({', '.join(f'{v:.5f}' for v in self.direction)})"
+        return f"{self.kind}{size} at ({place}) mm{way}{'' if self.registration is None else ', fitted'}"
+
+
+def place_shape(
+    shape: IdealShape,
+    points_mm: np.ndarray,
+    *,
+    uncertainty: PointUncertainty | None = None,
+    frame: np.ndarray | None = None,
+) -> PlacedShape:
+    """The shape where it is given, or fitted to points (N, 3), the few that lie off it left out.
+
+    EvaluationError where the points do not determine it.
+    """
+    if not shape.fitted:
+        return _given(shape)
+    chosen = np.arange(len(points_mm))[:: -(-len(points_mm) // _MOST_FITTED)]
+    points = points_mm[chosen]
+    match shape:
+        case IdealPlane():
+            robust = fit_robustly(lambda p: fit_plane(p, towards=TOWARDS_SENSOR), points)
+            placed = PlacedShape("plane", robust.fit.point_mm, robust.fit.normal, 0.0)
+        case IdealSphere():
+            known = None if shape.diameter_mm is None else shape.diameter_mm / 2
+            robust = fit_robustly(lambda p: fit_sphere(p, radius_mm=known), points)
+            placed = PlacedShape("sphere", robust.fit.centre_mm, None, robust.fit.radius_mm)
+        case IdealCylinder():
+            known = None if shape.diameter_mm is None else shape.diameter_mm / 2
+            start = fit_cylinder(evenly_thinned(points, 2000), radius_mm=known).axis
+            robust = fit_robustly(lambda p: fit_cylinder(p, radius_mm=known, axis_start=start), points)
+            placed = PlacedShape("cylinder", robust.fit.point_mm, robust.fit.axis, robust.fit.radius_mm)
+        case _:
+            assert_never(shape)
+    used = chosen[robust.inliers]
+    registration = fitted_shape(
+        points_mm[used],
+        placed.nearest(points_mm[used]),
+        sized=not isinstance(shape, IdealPlane) and shape.diameter_mm is None,
+        uncertainty=None if uncertainty is None else uncertainty[used],
+        frame=None if frame is None else frame[used],
+    )
+    return PlacedShape(placed.kind, placed.point_mm, placed.direction, placed.radius_mm, registration)
+
+
+def _given(shape: IdealShape) -> PlacedShape:
+    point = np.array(shape.point_mm, float)
+    match shape:
+        case IdealPlane():
+            normal = np.array(shape.normal, float)
+            return PlacedShape("plane", point, normal / np.linalg.norm(normal), 0.0)
+        case IdealSphere():
+            return PlacedShape("sphere", point, None, (shape.diameter_mm or 0.0) / 2)
+        case IdealCylinder():
+            axis = np.array(shape.axis, float)
+            return PlacedShape("cylinder", point, axis / np.linalg.norm(axis), (shape.diameter_mm or 0.0) / 2)
+        case _:
+            assert_never(shape)

@@ -1,0 +1,282 @@
+"""Evaluation of point clouds against artefacts with calibrated sizes and against ground truth, and its JSON files."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, ValidationError, model_serializer
+
+from uwlts.errors import EvaluationError, problems_of
+from uwlts.evaluation.artefact_figures import evaluate_cloud
+from uwlts.evaluation.figure_uncertainty import figure_uncertainties, shift_std_mm
+from uwlts.evaluation.figures import ArtefactEvaluation, Figure, FigureKey, Quantity, figure_keys
+from uwlts.evaluation.truth_comparison import TruthComparison, best_fit_motion, compare_with_truth
+from uwlts.files.json_files import read_model, write_model
+from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.truth import Truth, read_truth
+
+# What points from perfect images by true parameters have to keep (tests/system/test_campaign.py).
+TOLERANCE_MM = 0.010
+FORMAT = "uwlts-evaluation"
+VERSION = 1
+Count = Annotated[int, Field(ge=0)]
+
+
+class _Stored(BaseModel):
+    # The results of each kind of artefact, and what newer versions may add, are kept as they are.
+    model_config = ConfigDict(frozen=True, extra="allow", allow_inf_nan=False)
+
+
+class ArtefactFigures(_Stored):
+    """Figures of an artefact's evaluation by name, mm, the numbers of points, and the kind's own results."""
+
+    kind: str
+    figures_mm: dict[str, float]
+    points_total: Count
+    points_used: Count
+    points_rejected: Count
+    within_vdi_outliers: bool
+
+    @model_serializer(mode="wrap")
+    def _verdict_last(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        content = plain(self)
+        content["within_vdi_outliers"] = content.pop("within_vdi_outliers")
+        return content
+
+
+class TruthFigures(_Stored):
+    """Signed distances of the matched points to the true surface, mm; see `TruthComparison`."""
+
+    matched: Count
+    tolerance_mm: float
+    mean_mm: float
+    std_mm: float
+    rms_mm: float
+    p95_mm: float
+    p99_mm: float
+    largest_mm: float
+    share_within_tolerance: Annotated[float, Field(ge=0, le=1)]
+    false_points: Count
+    missed: Count
+
+
+class TruthComparisons(TruthFigures):
+    """The points as measured, and after the rigid motion that fits them best to the truth.
+
+    ``shift_mm`` is the mean error of the points along X, Y and Z, ``shift_expanded_mm`` its stated uncertainty (k = 2).
+    """
+
+    after_best_fit: TruthFigures | None = None
+    shift_mm: tuple[float, float, float] | None = None
+    shift_expanded_mm: tuple[float, float, float] | None = None
+
+
+class StoredUncertainty(_Stored):
+    """Standard uncertainties of a figure, mm, and the expanded one (k = 2) of both together."""
+
+    random_mm: float
+    systematic_mm: float
+    expanded_mm: float
+
+
+class EvaluationRecord(_Stored):
+    """Content of an evaluation file; ``calibration`` is the digest of the one with which the cloud was made."""
+
+    cloud: str
+    capture: str | None = None
+    sensor: str | None = None
+    medium: str | None = None
+    medium_index: float | None = None
+    artefact: Artefact | None = None
+    calibration: str | None = None
+    evaluation: ArtefactFigures | None = None
+    truth: TruthComparisons | None = None
+    uncertainty: dict[str, StoredUncertainty] = {}
+
+    def figure_keys(self) -> dict[str, FigureKey]:
+        """Keys of the artefact's figures by name; empty where the file names no artefact."""
+        return {} if self.artefact is None else {key.name: key for key in figure_keys(self.artefact)}
+
+    @model_serializer(mode="wrap")
+    def _as_given(self, plain: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Without the keys that were not given: a cloud of another program has no metadata."""
+        return {key: value for key, value in plain(self).items() if key in self.model_fields_set}
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """Result of `evaluate`.
+
+    Attributes
+    ----------
+    source : str
+        Name of the cloud.
+    cloud : PointCloud
+        The evaluated cloud with the deviation of every point from the artefact's fit, or without an artefact from the
+        true surface after a best fit.
+    artefact : ArtefactEvaluation or None
+        The artefact and everything measured of it; None where there is no artefact.
+    figures : tuple of Figure
+        Of the artefact, with uncertainties where the cloud has them.
+    truth, truth_after_best_fit : TruthComparison or None
+        Of the points as measured, and after the rigid motion that fits them best to the truth; None without a truth.
+    """
+
+    source: str
+    cloud: PointCloud
+    artefact: ArtefactEvaluation | None
+    figures: tuple[Figure, ...]
+    truth: TruthComparison | None
+    truth_after_best_fit: TruthComparison | None
+
+    def all_of(self, quantity: Quantity) -> tuple[Figure, ...]:
+        """All figures of a quantity; EvaluationError where there is none."""
+        found = tuple(figure for figure in self.figures if figure.key.quantity is quantity)
+        if not found:
+            shown = "no artefact" if self.artefact is None else f"the artefact '{self.artefact.kind}'"
+            raise EvaluationError(f"the evaluation of {shown} has no figure '{quantity}'")
+        return found
+
+    @property
+    def sphere_spacings(self) -> tuple[Figure, ...]:
+        """Spacings of consecutive spheres."""
+        return self.all_of(Quantity.SPACING_ERROR)
+
+    @property
+    def sphere_spacing(self) -> Figure:
+        """Spacing of consecutive spheres with the largest error."""
+        return max(self.sphere_spacings, key=lambda figure: abs(figure.value_mm))
+
+    @property
+    def diameters(self) -> tuple[Figure, ...]:
+        """Diameters of the spheres, or of the pipe."""
+        return self.all_of(Quantity.DIAMETER_ERROR)
+
+    @property
+    def step_height(self) -> Figure:
+        """Height of the step."""
+        return self.all_of(Quantity.HEIGHT_ERROR)[0]
+
+    @property
+    def probing_error(self) -> Figure:
+        """Probing error of the worst sphere."""
+        return self.all_of(Quantity.PROBING_ERROR)[0]
+
+    @property
+    def range_error(self) -> Figure:
+        """Range of the deviations from the plane."""
+        return self.all_of(Quantity.RANGE_ERROR)[0]
+
+    @property
+    def std(self) -> Figure:
+        """Standard deviation about the fitted surface, of the worst one."""
+        return self.all_of(Quantity.STD)[0]
+
+    def record(self) -> EvaluationRecord:
+        """Content of the evaluation's file; EvaluationError where the cloud's metadata does not fit in."""
+        found = self.artefact
+        content: dict[str, Any] = {"cloud": self.source, **self.cloud.metadata}
+        content |= {"artefact": found and found.artefact, "evaluation": found and found.as_dict(), "truth": None}
+        if self.truth is not None and self.truth_after_best_fit is not None:
+            content["truth"] = self.truth.as_dict() | {"after_best_fit": self.truth_after_best_fit.as_dict()}
+            content["truth"]["shift_mm"] = self.truth.shift_mm.tolist()
+            if self.cloud.uncertainty is not None:
+                content["truth"]["shift_expanded_mm"] = (2 * shift_std_mm(self.cloud, self.truth.matched)).tolist()
+        if found is not None:
+            known = {figure.key.name: figure.uncertainty for figure in self.figures if figure.uncertainty is not None}
+            parts = ("random_mm", "systematic_mm", "expanded_mm")
+            content["uncertainty"] = {name: {part: getattr(u, part) for part in parts} for name, u in known.items()}
+        try:
+            return EvaluationRecord.model_validate(content)
+        except ValidationError as error:
+            raise EvaluationError(
+                f"the metadata of the cloud {self.source} is not valid: {problems_of(error)}"
+            ) from error
+
+
+def compared_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
+    """Distances of a cloud's points to the true surface; EvaluationError where truth and cloud do not match."""
+    return compare_with_truth(
+        cloud.points_mm,
+        cloud.frame,
+        cloud.line,
+        point_mm=truth.point_mm,
+        normal=truth.normal,
+        status=truth.status,
+        tolerance_mm=TOLERANCE_MM,
+    )
+
+
+def evaluate(
+    cloud: PointCloud | str | Path,
+    artefact: Artefact | dict[str, object] | str | Path | None = None,
+    truth: Truth | str | Path | None = None,
+    *,
+    source: str | None = None,
+) -> Evaluation:
+    """Compare a cloud with its artefact's calibrated sizes and, point by point, with ground truth.
+
+    Parameters
+    ----------
+    cloud : PointCloud or path
+        Points in the object coordinate system (OCS), mm.
+    artefact : Artefact, dict or path of a TOML file, optional
+        Kind and calibrated values; the one that the cloud's capture names unless given.
+    truth : Truth or path, optional
+        Ground truth of the capture, if it was rendered.
+    source : str, optional
+        Name of the cloud in the evaluation's file; that of the cloud's file or capture unless given.
+
+    Raises
+    ------
+    EvaluationError
+        There is neither an artefact nor a truth, an artefact's description is not valid, or the cloud does not show
+        the artefact.
+    CaptureError, DescriptionError
+        A file cannot be read.
+    """
+    if not isinstance(cloud, PointCloud):
+        source = source or Path(cloud).name
+        cloud = read_cloud(cloud)
+    if artefact is None and (named := cloud.metadata.get("artefact")) is not None:
+        artefact = parse_artefact(named)
+    if isinstance(artefact, str | Path):
+        artefact = read_artefact(artefact)
+    elif isinstance(artefact, dict):
+        artefact = parse_artefact(artefact)
+    if truth is not None and not isinstance(truth, Truth):
+        truth = read_truth(truth)[1]
+    if artefact is None and truth is None:
+        raise EvaluationError(
+            "nothing to judge by: the capture names no artefact (give --artefact) and there is no truth file (--truth)"
+        )
+    compared = fitted = None
+    if truth is not None:
+        compared = compared_with_truth(cloud, truth)
+        # Takes out the difference of the coordinate systems.
+        motion = best_fit_motion(compared, cloud.points_mm)
+        moved = cloud.points_mm @ motion[:3, :3].T + motion[:3, 3]
+        fitted = compared_with_truth(replace(cloud, points_mm=moved), truth)
+    found = None if artefact is None else evaluate_cloud(cloud, artefact)
+    figures: tuple[Figure, ...] = ()
+    deviation = np.full(len(cloud), np.nan) if fitted is None else fitted.distance_mm
+    if found is not None:
+        known = figure_uncertainties(cloud, found)
+        figures = tuple(replace(figure, uncertainty=known.get(figure.key.name)) for figure in found.figures)
+        deviation = found.deviation_mm
+    name = source or str(cloud.metadata.get("capture", ""))
+    return Evaluation(name, replace(cloud, deviation_mm=deviation), found, figures, compared, fitted)
+
+
+def write_evaluation(path: str | Path, evaluation: Evaluation, *, overwrite: bool = False) -> None:
+    """Write an evaluation as indented JSON, whole or not at all; OutputError where that fails."""
+    write_model(path, evaluation.record(), format=FORMAT, version=VERSION, overwrite=overwrite)
+
+
+def read_evaluation(path: str | Path) -> EvaluationRecord:
+    """Read an evaluation file; CaptureError where it is missing, foreign, newer or damaged."""
+    advice = "; evaluate the cloud again"
+    return read_model(path, EvaluationRecord, format=FORMAT, version=VERSION, called="evaluation", advice=advice)

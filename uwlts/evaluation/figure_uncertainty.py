@@ -1,0 +1,147 @@
+"""Uncertainty of an artefact's figures and of a cloud's place, including the correlations between the points."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from uwlts.evaluation.artefact_figures import evaluate_cloud
+from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, spread_mm
+from uwlts.evaluation.spheres import SphereEvaluation
+from uwlts.fitting.shapes import fit_sphere
+from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
+
+# The standard deviation of so many is right to 27 % and to 10 %.
+_DRAWS, _QUICK_DRAWS = 8, 50
+_SEED = 635
+
+
+def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> dict[str, FigureUncertainty]:
+    """Uncertainty of the figures of an evaluation of a cloud; nothing where the cloud's points have none.
+
+    Figures are calculated again with each pattern of the calibration added to the points; the squares of their changes
+    add up (GUM, section 5.1, with independent inputs). For the noise they are calculated with noise drawn anew
+    (GUM Supplement 1). Spheres are not searched for again. EvaluationError as `evaluate_cloud`.
+    """
+    if (uncertainty := cloud.uncertainty) is None:
+        return {}
+    plain = evaluation.figures_mm
+    spheres = MovedSpheres(cloud.points_mm, evaluation) if isinstance(evaluation, SphereEvaluation) else None
+
+    def changed(by: np.ndarray) -> np.ndarray:
+        if spheres is not None:
+            figures = spheres.figures_mm(by)
+        else:
+            figures = evaluate_cloud(replace(cloud, points_mm=cloud.points_mm + by), evaluation.artefact).figures_mm
+        return np.array([figures[name] - value for name, value in plain.items()])
+
+    systematic = [changed(pattern) for pattern in uncertainty.patterns_mm]
+    rng, along = np.random.default_rng(_SEED), noise_mm(uncertainty)
+    images, image = np.unique(cloud.frame, return_inverse=True)
+    by_image, drawn = uncertainty.by_image_mm(), []
+    for _ in range(_DRAWS if spheres is None else _QUICK_DRAWS):
+        together = drawn_by_image(rng, by_image, image, len(images))
+        drawn.append(changed(rng.standard_normal((len(cloud), 1)) * along + together))
+    by_calibration = np.sqrt(np.sum(np.square(systematic), axis=0))
+    by_noise = np.std(drawn, axis=0, ddof=1)
+    return {
+        name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(plain, by_noise, by_calibration, strict=True)
+    }
+
+
+def drawn_by_image(rng: np.random.Generator, by_image_mm: np.ndarray, image: np.ndarray, images: int) -> np.ndarray:
+    """Moves (N, 3) of the points of ``image`` (N,) by parts (K, N, 3) that are drawn anew for each of the images."""
+    moved = np.zeros(by_image_mm.shape[1:])
+    for part in by_image_mm:
+        moved += rng.standard_normal((images, 1))[image] * part
+    return moved
+
+
+def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
+    """Standard uncertainty (3,) of the mean of the ``used`` (N,) points, mm; NaN where the points have none.
+
+    Patterns move all points together, an image's position those of the image, noise each alone (GUM, Eq. 13).
+    """
+    if (uncertainty := cloud.uncertainty) is None:
+        return np.full(3, np.nan)
+    count = np.count_nonzero(used)
+    together = uncertainty.patterns_mm[:, used].sum(axis=1)
+    image = np.unique(cloud.frame[used], return_inverse=True)[1]
+    by_image = [
+        np.stack([np.bincount(image, moves) for moves in part[used].T], axis=1) for part in uncertainty.by_image_mm()
+    ]
+    moved = np.vstack([together, *by_image, noise_mm(uncertainty)[used]])
+    return np.sqrt(np.sum(moved**2, axis=0)) / count
+
+
+def noise_mm(uncertainty: PointUncertainty) -> np.ndarray:
+    """Motion (N, 3) of each point for one standard deviation of its stripe centre; of either sign."""
+    covariance = np.zeros((len(uncertainty.random_mm2), 3, 3))
+    for column, (i, j) in enumerate(PAIRS):
+        covariance[:, i, j] = covariance[:, j, i] = uncertainty.random_mm2[:, column]
+    # The covariance is v v^T: its column with the largest element on the diagonal is v times that of v.
+    largest = np.argmax(np.einsum("nii->ni", covariance), axis=1)
+    rows = np.arange(len(covariance))
+    size = np.sqrt(covariance[rows, largest, largest])[:, None]
+    return np.divide(covariance[rows, largest], size, out=np.zeros((len(rows), 3)), where=size > 0)
+
+
+class _MovedFit:
+    """Fit of a sphere of free or known radius to the ``used`` (K,) of points (N, 3), which follows their moves.
+
+    Centre and, where it is free, radius follow changes of the residuals linearly. Moves are so small against the radius
+    that the outward unit vectors stay.
+    """
+
+    def __init__(self, points: np.ndarray, used: np.ndarray, radius_mm: float | None):
+        self._used, self._fit = used, fit_sphere(points[used], radius_mm)
+        outward = points[used] - self._fit.centre_mm
+        self._outward = outward / np.linalg.norm(outward, axis=1, keepdims=True)
+        free = np.ones((len(used), 1 if radius_mm is None else 0))
+        by_parameters = np.hstack([self._outward, free])
+        self._solve = np.linalg.solve(by_parameters.T @ by_parameters, by_parameters.T)
+
+    def moved(self, moves: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+        """Centre (3,), change of the radius (0 where it is known) and residuals (K,) after moves (N, 3)."""
+        change = np.einsum("ni,ni->n", self._outward, moves[self._used])
+        step = self._solve @ change
+        by_radius = float(step[3:].sum())
+        residuals = self._fit.residuals_mm + change - self._outward @ step[:3] - by_radius
+        return self._fit.centre_mm + step[:3], by_radius, residuals
+
+
+class MovedSpheres:
+    """The spheres of an evaluation of points (N, 3), in mm: the same points belong to each wherever they move."""
+
+    def __init__(self, points: np.ndarray, evaluation: SphereEvaluation):
+        self._evaluation = evaluation
+        diameters = evaluation.artefact.diameters_mm
+        used = np.flatnonzero(np.isfinite(evaluation.deviation_mm))
+        centres = np.array([sphere.centre_mm for sphere in evaluation.spheres])
+        radii = np.array([sphere.diameter_mm for sphere in evaluation.spheres]) / 2
+        off = np.abs(np.linalg.norm(points[used, None] - centres, axis=2) - radii)
+        members = [used[np.argmin(off, axis=1) == number] for number in range(len(radii))]
+        self._free = [_MovedFit(points, own, None) for own in members]
+        self._known = [_MovedFit(points, own, d / 2) for own, d in zip(members, diameters, strict=True)]
+
+    def figures_mm(self, moves: np.ndarray) -> dict[str, float]:
+        """The evaluation's figures after moves (N, 3) of all points."""
+        free = [fit.moved(moves) for fit in self._free]
+        known = [fit.moved(moves)[0] for fit in self._known]
+        spheres = [
+            replace(
+                sphere,
+                diameter_mm=sphere.diameter_mm + 2 * by_radius,
+                diameter_error_mm=sphere.diameter_error_mm + 2 * by_radius,
+                pe_mm=spread_mm(residuals),
+                std_mm=float(np.sqrt(residuals @ residuals / (len(residuals) - 4))),
+            )
+            for sphere, (_, by_radius, residuals) in zip(self._evaluation.spheres, free, strict=True)
+        ]
+        spacings = []
+        for number, spacing in enumerate(self._evaluation.spacings):
+            calibrated = spacing.spacing_mm - spacing.sse_mm
+            apart = float(np.linalg.norm(free[number + 1][0] - free[number][0]))
+            apart_known = float(np.linalg.norm(known[number + 1] - known[number]))
+            errors = {"sse_mm": apart - calibrated, "sse_known_radius_mm": apart_known - calibrated}
+            spacings.append(replace(spacing, spacing_mm=apart, **errors))
+        return replace(self._evaluation, spheres=tuple(spheres), spacings=tuple(spacings)).figures_mm

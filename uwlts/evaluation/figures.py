@@ -1,0 +1,209 @@
+"""Figures of artefacts' evaluations: their typed keys, calibrated values and uncertainties."""
+
+import dataclasses
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, ClassVar, assert_never
+
+import numpy as np
+
+from uwlts.fitting.least_squares import VDI_OUTLIER_SHARE
+from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
+
+TOWARDS_SENSOR = np.array([0.0, 0.0, -1.0])
+"""Direction from a surface to the sensor in the object coordinate system."""
+
+
+class Quantity(StrEnum):
+    """Kind of a figure; PE, RE and SSE are the probing, range and sphere spacing errors of VDI/VDE 2634."""
+
+    PROBING_ERROR = "PE"
+    RANGE_ERROR = "RE"
+    RANGE = "range"
+    STD = "STD"
+    OVALITY = "ovality"
+    DIAMETER_ERROR = "diameter error"
+    SPACING_ERROR = "SSE"
+    SPACING_ERROR_KNOWN_RADIUS = "SSE known radius"
+    HEIGHT_ERROR = "height error"
+    PROFILE_HEIGHT_ERROR = "profile height error"
+
+
+FigureId = tuple[Quantity, tuple[int, ...]]
+"""A quantity, and the numbers (from 1) of the spheres it belongs to; none where it belongs to the whole artefact."""
+
+
+@dataclass(frozen=True)
+class CalibratedQuantity:
+    """A quantity of an artefact in mm: calibrated value and, if stated, its expanded uncertainty (k = 2)."""
+
+    name: str
+    value_mm: float
+    uncertainty_mm: float | None
+
+
+@dataclass(frozen=True)
+class FigureKey:
+    """Which figure of an artefact is meant.
+
+    ``name`` stands in evaluation files and on pages. ``spheres`` are the numbers, from 1, of the spheres the figure
+    belongs to, empty where it belongs to the whole artefact. ``calibrated`` is the quantity whose error the figure is,
+    None for figures that are no error of one.
+    """
+
+    quantity: Quantity
+    name: str
+    spheres: tuple[int, ...] = ()
+    calibrated: CalibratedQuantity | None = None
+
+    @property
+    def is_detail(self) -> bool:
+        """Whether another figure of the same evaluation summarises or supersedes this one."""
+        if self.quantity in (Quantity.PROBING_ERROR, Quantity.STD):
+            return bool(self.spheres)
+        return self.quantity in (Quantity.SPACING_ERROR_KNOWN_RADIUS, Quantity.PROFILE_HEIGHT_ERROR)
+
+
+@dataclass(frozen=True)
+class FigureUncertainty:
+    """Standard uncertainties in mm of one figure: by noise of stripe and positions, and by calibration and stage."""
+
+    random_mm: float
+    systematic_mm: float
+
+    @property
+    def expanded_mm(self) -> float:
+        """Expanded uncertainty in mm with the coverage factor 2."""
+        return 2.0 * float(np.hypot(self.random_mm, self.systematic_mm))
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure's key, value in mm and, where the points have one, uncertainty."""
+
+    key: FigureKey
+    value_mm: float
+    uncertainty: FigureUncertainty | None = None
+
+    @property
+    def calibrated_mm(self) -> float | None:
+        """Calibrated value of the quantity whose error the figure is; None for other figures."""
+        return None if self.key.calibrated is None else self.key.calibrated.value_mm
+
+    @property
+    def error_mm(self) -> float | None:
+        """Measured less calibrated value; None for figures without a calibrated value."""
+        return None if self.key.calibrated is None else self.value_mm
+
+    @property
+    def measured_mm(self) -> float:
+        """Measured value of the quantity: for errors the calibrated value is added."""
+        return self.value_mm + (self.calibrated_mm or 0.0)
+
+    @property
+    def expanded_uncertainty_mm(self) -> float | None:
+        """Expanded uncertainty (k = 2) of the measured value; None where not known."""
+        return None if self.uncertainty is None else self.uncertainty.expanded_mm
+
+
+def figure_keys(artefact: Artefact) -> tuple[FigureKey, ...]:
+    """Keys of all figures that the evaluation of an artefact may have, in their order."""
+    errors, plain = [], ()
+    match artefact:
+        case SphereStandard():
+            return _sphere_keys(artefact)
+        case PlaneStandard():
+            plain = Quantity.RANGE_ERROR, Quantity.STD
+        case StepStandard():
+            height = CalibratedQuantity("step height", artefact.height_mm, artefact.height_uncertainty_mm)
+            errors, plain = [(Quantity.HEIGHT_ERROR, height)], (Quantity.STD, Quantity.PROFILE_HEIGHT_ERROR)
+        case PipeStandard():
+            diameter = CalibratedQuantity("pipe diameter", artefact.diameter_mm, artefact.diameter_uncertainty_mm)
+            errors, plain = [(Quantity.DIAMETER_ERROR, diameter)], (Quantity.RANGE, Quantity.STD, Quantity.OVALITY)
+        case _:
+            assert_never(artefact)
+    with_errors = [*errors, *((quantity, None) for quantity in plain)]
+    return tuple(FigureKey(quantity, str(quantity), calibrated=known) for quantity, known in with_errors)
+
+
+def _sphere_keys(artefact: SphereStandard) -> tuple[FigureKey, ...]:
+    keys = [FigureKey(quantity, str(quantity)) for quantity in (Quantity.PROBING_ERROR, Quantity.STD)]
+    for number, diameter in enumerate(artefact.diameters_mm, start=1):
+        known = CalibratedQuantity(f"diameter, sphere {number}", diameter, artefact.diameter_uncertainty_mm)
+        of_sphere = (Quantity.PROBING_ERROR, None), (Quantity.STD, None), (Quantity.DIAMETER_ERROR, known)
+        keys += [FigureKey(quantity, f"{quantity} sphere {number}", (number,), size) for quantity, size in of_sphere]
+    for number, spacing in enumerate(artefact.spacings_mm, start=1):
+        pair = "" if len(artefact.spacings_mm) == 1 else f" {number}-{number + 1}"
+        for quantity, suffix in ((Quantity.SPACING_ERROR, ""), (Quantity.SPACING_ERROR_KNOWN_RADIUS, " known radius")):
+            known = CalibratedQuantity(f"sphere spacing{pair}{suffix}", spacing, artefact.spacing_uncertainty_mm)
+            keys.append(FigureKey(quantity, f"SSE{pair}{suffix}", (number, number + 1), known))
+    return tuple(keys)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ArtefactEvaluation(ABC):
+    """Figures of an artefact and the numbers of points.
+
+    ``points_rejected`` are the outliers on the artefact that were left out (`fit_robustly`); points of the cloud that
+    do not belong to the artefact are in neither number. ``deviation_mm`` (N,) is the signed deviation of every used
+    point of the cloud, NaN for all others.
+    """
+
+    kind: ClassVar[str]
+
+    artefact: Artefact
+    points_used: int
+    points_rejected: int
+    deviation_mm: np.ndarray
+
+    @property
+    def rejected_share(self) -> float:
+        """Share of the artefact's points that were left out."""
+        return self.points_rejected / (self.points_used + self.points_rejected)
+
+    @property
+    def within_vdi_outliers(self) -> bool:
+        """Whether no more points were left out than the 3 permille that VDI/VDE 2634 allows."""
+        return self.rejected_share <= VDI_OUTLIER_SHARE
+
+    @abstractmethod
+    def values_mm(self) -> dict[FigureId, float | None]:
+        """Values of the figures, mm; None, or no entry, for one that could not be measured."""
+
+    @property
+    def figures(self) -> tuple[Figure, ...]:
+        """The figures by which the artefact is judged."""
+        values = self.values_mm()
+        found = ((key, values.get((key.quantity, key.spheres))) for key in figure_keys(self.artefact))
+        return tuple(Figure(key, value) for key, value in found if value is not None)
+
+    @property
+    def figures_mm(self) -> dict[str, float]:
+        """Values of the figures by name, mm, as evaluation files hold them."""
+        return {figure.key.name: figure.value_mm for figure in self.figures}
+
+    def as_dict(self) -> dict[str, Any]:
+        """Everything but the artefact and the deviations of the single points, as plain JSON."""
+        own = [field.name for field in dataclasses.fields(self) if field.name not in ("artefact", "deviation_mm")]
+        return {
+            "kind": self.kind,
+            "figures_mm": self.figures_mm,
+            "points_total": len(self.deviation_mm),
+            **{name: _plain(getattr(self, name)) for name in own},
+            "rejected_share": self.rejected_share,
+            "within_vdi_outliers": self.within_vdi_outliers,
+        }
+
+
+def spread_mm(residuals_mm: np.ndarray) -> float:
+    """Range of residuals: largest less smallest (PE and RE of VDI/VDE 2634)."""
+    return float(np.ptp(residuals_mm))
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, tuple):
+        return [_plain(item) for item in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

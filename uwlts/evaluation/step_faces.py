@@ -1,0 +1,191 @@
+"""Faces of a step standard: the points on each and the distance between them.
+
+Points are (N, 2) of one profile (Y, Z) or (N, 3) of a scan (X, Y, Z); the last coordinate points away from the sensor.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from uwlts.errors import EvaluationError
+from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD, accepted_points, evenly_thinned, principal_axes
+from uwlts.fitting.shapes import fit_line, fit_plane
+from uwlts.runtime.compiled import compiled
+
+# Shares of the height: band in which support is counted, error of the described height, limits of a face's band, and
+# the largest standard deviation of a face: a slope that fills the widest band has 0.17.
+_SEARCH_LIMIT, _HEIGHT_TOLERANCE, _LIMITS, _LARGEST_STD = 0.05, 0.25, (0.01, 0.3), 0.125
+# Pairs (triples) of points tried, points on which they are judged, least share of these on a face, and refinements.
+_PROPOSALS, _THINNED, _SMALLEST_FACE, _ROUNDS = 500, 800, 0.02, 5
+
+
+class StepFace(IntEnum):
+    """Label of a point: on the face farther from the sensor, on the nearer one, or on neither."""
+
+    NEITHER = 0
+    LOWER = 1
+    UPPER = 2
+
+    @property
+    def other(self) -> "StepFace":
+        """The upper face of the lower one and the other way round."""
+        return StepFace(3 - self)
+
+
+@dataclass(frozen=True)
+class StepMeasurement:
+    """Height of a step and its standard uncertainty from the scatter of the points alone, mm."""
+
+    height_mm: float
+    std_mm: float
+
+
+def label_step_faces(points: np.ndarray, *, height_mm: float, edge_mm: float = 1.0, seed: int = 0) -> np.ndarray:
+    """Face of every point (N,) int8, as `StepFace`.
+
+    Two parallel lines (planes) about one height apart, within a quarter, are searched among the directions of random
+    pairs (triples) of points; the faces may be in several pieces (base - block - base) and lie at any angle. A point
+    belongs to a face when it is nearer to it than five robust standard deviations (within 1 to 30 % of the height)
+    and, along the face, farther than `edge_mm` from all points that are not on it: so the rounded, mixed points at
+    edges and the riser stay out. ``height_mm`` is approximate. EvaluationError, which says what was found, for too few
+    points or no two such faces.
+    """
+    points = accepted_points(points, least=20, what="a step", dimensions=(2, 3))
+    least = 10 if points.shape[1] == 2 else 40
+    proposal = _best_proposal(evenly_thinned(points, _THINNED), height_mm, np.random.default_rng(seed))
+    if proposal is None:
+        raise EvaluationError(
+            f"no two parallel step faces about {height_mm:g} mm apart among {len(points)} points; "
+            f"show both faces, or correct the height"
+        )
+    normal, anchor, offset = proposal
+    on_anchor = on_other = np.zeros(len(points), dtype=bool)
+    for _ in range(_ROUNDS):
+        on_anchor, on_other = _levels(points @ normal, anchor, offset)
+        # Common to two parallel lines or planes, each through the middle of its points.
+        faces = [face - face.mean(axis=0) for face in (points[on_anchor], points[on_other]) if len(face)]
+        axis = principal_axes(np.vstack(faces))[1][-1]
+        normal = axis if axis @ normal > 0 else -axis
+        anchor = float(np.median(points[on_anchor] @ normal))
+    lower, upper = (on_anchor, on_other) if offset > 0 else (on_other, on_anchor)
+    labels = np.zeros(len(points), dtype=np.int8)
+    along = points @ np.linalg.svd(normal[None])[2][1:].T
+    for face, on_it in ((StepFace.LOWER, lower), (StepFace.UPPER, upper)):
+        members = np.flatnonzero(on_it)
+        if len(members) and edge_mm > 0 and not on_it.all():
+            distance, _ = KDTree(along[~on_it]).query(along[members], distance_upper_bound=edge_mm)
+            members = members[distance > edge_mm]
+        labels[members] = face
+    _require_faces(heights=points @ normal, labels=labels, height=height_mm, least=least)
+    return labels
+
+
+def step_height(
+    points: np.ndarray, labels: np.ndarray, *, reference: Literal["lower", "upper"] = "lower"
+) -> StepMeasurement:
+    """Mean distance of one face's points to the line (profile) or plane (scan) through the other's.
+
+    Thesis, section 3.2.2. In a profile whose sheet does not cut the step along its normal this is the height over the
+    cosine of the angle between. ``points`` are (N, 2) or (N, 3), mm, ``labels`` (N,) from `label_step_faces`; while
+    points move a little, as in a calibration, the labels can stay. The line or plane is fitted to the ``reference``
+    face. EvaluationError for too few points on a face.
+    """
+    base = StepFace[reference.upper()]
+    points = np.asarray(points, dtype=np.float64)
+    surface = (fit_line if points.shape[1] == 2 else fit_plane)(points[labels == base])
+    across = accepted_points(points[labels == base.other], least=2, what="a step face", dimensions=(2, 3))
+    distances = surface.distances_mm(across)
+    lever = np.array([1.0, *(surface.axes @ (across.mean(axis=0) - surface.point_mm))])
+    variance = lever @ surface.covariance @ lever + distances.var(ddof=1) / len(distances)
+    return StepMeasurement(abs(float(distances.mean())), float(np.sqrt(variance)))
+
+
+def _require_faces(*, heights: np.ndarray, labels: np.ndarray, height: float, least: int) -> None:
+    """Two levels at the right distance, each with enough points and narrow: a slope or curve fills its whole band."""
+    lower, upper = heights[labels == StepFace.LOWER], heights[labels == StepFace.UPPER]
+    found = ""
+    if min(len(lower), len(upper)) < least:
+        found = (
+            f"{len(lower)} points on the lower level, {len(upper)} on the upper one, at least {least} needed on each"
+        )
+    elif (widest := max(float(lower.std()), float(upper.std()))) > _LARGEST_STD * height:
+        found = f"what lies at these levels scatters by {widest:.2g} mm (standard deviation) and is sloping or curved"
+    if found:
+        raise EvaluationError(
+            f"no two step faces about {height:g} mm apart: {found}; show both faces, or correct the height"
+        )
+    distance = float(upper.mean() - lower.mean())
+    if abs(distance - height) > _HEIGHT_TOLERANCE * height:
+        raise EvaluationError(f"the step faces are {distance:.2f} mm apart; the step is described with {height:g} mm")
+
+
+def _best_proposal(
+    points: np.ndarray, height: float, rng: np.random.Generator
+) -> tuple[np.ndarray, float, float] | None:
+    """Normal towards the sensor, level of one face and signed offset of the other, with most points on both."""
+    limit, least = _SEARCH_LIMIT * height, max(3, _SMALLEST_FACE * len(points))
+    most, best = 0.0, None
+    here, there = np.empty((2, len(points)), np.intp)
+    for normal in _proposed_normals(points, rng):
+        heights = np.sort(points @ normal)
+        _count_within(heights, -limit, limit, here)
+        for side in (1.0, -1.0):
+            _count_within(heights, (side - _HEIGHT_TOLERANCE) * height, (side + _HEIGHT_TOLERANCE) * height, there)
+            support = np.where((here >= least) & (there >= least), here + there, 0)
+            top = int(np.argmax(support))
+            if support[top] > most:
+                most = float(support[top])
+                best = (normal, float(heights[top]), side * height)
+    return best
+
+
+@compiled
+def _count_within(heights: np.ndarray, low: float, high: float, counts: np.ndarray) -> None:
+    """How many of some heights (N,) in growing order lie from ``low`` to ``high`` above each of them."""
+    first = last = 0
+    for n in range(len(heights)):
+        while first < len(heights) and heights[first] < heights[n] + low:
+            first += 1
+        while last < len(heights) and heights[last] <= heights[n] + high:
+            last += 1
+        counts[n] = last - first
+
+
+def _proposed_normals(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Unit normals (M, D), towards the sensor, of lines (planes) through random pairs (triples) of points."""
+    dimension = points.shape[1]
+    corners = points[rng.integers(len(points), size=(_PROPOSALS, dimension))]
+    side = corners[:, 1] - corners[:, 0]
+    if dimension == 2:
+        normals = np.column_stack([-side[:, 1], side[:, 0]])
+    else:
+        normals = np.cross(side, corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    proper = length > 1e-6 * length.max()
+    normals = normals[proper] / length[proper, None]
+    return np.where(normals[:, -1:] > 0, -normals, normals)
+
+
+def _levels(heights: np.ndarray, anchor: float, offset: float) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N,) bool on the face at the anchor's level, and on the one where points crowd most about an offset."""
+    height = abs(offset)
+    about = np.sort(heights[np.abs(heights - anchor - offset) <= _HEIGHT_TOLERANCE * height])
+    window = _SEARCH_LIMIT * height
+    crowd = np.searchsorted(about, about + 2 * window, side="right") - np.arange(len(about))
+    other = float(about[np.argmax(crowd)]) + window if len(about) else anchor + offset
+    return _near_level(heights, anchor, height), _near_level(heights, other, height)
+
+
+def _near_level(heights: np.ndarray, level: float, height: float) -> np.ndarray:
+    limit = 2 * _SEARCH_LIMIT * height
+    for _ in range(3):
+        near = heights[np.abs(heights - level) <= limit]
+        if not len(near):
+            break
+        level = float(np.median(near))
+        spread = MAD_TO_STD * float(np.median(np.abs(near - level)))
+        limit = float(np.clip(DEFAULT_K * spread, _LIMITS[0] * height, _LIMITS[1] * height))
+    return np.abs(heights - level) <= limit

@@ -1,0 +1,123 @@
+"""Files of JSON: one object, whose "format" and "version" say what it is; how two of them differ."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel, JsonValue, ValidationError
+
+from uwlts.errors import CaptureError, Error, problems_of
+from uwlts.files.reading import MOST_JSON_BYTES, parsed_json, read_text, with_article
+from uwlts.files.writing import written_aside
+
+_SHOWN, _BRIEF = 3, 80
+"""Entries that are named where two descriptions differ, and characters of each value."""
+
+AnyModel = TypeVar("AnyModel", bound=BaseModel)
+
+
+def read_json(path: str | Path, *, called: str) -> dict[str, JsonValue]:
+    """Object in a file; CaptureError where it is missing, no JSON or truncated. ``called`` is what it should be.
+
+    Numbers are finite and no key occurs twice (`uwlts.files.reading`).
+    """
+    text = read_text(path, most_bytes=MOST_JSON_BYTES, called=called)
+    try:
+        content = parsed_json(text)
+    except json.JSONDecodeError as error:
+        raise CaptureError(f"{path} is not {with_article(called)}, or is truncated: {error}") from error
+    except ValueError as error:
+        raise CaptureError(f"{path} is not a valid {called}: {error}") from error
+    if not isinstance(content, dict):
+        raise CaptureError(f"{path} is JSON but not {with_article(called)}: expected an object with named entries")
+    return content
+
+
+def read_model(
+    path: str | Path, model: type[AnyModel], *, format: str, version: int, called: str, advice: str = ""
+) -> AnyModel:
+    """Content of a JSON file of the program; CaptureError where it is missing, foreign, newer or damaged."""
+    content = read_json(path, called=called)
+    return model_in(content, path, model, format=format, version=version, called=called, advice=advice)
+
+
+def model_in(
+    content: dict[str, JsonValue],
+    path: str | Path,
+    model: type[AnyModel],
+    *,
+    format: str,
+    version: int,
+    called: str,
+    advice: str = "",
+) -> AnyModel:
+    """What `read_json` gave of a file as a model; CaptureError as from `read_model`."""
+    content = dict(content)
+    if content.pop("format", None) != format:
+        raise CaptureError(f'{path} is JSON but not {with_article(called)}: expected "format": "{format}"')
+    if (found := content.pop("version", None)) != version:
+        raise CaptureError(f"{path} has version {found}; this program reads {version}")
+    return validated_content(model, content, f"{path} is not a valid {called}", advice=advice)
+
+
+def validated_content(model: type[AnyModel], content: object, complaint: str, *, advice: str = "") -> AnyModel:
+    """The content of a file as a model; CaptureError that begins with ``complaint`` where it is not valid."""
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise CaptureError(f"{complaint}: {problems_of(error)}{advice}") from error
+    except (Error, ArithmeticError) as error:
+        raise CaptureError(f"{complaint}: {error}{advice}") from error
+
+
+def write_model(path: str | Path, model: BaseModel, *, format: str, version: int, overwrite: bool) -> None:
+    """Write a model with its format and version as indented JSON, whole or not at all; OutputError where that fails."""
+    content = {"format": format, "version": version} | model.model_dump(mode="json")
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+
+def write_record(path: str | Path, record: object, *, overwrite: bool) -> None:
+    """Write the record of a result as indented JSON, whole or not at all; OutputError where that fails."""
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_text(json_text(record, indent=1), encoding="utf-8")
+
+
+def differences(there: object, now: object) -> str:
+    """Words for the entries in which two JSON values differ, each with both values; empty where they are the same.
+
+    ``there`` is what a file holds, ``now`` what is wanted.
+    """
+    found = list(_different(there, now, ""))
+    more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
+    return "; ".join(
+        [*(f"{entry} is {_brief(old)} in it, {_brief(new)} now" for entry, old, new in found[:_SHOWN])] + more
+    )
+
+
+def another(there: dict[str, JsonValue], now: dict[str, JsonValue]) -> str:
+    """Words for a plan that a file holds and that is not the one wanted: "another" with its keys, and `differences`."""
+    return f"another {', '.join(key for key in now if there.get(key) != now[key])} ({differences(there, now)})"
+
+
+def _different(there: object, now: object, entry: str) -> Iterator[tuple[str, object, object]]:
+    if isinstance(there, dict) and isinstance(now, dict):
+        for key in dict.fromkeys((*now, *there)):
+            yield from _different(there.get(key), now.get(key), f"{entry}.{key}" if entry else f"{key}")
+    elif isinstance(there, list) and isinstance(now, list) and len(there) == len(now):
+        for place, (old, new) in enumerate(zip(there, now, strict=True)):
+            yield from _different(old, new, f"{entry}[{place}]")
+    elif there != now:
+        yield entry, there, now
+
+
+def _brief(value: object) -> str:
+    text = "not stated" if value is None else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= _BRIEF else f"{text[:_BRIEF]}..."
+
+
+def json_text(content: object, *, indent: int | None = None, ascii: bool = True) -> str:
+    """Text of a JSON file, of a model with the fields that were set; ValueError for numbers that are not finite."""
+    plain = content.model_dump(mode="json", exclude_unset=True) if isinstance(content, BaseModel) else content
+    return json.dumps(plain, indent=indent, ensure_ascii=ascii, allow_nan=False) + "\n"

@@ -1,0 +1,228 @@
+"""Files that come from outside: regular files of limited size, and text formats of limited depth and plain numbers.
+
+Every reader opens its file here, so that no pipe blocks it, no size, depth or number in a file exhausts the machine,
+and no output replaces it. Limits hold before anything is parsed; what a file means is checked by the reader afterwards.
+"""
+
+import json
+import math
+import os
+import re
+import stat
+import tomllib
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BufferedReader
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from uwlts.errors import CaptureError, Error
+from uwlts.files.command_files import note_input
+
+if TYPE_CHECKING:
+    from pydantic import JsonValue
+
+Content = TypeVar("Content")
+
+MiB = 2**20
+MOST_TOML_BYTES = MiB
+"""The parser takes about a second for it; the longest descriptions, lists of positions, have a tenth."""
+MOST_JSON_BYTES = 32 * MiB
+MOST_VALUES = 500_000
+"""Values in a JSON file: a covariance of 700 parameters. As Python objects they take less than 100 MB."""
+MOST_DEPTH = 64
+"""Nested tables and lists; the program's own files have fewer than ten."""
+_LARGEST_INT = 2**63
+_LONGEST_KEY = 32  # parts of a dotted key; the parser takes time by the square of their number
+
+_WORD = r"(?<![\w-])[\w-]++"
+_QUOTED = r"""(?<!\\)"(?:[^"\\\n]|\\.)*+"|'[^'\n]*+'"""
+_LONG_KEY = re.compile(rf"(?:(?:{_WORD}|{_QUOTED})[ \t]*+\.[ \t]*+){{{_LONGEST_KEY}}}")
+
+_FOREIGN = {b"\x89HDF": "an HDF5 file, such as a capture or a cloud", b"ply": "a PLY file", b"\x89PNG": "a PNG image"}
+_FOREIGN |= {b"\xff\xd8\xff": "a JPEG image", b"PK\x03\x04": "a ZIP archive", b"\x1f\x8b": "a gzip file"}
+_FOREIGN |= {b"%PDF": "a PDF document"}
+
+
+def is_regular_file(path: str | Path) -> bool:
+    """Whether there is a regular file; False also for names that no file can have."""
+    try:
+        return stat.S_ISREG(os.stat(path).st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def require_regular_file(
+    path: str | Path, *, most_bytes: int | None = None, error: type[Error] = CaptureError, called: str = "file"
+) -> int:
+    """Size in bytes of a regular file that may be opened by its name; else ``error``, as from `opened`."""
+    with opened(path, most_bytes=most_bytes, error=error, called=called) as file:
+        return os.fstat(file.fileno()).st_size
+
+
+@contextmanager
+def opened(
+    path: str | Path, *, most_bytes: int | None = None, error: type[Error] = CaptureError, called: str = "file"
+) -> Iterator[BufferedReader]:
+    """A context with a regular file, opened for reading bytes.
+
+    It is an input of the running command: OutputError where that is to write it.
+    ``error`` where it is missing, unreadable, no regular file (a pipe or device would block), larger than
+    ``most_bytes``, or its name is too long or holds a null character. ``called`` is what it should be.
+    """
+    note_input(path)
+    try:
+        # Without waiting for a writer, should it be a pipe.
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    except FileNotFoundError as problem:
+        raise error(f"no {called} at {_shown(path)}") from problem
+    except OSError as problem:
+        raise error(f"cannot read the {called} {_shown(path)}: {problem.strerror}") from problem
+    except ValueError as problem:
+        raise error(f"cannot read the {called} {_shown(path)}: no file can have this name") from problem
+    with os.fdopen(descriptor, "rb") if _is_regular(descriptor) else _closed(descriptor) as file:
+        if file is None:
+            kind = "it is a directory" if os.path.isdir(path) else "it is no regular file, but a pipe or device"
+            raise error(f"cannot read the {called} {_shown(path)}: {kind}")
+        size = os.fstat(file.fileno()).st_size
+        if most_bytes is not None and size > most_bytes:
+            raise error(
+                f"the {called} {_shown(path)} has {size / MiB:,.1f} MiB; this program reads up to "
+                f"{most_bytes / MiB:,.1f} MiB"
+            )
+        try:
+            yield file
+        except OSError as problem:
+            raise error(f"cannot read the {called} {_shown(path)}: {problem.strerror or problem}") from problem
+
+
+def _is_regular(descriptor: int) -> bool:
+    return stat.S_ISREG(os.fstat(descriptor).st_mode)
+
+
+@contextmanager
+def _closed(descriptor: int) -> Iterator[None]:
+    os.close(descriptor)
+    yield None
+
+
+def _shown(path: str | Path) -> str:
+    """A name as messages have it: printable, and not longer than a line."""
+    return shortened(str(path).encode("unicode_escape").decode() if "\0" in str(path) else str(path))
+
+
+def shortened(text: str, most: int = 300) -> str:
+    """A text that fits into a message."""
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 4 :]}"
+
+
+def read_bytes(path: str | Path, *, most_bytes: int, error: type[Error] = CaptureError, called: str = "file") -> bytes:
+    """Content of a regular file; ``error`` as from `opened`."""
+    with opened(path, most_bytes=most_bytes, error=error, called=called) as file:
+        content = file.read(most_bytes + 1)
+    # Some files of the system state no size.
+    if len(content) > most_bytes:
+        raise error(f"the {called} {_shown(path)} has more than {most_bytes / MiB:,.1f} MiB")
+    return content
+
+
+def read_text(
+    path: str | Path,
+    *,
+    most_bytes: int,
+    error: type[Error] = CaptureError,
+    called: str = "file",
+    foreign: str | None = None,
+) -> str:
+    """Text of a regular file in UTF-8, without byte order mark; ``error`` as from `opened`, or where it is no text.
+
+    ``foreign`` are words for what is no text, "is not a file" and the like unless given.
+    """
+    content = read_bytes(path, most_bytes=most_bytes, error=error, called=called)
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as problem:
+        kind = next((kind for mark, kind in _FOREIGN.items() if content.startswith(mark)), "no text in UTF-8")
+        raise error(f"{_shown(path)} {foreign or f'is not {with_article(called)}'}: it is {kind}") from problem
+
+
+def with_article(called: str) -> str:
+    """The name of a thing with its article."""
+    return f"{'an' if called[0] in 'aeiou' else 'a'} {called}"
+
+
+def parsed_json(text: str) -> "JsonValue":
+    """Content of JSON; ValueError where it is no JSON, too large, or as from `require_plain`.
+
+    Also refused are keys that occur twice in a table, of which every reader takes another one.
+    """
+    if text.count(",") + text.count("[") + text.count("{") > MOST_VALUES:
+        raise ValueError(f"it holds more than {MOST_VALUES:,} values")
+    try:
+        content = json.loads(text, object_pairs_hook=_unique)
+    except RecursionError as error:
+        raise json.JSONDecodeError(_TOO_DEEP, text, 0) from error
+    return require_plain(content)
+
+
+def parsed_toml(text: str) -> "dict[str, JsonValue]":
+    """Content of TOML; ValueError where it is no TOML, has a key of too many parts, or as from `require_plain`.
+
+    Numbers that are not finite are left to the descriptions, which name all wrong keys at once.
+    """
+    if _LONG_KEY.search(text):
+        raise ValueError(f"a key has more than {_LONGEST_KEY} parts")
+    try:
+        content = tomllib.loads(text)
+    except RecursionError as error:
+        raise ValueError(_TOO_DEEP) from error
+    return require_plain(content, finite=False)
+
+
+_TOO_DEEP = f"its tables and lists are nested more than {MOST_DEPTH} deep"
+
+
+def require_plain(content: Content, *, finite: bool = True) -> Content:
+    """The content; ValueError where it is nested too deep, or a number is not finite or too large for 64 bits."""
+    level: list[Any] = [content]
+    depth = 0
+    while level:
+        if depth > MOST_DEPTH:
+            raise ValueError(_TOO_DEEP)
+        below: list[Any] = []
+        for each in level:
+            # By their very type, as there may be a million; parsers make no others.
+            kind = type(each)
+            if kind is dict:
+                below.extend(each.values())
+            elif kind is list or kind is tuple:
+                below.extend(each)
+            elif kind is float:
+                if finite and not math.isfinite(each):
+                    raise ValueError(f"{_place_of(each, content)} is {each}; expected a finite number")
+            elif kind is int and not -_LARGEST_INT <= each < _LARGEST_INT:
+                raise ValueError("it holds a whole number of more than 64 bits")
+        level, depth = below, depth + 1
+    return content
+
+
+def _place_of(wanted: object, content: object) -> str:
+    """The keys and numbers that lead to a value."""
+    waiting: list[tuple[object, str]] = [(content, "")]
+    while waiting:
+        each, place = waiting.pop()
+        if each is wanted:
+            return shortened(place.removeprefix(".")) or "it"
+        inside = each.items() if isinstance(each, dict) else enumerate(each) if isinstance(each, list | tuple) else ()
+        waiting.extend((below, f"{place}.{key}") for key, below in inside)
+    return "it"
+
+
+def _unique(pairs: "list[tuple[str, JsonValue]]") -> "dict[str, JsonValue]":
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        counts = Counter(key for key, _ in pairs)
+        twice = next(key for key, count in counts.items() if count > 1)
+        raise ValueError(f"the key {shortened(twice)!r} occurs twice in a table")
+    return table

@@ -1,0 +1,381 @@
+"""Local surfaces of a cloud: second-order patches with their covariance, and distances of one set from another.
+
+A patch is a second-order fit to the points of a disc. It follows curved surfaces, inside of which a plane would lie,
+and its covariance says how much of a distance, and of a slope, is noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from uwlts.errors import EvaluationError
+from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.storage.cloud import PAIRS, PointUncertainty
+
+_CELLS_PER_RADIUS = 3.0
+"""Points are averaged in cubes of a third of the disc's radius: 28 of them fill a disc, enough for 6 coefficients."""
+_NEIGHBOURS = 40
+_FEWEST = 10
+"""Averages in a disc; a second-order surface has 6 coefficients."""
+_ROUND = 0.3
+"""Smallest share of a disc's narrow by its wide extent, squared: profiles far apart give strips instead of discs."""
+_LARGEST_PATCH = 0.1
+"""Of the cloud's size: a larger disc is no local surface."""
+_ROUGH = 5.0
+"""Times the usual scatter within a patch: one that scatters more lies on an edge."""
+_MOST = 15_000
+_SAMPLE = 400
+_SAME_WAY = 0.8
+"""Cosine of 37 deg: surfaces that lie on each other have normals that differ by less."""
+_FACING = 0.15
+"""Cosine of 81 deg: a sensor sees hardly anything of a surface that leans more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """P patches of the surface of a cloud, in its frame.
+
+    Attributes
+    ----------
+    places_mm : (P, 3) float64
+        Middle of each patch, on the surface.
+    axes : (P, 3, 3) float64
+        In rows two tangents and the unit normal.
+    shape : (P, 6) float64
+        Height over the tangents: 1, u, v, u2, uv, v2.
+    covariance : (P, 6, 6) float64
+        Of the shape, by the noise of the points.
+    patterns_mm : (M, P, 3) float64
+        How each patch moves by one standard deviation of what all points share (`PointUncertainty`).
+    numbers : (P,) int
+        Number of a point in the middle of the patch.
+    radius_mm : float
+        Of the discs.
+    shared : float
+        Number of patches that each point is part of: neighbouring patches are not independent.
+    one_sided : bool
+        All normals look to -Z, where the sensor was; else their signs have no meaning.
+    by_images : float
+        Share of the usual patch's variance that the errors of images make, which patches along an image have in common.
+    strips : float
+        Into how many strips of that kind, as wide as a patch, the cloud's images fall.
+    """
+
+    places_mm: np.ndarray
+    axes: np.ndarray
+    shape: np.ndarray
+    covariance: np.ndarray
+    patterns_mm: np.ndarray
+    numbers: np.ndarray
+    radius_mm: float
+    shared: float
+    one_sided: bool
+    by_images: float = 0.0
+    strips: float = 1.0
+
+    def alike(self, count: int) -> float:
+        """Of how many patches as one, so many of them tell, all over the images."""
+        along = max(count / self.strips, self.shared)
+        return (1 - self.by_images) * self.shared + self.by_images * along
+
+    def __len__(self) -> int:
+        return len(self.places_mm)
+
+    @property
+    def normals(self) -> np.ndarray:
+        """(P, 3) unit normals."""
+        return self.axes[:, 2]
+
+    @cached_property
+    def tree(self) -> KDTree:
+        return KDTree(self.places_mm)
+
+    def __getitem__(self, selection: Any) -> Patches:
+        """Some of the patches, by a slice, indices or a mask."""
+        return Patches(
+            self.places_mm[selection],
+            self.axes[selection],
+            self.shape[selection],
+            self.covariance[selection],
+            self.patterns_mm[:, selection],
+            self.numbers[selection],
+            self.radius_mm,
+            self.shared,
+            self.one_sided,
+            self.by_images,
+            self.strips,
+        )
+
+
+def surface_patches(
+    points_mm: np.ndarray,
+    uncertainty: PointUncertainty | None = None,
+    *,
+    frame: np.ndarray | None = None,
+    radius_mm: float | None = None,
+) -> Patches:
+    """Patches of the surface that points (N, 3) lie on, of images (N,) where these are known.
+
+    The radius of the discs is the smallest that holds enough points on both sides of every profile, unless given. What
+    moves all points of an image together (`PointUncertainty.poses_mm`) is averaged over the images of a disc alone, and
+    is common to all patches along an image.
+
+    Raises
+    ------
+    EvaluationError
+        There are too few points, or they do not lie on a surface.
+    """
+    if len(points_mm) < 10 * _FEWEST:
+        raise EvaluationError(f"the cloud has {len(points_mm)} points; at least {10 * _FEWEST} are needed")
+    radius = radius_mm or disc_radius(points_mm)
+    owner, means, counts = _averaged(points_mm, radius / _CELLS_PER_RADIUS)
+    middle = _one_each(means, radius)
+    away, near = _nearest(KDTree(means), means[middle], radius)
+    held = np.isfinite(away)
+    enough = held.sum(axis=1) >= _FEWEST
+    middle, near, held = middle[enough], near[enough], held[enough]
+    if not len(middle):
+        raise EvaluationError(f"no disc of {radius:.3g} mm holds points enough for a surface: the cloud is too sparse")
+    near = np.where(held, near, 0)
+    about = means[near] - means[middle][:, None]
+    weight = np.where(held, counts[near], 0.0)
+    axes = _principal(about, weight)
+    u, v, w = np.einsum("pij,pkj->ipk", axes, about) / radius
+    columns = _columns(u, v)
+    normal = np.einsum("pka,pk,pkb->pab", columns, weight, columns)
+    # Discs that hold points on a line do not tell a second order: the ridge stands for 1e-6 of the weight.
+    ridge = 1e-6 * weight.sum(axis=1)[:, None, None] * np.eye(6)
+    inverse = np.linalg.inv(normal + ridge)
+    shape = np.einsum("pab,pkb,pk,pk->pa", inverse, columns, weight, w)
+    left = np.where(held, w - np.einsum("pka,pa->pk", columns, shape), 0.0)
+    freedom = np.maximum(held.sum(axis=1) - 6, 1)
+    # Variance of one point: averages of n points scatter by a share 1/n of it.
+    variance = np.einsum("pk,pk,pk->p", weight, left, left) / freedom
+    typical = np.median(variance)
+    kept = variance <= _ROUGH**2 * max(typical, 1e-30)
+    if uncertainty is not None:
+        variance = np.maximum(variance, _along(uncertainty, points_mm, owner, middle, axes[:, 2]) / radius**2)
+    variance = np.maximum(variance, typical)
+    covariance = variance[:, None, None] * inverse
+    shared, share, strips = max(float(weight.sum() / counts.sum()), 1.0), 0.0, 1.0
+    if uncertainty is not None and uncertainty.poses_mm is not None and frame is not None:
+        first = _first_points(owner)
+        by_image, images = _by_images(uncertainty.poses_mm, frame, first[middle], first[near], held, axes[:, 2])
+        own, moved = covariance[:, 0, 0], by_image / radius**2 / images
+        share = float(np.median(moved) / (np.median(moved) + np.median(own)))
+        strips = max(len(np.unique(frame)) / float(np.median(images)), 1.0)
+        covariance[:, 0, 0] = own + moved
+    units = radius ** np.array([1.0, 0, 0, -1, -1, -1])
+    places, axes, shape = _levelled(means[middle], axes, shape * units)
+    flipped = axes[:, 2, 2] > 0
+    one_sided = bool(np.mean(np.abs(axes[:, 2, 2]) > _FACING) > 0.98)
+    sign = np.where(flipped, -1.0, 1.0)
+    axes = axes * np.stack([np.ones_like(sign), sign, sign], axis=1)[:, :, None]
+    # The mirrored tangent changes the sign of v, the mirrored normal that of the height.
+    signs = sign[:, None] ** np.array([1, 1, 2, 1, 2, 1])
+    shape = shape * signs
+    covariance = covariance * np.outer(units, units) * signs[:, :, None] * signs[:, None]
+    patterns = _patch_patterns(uncertainty, owner, middle, len(counts))
+    parts = (places, axes, shape, covariance, patterns, _first_points(owner)[middle])
+    patches = Patches(*parts, radius, shared, one_sided, share, strips)
+    chosen = np.flatnonzero(kept)
+    return patches[chosen[:: max(1, -(-len(chosen) // _MOST))]]
+
+
+def disc_radius(points_mm: np.ndarray) -> float:
+    """Radius of the smallest discs that hold enough points on several profiles.
+
+    EvaluationError where not even a tenth of the cloud's size is enough.
+    """
+    size = float(np.linalg.norm(np.ptp(points_mm, axis=0)))
+    sample = points_mm[:: max(1, len(points_mm) // _SAMPLE)][:_SAMPLE]
+    radius = float(np.median(KDTree(points_mm).query(sample, k=7)[0][:, 6])) * np.sqrt(_FEWEST)
+    while radius < _LARGEST_PATCH * size:
+        means = _averaged(points_mm, radius / _CELLS_PER_RADIUS)[1]
+        away, near = _nearest(KDTree(means), means[:: max(1, len(means) // _SAMPLE)], radius)
+        held = np.isfinite(away)
+        near = np.where(held, near, 0)
+        about = means[near] - means[near[:, 0]][:, None]
+        spread = np.linalg.eigvalsh(np.einsum("pk,pki,pkj->pij", 1.0 * held, about, about))
+        enough = held.sum(axis=1) >= 2 * _FEWEST
+        round_ = spread[:, 1] > _ROUND * spread[:, 2]
+        if np.mean(enough & round_) > 0.6:
+            return radius
+        radius *= 1.25
+    raise EvaluationError("the points lie too far apart for their surface to be found: scan with a smaller step")
+
+
+@dataclass(frozen=True, eq=False)
+class PatchDistances:
+    """Distances of patches from the patches of another cloud, Q of them, in the common frame.
+
+    Attributes
+    ----------
+    source, target : (Q,) int
+        Numbers of the patches.
+    places_mm, normals : (Q, 3) float64
+        Of the source, and of the target's surface below it.
+    distance_mm, std_mm : (Q,) float64
+        Along the normal, positive on the normal's side; and its standard deviation by the noise of both.
+    slope_variance : (Q,) float64
+        Of the normal, for each direction across it.
+    """
+
+    source: np.ndarray
+    target: np.ndarray
+    places_mm: np.ndarray
+    normals: np.ndarray
+    distance_mm: np.ndarray
+    std_mm: np.ndarray
+    slope_variance: np.ndarray
+
+
+def distances_between(
+    source: Patches, source_pose: np.ndarray, target: Patches, target_pose: np.ndarray, *, reach_mm: float
+) -> PatchDistances:
+    """Distances of the patches of one cloud from the surface of another, where both lie within ``reach_mm``.
+
+    Poses (4, 4) are into the common frame. A patch counts where the nearest patch of the other faces the same way and
+    lies within one radius across its normal, so that nothing is extrapolated.
+    """
+    places = source.places_mm @ source_pose[:3, :3].T + source_pose[:3, 3]
+    inverse = target_pose[:3, :3].T
+    local = (places - target_pose[:3, 3]) @ inverse.T
+    within = float(np.hypot(reach_mm, target.radius_mm))
+    found: Any = target.tree.query(local, distance_upper_bound=within)
+    rows = np.flatnonzero(np.isfinite(found[0]))
+    nearest = found[1][rows]
+    u, v, w = np.einsum("qij,qj->iq", target.axes[nearest], local[rows] - target.places_mm[nearest])
+    shape = target.shape[nearest]
+    columns = _columns(u, v)
+    slopes = np.stack(
+        [shape[:, 1] + 2 * shape[:, 3] * u + shape[:, 4] * v, shape[:, 2] + shape[:, 4] * u + 2 * shape[:, 5] * v]
+    )
+    steep = np.sqrt(1 + np.sum(slopes**2, axis=0))
+    distance = (w - np.einsum("qa,qa->q", columns, shape)) / steep
+    tilted = np.stack([-slopes[0] / steep, -slopes[1] / steep, 1 / steep], axis=1)
+    normals = np.einsum("qi,qij->qj", tilted, target.axes[nearest]) @ target_pose[:3, :3].T
+    facing = np.einsum("qi,qi->q", normals, source.normals[rows] @ source_pose[:3, :3].T)
+    if not (source.one_sided and target.one_sided):
+        facing = np.abs(facing)
+    good = (facing > _SAME_WAY) & (np.hypot(u, v) < target.radius_mm) & (np.abs(distance) < reach_mm)
+    rows, nearest, columns = rows[good], nearest[good], columns[good]
+    covariance = target.covariance[nearest]
+    variance = source.covariance[rows, 0, 0] + np.einsum("qa,qab,qb->q", columns, covariance, columns)
+    return PatchDistances(
+        rows,
+        nearest,
+        places[rows],
+        normals[good],
+        distance[good],
+        np.sqrt(np.maximum(variance, 1e-12)),
+        (covariance[:, 1, 1] + covariance[:, 2, 2]) / 2,
+    )
+
+
+def _columns(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Terms (..., 6) of a second-order surface."""
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
+
+
+def averaged_points(points_mm: np.ndarray, cell_mm: float) -> np.ndarray:
+    """Means (C, 3) of the points (N, 3) in each cube of a size."""
+    return _averaged(points_mm, cell_mm)[1]
+
+
+def _averaged(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Cube (N,) of each point, and means (C, 3) and counts (C,) of the points of each cube."""
+    cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+    size = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    _, owner, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(owner, column) for column in points.T], axis=1) / counts[:, None]
+    return owner, means, counts.astype(np.float64)
+
+
+def _one_each(points: np.ndarray, apart: float) -> np.ndarray:
+    """Numbers of the points nearest to the middle of each cube that holds any."""
+    place = (points - points.min(axis=0)) / apart
+    cells = np.floor(place).astype(np.int64)
+    off = np.sum((place - cells - 0.5) ** 2, axis=1)
+    order = np.lexsort((off, *cells.T))
+    changed = np.any(np.diff(cells[order], axis=0), axis=1)
+    return np.sort(order[np.r_[True, changed]])
+
+
+def _nearest(tree: KDTree, places: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    found: Any = tree.query(places, k=min(_NEIGHBOURS, tree.n), distance_upper_bound=radius)
+    return found
+
+
+def _principal(about: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Right-handed axes (P, 3, 3) in rows of weighted points (P, K, 3), the normal last."""
+    middle = np.einsum("pk,pki->pi", weight, about) / weight.sum(axis=1)[:, None]
+    centred = about - middle[:, None]
+    vectors = np.linalg.eigh(np.einsum("pk,pki,pkj->pij", weight, centred, centred))[1]
+    first, normal = vectors[:, :, 2], vectors[:, :, 0]
+    return np.stack([first, np.cross(normal, first), normal], axis=1)
+
+
+def _levelled(places: np.ndarray, axes: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same patches about their point on the surface, with the normal there; curvatures change by slope squared."""
+    slopes = shape[:, 1:3]
+    moved = places + shape[:, :1] * axes[:, 2]
+    normal = axes[:, 2] - slopes[:, :1] * axes[:, 0] - slopes[:, 1:] * axes[:, 1]
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    first = axes[:, 0] - np.einsum("pi,pi->p", axes[:, 0], normal)[:, None] * normal
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    level = shape.copy()
+    level[:, :3] = 0
+    return moved, np.stack([first, np.cross(normal, first), normal], axis=1), level
+
+
+def _along(
+    known: PointUncertainty, points: np.ndarray, owner: np.ndarray, middle: np.ndarray, normals: np.ndarray
+) -> np.ndarray:
+    """Stated variance (P,) of one point along the normals of patches: single points, and images."""
+    at = _first_points(owner)[middle]
+    pairs = known.random_mm2[at]
+    variance = np.einsum("pi,pi->p", known.position_mm[at], normals) ** 2
+    for column, (i, j) in enumerate(PAIRS):
+        variance += (1 if i == j else 2) * pairs[:, column] * normals[:, i] * normals[:, j]
+    return variance
+
+
+def _first_points(owner: np.ndarray) -> np.ndarray:
+    """Number of the first point in each cube, by the cubes (N,) of the points."""
+    first = np.zeros(int(owner.max()) + 1, np.int64)
+    first[owner[::-1]] = np.arange(len(owner))[::-1]
+    return first
+
+
+def _by_images(
+    poses_mm: np.ndarray, frame: np.ndarray, at: np.ndarray, near: np.ndarray, held: np.ndarray, normals: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Variance (P,) along normals by the pose of an image, and the number of images (P,) in each patch."""
+    variance = np.sum(np.einsum("kpi,pi->kp", poses_mm[:, at], normals) ** 2, axis=0)
+    images = np.sort(np.where(held, frame[near], frame[at][:, None]), axis=1)
+    return variance, 1 + np.count_nonzero(np.diff(images, axis=1), axis=1)
+
+
+def _patch_patterns(known: PointUncertainty | None, owner: np.ndarray, middle: np.ndarray, cells: int) -> np.ndarray:
+    """Patterns (M, P, 3) of patches: those of the middle's points."""
+    if known is None:
+        return np.zeros((0, len(middle), 3))
+    counts = np.bincount(owner, minlength=cells)[middle]
+    return np.array(
+        [
+            np.stack([np.bincount(owner, column, cells)[middle] for column in pattern.T], 1) / counts[:, None]
+            for pattern in known.patterns_mm
+        ]
+    ).reshape(-1, len(middle), 3)
+
+
+def scatter(relative: np.ndarray) -> float:
+    """Robust standard deviation of distances over their standard deviations, at least 1."""
+    return max(MAD_TO_STD * float(np.median(np.abs(relative))), 1.0) if len(relative) else 1.0

@@ -1,0 +1,233 @@
+"""Levenberg-Marquardt for observations in groups, with global parameters and local ones of each group."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from uwlts.errors import CalibrationError
+
+_ROUNDS = 60  # several times what usual problems take
+_SMALLEST_STEP = 1e-11  # in the residuals' unit: rounding of sums over all of them
+# Damping beside columns of length one up to which a step is the full one, and the largest share of the cost that is
+# gained so near the solution that residuals are linear.
+_HARDLY_DAMPED, _SAFE = 1e-8, 1e-7
+# Columns are scaled to length one: a smaller eigenvalue of the global parameters' normal matrix is rounding.
+_SINGULAR = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """Residuals (n, c) of one group and their derivatives by global (c n, k) and local (c n, b) parameters.
+
+    Derivatives by only some of the group's local parameters, ``local_columns``, may be given; the others are zero.
+    """
+
+    residuals: np.ndarray
+    by_global: np.ndarray
+    by_local: np.ndarray
+    local_columns: np.ndarray | None = None
+
+
+Model = Callable[[int, np.ndarray, np.ndarray], Observation | Sequence[Observation] | None]
+
+
+@dataclass(frozen=True, eq=False)
+class SchurFit:
+    """Solution of a grouped least-squares problem."""
+
+    global_values: np.ndarray  # (k,)
+    local: list[np.ndarray]  # list of (b,)
+    residuals: list[np.ndarray]  # list of (n, c)
+    covariance: np.ndarray  # (k, k); of the global parameters, scaled by the residuals' variance
+    local_covariances: list[np.ndarray]  # list of (b, b)
+    sigma: float  # standard deviation of one coordinate of a residual, with the degrees of freedom counted
+    rounds: int
+    stopped: str  # why the iteration ended
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """A group's residuals (n, c), and its blocks of the normal equations with columns scaled to length one."""
+
+    residuals: np.ndarray
+    border: np.ndarray
+    block: np.ndarray
+    gradient: np.ndarray
+    scale: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _Normal:
+    """Normal equations in blocks, with columns scaled to length one, and the cost they belong to."""
+
+    cost: float
+    block: np.ndarray
+    gradient: np.ndarray
+    scale: np.ndarray
+    groups: list[_Group]
+
+    def count(self) -> int:
+        """Number of coordinates of all residuals."""
+        return sum(group.residuals.size for group in self.groups)
+
+
+def schur_least_squares(
+    model: Model,
+    global_values: np.ndarray,
+    local: Sequence[np.ndarray],
+    *,
+    soft_limit: float | None = None,
+    smallest_gain: float = 1e-13,
+    damping: float = 1e-4,
+    enough_rounds: int | None = None,
+) -> SchurFit:
+    """Least squares over all groups; each step eliminates the groups' local parameters (Schur complement).
+
+    Parameters
+    ----------
+    model : callable; (group, shared, own of the group) to its `Observation`, or several that make it up, or None where
+        the parameters have no meaning
+    global_values : (k,); start
+    local : sequence of (b,); starts of the groups
+    soft_limit : residual vectors r count as 2 s^2 (sqrt(1 + |r|^2 / s^2) - 1), the "soft L1" loss with this s;
+        quadratic without it
+    smallest_gain : the iteration ends with a step that lowers the cost, or is to lower it, by less than this share
+    damping : of the first step, as a share of the squared lengths of the derivatives; none is needed near the solution
+    enough_rounds : the iteration ends after so many rounds, settled or not
+
+    Raises CalibrationError: the start has no meaning, the observations do not determine the parameters, or no end
+    within 60 rounds.
+    """
+    global_values, local = np.array(global_values, dtype=np.float64), [np.array(o, dtype=np.float64) for o in local]
+    normal = _assembled(model, global_values, local, soft_limit)
+    if normal is None:
+        raise CalibrationError("the calibration's start puts what was seen behind the camera: check points and poses")
+    for rounds in range(1, _ROUNDS + 1):
+        global_step, local_steps = _step(normal, damping)
+        tried_global = global_values + global_step
+        tried_local = [value + step for value, step in zip(local, local_steps, strict=True)]
+        scales = (normal.scale, *(group.scale for group in normal.groups))
+        steps = zip((global_step, *local_steps), scales, strict=True)
+        size = max(float(np.max(np.abs(step * scale), initial=0.0)) for step, scale in steps)
+        # Scaled steps are in the unit of the residuals, summed over all of them.
+        small = size <= _SMALLEST_STEP * np.sqrt(normal.count())
+        settling = damping <= _HARDLY_DAMPED and not small
+        if settling and _expected_gain(normal, global_step, local_steps) <= min(smallest_gain, _SAFE) * normal.cost:
+            # So near the solution the linear model tells what another look at all residuals would.
+            return _solution(tried_global, tried_local, normal, rounds, "cost settled")
+        tried = _assembled(model, tried_global, tried_local, soft_limit)
+        if tried is not None and tried.cost <= normal.cost:
+            gain = normal.cost - tried.cost
+            settled = small or gain <= smallest_gain * normal.cost
+            global_values, local, normal, damping = tried_global, tried_local, tried, max(damping / 10, 1e-12)
+            if settled:
+                why = "step below rounding" if small else "cost settled"
+                return _solution(global_values, local, normal, rounds, why)
+        elif small or damping > 1e8 or (tried is not None and tried.cost - normal.cost <= smallest_gain * normal.cost):
+            return _solution(global_values, local, normal, rounds, "no step lowers the cost further")
+        else:
+            damping *= 10
+        if rounds == enough_rounds:
+            return _solution(global_values, local, normal, rounds, "enough rounds")
+    raise CalibrationError(
+        f"the camera calibration did not settle in {_ROUNDS} rounds: either the target images do not determine the "
+        f"camera (tilt the target, or fix some parameters), or they contradict each other"
+    )
+
+
+def _assembled(
+    model: Model, global_values: np.ndarray, local: list[np.ndarray], soft_limit: float | None
+) -> _Normal | None:
+    count, cost, found = len(global_values), 0.0, []
+    for number, values in enumerate(local):
+        parts = model(number, global_values, values)
+        if parts is None:
+            return None
+        parts = [parts] if isinstance(parts, Observation) else parts
+        product = np.zeros((count + len(values) + 1,) * 2)
+        for part in parts:
+            if not np.isfinite(part.residuals).all():
+                return None
+            columns = np.hstack([part.by_global, part.by_local, part.residuals.reshape(-1, 1)])
+            squares = np.sum(part.residuals**2, axis=1)
+            if soft_limit is None:
+                cost += float(squares.sum())
+            else:
+                root = np.sqrt(1 + squares / soft_limit**2)
+                cost += float(np.sum(2 * soft_limit**2 * (root - 1)))
+                columns /= np.repeat(np.sqrt(root), part.residuals.shape[1])[:, None]
+            places = np.arange(len(values)) if part.local_columns is None else part.local_columns
+            at = np.r_[0:count, count + places, count + len(values)]
+            product[np.ix_(at, at)] += columns.T @ columns
+        found.append((np.vstack([part.residuals for part in parts]), product))
+    global_scale = _lengths(sum((np.diag(product)[:count] for _, product in found), np.zeros(count)))
+    block, gradient, groups = np.zeros((count, count)), np.zeros(count), []
+    for residuals, product in found:
+        scale = _lengths(np.diag(product)[count:-1])
+        scaled = product / np.outer(both := np.r_[global_scale, scale, 1.0], both)
+        block += scaled[:count, :count]
+        gradient += scaled[:count, -1]
+        own = (scaled[:count, count:-1], scaled[count:-1, count:-1], scaled[count:-1, -1])
+        groups.append(_Group(residuals, *own, scale))
+    return _Normal(cost, block, gradient, global_scale, groups)
+
+
+def _lengths(squares: np.ndarray) -> np.ndarray:
+    return np.where(squares > 0, np.sqrt(squares), 1.0)
+
+
+def _step(normal: _Normal, damping: float) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Damped step that lowers the cost; every block is positive definite for positive damping."""
+    reduced = normal.block + damping * np.eye(len(normal.block))
+    right = -normal.gradient
+    inverses = [np.linalg.inv(group.block + damping * np.eye(len(group.block))) for group in normal.groups]
+    for group, inverse in zip(normal.groups, inverses, strict=True):
+        reduced = reduced - group.border @ inverse @ group.border.T
+        right = right + group.border @ inverse @ group.gradient
+    step = np.linalg.lstsq(reduced, right, rcond=1e-15)[0]
+    local = [
+        -inverse @ (group.gradient + group.border.T @ step) / group.scale
+        for group, inverse in zip(normal.groups, inverses, strict=True)
+    ]
+    return step / normal.scale, local
+
+
+def _expected_gain(normal: _Normal, global_step: np.ndarray, local_steps: list[np.ndarray]) -> float:
+    """By how much a step is to lower the cost if residuals were linear, and damping small."""
+    groups = zip(normal.groups, local_steps, strict=True)
+    slopes = [normal.gradient @ (normal.scale * global_step), *(g.gradient @ (g.scale * step) for g, step in groups)]
+    return -float(sum(slopes))
+
+
+def _solution(
+    global_values: np.ndarray, local: list[np.ndarray], normal: _Normal, rounds: int, stopped: str
+) -> SchurFit:
+    undetermined = CalibrationError(
+        "the target images do not determine the camera: tilt the target differently between images, cover more of the "
+        "image, or fix some parameters (square pixels, principal point, fewer distortion coefficients)"
+    )
+    reduced, inverses = normal.block.copy(), []
+    for group in normal.groups:
+        if len(group.block) and np.linalg.eigvalsh(group.block)[0] < _SINGULAR:
+            raise undetermined
+        inverses.append(np.linalg.inv(group.block))
+        reduced -= group.border @ inverses[-1] @ group.border.T
+    if np.linalg.eigvalsh(reduced)[0] < _SINGULAR:
+        raise undetermined
+    sigma = float(np.sqrt(normal.cost / (normal.count() - len(global_values) - sum(map(len, local)))))
+    covariance, local_covariances = np.linalg.inv(reduced), []
+    for group, inverse in zip(normal.groups, inverses, strict=True):
+        spread = inverse @ group.border.T
+        own = inverse + spread @ covariance @ spread.T
+        local_covariances.append(sigma**2 * own / np.outer(group.scale, group.scale))
+    return SchurFit(
+        global_values=global_values,
+        local=local,
+        residuals=[group.residuals for group in normal.groups],
+        covariance=sigma**2 * covariance / np.outer(normal.scale, normal.scale),
+        local_covariances=local_covariances,
+        sigma=sigma,
+        rounds=rounds,
+        stopped=stopped,
+    )

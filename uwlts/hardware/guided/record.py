@@ -1,0 +1,168 @@
+"""A guided calibration: leads through the poses of the target, then of the step standard, and records what is good.
+
+The captures are ordinary ones, from which the calibration can be repeated. Whatever ends the recording, they keep what
+was accepted, and the laser goes off.
+"""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from uwlts.calibration.camera.camera_parameters import CameraOptions
+from uwlts.calibration.camera.target_poses import Poses
+from uwlts.calibration.guidance.pose_advice import Setting, State
+from uwlts.calibration.guidance.step import PLACES, apart_mm, next_depth_mm
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
+from uwlts.hardware.camera_addresses import open_camera
+from uwlts.hardware.grbl import GrblStage
+from uwlts.hardware.guided.operator import Operator, Screen
+from uwlts.hardware.guided.phases import PoseJudge, Session, StepJudge, StepPhase, TargetPhase, still_missing
+from uwlts.hardware.guided.plan import GuidedPlan, GuidedStage, GuidedStep
+from uwlts.hardware.rig import HandSwitchedLaser, LaserStage, Rig, with_provenance
+from uwlts.hardware.scanning import check_camera, left_over
+from uwlts.model.calibration import WindowModel
+from uwlts.storage.capture import Capture, CaptureHeader, part_path
+from uwlts.storage.capture_writer import CaptureWriter
+
+
+@dataclass(frozen=True)
+class GuidedRecording:
+    """Captures of the target in air or in water and of the step standard, how the poses are tied, what is missing."""
+
+    air: tuple[Path, ...]
+    water: tuple[Path, ...]
+    step: tuple[Path, ...]
+    poses: Poses
+    missing: tuple[str, ...]
+
+
+def guide(
+    plan: GuidedPlan,
+    out: Path,
+    screen: Screen,
+    *,
+    refractions: Literal[1, 2] = 2,
+    distortion: tuple[str, ...] = ("k1", "k2"),
+    resume: bool = False,
+    overwrite: bool = False,
+    report: Callable[[str], None] = print,
+    answers: int | None = None,
+) -> GuidedRecording:
+    """Lead through the images of a calibration on a screen; parameters and errors as of `uwlts.record_guided`.
+
+    Camera and stage are the plan's. ``answers`` is a file descriptor with the operator's words, standard input unless
+    given.
+    """
+    camera = plan.camera_address()
+    options = CalibrationOptions(refractions=refractions, poses=plan.poses, camera=CameraOptions(distortion=distortion))
+    setting = replace(plan.setting(), camera=options.camera)
+    operator = Operator(report, screen, answers=answers)
+    phases = _Phases(plan, setting, camera, screen, operator, resume, overwrite and not resume)
+    target, step = (out.with_name(f"{out.stem}-{shown}.h5") for shown in ("target", "step"))
+    missing = still_missing(phases.target(target))
+    if plan.step is not None:
+        with Capture(target) as capture:
+            known = calibrate_sequentially([capture], (), options=options).calibration
+        sensor = plan.described_sensor()
+        window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm, refractions=refractions)
+        missing += phases.step(step, plan.step, StepJudge(plan.step, sensor, known, window))
+    return GuidedRecording(
+        air=(target,) if plan.target_in_air() else (),
+        water=() if plan.target_in_air() else (target,),
+        step=(step,) if plan.step is not None else (),
+        poses=plan.poses,
+        missing=tuple(missing),
+    )
+
+
+@dataclass(frozen=True)
+class _Phases:
+    """Both parts of the recording, each with camera and stage opened for it: between them the tank is worked at."""
+
+    plan: GuidedPlan
+    setting: Setting
+    camera: str
+    screen: Screen
+    operator: Operator
+    resume: bool
+    overwrite: bool
+
+    def _left(self, path: Path) -> Path | None:
+        """Recording to go on with: interrupted, or finished but perhaps not enough."""
+        return next((each for each in (part_path(path), path) if each.is_file()), None) if self.resume else None
+
+    def target(self, path: Path) -> State:
+        """Record the target; how far that leads."""
+        plan = self.plan
+        judge = PoseJudge(self.setting, plan.goal(), full_dn=self.setting.sensor.detector.full_scale_dn())
+        left = self._left(path)
+        state = judge.state([] if left is None else judge.recorded(left))
+        if left == path:
+            if plan.poses == "free":
+                more = bool(still_missing(state)) and len(state.recorded) < plan.most_images
+            else:
+                more = bool(plan.places_left(state.recorded))
+            if not more:
+                self.operator.say(f"{path.name} is complete: {len(state.recorded)} poses")
+                return state
+            os.replace(path, part_path(path))
+        positions = plan.places_left([])
+        with self._session(path, positions, plan.target_header(path.stem)) as session:
+            return TargetPhase(plan, session, judge).run(state)
+
+    def step(self, path: Path, step: GuidedStep, judge: StepJudge) -> list[str]:
+        """Record the step standard; what is missing of it."""
+        left = self._left(path)
+        seen = [] if left is None else judge.depths_mm(left)
+        if left == path:
+            if next_depth_mm(seen, judge.sensor) is None:
+                self.operator.say(f"{path.name} is complete")
+                return []
+            os.replace(path, part_path(path))
+        request = f"bring the sensor into {step.medium}, with its window, and the step standard before it"
+        self.screen.request(request)
+        self.operator.wait(request)
+        with self._session(path, list(step.positions_mm), self.plan.step_header(path.stem, step)) as session:
+            seen = StepPhase(judge, session).run(seen)
+        count = len(apart_mm(seen, judge.sensor))
+        return [] if count >= PLACES else [f"the step standard was seen at {count} depths apart, {PLACES} are wanted"]
+
+    @contextmanager
+    def _session(self, path: Path, positions_mm: list[float], header: CaptureHeader) -> Iterator[Session]:
+        """Camera and stage, ready to record a capture."""
+        sensor = self.setting.sensor
+        with self._stage(positions_mm) as stage, open_camera(self.camera) as camera:
+            check_camera(camera, sensor)
+            version = f"Grbl {stage.version}" if isinstance(stage, GrblStage) else "none"
+            header = with_provenance(header, self.plan, camera, source="guided calibration", stage=version)
+            dtype = np.dtype(np.uint16 if camera.info.bits > 8 else np.uint8)
+            ahead = positions_mm[-1] - positions_mm[0] if positions_mm else 1.0
+            rig = Rig(self.plan, self.plan.stage or GuidedStage(), sensor, camera, stage, ahead=ahead)
+            known, before_s = left_over(path) if self.resume else ({}, 0.0)
+            with CaptureWriter(path, header, dtype=dtype, overwrite=self.overwrite, resume=self.resume) as writer:
+                yield Session(
+                    rig, self.plan, writer, self.operator, self.screen, dtype=dtype, known_ms=known, before_s=before_s
+                )
+
+    @contextmanager
+    def _stage(self, positions_mm: list[float]) -> Iterator[LaserStage]:
+        planned = self.plan.stage
+        if planned is None or planned.port is None:
+            yield HandSwitchedLaser(self.operator.wait)
+            return
+        with GrblStage(planned.port) as stage:
+            self.screen.connected(stage)
+            planned.check(positions_mm, stage)
+            if planned.home:
+                stage.home()
+            elif not stage.position_known:
+                stage.unlock()
+            try:
+                yield stage
+            finally:
+                self.screen.connected(None)

@@ -1,0 +1,123 @@
+"""Lengths and shapes measured where someone points in a cloud, with their uncertainty."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from uwlts.errors import EvaluationError
+from uwlts.evaluation.figure_uncertainty import drawn_by_image, noise_mm
+from uwlts.evaluation.figures import FigureUncertainty
+from uwlts.fitting.least_squares import fit_robustly
+from uwlts.fitting.shapes import CylinderFit, FlatFit, SphereFit, fit_cylinder, fit_plane, fit_sphere
+from uwlts.storage.cloud import PointCloud
+
+Shape = Literal["sphere", "plane", "cylinder"]
+_FITS: dict[Shape, Callable[[np.ndarray], SphereFit | FlatFit | CylinderFit]] = {
+    "sphere": fit_sphere,
+    "plane": fit_plane,
+    "cylinder": fit_cylinder,
+}
+_MOST_POINTS = 20_000
+"""More add nothing but time: what remains is common to all points."""
+_DRAWS, _SEED = 8, 635
+
+
+@dataclass(frozen=True, eq=False)
+class Inspected:
+    """What was measured: figures in mm by their names, their uncertainty where the cloud has one, and the points used.
+
+    Of a length ``points`` are the two that it joins; of a shape ``points_used`` of those near it agree with it.
+    """
+
+    name: str
+    figures_mm: dict[str, float]
+    uncertainty: dict[str, FigureUncertainty]
+    points_used: int
+    points_rejected: int
+
+    def text(self) -> str:
+        """In a line, with expanded uncertainties (k = 2) where they are known."""
+        figures = []
+        for name, value in self.figures_mm.items():
+            known = self.uncertainty.get(name)
+            stated = "" if known is None else f" ± {known.expanded_mm:.4f}"
+            figures.append(f"{name} {value:.4f}{stated} mm")
+        of = f" ({self.points_used} points" + (f", {self.points_rejected} left out)" if self.points_rejected else ")")
+        return f"{self.name}: {', '.join(figures)}{of}"
+
+
+def point_near(cloud: PointCloud, place_mm: np.ndarray) -> int:
+    """Index of the point nearest to a place (3,)."""
+    if len(cloud) == 0:
+        raise EvaluationError("the cloud has no points to measure")
+    return int(np.argmin(np.sum((cloud.points_mm - place_mm) ** 2, axis=1)))
+
+
+def length_between(cloud: PointCloud, first: int, second: int) -> Inspected:
+    """Distance between two points of a cloud.
+
+    Its uncertainty is that of the two points with what they share (GUM, Eq. 13): a pattern of the calibration moves
+    both, the position of an image both if they are of one image.
+    """
+    if first == second:
+        raise EvaluationError("both ends of the length are the same point: pick another one")
+    way = cloud.points_mm[second] - cloud.points_mm[first]
+    length = float(np.linalg.norm(way))
+    unit = way / length if length else np.array([0.0, 0.0, 1.0])
+    stated = {}
+    if (known := cloud.uncertainty) is not None:
+        together = (known.patterns_mm[:, second] - known.patterns_mm[:, first]) @ unit
+        ends = np.array([first, second])
+        by_image = known[ends].by_image_mm() @ unit
+        if cloud.frame[first] == cloud.frame[second]:
+            by_image = np.diff(by_image, axis=1)
+        noise = noise_mm(known[ends]) @ unit
+        random = float(np.sqrt(noise @ noise + np.sum(by_image**2)))
+        stated["distance"] = FigureUncertainty(random, float(np.linalg.norm(together)))
+    return Inspected("length", {"distance": length}, stated, 2, 0)
+
+
+def shape_near(cloud: PointCloud, place_mm: np.ndarray, radius_mm: float, shape: Shape) -> Inspected:
+    """The shape that best fits the points within a radius of a place (3,), those off it left out.
+
+    Uncertainties are as of an artefact's figures (`uwlts.evaluation.figure_uncertainty`): the fit is repeated with
+    each pattern of the calibration, and with noise drawn anew. EvaluationError where the points do not determine the
+    shape.
+    """
+    near = np.flatnonzero(np.sum((cloud.points_mm - place_mm) ** 2, axis=1) <= radius_mm**2)
+    if len(near) == 0:
+        raise EvaluationError(f"no points within {radius_mm:g} mm of the place: pick another one, or a larger radius")
+    near = near[:: -(-len(near) // _MOST_POINTS)]
+    points, fit = cloud.points_mm[near], _FITS[shape]
+    robust = fit_robustly(fit, points)
+    used = near[robust.inliers]
+    figures = _figures(robust.fit)
+    names = list(figures)
+    stated = {}
+    if (known := cloud.uncertainty) is not None:
+
+        def changed(moves: np.ndarray) -> list[float]:
+            moved = _figures(fit(cloud.points_mm[used] + moves))
+            return [moved[name] - figures[name] for name in names]
+
+        known = known[used]
+        by_pattern = [changed(pattern) for pattern in known.patterns_mm]
+        rng, along = np.random.default_rng(_SEED), noise_mm(known)
+        images, image = np.unique(cloud.frame[used], return_inverse=True)
+        by_image, drawn = known.by_image_mm(), []
+        for _ in range(_DRAWS):
+            together = drawn_by_image(rng, by_image, image, len(images))
+            drawn.append(changed(rng.standard_normal((len(used), 1)) * along + together))
+        systematic = np.sqrt(np.sum(np.square(by_pattern), axis=0))
+        random = np.std(drawn, axis=0, ddof=1)
+        stated = {
+            name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(names, random, systematic, strict=True)
+        }
+    return Inspected(shape, figures, stated, len(used), robust.rejected)
+
+
+def _figures(fit: SphereFit | FlatFit | CylinderFit) -> dict[str, float]:
+    form = {"standard deviation": fit.std_mm}
+    return form if isinstance(fit, FlatFit) else {"diameter": 2 * fit.radius_mm} | form

@@ -1,1 +1,0 @@
-"""Reconstruction, uncertainty of points and figures, evaluation and verification."""

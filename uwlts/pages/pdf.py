@@ -1,0 +1,60 @@
+"""Pages printed as PDF by a browser, so that both come from one source."""
+
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from uwlts.errors import OutputError, SetupError
+from uwlts.files.writing import written_aside
+
+BROWSERS = ("chromium", "chromium-headless-shell", "google-chrome", "google-chrome-stable", "msedge")
+"""Names on PATH; the environment variable CHROMIUM names another one."""
+
+_PATIENCE_S = 120.0
+"""A page of a few pictures takes 2 s; a slow machine much longer."""
+
+
+def print_pdf(page: str, path: Path, *, overwrite: bool = False) -> None:
+    """Print the text of a page as PDF, whole or not at all.
+
+    SetupError where there is no Chromium, Chrome or Edge, or it does not print; OutputError where the file exists or
+    cannot be written.
+    """
+    browser = find_browser()
+    with written_aside(path, overwrite=overwrite) as aside, tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / "page.html"
+        source.write_text(page, encoding="utf-8", errors="replace")
+        # The page is the program's own and loads nothing; the sandbox is refused to root.
+        words = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}/profile"]
+        words += ["--no-pdf-header-footer", f"--print-to-pdf={aside.absolute()}", source.as_uri()]
+        try:
+            done = subprocess.run([browser, *words], capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise SetupError(f"{browser} does not print {path.name}: {error}") from error
+        if not aside.stat().st_size:
+            said = " ".join(done.stderr.split())[-300:]
+            raise SetupError(f"{browser} has not printed {path.name} (exit status {done.returncode}): {said}")
+
+
+def find_browser() -> str:
+    """The browser that prints; SetupError where there is none."""
+    if chosen := os.environ.get("CHROMIUM"):
+        if found := shutil.which(chosen):
+            return found
+        raise SetupError(f"the environment variable CHROMIUM names {chosen}, which is no program")
+    for name in BROWSERS:
+        if found := shutil.which(name):
+            return found
+    raise SetupError(
+        "a PDF needs Chromium, Chrome or Edge, and none is on PATH: install one (Debian: apt-get install chromium), "
+        "let the environment variable CHROMIUM name one, or print the page from a browser"
+    )
+
+
+def refuse_unsuitable_pdf(path: Path) -> None:
+    """Raise an error before the work where a PDF cannot be made."""
+    if path.suffix.lower() != ".pdf":
+        raise OutputError(f"{path} is to be a PDF; give a name like findings.pdf")
+    find_browser()

@@ -1,0 +1,269 @@
+"""Templates, style, figures and files shared by all HTML pages.
+
+A page is a Jinja template that extends ``base.html.j2`` and imports what it needs from ``components.html.j2``::
+
+    {% extends "base.html.j2" %}
+    {% from "components.html.j2" import tiles, facts, comparison, picture, chart %}
+    {% block title %}Measurement report{% endblock %}
+    {% block content %}{{ tiles(key_figures) }} ... {{ chart(cloud) }}{% endblock %}
+
+    figures = FigureCollector()
+    text = render_page("uwlts.report", "campaign.html.j2", interactive=figures,
+                       histogram=svg_of(static), cloud=figures.add(interactive, "All points."))
+    write_page(path, text, overwrite=overwrite)
+
+Pages contain everything that they show and load nothing from the network. This module computes nothing and imports
+nothing of the measurement software, so the twin may use it, too.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import warnings
+from contextlib import ExitStack
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from jinja2 import Environment, FileSystemLoader
+from markupsafe import Markup
+
+from uwlts.errors import OutputError
+from uwlts.files.writing import refuse_unsuitable, written_aside
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+    Drawn = Figure | SubFigure | Axes
+
+MISSING = "-"
+"""Stands for a missing value in tables of text."""
+
+INK, SOFT, FAINT, BLUE, RED = "#2b3440", "#5c6875", "#dde2e8", "#3573b1", "#b5303c"
+"""Colours of text, notes, grid lines, and of the main and the contrasting line; those of ``style.css``."""
+
+COLOURS = (BLUE, "#d9822b", "#2e8b57", RED, "#7b4fa3", "#5b6770", "#12a3a8", "#a0722a")
+"""Colours of the lines of one figure, in order."""
+
+_STYLE: dict[Any, Any] = {
+    "axes.prop_cycle": f"cycler(color={list(COLOURS)})",
+    "font.size": 9.0,
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.titlesize": 10.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": FAINT,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
+# Text stays text, and the same figure gives the same file.
+_SVG: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "page"}
+
+
+def render_page(package: str, template: str, /, *, interactive: FigureCollector | None = None, **values: Any) -> str:
+    """Text of a page from a template and values.
+
+    Parameters
+    ----------
+    package
+        Package whose folder, or whose ``templates`` folder, holds the template.
+    template
+        File name of the template, which extends ``base.html.j2``.
+    interactive
+        The page's interactive figures; scripts are allowed and embedded only if there are any.
+    **values
+        Variables of the template.
+    """
+    templates = Path(__file__).with_name("templates")
+    own = Path(str(files(package)))
+    loader = FileSystemLoader([own, own / "templates", templates])
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["minus"] = typographic
+    scripts, plotly = [] if interactive is None else interactive.scripts, ""
+    if scripts:
+        from plotly.offline import get_plotlyjs
+
+        # Nothing in plotly's script may look like the script's end.
+        plotly = Markup(get_plotlyjs().replace("</script", "<\\/script"))
+    return environment.get_template(template).render(
+        page_style=Markup((templates / "style.css").read_text(encoding="utf-8")),
+        page_figures=scripts,
+        page_plotly=plotly,
+        **values,
+    )
+
+
+def write_page(path: str | Path, text: str, *, beside: str | None = None, overwrite: bool = False) -> None:
+    """Write a page, and a JSON text beside it if one is given, each whole or not at all.
+
+    Raises OutputError: a file exists and ``overwrite`` is not given, or cannot be written.
+    """
+    with ExitStack() as stack:
+        if beside is not None:
+            aside = stack.enter_context(written_aside(json_beside(Path(path)), overwrite=overwrite))
+            aside.write_text(beside, encoding="utf-8")
+        aside = stack.enter_context(written_aside(path, overwrite=overwrite))
+        # A file name on the page may hold bytes that are no text.
+        aside.write_text(text, encoding="utf-8", errors="replace")
+
+
+def json_beside(page: Path) -> Path:
+    """Path of the JSON of a page."""
+    return page.with_suffix(".json")
+
+
+def refuse_unsuitable_page(page: Path, *, example: str, overwrite: bool) -> None:
+    """Raise OutputError if a page, or the JSON beside it, cannot be written; ``example`` is a suitable name."""
+    if page.suffix == ".json":
+        raise OutputError(f"{page} is the page, which is HTML, and its JSON goes beside it; give a name like {example}")
+    for path in (page, json_beside(page)):
+        refuse_unsuitable(path, overwrite=overwrite)
+
+
+@dataclass(frozen=True)
+class InteractiveFigure:
+    """Place of an interactive figure in a page; ``still`` is the address of a picture that replaces it in print."""
+
+    number: int
+    caption: str
+    height: int
+    webgl: bool = False
+    still: str | None = None
+
+
+class FigureCollector:
+    """Numbers the interactive figures of a page and keeps their JSON for the page's end."""
+
+    def __init__(self) -> None:
+        self.scripts: list[Markup] = []
+
+    def add(
+        self, figure: go.Figure, caption: str = "", *, webgl: bool = False, still: str | None = None
+    ) -> InteractiveFigure:
+        """Keep a plotly figure that has a height; those with ``webgl`` are drawn near the screen, browsers keep few."""
+        # Within a script element nothing is escaped, and nothing may look like its end.
+        text = figure.to_json(validate=False) or ""
+        self.scripts.append(Markup(text.replace("<", "\\u003c")))
+        return InteractiveFigure(len(self.scripts) - 1, caption, int(figure.layout.height), webgl, still)
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A key figure of the ``tiles`` component: its name, its value, and lines of notes below."""
+
+    name: str
+    value: str
+    note: str = ""
+    accent: bool = False
+
+
+@dataclass(frozen=True)
+class ComparisonTable:
+    """A table of the ``comparison`` component: columns of values, and rows of words, unit and one value per column."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, str, tuple[str, ...]], ...]
+
+
+def figure_of(width: float, height: float, *, layout: Literal["constrained"] | None = "constrained") -> Figure:
+    """An empty matplotlib figure of a size in inches, which no window shows."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout=layout)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def new_figure(
+    width: float = 5.6,
+    height: float = 3.2,
+    *,
+    rows: int = 1,
+    columns: int = 1,
+    height_ratios: list[float] | None = None,
+) -> tuple[Figure, list[Axes]]:
+    """A matplotlib figure in the pages' style, and its axes row by row; sizes in inches."""
+    import matplotlib
+
+    figure = figure_of(width, height)
+    with matplotlib.rc_context(_STYLE):
+        return figure, list(figure.subplots(rows, columns, squeeze=False, height_ratios=height_ratios).flat)
+
+
+def legend_below(figure: Figure, *, columns: int = 4) -> None:
+    """One legend below all axes of a figure, each label once."""
+    handles = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    if handles:
+        style = {"loc": "outside lower left", "fontsize": 9, "frameon": False, "labelcolor": INK}
+        figure.legend(handles.values(), handles.keys(), ncols=columns, **style)
+
+
+def svg_of(drawn: Drawn) -> Markup:
+    """A matplotlib figure, or that of axes, as an SVG element to stand in a page."""
+    text = _saved(drawn, format="svg", metadata={"Date": None}).decode("utf-8")
+    # Ids of groups would occur in every figure, and nothing refers to them; within HTML, SVG needs no namespaces.
+    text = re.sub(r'(?<=<g) id="[^"]*"|<metadata>.*?</metadata>| xmlns(:\w+)?="[^"]*"', "", text, flags=re.S)
+    return Markup(text[text.index("<svg") :].replace("xlink:href", "href"))
+
+
+def png_of(drawn: Drawn, *, dpi: int = 100, few_colours: bool = False) -> bytes:
+    """A matplotlib figure, or that of axes, as PNG; with ``few_colours`` of 256 colours, in a third of the room."""
+    # The software's name with its version would change the file.
+    data = _saved(drawn, format="png", dpi=dpi, metadata={"Software": None})
+    if not few_colours:
+        return data
+    from PIL import Image
+
+    smaller = io.BytesIO()
+    # Of Pillow's methods the octree takes a fifth of the others' time.
+    reduced = Image.open(io.BytesIO(data)).convert("RGB")
+    reduced.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(smaller, "png")
+    return smaller.getvalue()
+
+
+def _saved(drawn: Drawn, **options: Any) -> bytes:
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    figure = drawn
+    while not isinstance(figure, Figure):
+        figure = figure.figure
+    data = io.BytesIO()
+    with matplotlib.rc_context(_SVG), warnings.catch_warnings():
+        # Names from files may have letters that the font lacks; a browser has others.
+        warnings.filterwarnings("ignore", "Glyph .* missing")
+        figure.savefig(data, **options)
+    return data.getvalue()
+
+
+def plain_text(text: str) -> str:
+    """Text in which matplotlib finds no formulas."""
+    return text.replace("$", r"\$")
+
+
+def png_data_uri(picture: Drawn | bytes, *, dpi: int = 100) -> str:
+    """A matplotlib figure, or the bytes of a PNG, as an address that holds the whole picture."""
+    data = picture if isinstance(picture, bytes) else png_of(picture, dpi=dpi)
+    return "data:image/png;base64," + base64.b64encode(data).decode("ascii")
+
+
+def typographic(text: str) -> str:
+    """A number as text with a proper minus sign; a dash for what is missing."""
+    if text == MISSING:
+        return "\N{EN DASH}"
+    return "\N{MINUS SIGN}" + text[1:] if text.startswith("-") else text

@@ -1,0 +1,1 @@
+"""Registration of several scans into one coordinate system."""

@@ -1,0 +1,324 @@
+"""Joint least squares for the poses of scans: distances between their surfaces, common spheres, patterns, and a prior.
+
+Unknown are the pose of every scan but the first, as a shift (mm) and a turn (rad) about the scan's middle in the common
+frame, and how much of each of its systematic patterns every scan has. Scans by one calibration of the sensor, or one of
+its mount, have these errors in common: their patterns are correlated beforehand as far as they consist of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise, permutations
+
+import numpy as np
+from scipy.linalg import eigh
+from scipy.spatial.transform import Rotation
+
+from uwlts.errors import EvaluationError
+from uwlts.fitting.patches import PatchDistances, Patches, distances_between, scatter
+from uwlts.registration.marker_spheres import MarkerSphere, common_markers
+
+_TUKEY = 4.685
+"""Of Tukey's biweight, in standard deviations: 95 % efficient for normal noise."""
+_FEWEST = 12
+"""Patches of an overlap; a movement has six parameters."""
+_NOISE = 5.0
+"""Times the information that the noise of normals alone would give: a direction with less is open."""
+_OWN_PART = 1e-4
+"""Variance of a pattern that no other scan has, of one: a hundredth of its errors, as temperature and load change."""
+_ROUNDING = 1e-9
+"""Of the information of the best determined direction: less is rounding."""
+_SPHERE_REACH = 0.25
+"""Of the diameter: how far the centres of one sphere lie apart in two scans, at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairEvidence:
+    """What one pair of scans says: derivatives (Q, U) by all unknowns, residuals, weights and their noise (Q,).
+
+    Rows of ``patches`` surface distances, with their places (patches, 3), come first, then three rows for each of so
+    many ``spheres``. ``spread`` is the scatter of the distances over their noise, ``spurious`` (P, P) the information
+    that the noise of the normals alone would give.
+    """
+
+    derivatives: np.ndarray
+    residuals: np.ndarray
+    weights: np.ndarray
+    std: np.ndarray
+    spread: float
+    spurious: np.ndarray
+    places_mm: np.ndarray
+    patches: int
+    spheres: int
+
+    def normal(self) -> np.ndarray:
+        """Normal matrix (U, U)."""
+        return self.derivatives.T @ (self.weights[:, None] * self.derivatives)
+
+    def gradient(self) -> np.ndarray:
+        """Gradient (U,) of half the sum of squares."""
+        return self.derivatives.T @ (self.weights * self.residuals)
+
+    @property
+    def counted(self) -> np.ndarray:
+        """(Q,) bool: rows of surfaces that count."""
+        return (self.weights > 0) & (np.arange(len(self.weights)) < self.patches)
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Step (U,) in the determined directions, joint covariance (U, U), and open directions (K, P) of the poses."""
+
+    step: np.ndarray
+    covariance: np.ndarray
+    open_directions: np.ndarray
+
+
+class JointRegistration:
+    """The estimate, round by round; `poses` (N, 4, 4) and `patterns`, N arrays (M,), are its present state."""
+
+    def __init__(
+        self,
+        patches: Sequence[Patches],
+        markers: Sequence[Sequence[MarkerSphere]],
+        poses: np.ndarray,
+        *,
+        start_std: tuple[float, float] | None,
+        sphere_mm: float | None,
+        shared: Sequence[dict[str, np.ndarray]] | None = None,
+    ) -> None:
+        self.patches, self.markers, self.start = patches, markers, poses
+        self.poses = poses.copy()
+        self.patterns = [np.zeros(len(each.patterns_mm)) for each in patches]
+        self.start_std, self.sphere_mm = start_std, sphere_mm
+        self.local_middles = np.array([each.places_mm.mean(axis=0) for each in patches])
+        self.sizes = np.array([_usual_distance(p.places_mm) for p in patches])
+        ends = 6 * (len(patches) - 1) + np.cumsum([0, *map(len, self.patterns)])
+        self.pattern_columns = [np.arange(a, b) for a, b in pairwise(ends)]
+        self.pose_columns = [np.arange(6 * (n - 1), 6 * n) if n else np.arange(0) for n in range(len(patches))]
+        # Turns in units of the shift that they give to the usual point.
+        turns = np.repeat(np.array([[1.0, 1 / size] for size in self.sizes[1:]]).ravel(), 3)
+        self.units = np.append(turns, np.ones(ends[-1] - ends[0]))
+        self.alike = _alike(self.patterns, shared or [{}] * len(patches))
+
+    @property
+    def unknown_poses(self) -> int:
+        """Number of parameters of all poses but the first."""
+        return 6 * (len(self.patches) - 1)
+
+    @property
+    def middles_mm(self) -> np.ndarray:
+        """(N, 3): middles of the scans in the common frame."""
+        return np.einsum("nij,nj->ni", self.poses[:, :3, :3], self.local_middles) + self.poses[:, :3, 3]
+
+    def evidence(self, reach_mm: float) -> dict[tuple[int, int], PairEvidence]:
+        """What all pairs of scans that overlap or share spheres say, about the present state."""
+        moved = [self._moved(number) for number in range(len(self.patches))]
+        found: dict[tuple[int, int], PatchDistances] = {}
+        others = [np.ones(len(each)) for each in moved]
+        for a, b in permutations(range(len(moved)), 2):
+            distances = distances_between(moved[a], self.poses[a], moved[b], self.poses[b], reach_mm=reach_mm)
+            if len(distances.source):
+                found[a, b] = distances
+                others[a][distances.source] += 1
+        centres = [self._centres(number) for number in range(len(self.markers))]
+        common = common_markers(centres, _SPHERE_REACH * (self.sphere_mm or 0.0))
+        pairs = {}
+        for a, b in combinations(range(len(moved)), 2):
+            ways = [
+                (source, target, found[source, target])
+                for source, target in ((a, b), (b, a))
+                if (source, target) in found
+            ]
+            if sum(len(distances.source) for *_, distances in ways) < _FEWEST:
+                ways = []
+            shared = [(views[a], views[b], len(views)) for views in common if a in views and b in views]
+            if ways or shared:
+                pairs[a, b] = self._pair(a, b, ways, others, shared)
+        return pairs
+
+    def solved(self, pairs: Sequence[PairEvidence]) -> Solved:
+        """The least-squares step by the evidence of pairs and what is known beforehand."""
+        count, unknown = self.unknown_poses, len(self.units)
+        normal, gradient, spurious = np.zeros((unknown, unknown)), np.zeros(unknown), np.zeros((count, count))
+        for pair in pairs:
+            normal += pair.normal()
+            gradient += pair.gradient()
+            spurious += pair.spurious
+        scale = np.outer(self.units, self.units)
+        normal, gradient = normal * scale, gradient * self.units
+        spurious *= scale[:count, :count]
+        beside = normal[count:, count:] + self.alike
+        gradient[count:] += self.alike @ np.concatenate(self.patterns)
+        within = np.linalg.solve(beside, normal[count:, :count])
+        reduced = normal[:count, :count] - normal[:count, count:] @ within
+        reduced = (reduced + reduced.T) / 2
+        rounding = _ROUNDING / _NOISE * float(np.linalg.eigvalsh(reduced)[-1])
+        metric = spurious + max(rounding, 1e-300) * np.eye(count)
+        values, vectors = eigh(reduced, metric)
+        known = values > _NOISE
+        ways, strengths = vectors[:, known], values[known]
+        down = gradient[:count] - within.T @ gradient[count:]
+        open_ways = np.linalg.qr(vectors[:, np.logical_not(known)])[0]
+        off = self._from_start()
+        if self.start_std is None:
+            ways = ways - open_ways @ (open_ways.T @ ways)
+            covariance = (ways / strengths) @ ways.T
+        else:
+            beforehand = np.tile(np.repeat(1 / np.square(self.start_std), 3), count // 6) * self.units[:count] ** 2
+            by = metric @ ways
+            covariance = np.linalg.inv((by * strengths) @ by.T + np.diag(beforehand))
+            down = by @ (ways.T @ down) + beforehand * off / self.units[:count]
+        step = -covariance @ down
+        if self.start_std is None:
+            # Along open directions scans go back to where they were: a wrong start may seem to tell more.
+            step = step - open_ways @ (open_ways.T @ (off / self.units[:count]))
+        rest = -np.linalg.solve(beside, gradient[count:]) - within @ step
+        whole = np.block(
+            [
+                [covariance, -covariance @ within.T],
+                [-within @ covariance, np.linalg.inv(beside) + within @ covariance @ within.T],
+            ]
+        )
+        return Solved(self.units * np.append(step, rest), whole * scale, open_ways.T * self.units[:count])
+
+    def move(self, step: np.ndarray) -> None:
+        """Change the state by a step (U,)."""
+        middles = self.middles_mm
+        for number, columns in enumerate(self.pose_columns):
+            if not len(columns):
+                continue
+            shift, turn = step[columns].reshape(2, 3)
+            rotation = Rotation.from_rotvec(turn).as_matrix()
+            pose, middle = self.poses[number], middles[number]
+            pose[:3, 3] = rotation @ (pose[:3, 3] - middle) + middle + shift
+            pose[:3, :3] = rotation @ pose[:3, :3]
+        self.patterns = [z + step[columns] for z, columns in zip(self.patterns, self.pattern_columns, strict=True)]
+
+    def require_connected(self, pairs: Sequence[tuple[int, int]], names: Sequence[str]) -> None:
+        """EvaluationError where some scans overlap none of those that the first is connected with."""
+        reached = {0}
+        while more := {number for pair in pairs if reached & set(pair) for number in pair} - reached:
+            reached |= more
+        if lost := [names[number] for number in range(len(names)) if number not in reached]:
+            raise EvaluationError(
+                f"{', '.join(lost)}: no overlap with {names[0]} or with what overlaps it. Give better poses at the "
+                "start, a larger reach, spheres, or search the start (search)"
+            )
+
+    def _moved(self, number: int) -> Patches:
+        patches, amounts = self.patches[number], self.patterns[number]
+        return replace(patches, places_mm=patches.places_mm + np.tensordot(amounts, patches.patterns_mm, axes=1))
+
+    def _centres(self, number: int) -> list[MarkerSphere]:
+        """The spheres of a scan in the common frame."""
+        pose, amounts, turned = self.poses[number], self.patterns[number], []
+        for marker in self.markers[number]:
+            centre = marker.centre_mm + amounts @ marker.patterns_mm
+            rotation = pose[:3, :3]
+            turned.append(
+                MarkerSphere(
+                    rotation @ centre + pose[:3, 3],
+                    rotation @ marker.covariance @ rotation.T,
+                    marker.patterns_mm @ rotation.T,
+                )
+            )
+        return turned
+
+    def _pair(
+        self,
+        a: int,
+        b: int,
+        ways: list[tuple[int, int, PatchDistances]],
+        others: list[np.ndarray],
+        spheres: list[tuple[MarkerSphere, MarkerSphere, int]],
+    ) -> PairEvidence:
+        unknown, count = len(self.units), self.unknown_poses
+        relative = np.concatenate([each.distance_mm / each.std_mm for *_, each in ways]) if ways else np.empty(0)
+        spread = scatter(relative)
+        blocks, residuals, weights, deviations = [], [], [], []
+        spurious = np.zeros((count, count))
+        for source, target, found in ways:
+            std = found.std_mm * spread
+            u = np.clip(found.distance_mm / std / _TUKEY, -1, 1)
+            # Both directions count by half, and K scans of one place have K (K - 1) / 2 pairs and K - 1 differences.
+            each = 1 / (others[source][found.source] * self.patches[source].alike(len(found.source)))
+            weight = (1 - u * u) ** 2 / std**2 * each
+            block = np.zeros((len(weight), unknown))
+            for number, rows, sign in ((source, found.source, 1.0), (target, found.target, -1.0)):
+                if len(columns := self.pose_columns[number]):
+                    block[:, columns] = sign * self._by_pose(number, found.places_mm, found.normals)
+                turned = self.patches[number].patterns_mm[:, rows] @ self.poses[number, :3, :3].T
+                block[:, self.pattern_columns[number]] = sign * np.einsum("mqi,qi->qm", turned, found.normals)
+            blocks.append(block)
+            residuals.append(found.distance_mm)
+            weights.append(weight)
+            deviations.append(found.std_mm)
+            spurious += self._spurious(source, target, found, weight)
+        for first, second, views in spheres:
+            covariance = first.covariance + second.covariance
+            root = np.linalg.cholesky(np.linalg.inv(covariance)).T
+            off = root @ (first.centre_mm - second.centre_mm)
+            block = np.zeros((3, unknown))
+            for number, marker, sign in ((a, first, 1.0), (b, second, -1.0)):
+                if len(columns := self.pose_columns[number]):
+                    block[:, columns] = sign * self._by_pose(number, np.tile(marker.centre_mm, (3, 1)), root)
+                block[:, self.pattern_columns[number]] = sign * root @ marker.patterns_mm.T
+            blocks.append(block)
+            residuals.append(off)
+            # Where surfaces fit worse than stated, spheres do too: else they would decide, and keep surfaces apart.
+            weights.append(np.full(3, 2 / views / spread**2))
+            deviations.append(np.ones(3))
+        return PairEvidence(
+            np.vstack(blocks),
+            np.concatenate(residuals),
+            np.concatenate(weights),
+            np.concatenate(deviations),
+            spread,
+            spurious,
+            np.vstack([found.places_mm for *_, found in ways]) if ways else np.empty((0, 3)),
+            len(relative),
+            len(spheres),
+        )
+
+    def _by_pose(self, number: int, places: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Motion (Q, 6) of places (Q, 3) along directions (Q, 3) by shift and turn of a scan."""
+        return np.hstack([directions, np.cross(places - self.middles_mm[number], directions)])
+
+    def _spurious(self, source: int, target: int, found: PatchDistances, weight: np.ndarray) -> np.ndarray:
+        """Information (P, P) that the noise of the normals alone would give."""
+        across = np.cross(found.normals, np.eye(3)[np.argmin(np.abs(found.normals), axis=1)])
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        result = np.zeros((self.unknown_poses,) * 2)
+        for direction in (across, np.cross(found.normals, across)):
+            block = np.zeros((len(weight), self.unknown_poses))
+            for number, sign in ((source, 1.0), (target, -1.0)):
+                if len(columns := self.pose_columns[number]):
+                    block[:, columns] = sign * self._by_pose(number, found.places_mm, direction)
+            result += block.T @ ((weight * found.slope_variance)[:, None] * block)
+        return result
+
+    def _from_start(self) -> np.ndarray:
+        """Shifts and turns (P,) of the poses from the start."""
+        turned = Rotation.from_matrix(self.poses[1:, :3, :3] @ self.start[1:, :3, :3].transpose(0, 2, 1)).as_rotvec()
+        before = np.einsum("nij,nj->ni", self.start[1:, :3, :3], self.local_middles[1:]) + self.start[1:, :3, 3]
+        return np.hstack([self.middles_mm[1:] - before, turned]).ravel()
+
+
+def _alike(patterns: Sequence[np.ndarray], shared: Sequence[dict[str, np.ndarray]]) -> np.ndarray:
+    """Information (U, U) beforehand on the patterns of all scans, each of variance one."""
+    ends = np.cumsum([0, *map(len, patterns)])
+    covariance = (1 + _OWN_PART) * np.eye(ends[-1])
+    for a, b in permutations(range(len(patterns)), 2):
+        for name in shared[a].keys() & shared[b].keys():
+            if shared[a][name].shape[1] == shared[b][name].shape[1]:
+                covariance[ends[a] : ends[a + 1], ends[b] : ends[b + 1]] += shared[a][name] @ shared[b][name].T
+    # What rounds wrong, or contradicts itself, counts as apart.
+    least = float(np.linalg.eigvalsh(covariance)[0]) if len(covariance) else 1.0
+    return np.linalg.inv(covariance + max(_OWN_PART - least, 0.0) * np.eye(ends[-1]))
+
+
+def _usual_distance(points: np.ndarray) -> float:
+    """Root mean square distance of points (N, 3) from their middle."""
+    return float(np.sqrt(np.mean(np.sum((points - points.mean(axis=0)) ** 2, axis=1))))

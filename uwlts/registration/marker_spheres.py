@@ -1,0 +1,103 @@
+"""Spheres as markers: their centres in each scan, and which centres in several scans are those of one sphere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+
+from uwlts.evaluation.spheres import find_sphere
+from uwlts.fitting.shapes import fit_sphere
+from uwlts.storage.cloud import PointCloud
+
+_MOST = 12
+"""Spheres in one scan."""
+_AGREE = 0.05
+"""Of the diameter: distances between centres, before registration, agree within it."""
+_TRIPLES = 200
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerSphere:
+    """A sphere's centre (3,), its covariance (3, 3) by noise, and how patterns move it (M, 3), mm."""
+
+    centre_mm: np.ndarray
+    covariance: np.ndarray
+    patterns_mm: np.ndarray
+
+
+def find_markers(cloud: PointCloud, diameter_mm: float) -> list[MarkerSphere]:
+    """Spheres of a diameter in a cloud."""
+    usable, found = np.ones(len(cloud), bool), []
+    rng = np.random.default_rng(0)
+    while len(found) < _MOST:
+        sphere = find_sphere(cloud.points_mm, diameter_mm / 2, usable=usable, rng=rng)
+        if sphere is None:
+            break
+        members = sphere.members[sphere.robust.inliers]
+        usable[sphere.near] = False
+        # Of a cap, centre and radius are known together only; the diameter is given.
+        fit = fit_sphere(cloud.points_mm[members], diameter_mm / 2)
+        outwards = cloud.points_mm[members] - fit.centre_mm
+        outwards /= np.linalg.norm(outwards, axis=1, keepdims=True)
+        # A displacement moves the centre of the fit by least squares.
+        solve = np.linalg.pinv(outwards)
+        patterns = np.zeros((0, 3))
+        if cloud.uncertainty is not None:
+            moved = np.einsum("mni,ni->mn", cloud.uncertainty.patterns_mm[:, members], outwards)
+            patterns = moved @ solve.T
+        found.append(MarkerSphere(fit.centre_mm, fit.covariance[:3, :3], patterns))
+    return found
+
+
+def common_markers(scans: Sequence[Sequence[MarkerSphere]], reach_mm: float) -> list[dict[int, MarkerSphere]]:
+    """Spheres of different scans within a reach of each other in the common frame, by the number of the scan."""
+    groups: list[dict[int, MarkerSphere]] = []
+    for number, markers in enumerate(scans):
+        for marker in markers:
+            away = [np.inf if number in group else _from_middle(marker, group) for group in groups]
+            if away and min(away) < reach_mm:
+                groups[int(np.argmin(away))][number] = marker
+            else:
+                groups.append({number: marker})
+    return [group for group in groups if len(group) > 1]
+
+
+def movement_by_markers(
+    source: Sequence[MarkerSphere], target: Sequence[MarkerSphere], diameter_mm: float
+) -> tuple[np.ndarray, int] | None:
+    """Movement (4, 4) of most spheres of one scan onto those of another, and their number; None below three."""
+    a, b = (np.array([each.centre_mm for each in markers]).reshape(-1, 3) for markers in (source, target))
+    if min(len(a), len(b)) < 3:
+        return None
+    limit, best = _AGREE * diameter_mm, None
+    sides_a, sides_b = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in (a, b))
+    for i, j, k in list(permutations(range(len(a)), 3))[:_TRIPLES]:
+        near = np.argwhere(np.abs(sides_b - sides_a[i, j]) < limit)
+        for p, q in near[near[:, 0] != near[:, 1]]:
+            last = np.flatnonzero(
+                (np.abs(sides_b[p] - sides_a[i, k]) < limit) & (np.abs(sides_b[q] - sides_a[j, k]) < limit)
+            )
+            for r in last[(last != p) & (last != q)]:
+                movement = movement_of(a[[i, j, k]], b[[p, q, r]])
+                off = np.linalg.norm((a @ movement[:3, :3].T + movement[:3, 3])[:, None] - b[None], axis=2)
+                fits = off.min(axis=1) < limit
+                if best is None or np.count_nonzero(fits) > best[1]:
+                    best = movement_of(a[fits], b[off.argmin(axis=1)[fits]]), int(np.count_nonzero(fits))
+    return best if best is not None and best[1] >= 3 else None
+
+
+def _from_middle(marker: MarkerSphere, group: dict[int, MarkerSphere]) -> float:
+    return float(np.linalg.norm(np.mean([each.centre_mm for each in group.values()], axis=0) - marker.centre_mm))
+
+
+def movement_of(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Rigid movement (4, 4) of points (N, 3) onto others in the same order (Arun, Huang and Blostein, 1987)."""
+    middle = source.mean(axis=0), target.mean(axis=0)
+    left, _, right = np.linalg.svd((target - middle[1]).T @ (source - middle[0]))
+    rotation = left @ np.diag([1, 1, np.sign(np.linalg.det(left @ right))]) @ right
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = rotation, middle[1] - rotation @ middle[0]
+    return result

@@ -1,0 +1,126 @@
+"""One cloud of several scans, with the uncertainty of points and poses together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from uwlts.registration.joint_registration import JointRegistration
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, NO_INDEX, PAIRS, PointCloud, PointUncertainty
+
+_BLOCK = 50_000
+_LEFT_OUT = 1e-4
+"""Of the sum of squares of all patterns: patterns that together have less are left out, a hundredth of the distance."""
+
+
+def merged_cloud(
+    scans: Sequence[PointCloud], names: Sequence[str], joint: JointRegistration, covariance: np.ndarray
+) -> PointCloud:
+    """All points in the common frame, moved by the patterns that were found.
+
+    ``covariance`` (U, U) is that of all unknowns of the estimate. Scans without uncertainty have that of their pose
+    alone.
+    """
+    points, random, position, frames, firsts = [], [], [], [], []
+    first = 0
+    for number, scan in enumerate(scans):
+        rotation = joint.poses[number, :3, :3]
+        points.append(_corrected(scan, joint.patterns[number]) @ rotation.T + joint.poses[number, :3, 3])
+        known = scan.uncertainty
+        matrices = np.zeros((len(scan), 3, 3))
+        if known is not None:
+            for column, (i, j) in enumerate(PAIRS):
+                matrices[:, i, j] = matrices[:, j, i] = known.random_mm2[:, column]
+        turned = rotation @ matrices @ rotation.T
+        random.append(np.stack([turned[:, i, j] for i, j in PAIRS], axis=1))
+        position.append(np.zeros((len(scan), 3)) if known is None else known.position_mm @ rotation.T)
+        frames.append(np.where(scan.frame == NO_INDEX, NO_INDEX, scan.frame + first))
+        firsts.append(first)
+        first += int(scan.frame.max(initial=-1)) + 1
+    times = [scan.time_s for scan in scans if scan.time_s is not None]
+    return PointCloud(
+        points_mm=np.vstack(points),
+        intensity=np.concatenate([scan.intensity for scan in scans]),
+        frame=np.concatenate(frames),
+        line=np.concatenate([scan.line for scan in scans]),
+        uncertainty=PointUncertainty(
+            np.vstack(random).astype(np.float32),
+            np.vstack(position).astype(np.float32),
+            _patterns(scans, points, joint, covariance),
+            _by_pose(scans, joint),
+        ),
+        time_s=np.concatenate(times) if len(times) == len(scans) else None,
+        metadata=_metadata(scans, names, joint, firsts),
+    )
+
+
+def _by_pose(scans: Sequence[PointCloud], joint: JointRegistration) -> np.ndarray | None:
+    """Parts (K, N, 3) of the poses of images, in the common frame; None where no scan has any."""
+    known = [None if scan.uncertainty is None else scan.uncertainty.poses_mm for scan in scans]
+    count = max((len(each) for each in known if each is not None), default=0)
+    if not count:
+        return None
+    parts = [np.zeros((count, len(scan), 3), np.float32) for scan in scans]
+    for number, each in enumerate(known):
+        if each is not None:
+            parts[number][: len(each)] = each @ joint.poses[number, :3, :3].T
+    return np.concatenate(parts, axis=1)
+
+
+def _corrected(scan: PointCloud, amounts: np.ndarray) -> np.ndarray:
+    if scan.uncertainty is None or not len(amounts):
+        return scan.points_mm
+    return scan.points_mm + np.tensordot(amounts, scan.uncertainty.patterns_mm, axes=1)
+
+
+def _patterns(
+    scans: Sequence[PointCloud], points: Sequence[np.ndarray], joint: JointRegistration, covariance: np.ndarray
+) -> np.ndarray:
+    """Patterns (M, N, 3), orthogonal over all points, of the covariance of poses and patterns together."""
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+
+    def blocks() -> list[tuple[int, slice]]:
+        return [(n, slice(k, k + _BLOCK)) for n, each in enumerate(points) for k in range(0, len(each), _BLOCK)]
+
+    def moved(number: int, here: slice) -> np.ndarray:
+        """Motion (R, B, 3) of points of a scan by independent parts."""
+        scan, columns = scans[number], joint.pose_columns[number]
+        result = np.zeros((root.shape[1], len(points[number][here]), 3))
+        if len(columns):
+            about = points[number][here] - joint.middles_mm[number]
+            by_shift, by_turn = root[columns[:3]].T, root[columns[3:]].T
+            result += by_shift[:, None] + np.cross(by_turn[:, None], about[None])
+        own = joint.pattern_columns[number]
+        if len(own) and scan.uncertainty is not None:
+            turned = scan.uncertainty.patterns_mm[:, here] @ joint.poses[number, :3, :3].T
+            result += np.tensordot(root[own].T, turned, axes=1)
+        return result
+
+    gram = np.zeros((root.shape[1],) * 2)
+    for number, here in blocks():
+        flat = moved(number, here).reshape(len(gram), -1)
+        gram += flat @ flat.T
+    strengths, ways = np.linalg.eigh(gram)
+    strengths, ways = np.maximum(strengths[::-1], 0.0), ways[:, ::-1]
+    left = 1 - np.cumsum(strengths) / max(strengths.sum(), 1e-300)
+    count = 1 + int(np.argmax(left <= _LEFT_OUT))
+    parts = [
+        np.tensordot(ways[:, :count].T, moved(number, here), axes=1).astype(np.float32) for number, here in blocks()
+    ]
+    return np.concatenate(parts, axis=1)
+
+
+def _metadata(scans: Sequence[PointCloud], names: Sequence[str], joint: JointRegistration, firsts: list[int]) -> dict:
+    """What all scans have in common, and each scan's name, pose and first image."""
+    shared = {
+        key: value
+        for key, value in scans[0].metadata.items()
+        if key not in (FOOTPRINT, FOOTPRINT_STD) and all(scan.metadata.get(key) == value for scan in scans[1:])
+    }
+    listed = [
+        {"name": name, "first_frame": first, "pose": pose.tolist()}
+        for name, first, pose in zip(names, firsts, joint.poses, strict=True)
+    ]
+    return shared | {"scans": listed}

@@ -1,0 +1,321 @@
+"""Registration of several scans into one frame: joint least squares over all overlaps, with what stays open named.
+
+Residuals are distances of patches of one scan from the surface of another (`uwlts.fitting.patches`), and differences
+of the centres of spheres that several scans show. Unknown are the pose of every scan but the first, and how much of
+each of its systematic patterns a scan has (`PointUncertainty`), which are known beforehand to be of standard deviation
+one, and the same in all scans as far as they come from one calibration. Tukey's biweight leaves out what fits no
+surface.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from uwlts.errors import EvaluationError
+from uwlts.fitting.patches import surface_patches
+from uwlts.model.calibration import is_rigid
+from uwlts.model.sensor import Table
+from uwlts.registration.coarse_registration import coarse_poses
+from uwlts.registration.joint_registration import JointRegistration, PairEvidence, Solved
+from uwlts.registration.marker_spheres import find_markers
+from uwlts.registration.merging import merged_cloud
+from uwlts.registration.open_movements import OpenMovement, open_movements
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import read_cloud
+
+_ROUNDS = 60
+_STILL_MM = 1e-5
+"""A step that moves the usual point by less changes nothing that can be measured."""
+_REACH = 0.05
+"""Of a scan's size: how far overlapping surfaces lie apart at the start, at most, unless that is given."""
+_NARROWER = 0.8
+_ROUNDED = 1e-6
+
+
+@dataclass(frozen=True)
+class PairFit:
+    """How two scans fit: numbers of the scans, patches of the overlap that count, and distances, mm.
+
+    ``mean_mm`` and ``rms_mm`` are of the distances after registration, ``scatter`` is their robust standard deviation
+    in units of that which noise explains. ``closure_mm`` is the root mean square distance, with noise taken off, that
+    the other overlaps alone leave here; None where without this pair the scans are not connected. ``spheres`` is the
+    number of common spheres, ``sphere_rms`` the root mean square difference of their centres over its uncertainty.
+    """
+
+    scans: tuple[int, int]
+    patches: int
+    mean_mm: float
+    rms_mm: float
+    scatter: float
+    closure_mm: float | None
+    spheres: int
+    sphere_rms: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class Overlap:
+    """Places (Q, 3) where two scans show one surface, common frame, and their distances (Q,), mm."""
+
+    places_mm: np.ndarray
+    distance_mm: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredScans:
+    """Several scans in the frame of the first.
+
+    Attributes
+    ----------
+    names : tuple of str
+    poses : (N, 4, 4) float64
+        Frame of the first scan from that of each, mm.
+    covariance : (6 N, 6 N) float64
+        Of a shift (mm), then a turn (rad) of each scan about its `middles_mm`; 0 for the first scan, and in directions
+        that are open unless the start was given with its standard uncertainty.
+    middles_mm : (N, 3) float64
+    open_movements : tuple of OpenMovement
+        What neither surfaces nor spheres tell; left as at the start.
+    pairs : tuple of PairFit
+    overlaps : tuple of Overlap
+        Where each pair overlaps, in the order of the pairs.
+    scale : float
+        Patterns that were found, root mean square over all in units of what the calibration expects; NaN without.
+    cloud : PointCloud
+        All points with their uncertainty, that of the registration included. Numbers of images go on from scan to scan.
+    """
+
+    names: tuple[str, ...]
+    poses: np.ndarray
+    covariance: np.ndarray
+    middles_mm: np.ndarray
+    open_movements: tuple[OpenMovement, ...]
+    pairs: tuple[PairFit, ...]
+    overlaps: tuple[Overlap, ...] = field(repr=False)
+    scale: float
+    cloud: PointCloud = field(repr=False)
+
+    @property
+    def std(self) -> np.ndarray:
+        """Standard uncertainty (N, 6) of each scan's shift (mm) and turn (rad)."""
+        return np.sqrt(np.diag(self.covariance)).reshape(-1, 6)
+
+    def record(self) -> Table:
+        """All but points and distances as JSON; angles in rad."""
+        return {
+            "scans": [
+                {"name": name, "transform": pose.tolist(), "middle_mm": middle.tolist()}
+                for name, pose, middle in zip(self.names, self.poses, self.middles_mm, strict=True)
+            ],
+            "covariance": self.covariance.tolist(),
+            "open_movements": [
+                {"scan": self.names[each.scan], "movement": each.words()} for each in self.open_movements
+            ],
+            "pairs": [
+                {
+                    "scans": [self.names[number] for number in pair.scans],
+                    "patches": pair.patches,
+                    "mean_mm": pair.mean_mm,
+                    "rms_mm": pair.rms_mm,
+                    "scatter": pair.scatter,
+                    "closure_mm": pair.closure_mm,
+                    "spheres": pair.spheres,
+                    "sphere_rms": pair.sphere_rms,
+                }
+                for pair in self.pairs
+            ],
+            "pattern_scale": self.scale if np.isfinite(self.scale) else None,
+            "points": len(self.cloud),
+        }
+
+    def lines(self) -> list[str]:
+        """The summary as text."""
+        lines = [f"{len(self.names)} scans, {len(self.cloud)} points, {len(self.pairs)} overlaps"]
+        for pair in self.pairs:
+            first, second = (self.names[number] for number in pair.scans)
+            closure = "" if pair.closure_mm is None else f", closure {pair.closure_mm:.4f}"
+            spheres = (
+                "" if not pair.spheres else f"; {pair.spheres} spheres, rms {pair.sphere_rms:.2f} of their uncertainty"
+            )
+            lines.append(
+                f"  {first} - {second}: {pair.patches} patches, mm: mean {pair.mean_mm:+.4f}, rms {pair.rms_mm:.4f}"
+                f"{closure}{spheres}"
+            )
+        for name, std in list(zip(self.names, self.std, strict=True))[1:]:
+            shift, turn = np.linalg.norm(std[:3]), np.degrees(np.linalg.norm(std[3:]))
+            lines.append(f"  {name}: standard uncertainty {shift:.4f} mm, {turn:.5f} deg")
+        lines += [
+            f"  open, left as at the start: {self.names[each.scan]}: {each.words()}" for each in self.open_movements
+        ]
+        return lines
+
+
+def register(
+    clouds: Sequence[PointCloud | str | os.PathLike[str]],
+    *,
+    poses: np.ndarray | None = None,
+    start_std_mm: float | None = None,
+    start_std_deg: float | None = None,
+    search: bool = False,
+    sphere_mm: float | None = None,
+    reach_mm: float | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> RegisteredScans:
+    """Bring scans that overlap into the frame of the first, and merge them.
+
+    Parameters
+    ----------
+    clouds
+        Two or more clouds or their files, in any order; every one overlaps another, not necessarily the first.
+    poses : (N, 4, 4), optional
+        Poses at the start, common frame from each scan's; the scans' frames are taken as one frame unless given.
+    start_std_mm, start_std_deg : float, optional
+        Standard uncertainty of the poses at the start, of each scan's shift and of its turn about its middle, by axis.
+        They count as evidence then, and decide what surfaces leave open.
+    search : bool
+        Search the start by the shape of the surfaces (KISS-Matcher), or by spheres; whatever the frames and poses are.
+    sphere_mm : float, optional
+        Diameter of spheres that stand in the scene: their centres tie scans together that do not see one surface.
+    reach_mm : float, optional
+        How far overlapping surfaces lie apart at the start, at most; a twentieth of a scan's size unless given.
+    progress : callable, optional
+        Called with steps done and steps in all.
+
+    Raises
+    ------
+    CaptureError
+        A file cannot be read.
+    EvaluationError
+        Scans have too few points or no overlap, or no start was found.
+    SetupError
+        The library for the search is not installed.
+
+    Examples
+    --------
+    >>> found = uwlts.register(["top.ply", "left.ply", "right.ply"])
+    >>> uwlts.write_cloud("pipe.ply", found.cloud)
+    """
+    names = tuple(_name(each, number) for number, each in enumerate(clouds))
+    scans = [_opened(each) for each in clouds]
+    if len(scans) < 2:
+        raise EvaluationError(f"found {len(scans)} cloud; two or more are needed for a registration")
+    for name, length in (("sphere_mm", sphere_mm), ("reach_mm", reach_mm), ("start_std_mm", start_std_mm)):
+        if length is not None and not 0 < length < np.inf:
+            raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
+    if (start_std_mm is None) != (start_std_deg is None):
+        raise EvaluationError("the start's uncertainty needs both parts: start_std_mm and start_std_deg")
+    steps = len(scans) + _ROUNDS
+    patches = []
+    for number, (name, scan) in enumerate(zip(names, scans, strict=True)):
+        try:
+            patches.append(surface_patches(scan.points_mm, scan.uncertainty, frame=scan.frame))
+        except EvaluationError as error:
+            raise EvaluationError(f"{name}: {error}") from error
+        progress(number + 1, steps)
+    markers = [find_markers(scan, sphere_mm) if sphere_mm else [] for scan in scans]
+    start = (
+        coarse_poses([scan.points_mm for scan in scans], patches, markers, names, sphere_mm=sphere_mm)
+        if search
+        else _given(poses, len(scans))
+    )
+    std = None if start_std_mm is None or start_std_deg is None else (start_std_mm, float(np.radians(start_std_deg)))
+    shared = [{} if scan.uncertainty is None else scan.uncertainty.shared for scan in scans]
+    joint = JointRegistration(patches, markers, start, start_std=std, sphere_mm=sphere_mm, shared=shared)
+    least = 2 * max(each.radius_mm for each in patches)
+    reach = least if search else reach_mm or _REACH * float(np.median([_size(scan) for scan in scans]))
+    for done in range(_ROUNDS):
+        pairs = joint.evidence(reach)
+        joint.require_connected(list(pairs), names)
+        step = joint.solved(list(pairs.values())).step
+        joint.move(step)
+        progress(len(scans) + done + 1, steps)
+        if (
+            reach <= least
+            and np.abs(step[: joint.unknown_poses] / joint.units[: joint.unknown_poses]).max() < _STILL_MM
+        ):
+            break
+        reach = max(_NARROWER * reach, least)
+    progress(steps, steps)
+    pairs = joint.evidence(reach)
+    solved = joint.solved(list(pairs.values()))
+    amounts = np.concatenate(joint.patterns)
+    covariance = np.zeros((6 * len(scans),) * 2)
+    covariance[6:, 6:] = solved.covariance[: joint.unknown_poses, : joint.unknown_poses]
+    return RegisteredScans(
+        names=names,
+        poses=joint.poses,
+        covariance=covariance,
+        middles_mm=joint.middles_mm,
+        open_movements=open_movements(solved.open_directions, joint.middles_mm, joint.sizes),
+        pairs=tuple(_fit_of(joint, key, pairs, solved) for key in pairs),
+        overlaps=tuple(_overlap(pair) for pair in pairs.values()),
+        scale=float(np.sqrt(np.mean(amounts**2))) if len(amounts) else np.nan,
+        cloud=merged_cloud(scans, names, joint, solved.covariance),
+    )
+
+
+def _fit_of(
+    joint: JointRegistration, key: tuple[int, int], pairs: dict[tuple[int, int], PairEvidence], solved: Solved
+) -> PairFit:
+    pair = pairs[key]
+    counted = pair.residuals[pair.counted]
+    centres = pair.residuals[pair.patches :]
+    return PairFit(
+        scans=key,
+        patches=len(counted),
+        mean_mm=float(np.mean(counted)) if len(counted) else 0.0,
+        rms_mm=float(np.sqrt(np.mean(counted**2))) if len(counted) else 0.0,
+        scatter=pair.spread,
+        closure_mm=_closure(joint, key, pairs, solved) if len(counted) else None,
+        spheres=pair.spheres,
+        # Relative to the centres' uncertainty in the estimate.
+        sphere_rms=float(np.sqrt(np.mean(centres**2))) if pair.spheres else None,
+    )
+
+
+def _overlap(pair: PairEvidence) -> Overlap:
+    counted = pair.counted[: pair.patches]
+    return Overlap(pair.places_mm[counted], pair.residuals[: pair.patches][counted])
+
+
+def _closure(
+    joint: JointRegistration, key: tuple[int, int], pairs: dict[tuple[int, int], PairEvidence], solved: Solved
+) -> float | None:
+    """Distance that the other pairs alone leave in an overlap; None where they do not tell it."""
+    others = [pair for other, pair in pairs.items() if other != key]
+    if not others:
+        return None
+    without = joint.solved(others)
+    if len(without.open_directions) > len(solved.open_directions):
+        return None
+    pair = pairs[key]
+    left = (pair.residuals + pair.derivatives @ without.step)[pair.counted]
+    noise = (pair.std * pair.spread)[pair.counted]
+    return float(np.sqrt(max(np.mean(left**2) - np.mean(noise**2), 0.0)))
+
+
+def _given(poses: np.ndarray | None, count: int) -> np.ndarray:
+    if poses is None:
+        return np.tile(np.eye(4), (count, 1, 1))
+    start = np.array(poses, dtype=np.float64)
+    if start.shape != (count, 4, 4):
+        raise EvaluationError(f"the poses at the start have the shape {start.shape}; expected ({count}, 4, 4)")
+    if not is_rigid(start, within=_ROUNDED):
+        raise EvaluationError("the poses at the start must be rotations with a shift (0 0 0 1 as last row)")
+    return np.linalg.inv(start[0]) @ start
+
+
+def _size(cloud: PointCloud) -> float:
+    return float(np.linalg.norm(np.ptp(cloud.points_mm, axis=0)))
+
+
+def _opened(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
+    return cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
+
+
+def _name(cloud: PointCloud | str | os.PathLike[str], number: int) -> str:
+    return f"scan {number + 1}" if isinstance(cloud, PointCloud) else Path(cloud).stem

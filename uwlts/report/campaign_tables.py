@@ -1,0 +1,200 @@
+"""Tables of a campaign: results of its measurements, and parameters and residuals of its calibrations."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from uwlts.model.calibration import Calibration
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.pages.numbers import as_fine_as, entries_of, fixed, is_number, numbers_in, plain, unit_of, words_of
+from uwlts.pages.toolkit import MISSING, ComparisonTable
+from uwlts.report.gather import CALIBRATION, GatheredCalibration, GatheredCampaign, GatheredMeasurement, Reference
+from uwlts.report.plot import SHORT_LIST
+
+_QUANTITIES = {"PE": "probing error PE", "RE": "range error RE", "STD": "deviations STD", "range": "deviations range"}
+_ORDER = ("sphere spacing", "step height", "pipe diameter", "diameter", "probing", "range", "deviations", "ovality")
+_WIDTH = 110
+
+
+@dataclass(frozen=True)
+class Row:
+    """One quantity, in mm or as a share.
+
+    ``true`` is the calibrated (or, for a twin, set) value with its ``uncertainty``, ``stated`` the expanded uncertainty
+    (k = 2) of the measured one; ``published`` are errors for quantities that have a true value of their own, else
+    values of the quantity itself.
+    """
+
+    measurement: str
+    quantity: str
+    true: float | None = None
+    measured: float | None = None
+    error: float | None = None
+    stated: float | None = None
+    published: tuple[float, ...] = ()
+    uncertainty: float | None = None
+    unit: Literal["mm", "share"] = "mm"
+
+    def texts(self) -> tuple[str, str, str, str, str, str, str]:
+        """The row as text: measurement, quantity, true, measured, error, stated, published."""
+        if self.unit == "share":
+            measured = MISSING if self.measured is None else f"{fixed(100 * self.measured, 2)} %"
+        else:
+            measured = fixed(self.measured)
+        # Two decimals below a millimetre where more were not printed: 0.10 is not the same claim as 0.1.
+        published = [fixed(v, 2) if abs(v) < 1 and round(v, 2) == v else f"{v:g}" for v in self.published]
+        error, stated = fixed(self.error, signed=True), fixed(self.stated)
+        known = fixed(self.true), measured, error, stated
+        return self.measurement, self.quantity, *known, ", ".join(published) or MISSING
+
+
+def summary_table(campaign: GatheredCampaign, reference: Reference | None = None) -> list[Row]:
+    """Rows of all measurements, then the window's distance of every calibration."""
+    rows = [row for measurement in campaign.measurements for row in _measurement_rows(measurement, reference)]
+    return rows + _window_rows(campaign, reference)
+
+
+def print_table(rows: list[Row], *, published: str = "thesis", console: Console | None = None) -> None:
+    """Print rows on a terminal of any kind, a dumb one included, or to a file; ``published`` heads the last column."""
+    if console is None:
+        usual = Console()
+        console = usual if usual.is_terminal and not usual.is_dumb_terminal else Console(width=_WIDTH)
+    table = Table(box=box.SIMPLE_HEAD, title="lengths in mm", title_justify="left", pad_edge=False)
+    for number, heading in enumerate(("measurement", "quantity", "true", "measured", "error", "U (k = 2)", published)):
+        table.add_column(heading, justify="left" if number < 2 else "right", no_wrap=number >= 2)
+    last = None
+    for row in rows:
+        name, *others = row.texts()
+        if last not in (None, name):
+            table.add_section()
+        # Text, so that names from files are never taken for markup.
+        table.add_row(*(Text(text) for text in ("" if name == last else name, *others)))
+        last = name
+    console.print(table)
+
+
+def _measurement_rows(measurement: GatheredMeasurement, reference: Reference | None) -> list[Row]:
+    judged = measurement.judged
+    if judged is None:
+        return []
+    rows, keys = [], judged.figure_keys()
+    for figure, value in ({} if judged.evaluation is None else judged.evaluation.figures_mm).items():
+        key = keys.get(figure)
+        if key is not None and key.is_detail:
+            continue
+        published = () if reference is None else reference.values(measurement.known_as, figure)
+        stated = judged.uncertainty[figure].expanded_mm if figure in judged.uncertainty else None
+        if key is None or key.calibrated is None:
+            name = _QUANTITIES.get(figure, figure)
+            rows.append(Row(measurement.name, name, measured=value, stated=stated, published=published))
+        else:
+            name, true, std = key.calibrated.name, key.calibrated.value_mm, key.calibrated.uncertainty_mm
+            rows.append(Row(measurement.name, name, true, true + value, value, stated, published, std))
+    rows.sort(key=lambda row: [*map(row.quantity.startswith, _ORDER), True].index(True))
+    if judged.truth is not None:
+        truth, fitted = judged.truth, judged.truth.after_best_fit
+        rows.append(Row(measurement.name, "rms distance to truth", measured=truth.rms_mm))
+        if fitted is not None:
+            rows.append(Row(measurement.name, "rms distance after best fit", measured=fitted.rms_mm))
+        best, name = (truth, "of truth") if fitted is None else (fitted, "after best fit")
+        within = f"within {best.tolerance_mm:.3f} {name}"
+        rows.append(Row(measurement.name, within, measured=best.share_within_tolerance, unit="share"))
+    return rows
+
+
+def _window_rows(campaign: GatheredCampaign, reference: Reference | None) -> list[Row]:
+    rows = []
+    for found in campaign.calibrations:
+        window = found.calibration.window
+        if window is None:
+            continue
+        # A single interface stands for the whole window: its distance has no true value.
+        pane = window.refractions == 2
+        true = campaign.true_window_mm if pane else None
+        published = reference.values((CALIBRATION,), "window_distance_mm") if reference is not None and pane else ()
+        error = None if true is None else window.distance_mm - true
+        quantity = "window distance" if pane else "interface distance (1 refraction)"
+        rows.append(Row(found.name, quantity, true, window.distance_mm, error, published=published))
+    return rows
+
+
+def parameter_table(campaign: GatheredCampaign) -> ComparisonTable:
+    """All parameters with their units and, where known, standard deviations; a last column of a twin's true values."""
+    columns = [(found.name, _parameters(found.calibration)) for found in campaign.calibrations]
+    if campaign.true_sensor is not None:
+        columns.append(("true", _parameters(nominal_calibration(campaign.true_sensor))))
+    return _side_by_side(columns)
+
+
+def residual_table(calibrations: tuple[GatheredCalibration, ...]) -> ComparisonTable:
+    """Every single figure that the residuals of the calibrations hold, by its name."""
+    return _side_by_side([(found.name, dict(_figures(found.calibration))) for found in calibrations])
+
+
+def _side_by_side(columns: list[tuple[str, dict[tuple[str, str], str]]]) -> ComparisonTable:
+    """Columns by their headings, each of texts by words and unit."""
+    rows = dict.fromkeys(row for _, table in columns for row in table)
+    return ComparisonTable(
+        tuple(heading for heading, _ in columns),
+        tuple((*row, tuple(table.get(row, MISSING) for _, table in columns)) for row in rows),
+    )
+
+
+def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
+    camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
+    std = numbers_in(calibration.figures("camera").get("std"))
+    table = {}
+    for words, value, names in (
+        ("focal length, x", camera.fx_px, ("fx", "f")),
+        ("focal length, y", camera.fy_px, ("fy", "f")),
+        ("principal point, x", camera.cx_px, ("cx",)),
+        ("principal point, y", camera.cy_px, ("cy",)),
+    ):
+        table[words, "px"] = _with_std(value, next((std[name] for name in names if name in std), None), 3)
+    for name, value in camera.distortion.used().items():
+        table[f"distortion {name}", ""] = _with_std(value, std.get(name), 6)
+    pose = calibration.object_transform()
+    table["stand-off: sheet on the camera's axis", "mm"] = fixed(pose[2, 3])
+    table["angle between camera and sheet", "°"] = fixed(math.degrees(math.asin(min(1, abs(sheet.normal[2])))), 4)
+    table["sheet's distance from the camera", "mm"] = fixed(sheet.offset_mm)
+    if window is not None:
+        table["refractions", ""] = str(window.refractions)
+        known = numbers_in(calibration.figures("window")).get("std_mm")
+        table["window distance d", "mm"] = _with_std(window.distance_mm, known, 3)
+        cosine = float(window.normal[2] / np.linalg.norm(window.normal))
+        table["window tilt", "°"] = fixed(math.degrees(math.acos(min(1, cosine))), 3)
+        if window.refractions == 2:
+            table["glass thickness", "mm"] = fixed(window.thickness_mm)
+            table["index of the glass", ""] = fixed(window.glass_index, 4)
+    return table
+
+
+def _with_std(value: float, std: float | None, decimals: int) -> str:
+    """A value, and its standard deviation with two significant digits; both with the same decimals."""
+    if std is None or not std > 0:
+        return fixed(value, decimals)
+    return f"{as_fine_as(value, std, digits=2)} ± {as_fine_as(std, std, digits=2)}"
+
+
+def _figures(calibration: Calibration) -> Iterator[tuple[tuple[str, str], str]]:
+    """Name with unit, and text, of every single figure among the residuals."""
+    for group, name, value in entries_of(calibration.residuals_in_file()):
+        words = f"{group}: {words_of(name)}" if group else words_of(name)
+        if group == "camera std":
+            # Standard deviations of the camera stand beside its parameters.
+            continue
+        if is_number(value):
+            yield (words, unit_of(name)), plain(value)
+        elif isinstance(value, bool):
+            yield (words, unit_of(name)), "yes" if value else "no"
+        elif isinstance(value, str):
+            yield (words, ""), value
+        elif isinstance(value, list) and 0 < len(value) <= SHORT_LIST and all(map(is_number, value)):
+            yield (words, unit_of(name)), ", ".join(map(plain, value))

@@ -1,0 +1,208 @@
+"""Cameras that other programs calibrated: OpenCV's files and ROS CameraInfo."""
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import yaml
+
+from uwlts.errors import DescriptionError
+from uwlts.files.reading import MOST_DEPTH, read_text, require_plain, shortened
+from uwlts.model.library import merged, validated
+from uwlts.model.sensor import Distortion, Sensor
+
+# Names in use for the same thing; compared without case and underscores.
+_MATRIX = ("cameramatrix", "intrinsicmatrix", "k", "m1")
+_COEFFICIENTS = ("distortioncoefficients", "distcoeffs", "distortioncoeffs", "distcoef", "d", "d1")
+_BROWN_CONRADY = ("plumb_bob", "rational_polynomial", "radtan", "")
+
+
+_MOST_BYTES = 2**20
+_LARGEST = 1e9
+"""Focal lengths in px and coefficients are far below it; their products stay in the range of numbers."""
+_SQUARE = 0.005  # calibrations of square pixels find focal lengths that differ by less
+
+
+_SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class _Loader(_SafeLoader):
+    """Plain YAML, in which a matrix of OpenCV is a table."""
+
+
+_Loader.add_multi_constructor(
+    "tag:yaml.org,2002:opencv-", lambda loader, suffix, node: loader.construct_mapping(node, deep=True)
+)
+
+
+@dataclass(frozen=True)
+class KnownCamera:
+    """Focal lengths and principal point in px, distortion, and the image size (width, height) where it is given."""
+
+    fx_px: float
+    fy_px: float
+    cx_px: float
+    cy_px: float
+    distortion: Distortion
+    size_px: tuple[int, int] | None
+
+
+def read_intrinsics(path: Path) -> KnownCamera:
+    """Camera from an OpenCV file (YAML, XML or JSON) or a ROS CameraInfo (YAML).
+
+    DescriptionError where the file is missing or damaged, has no camera matrix or distortion, or the camera is another
+    than a pinhole with Brown-Conrady or rational distortion.
+    """
+    text = read_text(
+        path, most_bytes=_MOST_BYTES, error=DescriptionError, called="intrinsics", foreign="is not a file of intrinsics"
+    )
+    # OpenCV's own parser hangs or ends the process with some damaged files.
+    entries = _xml(text, path) if text.lstrip().startswith("<?xml") else _yaml(text, path)
+    known = {key.lower().replace("_", ""): value for key, value in entries.items()}
+    model = str(known.get("distortionmodel") or "").lower()
+    if model not in _BROWN_CONRADY:
+        raise DescriptionError(
+            f"{path}: the distortion model is {shortened(repr(model))}; this program's camera is a pinhole with k1, "
+            "k2, p1, p2, k3 (plumb_bob) or with k4, k5, k6 as well (rational_polynomial): calibrate with one of these"
+        )
+    matrix, coefficients = _numbers(known, _MATRIX, path), _numbers(known, _COEFFICIENTS, path)
+    if matrix.size != 9:
+        raise DescriptionError(f"{path}: the camera matrix has {matrix.size} elements; expected 3 x 3")
+    fx, skew, cx, _, fy, cy = matrix[:6].tolist()
+    if not (fx > 0 and fy > 0 and abs(skew) < 1e-6 * fx and np.allclose(matrix[[3, 6, 7, 8]], (0, 0, 0, 1))):
+        raise DescriptionError(
+            f"{path}: the camera matrix is {matrix.tolist()}; expected fx 0 cx, 0 fy cy, 0 0 1 with positive fx, fy"
+        )
+    return KnownCamera(fx, fy, cx, cy, _distortion(coefficients, path), _size(known, path))
+
+
+def with_intrinsics(sensor: Sensor, known: KnownCamera, *, source: str) -> Sensor:
+    """The sensor with focal lengths, principal point and distortion of a known camera.
+
+    DescriptionError where the camera has another image size, or focal lengths that differ by more than pixels do.
+    """
+    camera = sensor.camera
+    if known.size_px is not None and known.size_px != (camera.width_px, camera.height_px):
+        raise DescriptionError(
+            f"{source} is for images of {' x '.join(map(str, known.size_px))} pixels, the sensor's are "
+            f"{camera.width_px} x {camera.height_px}: give the intrinsics of this camera at this size"
+        )
+    fx, fy = known.fx_px, known.fy_px
+    if abs(fy / fx - 1) < _SQUARE:
+        fx = fy = (fx + fy) / 2
+    changes = {
+        "focal_length_mm": 1e-3 * fx * camera.pixel_size_um,
+        "pixel_aspect": fy / fx,
+        "principal_point_px": [known.cx_px, known.cy_px],
+        "distortion": known.distortion.model_dump(),
+    }
+    return validated(Sensor, merged(sensor.model_dump(), {"camera": changes}), source)
+
+
+def _xml(text: str, path: Path) -> dict[str, object]:
+    """Top entries of an XML file of OpenCV; what is plain text there are its words."""
+    if "<!" in text.replace("<!--", ""):
+        raise DescriptionError(f"{path} declares a type of document or entities, which no file of OpenCV does")
+    depth, root = 0, None
+    try:
+        for event, element in ElementTree.iterparse(io.BytesIO(text.encode()), ("start", "end")):
+            depth += 1 if event == "start" else -1
+            if depth > MOST_DEPTH:
+                raise DescriptionError(f"{path} nests its elements more than {MOST_DEPTH} deep")
+            root = element
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise DescriptionError(f"{path} is no complete XML: {error}") from error
+    return {child.tag: _value(child) for child in root} if root is not None else {}
+
+
+def _value(element: ElementTree.Element) -> object:
+    if len(element) == 0:
+        words = [word.strip('"') for word in (element.text or "").split()]
+        return words[0] if len(words) == 1 else words
+    if all(child.tag == "_" for child in element):
+        return [_value(child) for child in element]
+    return {child.tag: _value(child) for child in element}
+
+
+def _yaml(text: str, path: Path) -> dict[str, object]:
+    """Entries of a file of YAML, or of JSON, which is YAML but for its tabs."""
+    if text.startswith("%YAML"):
+        # OpenCV writes "%YAML:1.0", which YAML does not know.
+        text = text.partition("\n")[2]
+    if text.lstrip().startswith("{"):
+        text = text.expandtabs(1)
+    try:
+        _refuse_references(text)
+        # What `rostopic echo` prints ends with the mark of a next document.
+        entries = next(iter(yaml.load_all(text, _Loader)), None)
+        require_plain(entries)
+    except RecursionError as error:
+        raise DescriptionError(f"{path} nests its tables and lists too deep") from error
+    except (yaml.YAMLError, ValueError, TypeError) as error:
+        raise DescriptionError(f"{path} is no valid YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(entries, dict):
+        raise DescriptionError(f"{path} holds no table of names and values; expected ROS CameraInfo or an OpenCV file")
+    return {str(key): value for key, value in entries.items()}
+
+
+def _refuse_references(text: str) -> None:
+    """ValueError where values refer to others, of which a short file makes any number, or are nested too deep."""
+    depth = 0
+    for event in yaml.parse(text, _Loader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError("it refers to values by name (*name), which this program does not read")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > MOST_DEPTH:
+            raise ValueError(f"it is nested more than {MOST_DEPTH} deep")
+
+
+def _first(known: dict[str, object], names: tuple[str, ...]) -> object:
+    return next((known[name] for name in names if known.get(name) is not None), None)
+
+
+def _numbers(known: dict[str, object], names: tuple[str, ...], path: Path) -> np.ndarray:
+    """Finite numbers (N,) of a matrix in any of its writings."""
+    value = _first(known, names)
+    value = value.get("data") if isinstance(value, dict) else value
+    if value is None:
+        raise DescriptionError(
+            f"{path} has none of {', '.join(names)} (in any case, with or without underscores); it has "
+            f"{shortened(', '.join(known)) or 'nothing'}"
+        )
+    try:
+        numbers = np.asarray(value, dtype=np.float64).ravel()
+    except (TypeError, ValueError, OverflowError) as error:
+        raise DescriptionError(f"{path}: {names[0]} is {shortened(repr(value))}; expected numbers") from error
+    if not (np.abs(numbers) < _LARGEST).all():
+        found = shortened(str(numbers.tolist()))
+        raise DescriptionError(f"{path}: {names[0]} holds {found}; expected finite numbers below {_LARGEST:g}")
+    return numbers
+
+
+def _distortion(coefficients: np.ndarray, path: Path) -> Distortion:
+    """k1, k2, p1, p2, k3, k4, k5, k6; further ones of OpenCV's longer models must be zero."""
+    if len(coefficients) not in (0, 4, 5, 8, 12, 14):
+        raise DescriptionError(f"{path}: there are {len(coefficients)} distortion coefficients; expected 4, 5 or 8")
+    known = dict(zip(Distortion.model_fields, coefficients.tolist(), strict=False))
+    if np.any(coefficients[len(known) :]):
+        raise DescriptionError(
+            f"{path}: the distortion has {len(coefficients)} coefficients (thin prism or tilted sensor); this "
+            "program's camera has k1, k2, p1, p2, k3, k4, k5, k6: calibrate with one of the models plumb_bob and "
+            "rational_polynomial"
+        )
+    return validated(Distortion, known, path)
+
+
+def _size(known: dict[str, object], path: Path) -> tuple[int, int] | None:
+    size = _first(known, ("imagewidth", "width")), _first(known, ("imageheight", "height"))
+    if None in size:
+        return None
+    try:
+        width_px, height_px = (int(float(str(each))) for each in size)
+    except (TypeError, ValueError, OverflowError) as error:
+        found = shortened(" x ".join(map(repr, size)))
+        raise DescriptionError(f"{path}: the image size is {found}; expected whole numbers") from error
+    return width_px, height_px

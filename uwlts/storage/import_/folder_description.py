@@ -1,0 +1,178 @@
+"""Description of a folder of images: a TOML file with the sensor, the medium, what each image is, and the stage."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from uwlts.errors import DescriptionError
+from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parsed_json, read_text
+from uwlts.model.artefacts import parse_artefact
+from uwlts.model.library import find, load_sensor, merged, read_table, validated
+from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
+from uwlts.storage.capture import CaptureHeader
+from uwlts.storage.import_.camera_files import read_intrinsics, with_intrinsics
+from uwlts.storage.import_.channels import Channel
+from uwlts.targets import parse_target
+
+NAME = "import.toml"
+"""File of this name in the folder of the images is read unless another is given."""
+
+Patterns = str | tuple[str, ...]
+
+_OF_THE_HEADER = ("name", "sensor", "intrinsics", "medium", "saturation_dn", "target", "artefact")
+_OF_THE_HEADER += ("provenance", "bits", "aligned")
+
+
+class StageMotion(Description):
+    """Positions of the stage: by start and step, by a list, or nowhere, when every image has a pose of its own (free).
+
+    ``direction`` is the unit direction in which growing positions move the sensor, in the OCS.
+    """
+
+    start_mm: float | None = None
+    step_mm: float | None = None
+    positions_mm: tuple[float, ...] | None = None
+    free: bool = False
+    direction: Vector | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "StageMotion":
+        if (self.start_mm is None) != (self.step_mm is None):
+            raise ValueError("start_mm and step_mm belong together: give both, or positions_mm")
+        ways = [self.start_mm is not None, self.positions_mm is not None, self.free]
+        if sum(ways) > 1:
+            raise ValueError("give the positions once: start_mm and step_mm, or positions_mm, or free = true")
+        return self
+
+
+class CentreLines(Description):
+    """Laser files that hold the centre lines of a 3D camera, one number per profile line, in place of images.
+
+    A place in px is ``scale`` times the number plus ``offset``; ``invalid`` is the number of lines without a stripe.
+    ``table`` is a CSV file with a row for each profile: any of stage_mm, exposure_ms, time_s and encoder. With
+    ``mm_per_count`` the encoder gives the stage's positions.
+    """
+
+    scale: Annotated[float, Field(gt=0)] = 1.0
+    offset: float = 0.0
+    invalid: float | None = None
+    table: str | None = None
+    mm_per_count: float | None = None
+
+
+class ImportDescription(Description):
+    """Everything that is known about a folder of images.
+
+    ``header`` names a capture's header as JSON, in place of everything it holds. Other files are sought beside the
+    description, images in their folder. ``sensor`` is a name, the path of a description, or a table of one, which may
+    name a ``base``. ``laser``, ``lamp``, ``background`` and ``ignore`` are patterns of file names; images that are both
+    ``laser`` and ``lamp`` show the laser on the lit target. ``table`` is a CSV file with each image's values. With
+    ``centre_lines`` the laser files hold centre lines, with one profile or many.
+    """
+
+    header: str | None = None
+    name: str | None = None
+    sensor: str | Table | None = None
+    intrinsics: str | None = None
+    medium: str | None = None
+    laser: Patterns = ()
+    lamp: Patterns = ()
+    background: Patterns = ()
+    ignore: Patterns = ()
+    table: str | None = None
+    channel: Channel | None = None
+    lamp_channel: Channel | None = None
+    bits: Annotated[int, Field(ge=8, le=16)] | None = None
+    aligned: Literal["low", "high"] = "low"
+    saturation_dn: Annotated[int, Field(gt=0)] | None = None
+    exposure_ms: NotNegative | None = None
+    lamp_exposure_ms: NotNegative | None = None
+    repeated: bool = False
+    centre_lines: CentreLines | None = None
+    stage: StageMotion = StageMotion()
+    target: Table | None = None
+    artefact: Table | None = None
+    provenance: Table | None = None
+
+    @model_validator(mode="after")
+    def _given_once(self) -> "ImportDescription":
+        missing = [name for name in ("sensor", "medium") if getattr(self, name) is None]
+        if self.header is None and missing:
+            raise ValueError(f"{' and '.join(missing)} missing: a capture says which sensor saw it, in what")
+        twice = [name for name in _OF_THE_HEADER if name in self.model_fields_set]
+        twice += ["stage.direction"] if self.stage.direction is not None else []
+        if self.header is not None and twice:
+            raise ValueError(f"the header gives {', '.join(twice)} already: leave out one of the two")
+        if self.centre_lines is not None and (self.background or self.channel is not None):
+            raise ValueError("centre lines have neither background nor channel: leave these out; lamp_channel may stay")
+        return self
+
+
+def read_description(path: Path) -> ImportDescription:
+    """Description in a TOML file; DescriptionError where it is missing, no TOML, or holds an unknown or wrong key."""
+    if not is_regular_file(path):
+        raise DescriptionError(
+            f"no description at {path}: write one with sensor, medium, and which image is what "
+            "(docs/how-to/import-images.md)"
+        )
+    return validated(ImportDescription, read_table(path), path)
+
+
+def capture_header(
+    given: ImportDescription, sensor: Sensor, *, beside: Path, name: str, saturation_dn: int, remarks: Table
+) -> CaptureHeader:
+    """Header of the capture; ``name`` and ``remarks`` (as provenance) serve where the description gives none.
+
+    ``beside`` is the folder in which files that the description names are sought. DescriptionError where medium,
+    target, direction or header are missing, unknown or not valid, EvaluationError where the artefact is not.
+    """
+    if given.header is not None:
+        return read_header(beside / given.header)
+    if given.stage.direction is None and not given.stage.free:
+        raise DescriptionError(
+            "stage.direction is missing: give the unit direction in which the stage moves the sensor, in the OCS, "
+            "such as [1, 0, 0] across the sheet, or stage.free = true for images without a stage"
+        )
+    if given.target is not None:
+        parse_target(given.target)
+    if given.artefact is not None:
+        parse_artefact(given.artefact)
+    table = {"name": given.name or name, "sensor": sensor, "saturation_dn": saturation_dn}
+    table |= {"stage_direction": given.stage.direction or (1.0, 0.0, 0.0), "medium_name": given.medium}
+    table |= {"medium": sensor.medium(given.medium or ""), "target": given.target, "artefact": given.artefact}
+    table |= {"provenance": remarks if given.provenance is None else given.provenance}
+    return validated(CaptureHeader, table, "the header from the description")
+
+
+def read_header(path: Path) -> CaptureHeader:
+    """A capture's header from JSON; DescriptionError where it is missing, no JSON or not valid."""
+    text = read_text(path, most_bytes=MOST_JSON_BYTES, error=DescriptionError, called="header in JSON")
+    try:
+        content = parsed_json(text)
+    except ValueError as error:
+        raise DescriptionError(f"{path} is no header in JSON, or is truncated: {error}") from error
+    return validated(CaptureHeader, content, path)
+
+
+def described_sensor(given: ImportDescription, *, beside: Path) -> Sensor:
+    """The sensor that took the images, with the intrinsics of another program's calibration where given."""
+    if given.header is not None:
+        return read_header(beside / given.header).sensor
+    if isinstance(given.sensor, dict):
+        table = {key: value for key, value in given.sensor.items() if key != "base"}
+        if (base := given.sensor.get("base")) is not None:
+            table = merged(read_table(find(_beside(beside, base), "sensors"), "sensors"), table)
+        sensor = validated(Sensor, table, "sensor")
+    else:
+        sensor = load_sensor(_beside(beside, given.sensor))
+    if given.intrinsics is None:
+        return sensor
+    return with_intrinsics(sensor, read_intrinsics(beside / given.intrinsics), source=given.intrinsics)
+
+
+def _beside(folder: Path, name: object) -> str:
+    """A sensor's name as it is, the path of a description sought beside the one that names it."""
+    if not isinstance(name, str):
+        raise DescriptionError(f"sensor is based on {name!r}; expected the name or path of a description")
+    return str(folder / name) if name.endswith(".toml") else name

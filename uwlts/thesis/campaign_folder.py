@@ -1,0 +1,74 @@
+"""A campaign's folder: its recordings by their names.
+
+Scans are called OBJECT-PLACEMENT-MEDIUM.h5, such as spheres-near-2-water.h5. The calibration has target-air.h5 (through
+the camera's window), target-bare.h5 (without it), target-water.h5, and step-PLACEMENT-water.h5; line-width.h5 and
+line-height.h5 show the stripe on the pipe for either orientation of the camera.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from uwlts.errors import CaptureError
+
+MEDIA = ("air", "water")
+OBJECTS = ("spheres", "plane", "pipe", "head", "weld")
+STEP_PLACES = ("near", "standoff", "far")
+
+
+@dataclass(frozen=True)
+class ScanFile:
+    """A recording of one object at a placement in a medium."""
+
+    path: Path
+    thing: str
+    placement: str
+    medium: str
+
+
+@dataclass(frozen=True)
+class CampaignFolder:
+    """The recordings of one campaign."""
+
+    path: Path
+
+    def target(self, kind: str) -> Path:
+        """The recording of the target: in "air", "bare" or "water"; CaptureError where it is missing."""
+        return self._needed(f"target-{kind}.h5")
+
+    def steps(self) -> list[Path]:
+        """The recordings of the step standard, nearest first."""
+        return [self._needed(f"step-{place}-water.h5") for place in STEP_PLACES]
+
+    def line(self, side: str) -> Path | None:
+        """The recording of the stripe on the pipe along an image side, if there is one."""
+        path = self.path / f"line-{side}.h5"
+        return path if path.is_file() else None
+
+    def scans(self) -> list[ScanFile]:
+        """All scans of objects, by name."""
+        found = []
+        for path in sorted(self.path.glob("*.h5")):
+            thing, *placement, medium = path.stem.split("-")
+            if thing in OBJECTS and placement and medium in MEDIA:
+                found.append(ScanFile(path, thing, "-".join(placement), medium))
+        return found
+
+    def _needed(self, name: str) -> Path:
+        path = self.path / name
+        if not path.is_file():
+            raise CaptureError(f"{self.path} has no {name}: record the campaign's calibration first")
+        return path
+
+
+def campaign_folders(folder: Path) -> list[CampaignFolder]:
+    """The folders campaign-0, campaign-1, ... of a reproduction; CaptureError where there is none."""
+    found = [path for path in folder.glob("campaign-*") if path.is_dir()]
+    if not found:
+        raise CaptureError(f"{folder} holds no campaign: a folder called campaign-0, campaign-1, ... is expected")
+    return [CampaignFolder(path) for path in sorted(found, key=lambda path: (len(path.name), path.name))]
+
+
+def up_to_date(path: Path) -> bool:
+    """Whether there are results and no recording of the campaign is newer."""
+    recordings = path.parent.glob("*.h5")
+    return path.is_file() and all(each.stat().st_mtime_ns <= path.stat().st_mtime_ns for each in recordings)

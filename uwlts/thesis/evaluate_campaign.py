@@ -1,0 +1,205 @@
+"""Evaluates one campaign: calibrates by every method, measures every scan, and studies what the results rest on."""
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from itertools import chain, count
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, gather
+from uwlts.errors import CaptureError, problems_of
+from uwlts.files.json_files import read_json
+from uwlts.model.any_calibration import AnyCalibration
+from uwlts.model.calibration import Calibration
+from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.optics.nominal import nominal_calibration
+from uwlts.optics.triangulation import reconstruct_by_polynomials
+from uwlts.reconstruction.reconstruct import reconstruct
+from uwlts.runtime.workers import work_through
+from uwlts.storage.capture import Capture
+from uwlts.thesis.campaign_folder import CampaignFolder, ScanFile, up_to_date
+from uwlts.thesis.measurements import PROPOSED, THESIS, TWO, calibrations, measure_scan
+from uwlts.thesis.monte_carlo import propagate
+from uwlts.thesis.results import (
+    CampaignResults,
+    LineProfile,
+    Measurement,
+    PolynomialCurves,
+    PolynomialLine,
+    SpacingInterval,
+)
+from uwlts.thesis.sphere_spacing import SphereScan, spacing_budget, sphere_scan, window_choices, window_of
+
+RESULTS = "results.json"
+TRIALS = 100
+
+
+class _Known(BaseModel):
+    """The part of a campaign's plan that says how well its inputs were known."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    imperfections: dict[str, float]
+
+
+_SHOWN_LINES = {"one end": 0.05, "middle": 0.5, "other end": 0.95}
+Progress = Callable[[str, int, int], None]
+
+
+def evaluate_campaign(
+    folder: CampaignFolder,
+    *,
+    trials: int = TRIALS,
+    workers: int | None = None,
+    overwrite: bool = False,
+    progress: Progress = lambda stage, done, total: None,
+) -> CampaignResults:
+    """Results of a campaign, kept in its file results.json; read from there if no recording is newer.
+
+    Kept results without the Monte-Carlo propagation, or with another number of trials, are completed.
+
+    Raises
+    ------
+    CaptureError
+        A recording that the calibration needs is missing, or a file is damaged.
+    CalibrationError
+        The recordings do not determine a calibration.
+    """
+    path = folder.path / RESULTS
+    if not overwrite and up_to_date(path):
+        kept = CampaignResults.read(path)
+        if trials in (0, kept.trials):
+            return kept
+        scans = _sphere_scans(folder, _by_rays(calibrations(folder)[PROPOSED, "water"]))
+        intervals = _monte_carlo(folder, scans, trials, workers, progress)
+        return kept.model_copy(update={"monte_carlo": intervals, "trials": trials}).keep(path)
+    calibrated = calibrations(folder, progress=partial(progress, "calibrations"))
+    measurements = _measured(folder, calibrated, workers, progress)
+    proposed, two = (_by_rays(calibrated[method, "water"]) for method in (PROPOSED, TWO))
+    scans = _sphere_scans(folder, proposed)
+    choices, profiles = window_choices(folder, proposed, scans)
+    return CampaignResults(
+        measurements=measurements,
+        window={choice.images: choice for choice in choices},
+        window_profiles=profiles,
+        two_refractions_distance_mm=window_of(two).distance_mm,
+        polynomials={
+            medium: _curves(each) for (_, medium), each in calibrated.items() if isinstance(each, PolynomialCalibration)
+        },
+        budget=_budget(folder, measurements, proposed, scans),
+        line_profiles={side: profile for side in ("width", "height") if (profile := _line_profile(folder, side))},
+        monte_carlo=_monte_carlo(folder, scans, trials, workers, progress),
+        trials=trials,
+    ).keep(path)
+
+
+def _by_rays(calibration: AnyCalibration) -> Calibration:
+    if not isinstance(calibration, Calibration):
+        raise TypeError("a calibration by polynomials has neither camera nor window")
+    return calibration
+
+
+def _measured(
+    folder: CampaignFolder, calibrated: dict[tuple[str, str], AnyCalibration], workers: int | None, progress: Progress
+) -> list[Measurement]:
+    """All scans, several at a time."""
+    clouds = folder.path / "clouds"
+    clouds.mkdir(exist_ok=True)
+    scans, numbers = folder.scans(), count(1)
+    found = work_through(
+        partial(_measure, calibrated, clouds),
+        scans,
+        workers=workers,
+        on_message=lambda _: progress("measurements", next(numbers), len(scans)),
+    )
+    return list(chain.from_iterable(found))
+
+
+def _measure(
+    calibrated: dict[tuple[str, str], AnyCalibration], clouds: Path, scan: ScanFile, send: Callable[[None], None]
+) -> list[Measurement]:
+    found = measure_scan(scan, calibrated, clouds=clouds)
+    send(None)
+    return found
+
+
+def _sphere_scans(folder: CampaignFolder, calibration: Calibration) -> list[SphereScan]:
+    found = []
+    for scan in folder.scans():
+        if (scan.thing, scan.medium) == ("spheres", "water"):
+            with Capture(scan.path) as capture:
+                found.append(sphere_scan(capture, calibration, placement=scan.placement))
+    return found
+
+
+def _curves(calibration: PolynomialCalibration) -> PolynomialCurves:
+    """Z(v) and Y(Z) of an outer, the middle and the other outer profile line (Figures 58 and 59), and the residual."""
+    lines = {}
+    known = np.flatnonzero(np.isfinite(calibration.domains()[:, 0]))
+    for name, share in _SHOWN_LINES.items():
+        row = int(known[round(share * (len(known) - 1))])
+        low, high = calibration.domains()[row]
+        centres, number = np.linspace(low, high, 60), calibration.first_line + row
+        found = reconstruct_by_polynomials(
+            calibration, np.full(len(centres), number), centres, stage_mm=0.0, stage_direction=np.eye(3)[0]
+        )
+        y_mm, z_mm = np.round(found.points_mm[:, 1:], 4).T.tolist()
+        lines[name] = PolynomialLine(number, np.round(centres, 3).tolist(), y_mm, z_mm)
+    rms = calibration.figures("depth")["rms_mm"]
+    if not isinstance(rms, int | float):
+        raise CaptureError(f"the polynomials' residual is {rms!r}; expected a number of mm: calibrate again")
+    return PolynomialCurves(lines, rms)
+
+
+def _budget(
+    folder: CampaignFolder, measurements: list[Measurement], calibration: Calibration, scans: list[SphereScan]
+) -> dict[str, float]:
+    if len(scans) < 2:
+        return {}
+    with Capture(folder.steps()[0]) as capture:
+        medium = capture.header.medium
+    wanted = ("spheres", "water", PROPOSED, THESIS)
+    spheres = [m.figures_mm for m in measurements if (m.thing, m.medium, m.method, m.processing) == wanted]
+    deviation_mm = max((figures["STD"] for figures in spheres if "STD" in figures), default=0.0)
+    return spacing_budget(calibration, scans, medium, deviation_mm=deviation_mm)
+
+
+def _monte_carlo(
+    folder: CampaignFolder, scans: list[SphereScan], trials: int, workers: int | None, progress: Progress
+) -> list[SpacingInterval]:
+    """Intervals of every scan of spheres."""
+    if trials == 0 or not scans:
+        return []
+    options = CalibrationOptions(refractions=1)
+    with ExitStack() as stack:
+        air = [stack.enter_context(Capture(folder.target("air")))]
+        steps = [stack.enter_context(Capture(path)) for path in folder.steps()]
+        evidence, medium = gather(air, steps, options=options), steps[0].header.medium
+    # Imperfections of the inputs, from the plan that lies beside the campaigns; none without one.
+    plan = folder.path.parent / "plan.json"
+    try:
+        campaign = read_json(plan, called="plan").get("campaign") if plan.exists() else {"imperfections": {}}
+        knowledge = _Known.model_validate(campaign).imperfections
+    except ValidationError as error:
+        raise CaptureError(f"{plan} does not hold the campaign's imperfections: {problems_of(error)}") from error
+    shown = partial(progress, "Monte Carlo")
+    return [
+        SpacingInterval(each.placement, each.observed_mm, each.std_mm(), each.interval_mm(), each.contains_truth())
+        for each in propagate(
+            evidence, scans, medium, knowledge, options=options, trials=trials, workers=workers, progress=shown
+        )
+    ]
+
+
+def _line_profile(folder: CampaignFolder, side: str) -> LineProfile | None:
+    """Stripe on the pipe by the calibration of a sensor that is as described: its length along Y and points, mm."""
+    path = folder.line(side)
+    if path is None:
+        return None
+    with Capture(path) as capture:
+        header = capture.header
+        scan = reconstruct(capture, nominal_calibration(header.sensor, header.medium))
+    points = scan.points_mm[:, 1:]
+    return LineProfile(float(np.ptp(points[:, 0])), [(x, y) for x, y in np.round(points[::4], 3).tolist()])
