@@ -23,7 +23,7 @@ help:
 	@echo "make bench   measure speed"
 	@echo "make docs    build the documentation site in docs/_build/html"
 	@echo "make setup   only prepare .venv and libLLVM (the targets above do it too)"
-	@echo "make clean   remove .venv, .llvm, .aravis, .chromium, caches and build results"
+	@echo "make clean   remove .venv, caches and build results"
 
 demo: setup
 	@$(PYTHON) -m twin.cli demo
@@ -77,7 +77,7 @@ $(INSTALLED): pyproject.toml
 	@touch $@
 
 clean:
-	@rm -rf $(VENV) .llvm .aravis .chromium build dist docs/_build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) build dist docs/_build *.egg-info .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Takes the first Python that is new enough and brings pip along; on Debian pip comes with an extra package.

@@ -4,7 +4,6 @@ Real shared libraries stand in for broken ones: a copy of a small library from M
 library it needs is overwritten with one of the same length that no system has.
 """
 
-import ctypes
 import importlib.util
 import json
 import os
@@ -16,9 +15,8 @@ from pathlib import Path
 import pytest
 
 from twin.backend import llvm, packages
-from twin.backend.llvm import LlvmLibrary, examine, find_llvm, install_llvm, list_candidates, main, named_version
+from twin.backend.llvm import LlvmLibrary, examine, find_llvm, list_candidates, main
 from uwlts.errors import SetupError
-from uwlts.runtime.shared_library import own_folders
 
 NEEDED, ABSENT = b"libm.so.6\0", b"libQ.so.6\0"
 
@@ -58,22 +56,6 @@ def run_child(script, **environment):
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "version"),
-    [
-        ("libLLVM.so.19.1", (19, 1)),
-        ("libLLVM-19.so", (19,)),
-        ("libLLVM-14.so.1", (14,)),
-        ("libLLVM-14.0.6.so.1", (14, 0)),
-        ("libLLVM.so.22.1-rust-1.95.0-stable", (22, 1)),
-        ("libLLVM.so", (float("inf"),)),
-        ("libLLVM.so.1", (float("inf"),)),
-    ],
-)
-def test_version_claimed_by_the_name(name, version):
-    assert named_version(Path("/usr/lib", name)) == version
-
-
 def test_candidates_are_shared_libraries_named_llvm_each_once(tmp_path):
     for name in ("libLLVM.so.19.1", "libLLVM-15.so.1", "libLLVM.so.20.1-custom"):
         (tmp_path / name).touch()
@@ -98,7 +80,7 @@ def loaded(monkeypatch):
                     setattr(number._obj, "value", value) for number, value in zip(numbers, version, strict=True)
                 ]
 
-    return lambda version: monkeypatch.setattr(llvm, "load_with_companions", lambda library: (Handle(version), []))
+    return lambda version: monkeypatch.setattr(llvm.ctypes, "CDLL", lambda library: Handle(version))
 
 
 @pytest.mark.parametrize("major", [14, 15, 16])
@@ -115,32 +97,24 @@ def test_library_without_version_function_is_refused_as_too_old(loaded):
 @pytest.mark.parametrize("major", [17, 19, 22, 23])
 def test_newer_versions_are_accepted(loaded, major):
     loaded((major, 1, 2))
-    assert llvm.describe("libLLVM.so") == {"version": [major, 1, 2], "companions": []}
+    assert llvm.describe("libLLVM.so") == {"version": [major, 1, 2]}
 
 
-def test_newest_supported_is_chosen_whatever_the_names_claim(tmp_path, monkeypatch):
-    true_versions = {
-        "libLLVM.so": (18, 1, 8),
-        "libLLVM.so.22.1": (15, 0, 7),
-        "libLLVM.so.20.1": (20, 1, 0),
-        "libLLVM.so.19.1": (19, 1, 7),
-        "libLLVM-16.so.1": (16, 0, 6),
-    }
+def test_the_first_suitable_is_chosen_whatever_its_name_claims(tmp_path, monkeypatch):
+    true_versions = {"first/libLLVM.so.22.1": 15, "first/libLLVM-16.so.1": 18, "second/libLLVM.so.20.1": 20}
     for name in true_versions:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    looked_at = []
 
     def state(path):
-        looked_at.append(path.name)
-        version = true_versions[path.name]
-        if version[0] < 17:
+        version = true_versions[str(path.relative_to(tmp_path))]
+        if version < 17:
             raise SetupError(f"{path}: too old")
-        return LlvmLibrary(path, version)
+        return LlvmLibrary(path, (version, 1, 0))
 
     monkeypatch.setattr(llvm, "examine", state)
-    assert find_llvm([tmp_path]).path.name == "libLLVM.so.20.1"
-    # Those that cannot be newer than 20.1 by their own claim are left alone: loading one takes about 0.1 s.
-    assert looked_at == ["libLLVM.so", "libLLVM.so.22.1", "libLLVM.so.20.1"]
+    assert find_llvm([tmp_path / "first", tmp_path / "second"]).path.name == "libLLVM-16.so.1"
+    assert find_llvm([tmp_path / "second", tmp_path / "first"]).path.name == "libLLVM.so.20.1"
 
 
 def test_message_lists_what_was_found_and_how_to_install(tmp_path, monkeypatch):
@@ -157,7 +131,7 @@ def test_message_lists_what_was_found_and_how_to_install(tmp_path, monkeypatch):
         "LLVM 17 or newer",
         "apt-get install libllvm19",
         "dnf install llvm-libs",
-        "python -m twin.backend.llvm --install",
+        "pip install",
         "DRJIT_LIBLLVM_PATH",
     )
     assert [part for part in expected if part not in message] == []
@@ -169,12 +143,14 @@ def test_message_says_none_where_there_is_none(tmp_path):
 
 
 def test_version_comes_from_the_library_not_from_its_name(tmp_path, machine_library, foreign_library):
-    # A hard link or a copy keeps the false name, a symbolic link would be resolved to the true one.
-    for companion in machine_library.companions:
-        shutil.copyfile(companion, tmp_path / companion.name)
-    shutil.copyfile(machine_library.path, tmp_path / "libLLVM-15.so.1")
-    shutil.copyfile(foreign_library, tmp_path / "libLLVM.so.99.1")
-    chosen = find_llvm([tmp_path])
+    # A copy keeps the false name; a symbolic link would be resolved to the true one.
+    folder = tmp_path / "lib"
+    folder.mkdir()
+    for beside in machine_library.path.parent.glob("*-linux-gnu"):
+        (folder / beside.name).symlink_to(beside)
+    shutil.copyfile(machine_library.path, folder / "libLLVM-15.so.1")
+    shutil.copyfile(foreign_library, folder / "libLLVM.so.99.1")
+    chosen = find_llvm([folder])
     assert chosen.path.name == "libLLVM-15.so.1"
     assert chosen.version == machine_library.version
     assert chosen.version[0] >= 17
@@ -195,21 +171,6 @@ def test_missing_dependency_is_reported_by_name(tmp_path, foreign_library):
         find_llvm([tmp_path])
 
 
-def test_dependency_is_taken_from_the_same_folder(tmp_path, foreign_library):
-    """A copy of the mathematics library, its own name in it overwritten too, serves as the one that is missing."""
-    ctypes.CDLL("libm.so.6")
-    maps = Path("/proc/self/maps").read_text().splitlines()
-    original = next(Path(line[line.index("/") :]) for line in maps if line.endswith("/libm.so.6"))
-    lacking = overwrite_name(foreign_library, tmp_path / "liblacking.so")
-    supplied = overwrite_name(original, tmp_path / "libQ.so.6.1")
-    script = (
-        "from uwlts.runtime.shared_library import load_with_companions\n"
-        f"print(load_with_companions({str(lacking)!r})[1])"
-    )
-    child = run_child(script)
-    assert child.stdout.strip() == str([str(supplied)]), child.stderr
-
-
 def test_library_that_ends_its_process_is_refused(tmp_path, machine_library):
     """The loader maps a truncated file and touches pages beyond its end, which ends the process or fails to load."""
     truncated = tmp_path / "libLLVM.so.19.1"
@@ -224,8 +185,6 @@ def test_users_unsuitable_choice_is_refused_and_not_replaced(monkeypatch, foreig
     with pytest.raises(SetupError, match="DRJIT_LIBLLVM_PATH") as caught:
         find_llvm()
     assert str(foreign_library) in str(caught.value)
-    with pytest.raises(SetupError, match="DRJIT_LIBLLVM_PATH"):
-        install_llvm()
     assert os.environ["DRJIT_LIBLLVM_PATH"] == str(foreign_library)
 
 
@@ -240,37 +199,36 @@ def test_missing_runtime_library_of_drjit_is_reported(monkeypatch, machine_libra
         find_llvm([machine_library.path.parent])
 
 
-def test_install_leaves_a_suitable_library_alone(machine_library, tmp_path, monkeypatch):
-    monkeypatch.setattr(packages, "run_command", lambda command, folder=None: pytest.fail(f"ran {command}"))
-    monkeypatch.setattr(llvm, "own_folders", lambda name: [*own_folders(name), tmp_path / "unused"])
-    steps = []
-    assert install_llvm(steps.append) == machine_library
-    assert steps == [] and not (tmp_path / "unused").exists()
+def test_what_is_there_is_not_installed_again(machine_library, monkeypatch):
+    monkeypatch.setattr(packages, "run_command", lambda command: pytest.fail(f"ran {command}"))
+    assert packages.obtain(find_llvm, llvm.DEBIAN_PACKAGES, pytest.fail) == machine_library
 
 
-def test_install_gives_the_reason_of_every_way_that_failed(tmp_path, monkeypatch):
+def test_without_apt_get_the_message_says_how_to_install(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(llvm, "WHEEL", "")
-    monkeypatch.setattr(llvm, "own_folders", lambda name: [tmp_path / "unpacked"])
-    monkeypatch.setattr(llvm, "search_folders", lambda: [tmp_path])
-    with pytest.raises(SetupError) as caught:
-        install_llvm()
-    message = str(caught.value)
-    expected = ("Tried without success", "apt-get install: ", "apt-get download: ", " -m pip ", "Found:\n  none")
-    assert [part for part in expected if part not in message] == []
+    with pytest.raises(SetupError, match=r"Found:\n  none\n(.*\n)*.*apt-get install libllvm19"):
+        packages.obtain(lambda: find_llvm([tmp_path]), llvm.DEBIAN_PACKAGES)
 
 
-def test_debian_package_offered_by_the_lists_is_taken(monkeypatch):
-    policy = (
-        "libllvm19:\n  Installed: (none)\n  Candidate: (none)\n  Version table:\n"
-        "libllvm18:\n  Installed: (none)\n  Candidate: 1:18.1.8-1\n  Version table:\n"
-        "libllvm17:\n  Installed: 1:17.0.6-1\n  Candidate: 1:17.0.6-1\n  Version table:\n"
-    )
-    monkeypatch.setattr(packages, "run_command", lambda command: policy)
-    assert packages.first_offered(llvm.DEBIAN_PACKAGES, []) == "libllvm18"
-    monkeypatch.setattr(packages, "run_command", lambda command: "")
-    with pytest.raises(SetupError, match="there is none of libllvm19"):
-        packages.first_offered(llvm.DEBIAN_PACKAGES, [])
+def test_package_lists_are_renewed_if_an_installation_fails(monkeypatch):
+    ran, there = [], []
+
+    def run(command):
+        ran.append(command[1])
+        if ran == ["install"]:
+            raise SetupError("the package lists are old")
+        there.extend(command[-1:])
+
+    def find():
+        if not there or ran[-1] != "install":
+            raise SetupError("not there")
+        return there[-1]
+
+    monkeypatch.setattr(packages, "run_command", run)
+    monkeypatch.setattr(packages.os, "geteuid", lambda: 0)
+    monkeypatch.setattr(packages.shutil, "which", lambda name: name)
+    assert packages.obtain(find, ["libthing"]) == "libthing"
+    assert ran == ["install", "update", "install"]
 
 
 def test_command_line_shows_what_is_there_and_fails_without(capsys, monkeypatch, machine_library, foreign_library):
@@ -300,8 +258,7 @@ def test_prepared_machine_runs_a_mitsuba_kernel(machine_library):
 
 def test_drjit_imported_too_early_without_llvm_is_reported(machine_library):
     script = (
-        "import ctypes, os\n"
-        f"[ctypes.CDLL(path) for path in {[str(path) for path in machine_library.companions]}]\n"
+        "import os\n"
         "import drjit\n"
         "os.environ.pop('DRJIT_LIBLLVM_PATH')\n"
         "from twin.backend.llvm import prepare_llvm; prepare_llvm()"
