@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import uwlts
+
 ROOT = Path(__file__).resolve().parents[1]
 
 # Each would break a contract of pyproject.toml: late, conditional and relative imports, and those by way of a package.
@@ -106,3 +108,7 @@ def test_the_oracles_use_numpy_and_the_standard_library_alone():
                 continue
             foreign = {n for n in names if n.split(".")[0] not in allowed and not n.startswith("tests.oracles")}
             assert not foreign, path
+
+
+def test_the_citation_names_the_version():
+    assert f"\nversion: {uwlts.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
