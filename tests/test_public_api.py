@@ -1,6 +1,5 @@
 """The public functions of both packages: documented, imported when used, and with the parameters of their commands."""
 
-import ast
 import inspect
 import subprocess
 import sys
@@ -81,23 +80,9 @@ def commands() -> set[str]:
 
 @pytest.mark.parametrize("package", [uwlts, twin], ids=["uwlts", "twin"])
 def test_every_public_name_is_there_and_documented(package):
-    assert package.__all__ == sorted(set(package.__all__), key=lambda name: (name[0].islower(), name))
-    assert set(package.__all__) <= set(dir(package))
+    assert set(package.__all__) == set(dir(package))
     for name in package.__all__:
         assert inspect.getdoc(getattr(package, name)), name
-
-
-@pytest.mark.parametrize("package", [uwlts, twin], ids=["uwlts", "twin"])
-def test_type_checkers_see_every_public_name(package):
-    """What is imported for type checkers alone must be what is imported when it is used."""
-    (guarded,) = [
-        node
-        for node in ast.parse(Path(package.__file__).read_text(encoding="utf-8")).body
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-    ]
-    seen = {alias.name: node.module for node in guarded.body for alias in node.names}
-    assert sorted(seen) == sorted(package.__all__)
-    assert {n: m for n, m in package._MODULES.items() if n != "plot"} == {n: m for n, m in seen.items() if n != "plot"}
 
 
 @pytest.mark.parametrize("package", ["uwlts", "twin"])
@@ -109,7 +94,7 @@ def test_importing_is_light(package: str):
 
 def test_unknown_names_are_refused():
     for package in (uwlts, twin):
-        with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        with pytest.raises(AttributeError, match="attribute nothing"):
             package.nothing  # noqa: B018
 
 

@@ -17,8 +17,7 @@ from tests.uwlts.joint_views import Noise, gathered, target_series
 from tests.uwlts.mount_views import sphere_campaign
 from tests.uwlts.storage.test_capture import a_header, interrupted, record, small_sensor
 from tests.uwlts.storage.test_cloud import some_cloud, some_uncertainty
-from tests.uwlts.storage.test_truth import a_header as truth_header
-from tests.uwlts.storage.test_truth import a_truth
+from tests.uwlts.storage.test_truth import a_header as truth_header, a_truth
 from twin.design.screening import as_part, read_parts
 from twin.design.study import load_study
 from twin.scene.campaign import load_campaign

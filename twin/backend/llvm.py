@@ -162,7 +162,7 @@ def examine(path: Path) -> LlvmLibrary:
     SetupError
         The library does not load, is no libLLVM, or is too old.
     """
-    child = [sys.executable, "-I", "-S", "-c", _EXAMINE, str(Path(__file__).parents[2]), str(path)]
+    child = [sys.executable, "-I", "-c", _EXAMINE, str(Path(__file__).parents[2]), str(path)]
     found = json.loads(run_command(child, seconds=PROBE_SECONDS, shown=f"{path}: loading it"))
     if "fault" in found:
         raise SetupError(f"{path}: {found['fault']}")

@@ -10,8 +10,7 @@ from uwlts.errors import DescriptionError, Error
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION_FORMAT
 from uwlts.files.json_files import read_json
 from uwlts.files.reading import is_regular_file
-from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT
-from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
+from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT, POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
 from uwlts.storage.capture import part_path
 from uwlts.storage.cloud_files import is_cloud
 

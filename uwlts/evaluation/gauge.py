@@ -10,8 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import f as f_distribution
-from scipy.stats import t as t_distribution
+from scipy.stats import f as f_distribution, t as t_distribution
 
 from uwlts.errors import DescriptionError, EvaluationError
 from uwlts.files.reading import read_bytes

@@ -10,8 +10,17 @@ from uwlts._version import __version__
 from uwlts.calibration.camera.camera_parameters import DISTORTION
 from uwlts.calibration.camera.photographs import CameraCalibration, Photograph
 from uwlts.errors import Error
-from uwlts.pages.toolkit import BLUE, MISSING, RED, new_figure, plain_text, png_data_uri, render_page, svg_of
-from uwlts.pages.toolkit import write_page as write_text
+from uwlts.pages.toolkit import (
+    BLUE,
+    MISSING,
+    RED,
+    new_figure,
+    plain_text,
+    png_data_uri,
+    render_page,
+    svg_of,
+    write_page as write_text,
+)
 from uwlts.storage.image_file import read_image
 
 _THUMBNAIL_PX = 420

@@ -10,8 +10,7 @@ import numpy as np
 from pydantic import JsonValue
 
 from uwlts.errors import CaptureError, DescriptionError
-from uwlts.evaluation.evaluate import FORMAT as EVALUATION_FORMAT
-from uwlts.evaluation.evaluate import EvaluationRecord, TruthComparisons, read_evaluation
+from uwlts.evaluation.evaluate import FORMAT as EVALUATION_FORMAT, EvaluationRecord, TruthComparisons, read_evaluation
 from uwlts.files.json_files import read_json
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
@@ -21,14 +20,16 @@ from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics import design as formulas
 from uwlts.pages.numbers import numbers_in
 from uwlts.report.mount_lines import mount_lines
-from uwlts.storage.calibration_file import FORMAT as CALIBRATION_FORMAT
-from uwlts.storage.calibration_file import POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT
-from uwlts.storage.calibration_file import read_calibration, read_polynomials
+from uwlts.storage.calibration_file import (
+    FORMAT as CALIBRATION_FORMAT,
+    POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT,
+    read_calibration,
+    read_polynomials,
+)
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import is_cloud, read_cloud
-from uwlts.storage.mount_files import FORMAT as MOUNT_FORMAT
-from uwlts.storage.mount_files import read_mount
+from uwlts.storage.mount_files import FORMAT as MOUNT_FORMAT, read_mount
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth
 
 

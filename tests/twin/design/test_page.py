@@ -8,8 +8,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from twin.design.choice import Judged, pareto
 from twin.design.designs import Design, EvaluatedDesign, Marked, built, described, judged, row_of

@@ -5,8 +5,7 @@ import math
 import drjit as dr
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.special import chdtrc
 
 from tests.virtual_sensors import clear, gauss_legendre

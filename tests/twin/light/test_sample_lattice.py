@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
 from twin.light.image_sampling import lattice, pupil_shifts

@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from uwlts.errors import OutputError
-from uwlts.files import one_writer, unfinished
-from uwlts.files import writing as files
+from uwlts.files import one_writer, unfinished, writing as files
 from uwlts.files.writing import written_aside
 
 MODULES = {files.__file__, one_writer.__file__, unfinished.__file__}

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from uwlts.errors import DescriptionError, RangeError
 from uwlts.model.library import find, library_folder, load_sensor, merged, names, read_table, validated

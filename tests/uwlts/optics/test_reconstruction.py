@@ -5,8 +5,7 @@ import math
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tests.oracles import fermat
 from tests.uwlts.drawn_windows import faces_and_indices, indices, seeds, tilted, windows

@@ -9,8 +9,7 @@ from markupsafe import Markup
 
 from twin.design.choice import Judged
 from twin.design.designs import Columns, Marked
-from twin.design.report import charts, drawing
-from twin.design.report import study_tables as tables
+from twin.design.report import charts, drawing, study_tables as tables
 from twin.design.study import Study
 from twin.design.verification import Agreement
 from uwlts._version import __version__

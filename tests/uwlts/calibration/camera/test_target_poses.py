@@ -5,8 +5,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from tests.uwlts.calibration_views import Lens, built_sensor, inside, lattice, lens_of, stage_images, turn
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics

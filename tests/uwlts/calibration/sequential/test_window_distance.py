@@ -9,8 +9,7 @@ import pytest
 from tests.uwlts.calibration_views import STEP_MM, WATER, built_sensor, nine_steps, step_profile, through_window
 from uwlts.calibration.capture_evidence import StepEvidence
 from uwlts.calibration.sequential.step_images import label_step
-from uwlts.calibration.sequential.window_distance import solve_window
-from uwlts.calibration.sequential.window_distance import step_profile as reconstructed
+from uwlts.calibration.sequential.window_distance import solve_window, step_profile as reconstructed
 from uwlts.errors import CalibrationError, EvaluationError, RangeError
 from uwlts.evaluation.step_faces import StepFace
 from uwlts.model.artefacts import StepStandard
