@@ -15,7 +15,6 @@ import os
 import select
 import threading
 import time
-import tty
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -84,6 +83,8 @@ class GrblController:
     def __enter__(self) -> "GrblController":
         self._master, slave = os.openpty()
         # Raw from the start, or the terminal would echo the greeting back as a command.
+        import tty  # only POSIX systems have pseudo terminals
+
         tty.setraw(slave)
         self.port = os.ttyname(slave)
         os.close(slave)

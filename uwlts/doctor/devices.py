@@ -4,9 +4,7 @@ A stage is not moved and the laser stays off: only questions are sent, and Ctrl-
 laser's pin off.
 """
 
-import grp
 import os
-import pwd
 import shlex
 import sys
 import threading
@@ -110,6 +108,9 @@ def _examine_port(port: str, description: str) -> Finding:
     if os.access(port, os.R_OK | os.W_OK):
         return Finding("serial port", "ok", named)
     owned = os.stat(port)
+    import grp  # only on POSIX systems
+    import pwd
+
     user, group, members = f"user {os.geteuid()}", str(owned.st_gid), []
     with suppress(KeyError):
         user = pwd.getpwuid(os.geteuid()).pw_name

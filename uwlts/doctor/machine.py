@@ -19,6 +19,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from uwlts.runtime.workers import processors
+
 Status = Literal["ok", "warning", "missing"]
 
 _STYLES = {"ok": "green", "warning": "yellow", "missing": "bold red"}
@@ -113,11 +115,10 @@ def examine_buffer(limit: Path = _RMEM_MAX) -> Finding:
 
 def examine_computer() -> Finding:
     """Processors this program may use, and the memory."""
-    processors = len(os.sched_getaffinity(0))
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     load = os.getloadavg()[0]
-    found = f"{processors} processors, {load:.1f} of them busy in the last minute, {memory / 1e9:.0f} GB of memory"
-    enough = processors >= _LEAST_PROCESSORS and memory >= _LEAST_MEMORY
+    found = f"{processors()} processors, {load:.1f} of them busy in the last minute, {memory / 1e9:.0f} GB of memory"
+    enough = processors() >= _LEAST_PROCESSORS and memory >= _LEAST_MEMORY
     advice = f"take a computer of {_LEAST_PROCESSORS} processors and {_LEAST_MEMORY / 1e9:.0f} GB or more"
     return Finding.judged("computer", found, "" if enough else advice)
 

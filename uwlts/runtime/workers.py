@@ -89,9 +89,8 @@ def open_workers(
         with _cluster(scheduler, patience_s) as cluster:
             yield cluster
         return
-    processors = _processors()
-    count = workers or processors
-    with _Processes(count, threads=max(1, processors // count)) as pool:
+    count = workers or processors()
+    with _Processes(count, threads=max(1, processors() // count)) as pool:
         yield pool
 
 
@@ -114,7 +113,7 @@ def work_through(
     if workers == 1:
         return [work(job, on_message) for job in jobs]
     results: dict[int, Result] = {}
-    with _Processes(max(1, min(len(jobs), workers or _processors())), threads=1) as pool:
+    with _Processes(max(1, min(len(jobs), workers or processors())), threads=1) as pool:
         for number, _, result in pool.run(work, jobs, on_message):
             if isinstance(result, Lost):
                 raise SetupError(result.reason)
@@ -128,7 +127,7 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Ite
     For functions that spend their time outside the interpreter, in OpenCV, NumPy or compiled code. Items are taken in
     this thread, only shortly before their turn. What a function raises leaves this function.
     """
-    threads = _processors()
+    threads = processors()
     with ThreadPoolExecutor(threads) as pool:
         waiting: deque[tuple[Item, Future[Result]]] = deque()
         for item in items:
@@ -140,8 +139,10 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Ite
             yield done, result.result()
 
 
-def _processors() -> int:
-    return len(os.sched_getaffinity(0))
+def processors() -> int:
+    """Number of processors that this process may use."""
+    # Only Linux knows which processors a process is confined to.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _Processes(Workers):
