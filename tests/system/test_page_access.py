@@ -144,8 +144,10 @@ class Browser:
             if element["tag"] == "q-btn"
         }
         # It is no element of NiceGUI's; its event comes from the whole page.
-        events = [each for each in self.elements["0"]["events"] if each["type"] == "laser_off"]
-        return found | {"Laser off": (0, each["listener_id"]) for each in events}
+        for event in self.elements["0"]["events"]:
+            if event["type"] == "laser_off":
+                found["Laser off"] = (0, event["listener_id"])
+        return found
 
     def open(self) -> str:
         """Connect; the server's answer, which begins with 40 where it knows the page."""
