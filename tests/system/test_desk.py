@@ -18,6 +18,7 @@ import pytest
 
 import uwlts
 from tests.system.small_board import small_sensor, turned_board
+from tests.system.test_laser_off_attacked import light
 from tests.waiting import within
 from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import Scene
@@ -314,15 +315,9 @@ class LaserOff:
         self.page, self.controller, self.states = page, served.controller, []
         self._tap = page.evaluate("navigator.maxTouchPoints > 0")
 
-    def light(self) -> None:
-        """Light the laser as another program at the controller would: nothing but a reset ends it."""
-        with self.controller._lock:
-            self.controller._firmware.hear(b"G1F100M3S1000\n")
-        assert within(5.0, lambda: self.controller.state().laser_on)
-
     def works(self, state: str) -> None:
         """Press with the light on."""
-        self.light()
+        light(self.controller)
         box = self.page.locator("#laser-off").bounding_box()
         assert box and box["width"] >= 44 and box["height"] >= 44
         x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
@@ -380,7 +375,7 @@ def test_laser_off_works_in_every_state_of_the_page(desk, sized, served):
     page.get_by_role("tab", name="Connect").wait_for()
     off.works("reloaded")
     assert len(off.states) == 13
-    off.light()
+    light(served.controller)
     page.locator("#laser-off").focus()
     page.keyboard.press("Enter")
     assert dark(served)
