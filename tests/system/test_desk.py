@@ -18,6 +18,7 @@ import pytest
 
 import uwlts
 from tests.system.small_board import small_sensor, turned_board
+from tests.system.test_laser_off_attacked import light
 from tests.waiting import within
 from twin.devices.serve import ServedTwin, serve
 from twin.scene.description import Scene
@@ -27,7 +28,7 @@ from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.copc_file import write_copc
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page, WebSocketRoute
+    from playwright.sync_api import Browser, Page, Route, WebSocketRoute
 
 COUNT = 8
 DESCRIPTIONS = {
@@ -287,6 +288,97 @@ def test_laser_off_works_while_the_stage_moves_and_in_the_live_image(desk, page,
     # The light is not shown again by itself.
     page.wait_for_timeout(1000)
     assert not served.controller.state().laser_on
+
+
+SIZES = {"desktop": (1280, 800), "tablet": (800, 1280), "phone": (390, 844)}
+MOBILE = (
+    "Mozilla/5.0 (Linux; Android 14; Pixel 8) AppleWebKit/537.36 (KHTML, like Gecko) Chrome/130.0 Mobile Safari/537.36"
+)
+"""Quasar opens choices as dialogs there."""
+
+
+@pytest.fixture(params=SIZES)
+def sized(request: pytest.FixtureRequest, desk: Desk, chromium: "Browser") -> "Iterator[Page]":
+    """The operator's page on a screen of this size, where it is a mobile one with a finger in place of a mouse."""
+    width, height = SIZES[request.param]
+    mobile = {} if request.param == "desktop" else {"has_touch": True, "user_agent": MOBILE}
+    with watched(chromium.new_page(viewport={"width": width, "height": height}, **mobile)) as opened:
+        opened.set_default_timeout(SLOW_MS)
+        opened.goto(desk.operator_address)
+        yield opened
+
+
+class LaserOff:
+    """Presses the button as an operator does, at its place on the screen, and looks at the light."""
+
+    def __init__(self, page: "Page", served: ServedTwin):
+        self.page, self.controller, self.states = page, served.controller, []
+        self._tap = page.evaluate("navigator.maxTouchPoints > 0")
+
+    def works(self, state: str) -> None:
+        """Press with the light on."""
+        light(self.controller)
+        box = self.page.locator("#laser-off").bounding_box()
+        assert box and box["width"] >= 44 and box["height"] >= 44
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        shown = self.page.evaluate("([x, y]) => document.elementFromPoint(x, y).id", [x, y])
+        (self.page.touchscreen.tap if self._tap else self.page.mouse.click)(x, y)
+        # Judged by the light alone: it is off within 1 s on a machine at rest.
+        assert within(5.0, lambda: not self.controller.state().laser_on), state
+        assert shown == "laser-off", state
+        kept(self.page, f"off-{self.page.viewport_size['width']}-{state}")
+        self.states.append(state)
+
+
+def test_laser_off_works_in_every_state_of_the_page(desk, sized, served):
+    page = sized
+    off = LaserOff(page, served)
+    press(page, "connect")
+    says(page, "connected: Grbl")
+    # The stage stays at rest, and nothing but the button talks to it.
+    press(page, "stop")
+    tab(page, "Stage")
+    press(page, "unlock")
+    says(page, "unlocking done")
+    for name in ("Connect", "Stage", "Calibrate", "Scan", "Files", "Measure"):
+        tab(page, name)
+        off.works(f"tab-{name}")
+    page.get_by_label("colour").click()
+    page.get_by_role("option", name="intensity").wait_for()
+    off.works("choice")
+    if page.get_by_role("dialog").count():
+        page.get_by_role("option", name="intensity").click()
+    page.get_by_role("option", name="intensity").wait_for(state="hidden")
+    tab(page, "Files")
+    page.get_by_role("button", name="about", exact=True).first.click()
+    page.get_by_role("dialog").get_by_role("button", name="close").wait_for()
+    off.works("about")
+    assert page.get_by_role("dialog").is_visible()
+    page.evaluate("scrollTo(0, document.body.scrollHeight)")
+    off.works("about-scrolled")
+    os.kill(desk.process.pid, signal.SIGSTOP)
+    try:
+        off.works("server-stands-still")
+    finally:
+        os.kill(desk.process.pid, signal.SIGCONT)
+    press(page, "close")
+    off.works("dialog-closed")
+    # Before the page's scripts are there.
+    page.route(re.compile("nicegui.js"), lambda route: held.append(route))
+    held: list[Route] = []
+    page.reload(wait_until="commit")
+    page.locator("#laser-off").wait_for()
+    off.works("loading")
+    assert held
+    for route in held:
+        route.continue_()
+    page.get_by_role("tab", name="Connect").wait_for()
+    off.works("reloaded")
+    assert len(off.states) == 13
+    light(served.controller)
+    page.locator("#laser-off").focus()
+    page.keyboard.press("Enter")
+    assert dark(served)
 
 
 @pytest.mark.slow

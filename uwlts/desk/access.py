@@ -10,6 +10,7 @@ import ipaddress
 import re
 import secrets
 import socket
+from dataclasses import dataclass, field
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
@@ -25,6 +26,9 @@ _PROTECTION = (
     (b"x-content-type-options", b"nosniff"),
 )
 """Headers of every answer: no other site shows the page in a frame of its own, or learns its address."""
+
+_MOST_VIEWED = 100
+"""Every window of a viewer holds one connection, and some requests for a moment; a process may open 1024 files."""
 
 
 def is_local(host: str) -> bool:
@@ -44,29 +48,37 @@ def _is_loopback(name: str) -> bool:
     return address is not None and address.is_loopback
 
 
+@dataclass(frozen=True)
 class PageAccess:
     """Rules of a page that is served at ``host``.
 
     Everybody who reaches it may look. The operator opens it with the ``token`` in the address, which the browser keeps
-    in a cookie.
+    in a ``cookie`` of this name: cookies are shared by all ports of a machine.
     """
 
-    def __init__(self, host: str):
-        self.host, self.token = host, secrets.token_urlsafe(16)
-        # Cookies are shared by all ports of a machine.
-        self._cookie = f"uwlts-operator-{secrets.token_hex(4)}"
+    host: str
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(16))
+    cookie: str = field(default_factory=lambda: f"uwlts-operator-{secrets.token_hex(4)}")
 
-    def refusal(self, headers: Headers) -> str | None:
-        """Why a request is refused: its Host is not this machine's, as after DNS rebinding, or another site sent it."""
+    def refusal(self, headers: Headers, *, page_port: int | None = None) -> str | None:
+        """Why a request is refused: its Host is not this machine's, as after DNS rebinding, or another site sent it.
+
+        ``page_port`` is the port of the page whose requests are accepted, if it is another port than the request's.
+        """
         hosts, origins = headers.getlist("Host"), headers.getlist("Origin")
         if len(hosts) != 1 or not self._is_own(hosts[0]):
             return f"this page is not at {', '.join(hosts) or 'an address without Host'}: open the address it printed"
+        own, foreign = [hosts[0].lower()], {"cross-site", "same-site"}
+        if page_port is not None:
+            name = _HOST.sub(r"\1", own[0])
+            # Browsers leave out port 80, and count another port of one machine to the same site.
+            own, foreign = [f"{name}:{page_port}", *[name] * (page_port == 80)], {"cross-site"}
         for origin in origins:
             parts = urlsplit(origin)
-            if parts.scheme not in ("http", "https") or parts.netloc.lower() != hosts[0].lower():
+            if parts.scheme not in ("http", "https") or parts.netloc.lower() not in own:
                 return f"requests of other sites ({origin}) are refused"
         sites, modes = headers.getlist("Sec-Fetch-Site"), headers.getlist("Sec-Fetch-Mode")
-        if {"cross-site", "same-site"} & set(sites) and modes != ["navigate"]:
+        if foreign & set(sites) and modes != ["navigate"]:
             return "requests of other sites are refused"
         return None
 
@@ -91,7 +103,7 @@ class PageAccess:
         """Whether a request has the token's cookie."""
         for line in headers.getlist("Cookie"):
             try:
-                kept = SimpleCookie(line).get(self._cookie)
+                kept = SimpleCookie(line).get(self.cookie)
             except CookieError:
                 continue
             if kept is not None and self._is_token(kept.value):
@@ -114,21 +126,28 @@ class PageAccess:
             return PlainTextResponse(f"{why}\n", http.HTTPStatus.FORBIDDEN)
         # A path that begins with two slashes would lead to another site.
         moved = RedirectResponse(f"/{scope['path'].lstrip('/')}", http.HTTPStatus.SEE_OTHER)
-        moved.set_cookie(self._cookie, self.token, httponly=True, samesite="strict")
+        moved.set_cookie(self.cookie, self.token, httponly=True, samesite="strict")
         return moved
 
 
 class GuardedApp:
-    """An ASGI application behind the rules, whose answers are framed by no other site and tell none its address."""
+    """An ASGI application behind the rules, whose answers are framed by no other site and tell none its address.
+
+    It serves a limited number of viewers' requests and connections at once, and any number of the operator's.
+    """
 
     def __init__(self, app: ASGIApp, access: PageAccess):
-        self._app, self._access = app, access
+        self._app, self._access, self._viewed = app, access, 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
         answer = self._access.answer(scope)
+        viewer = answer is None and not self._access.is_operator(Headers(scope=scope))
+        if viewer and self._viewed >= _MOST_VIEWED:
+            why = f"{_MOST_VIEWED} requests of viewers are being served: close other windows of this page"
+            answer, viewer = PlainTextResponse(f"{why}\n", http.HTTPStatus.SERVICE_UNAVAILABLE), False
         if answer is not None and scope["type"] == "websocket":
             # Before it is accepted: the browser sees status 403.
             await WebSocketClose()(scope, receive, send)
@@ -139,4 +158,8 @@ class GuardedApp:
                 message["headers"] = [*message["headers"], *_PROTECTION]
             await send(message)
 
-        await (answer or self._app)(scope, receive, protected)
+        self._viewed += viewer
+        try:
+            await (answer or self._app)(scope, receive, protected)
+        finally:
+            self._viewed -= viewer

@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager
 
 import numpy as np
 from nicegui import ui
-from nicegui.events import KeyEventArguments
 
 from uwlts.desk.board import KEPT_LINES, Board, LaserState, Line, Picture
 from uwlts.desk.cloud_view import CloudView
@@ -193,15 +192,3 @@ def timed(refresh: Callable[[], object]) -> None:
     """Bring a browser's page up to date several times a second, and at once."""
     refresh()
     ui.timer(_REFRESH_S, refresh)
-
-
-def laser_off_button(switch_off: Callable[[], None], *, in_use: Callable[[], bool] = lambda: True) -> None:
-    """A button that works in every state; so does the key Escape while the laser is ``in_use``."""
-
-    def pressed(event: KeyEventArguments) -> None:
-        # It also closes menus, which must not reset a controller at rest.
-        if event.action.keydown and event.key.escape and in_use():
-            switch_off()
-
-    ui.button("Laser off", on_click=switch_off, icon="flash_off", color="red").props('size="lg"')
-    ui.keyboard(pressed, ignore=[])

@@ -11,7 +11,8 @@ from nicegui import ui
 
 from uwlts.calibration.guidance.pose_advice import Coverage
 from uwlts.desk.board import Board, Picture, png_of
-from uwlts.desk.board_page import BoardView, laser_off_button, timed
+from uwlts.desk.board_page import BoardView, timed
+from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.server import DeskServer
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.operator import ANSWERS
@@ -28,10 +29,10 @@ class Ended(Exception):
 
 
 class BoardScreen:
-    """Shows a guided calibration on a board, whose buttons answer."""
+    """Shows a guided calibration on a board, whose buttons answer; with a ``switch`` of its own unless given."""
 
-    def __init__(self, board: Board):
-        self._board = board
+    def __init__(self, board: Board, switch: LaserSwitch | None = None):
+        self._board, self.switch = board, switch or LaserSwitch(board, self.laser_off)
         self._given: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._stage: LaserStage | None = None
         self._ending = False
@@ -80,6 +81,7 @@ class BoardScreen:
     def connected(self, stage: LaserStage | None) -> None:
         """The stage that switches the laser from now on; None once it is closed."""
         self._stage = stage
+        self.switch.lend(stage)
         self._board.laser = "flashing" if isinstance(stage, GrblStage) else "none"
 
 
@@ -177,9 +179,7 @@ def record_guided(
 
     def build(board: Board, operator: bool) -> None:
         view = BoardView(board)
-        with view.header():
-            if operator:
-                laser_off_button(screen.laser_off)
+        view.header()
         with ui.element("main").classes("desk guided"):
             view.image()
             with ui.element("section").classes("cloud"):
@@ -188,7 +188,7 @@ def record_guided(
             view.log()
         timed(lambda: (view.refresh(), refresh()))
 
-    with DeskServer(board, build=build, port=port) as server:
+    with DeskServer(board, build=build, port=port, switch=screen.switch) as server:
         report(f"open {server.operator_address}; Ctrl-C ends it, what was accepted is kept")
         return guide(
             described,

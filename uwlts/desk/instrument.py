@@ -21,6 +21,7 @@ import numpy as np
 from uwlts.calibration.calibrate import calibrate
 from uwlts.desk.board import Board, Picture
 from uwlts.desk.guided import BoardScreen, Ended, darken
+from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.recording_view import RecordingView
 from uwlts.errors import DescriptionError, Error, HardwareError
 from uwlts.files.command_files import own_files
@@ -74,6 +75,7 @@ class Instrument:
 
     def __init__(self, board: Board):
         self._board = board
+        self.switch = LaserSwitch(board, self.laser_off, in_use=lambda: self.laser_in_use)
         self._work: queue.Queue[Callable[[], None]] = queue.Queue()
         self._connected: _Connected | None = None
         self._ending, self._paused, self._stop = threading.Event(), threading.Event(), threading.Event()
@@ -253,6 +255,8 @@ class Instrument:
             moved: LaserStage = HandSwitchedLaser(self._board.say)
             if port is not None:
                 moved = stack.enter_context(GrblStage(port))
+                stack.callback(self.switch.lend, None)
+                self.switch.lend(moved)
             self._connected = _Connected(plan, sensor, opened, moved, stack.pop_all())
         self.exposure_ms |= plan.planned_ms()
         self._board.say(f"connected: {opened.info.name} {opened.info.serial}".strip())
@@ -413,7 +417,7 @@ class Instrument:
         board = self._board
         self.state = InstrumentState.BUSY
         board.phase("guided calibration")
-        screen = self._screen = BoardScreen(board)
+        screen = self._screen = BoardScreen(board, self.switch)
         nobody = os.open(os.devnull, os.O_RDONLY)
         try:
             recording = guide(plan, out, screen, resume=resume, overwrite=overwrite, report=board.say, answers=nobody)

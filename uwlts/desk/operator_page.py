@@ -16,7 +16,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
 from uwlts.desk.board import Board
-from uwlts.desk.board_page import BoardView, build_board, laser_off_button, timed
+from uwlts.desk.board_page import BoardView, build_board, timed
 from uwlts.desk.desk_files import file_in, interrupted, kind_of, listed, new_in
 from uwlts.desk.guided import answer_buttons
 from uwlts.desk.instrument import Instrument, InstrumentState
@@ -89,7 +89,7 @@ def serve_desk(
     board = Board(f"desk: {place.resolve().name}")
     with closing(Instrument(board)) as instrument:
         work = _Desk(place, board, instrument, None if plan is None else Path(plan), begun)
-        with DeskServer(board, build=work.build, host=host, port=port) as server:
+        with DeskServer(board, build=work.build, host=host, port=port, switch=instrument.switch) as server:
             try:
                 work.serve_files(server)
                 report(f"open {server.operator_address} to work, {server.address} to look; Ctrl-C ends it")
@@ -210,9 +210,8 @@ class _OperatorPage:
 
     def build(self) -> None:
         """Build all of it."""
-        view, instrument = self._view, self._instrument
-        with view.header():
-            laser_off_button(instrument.laser_off, in_use=lambda: instrument.laser_in_use)
+        view = self._view
+        view.header()
         with ui.element("main").classes("desk"):
             view.image()
             view.cloud()

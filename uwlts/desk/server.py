@@ -1,5 +1,6 @@
 """Serves the page, in a thread of its own, at the wanted port or the next free one."""
 
+import asyncio
 import errno
 import logging
 import socket
@@ -7,8 +8,8 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from functools import cache
-from typing import Any, Self
+from functools import cache, partial
+from typing import Any, Self, cast
 
 import numpy as np
 import uvicorn
@@ -20,6 +21,8 @@ from starlette.responses import Response
 from uwlts.desk.access import GuardedApp, PageAccess, is_local
 from uwlts.desk.board import Board
 from uwlts.desk.board_page import build_board
+from uwlts.desk.laser_switch import LaserSwitch
+from uwlts.desk.request_limits import BACKLOG, HEAD_BYTES, AwaitedHeads, LimitedHttp
 from uwlts.desk.thinned_cloud import packed
 from uwlts.errors import Error, SetupError
 
@@ -52,7 +55,8 @@ class DeskServer:
 
     A browser finds it at its ``address``. Everybody who opens it there may look; controls are shown, and obeyed, at the
     ``operator_address``, which has a token. ``warning`` is what to say where the page can be seen from other machines.
-    ``build(board, operator)`` builds the page for the operator or for a viewer. SetupError where no port is free, the
+    ``build(board, operator)`` builds the page for the operator or for a viewer. The operator's page has the button of a
+    ``switch``, whose process listens at the next free port after the page's. SetupError where no port is free, the
     address is not one of this machine, or this process serves a page already.
     """
 
@@ -63,8 +67,9 @@ class DeskServer:
         build: Callable[[Board, bool], None] | None = None,
         host: str = "127.0.0.1",
         port: int = 8080,
+        switch: LaserSwitch | None = None,
     ):
-        self._access, nicegui = PageAccess(host), _nicegui()
+        self._access, nicegui, self._switch = PageAccess(host), _nicegui(), switch
         self._app = _application(lifespan=nicegui.router.lifespan_context)
         self._add_content(board)
         # What nothing else answers, whenever that is added.
@@ -72,14 +77,20 @@ class DeskServer:
 
         def show(request: Request) -> None:
             ui.page_title(board.title)
-            (build or build_board)(board, self.is_operator(request))
+            operator = self.is_operator(request)
+            (build or build_board)(board, operator)
+            if operator and switch is not None:
+                switch.show_button()
 
         if not _ALONE.acquire(blocking=False):
             raise SetupError("this program serves a page already: close that one first")
         try:
             self._socket = _bound(host, port)
+            own_port = self._socket.getsockname()[1]
+            if switch is not None:
+                switch.serve(self._access, _bound(host, (own_port + 1) % 65536), page_port=own_port)
             named = f"[{host}]" if ":" in host else host
-            self.address = f"http://{named}:{self._socket.getsockname()[1]}"
+            self.address = f"http://{named}:{own_port}"
             self.operator_address = f"{self.address}/?token={self._access.token}"
             self.warning = None
             if not is_local(host):
@@ -90,12 +101,23 @@ class DeskServer:
             self._open = True
             nicegui.state.show = show
             # Only errors: a browser that goes away in the middle of an answer is none.
-            config = uvicorn.Config(GuardedApp(self._app, self._access), log_level=logging.CRITICAL, ws_max_size=2**20)
+            config = uvicorn.Config(
+                GuardedApp(self._app, self._access),
+                http=cast("type[asyncio.Protocol]", partial(LimitedHttp, AwaitedHeads())),
+                # Another loop may accept more connections at a time.
+                loop="asyncio",
+                backlog=BACKLOG,
+                h11_max_incomplete_event_size=HEAD_BYTES,
+                log_level=logging.CRITICAL,
+                ws_max_size=2**20,
+            )
             self._server = uvicorn.Server(config)
             self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name="page", daemon=True)
             self._thread.start()
             self._await_start()
         except BaseException:
+            if switch is not None:
+                switch.close()
             _ALONE.release()
             raise
 
@@ -149,6 +171,8 @@ class DeskServer:
         self._server.should_exit = self._server.force_exit = True
         self._thread.join(_END_S)
         self._socket.close()
+        if self._switch is not None:
+            self._switch.close()
         # A browser that still shows this page must not reach it through the next one.
         for client in list(Client.instances.values()):
             client.delete()

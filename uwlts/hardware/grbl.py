@@ -342,6 +342,11 @@ class GrblStage:
         return self.position_mm()
 
     @property
+    def descriptor(self) -> int:
+        """The open serial port, to lend it to another process that switches the laser off by Ctrl-X."""
+        return self._line.descriptor
+
+    @property
     def laser_unreachable(self) -> bool:
         """Whether the last command to switch the laser off could not be sent."""
         return self._line.unreachable

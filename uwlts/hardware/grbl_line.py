@@ -395,6 +395,11 @@ class GrblLine:
         self._refuse_after_fault()
         self._write(byte)
 
+    @property
+    def descriptor(self) -> int:
+        """The open port."""
+        return self._serial.fileno()
+
     def darken(self) -> bool:
         """Send Ctrl-X and wait for nothing, from any thread; whether it could be sent.
 

@@ -156,13 +156,13 @@ class _Phases:
             yield HandSwitchedLaser(self.operator.wait)
             return
         with GrblStage(planned.port) as stage:
-            self.screen.connected(stage)
-            planned.check(positions_mm, stage)
-            if planned.home:
-                stage.home()
-            elif not stage.position_known:
-                stage.unlock()
             try:
+                self.screen.connected(stage)
+                planned.check(positions_mm, stage)
+                if planned.home:
+                    stage.home()
+                elif not stage.position_known:
+                    stage.unlock()
                 yield stage
             finally:
                 self.screen.connected(None)

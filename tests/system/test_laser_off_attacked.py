@@ -1,0 +1,308 @@
+"""Laser off while strangers on the same machine keep the page's server busy, judged by the controller's light.
+
+The page runs in a process of its own, with as many open files as systems usually allow. Its stage is the twin's
+controller, whose laser another one has lit: nothing but Laser off makes it dark. Only the loopback address is attacked.
+"""
+
+import http.client
+import json
+import os
+import re
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from urllib.parse import urlsplit
+
+import pytest
+from websockets.exceptions import InvalidStatus
+
+from tests.system.test_page_access import Browser, Place, asked, cookie, opened
+from tests.waiting import within
+from twin.devices.grbl_controller import GrblController
+from uwlts.desk.request_limits import HEAD_BYTES, HEAD_S
+from uwlts.hardware.grbl import GrblStage
+
+OFF_S = 2.0
+"""Bound of a press on a busy machine; at rest it takes some ms. Before there were limits: 7 s, or for ever."""
+HALF = 1300
+LONG_LINE_BYTES = 120 * 2**20
+USUAL_FILES = 1024
+
+PROGRAM = f"""
+import resource, sys
+from uwlts.desk.board import Board
+from uwlts.desk.guided import BoardScreen
+from uwlts.desk.server import DeskServer
+from uwlts.hardware.grbl import GrblStage
+
+resource.setrlimit(resource.RLIMIT_NOFILE, ({USUAL_FILES}, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+board = Board("attacked")
+screen = BoardScreen(board)
+with DeskServer(board, port=0, switch=screen.switch) as server:
+    with GrblStage(sys.argv[1]) as stage:
+        screen.connected(stage)
+        print(server.address, server.operator_address, screen.switch._process.pid, flush=True)
+        sys.stdin.readline()
+        screen.connected(None)
+    print("closed", flush=True)
+    sys.stdin.readline()
+print(*(line.text for line in board.lines()), sep="\\n", flush=True)
+"""
+
+
+def light(controller: GrblController, *, steady_s: float = 0.5) -> None:
+    """Light the laser as another program at the controller would: nothing but a reset ends it.
+
+    Both processes send one for each press; on a busy machine the second comes late. So the light has to be steady.
+    """
+
+    def lit() -> bool:
+        with controller._lock:
+            controller._firmware.hear(b"G1F100M3S1000\n")
+        return within(0.5, lambda: controller.state().laser_on) and not within(
+            steady_s, lambda: not controller.state().laser_on
+        )
+
+    assert within(20.0, lit)
+
+
+@dataclass(frozen=True)
+class Operated(Place):
+    """A page whose stage's laser is lit, its operator's cookie, and the port and process that obey Laser off."""
+
+    cookie: str
+    port: int
+    process: int
+    program: subprocess.Popen[str]
+    controller: GrblController
+
+    @property
+    def page_port(self) -> int:
+        return urlsplit(self.address).port
+
+    def press(self, name: str = "off-1", **headers: str) -> int:
+        """Press as the page does; the status of the answer."""
+        own = {"Cookie": self.cookie, "Origin": self.address}
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
+        connection.request("POST", f"/{name}", headers=own | {k.replace("_", "-"): v for k, v in headers.items()})
+        status = connection.getresponse().status
+        connection.close()
+        return status
+
+    def dark_after_s(self) -> float | None:
+        """Time in s until the light is off; None where it stays on for longer than `OFF_S`."""
+        began = time.monotonic()
+        return time.monotonic() - began if within(OFF_S, lambda: not self.controller.state().laser_on) else None
+
+    def go_on(self) -> str:
+        """Let the program go on to its next output."""
+        self.program.stdin.write("\n")
+        self.program.stdin.flush()
+        return self.program.stdout.readline()
+
+    def said(self) -> str:
+        """End the program; the lines of its board."""
+        self.go_on()
+        return self.go_on() + self.program.stdout.read()
+
+
+@pytest.fixture
+def operated() -> Iterator[Operated]:
+    with GrblController(settings={22: 0}, resets_when_opened=False) as controller:
+        program = subprocess.Popen(
+            [sys.executable, "-c", PROGRAM, controller.port], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        try:
+            address, operator_address, process = program.stdout.readline().split()
+            kept = cookie(Place(address, operator_address))
+            text = asked(Place(address, operator_address), Cookie=kept).body
+            port = int(re.search(rb"hostname}:(\d+)", text)[1])
+            page = Operated(address, operator_address, kept, port, int(process), program, controller)
+            light(controller)
+            yield page
+        finally:
+            program.kill()
+            program.communicate()
+
+
+def closed(line: socket.socket) -> bool:
+    """Whether the other side has ended a connection on which it sends nothing."""
+    try:
+        return line.recv(1, socket.MSG_DONTWAIT) == b""
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True
+
+
+@pytest.fixture
+def half_requests() -> Iterator[Callable[[int], list[socket.socket]]]:
+    """Opens many connections to a port, each with a request that has no end."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limits[1], limits[1]))
+    with ExitStack() as lines:
+
+        def opened(port: int) -> list[socket.socket]:
+            found = []
+            for _ in range(HALF):
+                found.append(lines.enter_context(socket.create_connection(("127.0.0.1", port), timeout=20)))
+                with suppress(OSError):
+                    found[-1].sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n")
+            return found
+
+        yield opened
+    resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+class LongLine:
+    """Sends a header line of 120 MB within a ``with``, until it is refused."""
+
+    def __init__(self, port: int):
+        self.sent, self.answer, self._ended = 0, b"", threading.Event()
+        self._thread = threading.Thread(target=self._send, args=(port,), daemon=True)
+
+    def _send(self, port: int) -> None:
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as line, suppress(OSError):
+            line.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Long: ")
+            while self.sent < LONG_LINE_BYTES and not self._ended.is_set():
+                self.sent += line.send(b"x" * 2**20)
+
+    def __enter__(self) -> "LongLine":
+        self._thread.start()
+        time.sleep(0.5)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join(20)
+
+
+def test_laser_off_does_not_need_the_program(operated):
+    controller = operated.controller
+    os.kill(operated.program.pid, signal.SIGSTOP)
+    try:
+        assert operated.press() == 204
+        assert operated.dark_after_s() is not None
+        # What the program had sent before may light it again; resets are repeated.
+        light(controller, steady_s=0.0)
+        assert operated.dark_after_s() is not None
+    finally:
+        os.kill(operated.program.pid, signal.SIGCONT)
+    # When the program has answered, nothing is sent any more.
+    light(controller, steady_s=2.0)
+
+
+def test_escape_switches_off_what_is_in_use(operated):
+    assert operated.press("escape-1") == 204
+    assert operated.dark_after_s() is not None
+
+
+def test_only_the_operators_own_page_is_obeyed(operated):
+    other_ports = [f"http://127.0.0.1:{operated.page_port + 1000}", f"http://127.0.0.1:{operated.port}"]
+    for origin in ("http://evil.example", "null", f"http://localhost:{operated.page_port}", *other_ports):
+        assert operated.press(Origin=origin) == 403
+    for host in ("evil.example", f"192.168.1.7:{operated.port}"):
+        assert operated.press(Host=host) == 403
+    for kept in ("", "uwlts-operator=x", operated.cookie[:-1], f"{operated.cookie}x"):
+        assert operated.press(Cookie=kept) == 403
+    assert operated.press(Sec_Fetch_Site="cross-site", Sec_Fetch_Mode="cors") == 403
+    for name in ("", "on-1", "off-", "off-x", f"off-{'1' * 41}"):
+        assert operated.press(name) == 404
+    for first in ("POST /off-1 HTTP/1.1", "GET /off-1 HTTP/1.1", "", "\xff"):
+        with socket.create_connection(("127.0.0.1", operated.port), timeout=20) as line:
+            line.sendall(f"{first}\r\nHost: 127.0.0.1:{operated.port}\r\n\r\n".encode())
+            assert line.recv(100).split()[1] == b"403"
+    assert operated.dark_after_s() is None
+    # As the page's requests are, to another port of its machine.
+    assert operated.press(Sec_Fetch_Site="same-site", Sec_Fetch_Mode="cors") == 204
+    assert operated.dark_after_s() is not None
+
+
+def test_a_press_by_both_ways_is_obeyed_once(operated):
+    assert operated.press("off-7") == 204
+    assert operated.dark_after_s() is not None
+    light(operated.controller)
+    with Browser(operated, Cookie=operated.cookie) as browser:
+        number, listener = browser.buttons()["Laser off"]
+        for name, dark in (("off-7", False), ("off-8", True)):
+            event = {"id": number, "client_id": browser.client, "listener_id": listener, "args": [json.dumps(name)]}
+            browser.connection.send(f"42{json.dumps(['event', event])}")
+            assert (operated.dark_after_s() is not None) == dark
+    assert operated.said().count("by hand") == 2
+
+
+def test_without_its_process_the_page_says_so_and_laser_off_works(operated):
+    os.kill(operated.process, signal.SIGKILL)
+    with Browser(operated, Cookie=operated.cookie) as browser:
+        browser.click(browser.buttons()["Laser off"])
+        assert operated.dark_after_s() is not None
+    assert "listens for Laser off has ended" in operated.said()
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_the_port_is_given_back(operated, stopped):
+    """A port that a process keeps open cannot be opened again."""
+    if stopped:
+        os.kill(operated.process, signal.SIGSTOP)
+    assert operated.go_on() == "closed\n"
+    with GrblStage(operated.controller.port) as again:
+        assert again.position_mm() == again.position_mm()
+
+
+def test_a_long_header_line_is_refused_and_holds_up_no_press(operated):
+    with Browser(operated, Cookie=operated.cookie) as browser:
+        for port in (operated.page_port, operated.port):
+            with LongLine(port) as line:
+                assert operated.press(f"off-{port}") == 204
+                directly_s = operated.dark_after_s()
+                light(operated.controller)
+                browser.click(browser.buttons()["Laser off"])
+                by_the_server_s = operated.dark_after_s()
+                light(operated.controller)
+            print(f"dark after {directly_s} s, by the page's server {by_the_server_s} s")
+            assert directly_s is not None and by_the_server_s is not None
+            # What the line's buffers hold is sent before the end of the connection comes back.
+            assert line.sent < LONG_LINE_BYTES / 4
+    for port in (operated.page_port, operated.port):
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as long:
+            long.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Long: " + b"x" * HEAD_BYTES)
+            assert long.recv(100).startswith(b"HTTP/1.1 431 Request Header Fields Too Large\r\n")
+
+
+def test_half_requests_end_and_lock_nobody_out(operated, half_requests):
+    held = [*half_requests(operated.page_port), *half_requests(operated.port)]
+    assert operated.press() == 204
+    assert operated.dark_after_s() is not None
+    light(operated.controller)
+    opened_s = time.monotonic()
+    with Browser(operated, Cookie=operated.cookie) as browser:
+        print(f"page opened in {time.monotonic() - opened_s:.2f} s beside {len(held)} half requests")
+        browser.click(browser.buttons()["Laser off"])
+        assert operated.dark_after_s() is not None
+        assert sum(map(closed, held)) >= 2 * (HALF - 256)
+    # A request that is sent little by little has no more time than one that stops.
+    for _ in range(50):
+        with suppress(OSError):
+            held[-1].sendall(b"X: y\r\n")
+        time.sleep((HEAD_S + 1.0) / 50)
+    assert within(20.0, lambda: all(map(closed, held)))
+    assert asked(operated).status == 200
+
+
+def test_viewers_that_take_all_connections_leave_the_operator_his(operated):
+    with ExitStack() as viewers:
+        for _ in range(150):
+            with suppress(InvalidStatus):
+                viewers.enter_context(opened(operated))
+        assert asked(operated).status == 503
+        with Browser(operated, Cookie=operated.cookie) as browser:
+            browser.click(browser.buttons()["Laser off"])
+            assert operated.dark_after_s() is not None
+    assert within(20.0, lambda: asked(operated).status == 200)

@@ -1,0 +1,136 @@
+"""The program's side of Laser off: the page's button, and the process that obeys it beside the page's server.
+
+Whoever reaches the page can keep its server busy. The button therefore asks `uwlts.desk.laser_listener` first, at a
+port of its own, and the page's server as well. A press by both ways is obeyed once.
+"""
+
+import json
+import socket
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+
+from nicegui import ui
+
+from uwlts.desk.access import PageAccess
+from uwlts.desk.board import Board
+from uwlts.desk.laser_listener import MESSAGE_BYTES, PRESS
+from uwlts.errors import HardwareError, SetupError
+from uwlts.hardware.grbl import GrblStage
+from uwlts.hardware.rig import LaserStage
+
+_BUTTON = Path(__file__).with_name("laser_off.html")
+_START_S, _ANSWER_S, _END_S = 30.0, 5.0, 3.0
+_REMEMBERED = 100
+"""Presses that are told from those that come by the other way, at the most some seconds later."""
+
+
+class LaserSwitch:
+    """Calls ``switch_off`` at every press of Laser off, and at the key Escape while the laser is ``in_use``.
+
+    ``switch_off`` must work from every thread. What goes wrong is said on the board.
+    """
+
+    def __init__(self, board: Board, switch_off: Callable[[], None], *, in_use: Callable[[], bool] = lambda: True):
+        self._board, self._switch_off, self._in_use = board, switch_off, in_use
+        self._obeyed: deque[str] = deque(maxlen=_REMEMBERED)
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._thread: threading.Thread | None = None
+
+    def serve(self, access: PageAccess, listening: socket.socket, *, page_port: int) -> None:
+        """Start the process at a socket, which it takes; SetupError where it does not start."""
+        self._port = listening.getsockname()[1]
+        self._lending, lending = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._presses, presses = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with listening, lending, presses:
+            given = [each.fileno() for each in (listening, lending, presses)]
+            # In a session of its own neither the terminal's Ctrl-C and Ctrl-Z nor signals to the group reach it.
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "uwlts.desk.laser_listener", *map(str, given)],
+                pass_fds=given,
+                start_new_session=True,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+            )
+        rules = json.dumps({"access": asdict(access), "page_port": page_port})
+        if not self._asked(rules.encode(), [], _START_S):
+            self.close()
+            raise SetupError("the process that listens for Laser off did not start")
+        self._thread = threading.Thread(target=self._listen, name="laser off", daemon=True)
+        self._thread.start()
+
+    def _asked(self, message: bytes, descriptors: list[int], wait_s: float) -> bool:
+        """Whether the process answers a message."""
+        self._lending.settimeout(wait_s)
+        try:
+            if descriptors:
+                socket.send_fds(self._lending, [message], descriptors)
+            else:
+                self._lending.send(message)
+            return bool(self._lending.recv(MESSAGE_BYTES))
+        except OSError:
+            return False
+
+    def _listen(self) -> None:
+        with suppress(OSError):
+            while name := self._presses.recv(MESSAGE_BYTES):
+                self.press(name.decode())
+                # Without this answer the process repeats Ctrl-X, also where `press` has failed.
+                self._presses.send(name)
+        if self._process is not None:
+            self._board.say("the process that listens for Laser off has ended: restart this program", "error")
+
+    def lend(self, stage: LaserStage | None) -> None:
+        """Lend the process the port of a stage to switch its laser off; None takes the port back.
+
+        HardwareError where the process is gone or stopped.
+        """
+        if self._process is None:
+            return
+        lent = [stage.descriptor] if isinstance(stage, GrblStage) else []
+        if self._asked(b"port" if lent else b"none", lent, _ANSWER_S):
+            return
+        # It must not keep the port.
+        self._process.kill()
+        if lent:
+            raise HardwareError("the process that listens for Laser off is gone or stopped: restart this program")
+
+    def press(self, name: object) -> None:
+        """Obey a press, the first time that it comes; what is no press is refused."""
+        if not isinstance(name, str) or not PRESS.fullmatch(name):
+            return
+        # Who comes second waits until it is done.
+        with self._lock:
+            if name in self._obeyed:
+                return
+            self._obeyed.append(name)
+            if name.startswith("off") or self._in_use():
+                self._switch_off()
+
+    def show_button(self) -> None:
+        """Put the button into a page; it is there before the page's scripts, and stands above whatever they show."""
+        ui.add_body_html(_BUTTON.read_text(encoding="utf-8").replace("LISTENER_PORT", str(self._port)))
+        ui.on("laser_off", lambda event: self.press(event.args))
+
+    def close(self) -> None:
+        """End the process."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        # Wakes the thread.
+        self._presses.shutdown(socket.SHUT_RDWR)
+        if self._thread is not None:
+            self._thread.join(_END_S)
+        self._presses.close()
+        self._lending.close()
+        try:
+            process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
