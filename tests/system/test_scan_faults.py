@@ -36,6 +36,7 @@ STAGE_FAULTS = {
     "restart": "restarted by itself",
     "garbage": "garbage on the line",
     "mute": "the controller hangs|does not answer",
+    "cut-line": "the controller hangs|does not answer",
     "break-laser": "the laser has failed: at .*, where its stripe was seen before",
 }
 """Faults that end a scan, and what the message names."""
@@ -101,7 +102,7 @@ def test_a_scan_meets_one_fault_after_the_other_and_goes_on_after_each(board, se
         for name in names:
             done = scan(plan, out, *(["--resume"] if kept else []))
             ended(done, STAGE_FAULTS[name])
-            served.controller.inject("mute", 0)
+            served.controller.inject("cut-line", 0)
             served.controller.inject("break-laser", 0)
             assert dark(served), name
             assert not out.exists()

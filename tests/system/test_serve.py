@@ -71,6 +71,15 @@ def grab(camera: CameraDevice) -> np.ndarray:
     return camera.grab(WAIT_S).image
 
 
+def grab_lit(camera: CameraDevice, stage: GrblStage, *, power: float = 1.0) -> np.ndarray:
+    """An image with laser; its rendering may take longer than the light."""
+    stage.laser(True, power=power)
+    try:
+        return grab(camera)
+    finally:
+        stage.laser(False)
+
+
 def centres(image: np.ndarray) -> np.ndarray:
     """Stripe centres (96,) in px, nan where there is none."""
     return extract_stripe(image, stripe_along="width").centre_px
@@ -88,11 +97,10 @@ def test_a_scan_shows_what_simulate_shows(served, stage, camera, board, sensor, 
         positions, exposure_ms = capture.stage_mm[:], float(capture.exposure_ms[0])
     assert served.exposure_ms["laser"] == pytest.approx(exposure_ms)
     start(camera, exposure_ms)
-    stage.laser(True)
     seen = []
     for position_mm in positions:
         stage.move_to(position_mm + served.track.offset_mm, feed_mm_per_min=FEED)
-        seen.append(grab(camera))
+        seen.append(grab_lit(camera, stage))
     for one, other in zip(seen, expected, strict=True):
         apart = np.abs(centres(one) - centres(other))
         assert np.isfinite(apart).mean() > 0.9
@@ -107,27 +115,22 @@ def test_a_scan_shows_what_simulate_shows(served, stage, camera, board, sensor, 
 def test_laser_and_exposure_make_the_light(served, stage, camera):
     exposure_ms = served.exposure_ms["laser"]
     stage.move_to(served.track.start_mm, feed_mm_per_min=FEED)
-    stage.laser(True)
     start(camera, exposure_ms)
-    full = grab(camera).astype(float)
+    full = grab_lit(camera, stage).astype(float)
     stripe = full > 0.4 * full.max()
     assert stripe.sum() > 96
     dark_dn = np.median(full[:50])
-    stage.laser(True, power=0.5)
-    half = grab(camera).astype(float)
+    half = grab_lit(camera, stage, power=0.5).astype(float)
     start(camera, exposure_ms / 2)
-    stage.laser(True)
-    shorter = grab(camera).astype(float)
-    stage.laser(False)
+    shorter = grab_lit(camera, stage).astype(float)
     off = grab(camera).astype(float)
     # The mean over more than 96 pixels of about 100 DN, each with shot and read noise below 4 DN, is right to 0.4 DN.
     light = (full - dark_dn)[stripe].mean()
     assert (half - dark_dn)[stripe].mean() == pytest.approx(light / 2, abs=1)
     assert (shorter - dark_dn)[stripe].mean() == pytest.approx(light / 2, abs=1)
     assert off[stripe].mean() < dark_dn + 0.05 * light
-    stage.laser(True)
     start(camera, 100 * exposure_ms)
-    assert (grab(camera)[stripe] == 255).all()
+    assert (grab_lit(camera, stage)[stripe] == 255).all()
 
 
 def test_daylight_stays_when_the_laser_is_off(served, stage, camera):
@@ -145,10 +148,9 @@ def test_daylight_stays_when_the_laser_is_off(served, stage, camera):
 
 def test_at_rest_only_the_noise_is_new(served, stage, camera):
     stage.move_to(served.track.start_mm + 1, feed_mm_per_min=FEED)
-    stage.laser(True)
     start(camera, served.exposure_ms["laser"])
     before = served.rates()
-    images = [grab(camera) for _ in range(5)]
+    images = [grab_lit(camera, stage) for _ in range(5)]
     rates = served.rates()
     assert (rates.frames - before.frames, rates.rendered - before.rendered) == (5, 1)
     assert all(not np.array_equal(a, b) for a, b in pairwise(images))
@@ -158,12 +160,11 @@ def test_at_rest_only_the_noise_is_new(served, stage, camera):
 def test_a_laser_that_breaks_leaves_the_dark(served, stage, camera):
     stage.move_to(served.track.start_mm, feed_mm_per_min=FEED)
     start(camera, served.exposure_ms["laser"])
-    stage.laser(True)
-    bright = grab(camera).max()
+    bright = grab_lit(camera, stage).max()
     assert bright > 100
     served.controller.inject("break-laser")
     try:
-        assert grab(camera).max() < 0.2 * bright
+        assert grab_lit(camera, stage).max() < 0.2 * bright
     finally:
         served.controller.inject("break-laser", 0)
 
@@ -211,7 +212,7 @@ def test_faults_are_read():
     assert parse_fault("delay:0.5@7") == Fault("delay", 0.5, 7)
     assert parse_fault("lose-steps:-40@2") == Fault("lose-steps", -40, 2)
     assert parse_fault("stall@3") == Fault("stall", None, 3)
-    assert len(NAMES) == 15
+    assert len(NAMES) == 16
     for wrong, message in [
         ("fire", "'fire' is no fault: .* break-laser"),
         ("drop@0", "no fault"),
@@ -254,8 +255,7 @@ def test_the_lamp_is_on_while_the_laser_is_off_and_frames_are_dropped_and_late(l
                 camera.trigger()
                 with pytest.raises(HardwareError, match="did not answer a trigger"):
                     camera.grab(1.0)
-                stage.laser(True)
-                assert np.median(grab(camera)) < 20
+                assert np.median(grab_lit(camera, stage)) < 20
                 began = time.monotonic()
                 grab(camera)
                 assert time.monotonic() - began > 1
@@ -316,9 +316,8 @@ def test_the_command_serves_until_it_is_interrupted(folder: Path, served):
         with GrblStage(port) as stage, open_camera(address) as camera:
             stage.home()
             stage.move_to(54.0, feed_mm_per_min=FEED)
-            stage.laser(True)
             start(camera, exposure_ms)
-            assert np.isfinite(centres(grab(camera))).mean() > 0.9
+            assert np.isfinite(centres(grab_lit(camera, stage))).mean() > 0.9
         command.send_signal(signal.SIGINT)
         output, errors = command.communicate(timeout=20)
     finally:

@@ -52,6 +52,19 @@ class StageState:
         return self.speed_mm_per_s != 0
 
 
+@dataclass(frozen=True)
+class Light:
+    """A period in which the laser was lit, in s of the monotonic clock; ``off_s`` is None while it still is."""
+
+    on_s: float
+    off_s: float | None = None
+
+    @property
+    def duration_s(self) -> float:
+        """How long it was lit, or has been until now."""
+        return (time.monotonic() if self.off_s is None else self.off_s) - self.on_s
+
+
 class GrblController:
     """The controller; runs in a thread of its own within a ``with``. All methods may be called from any thread.
 
@@ -74,7 +87,8 @@ class GrblController:
         self._speed_up, self._origin = speed_up, time.monotonic()
         self._lock, self._ending = threading.RLock(), threading.Event()
         self._resets_when_opened, self._gated, self._port_open = resets_when_opened, gated, False
-        self._powered, self._muted, self._laser_broken = True, False, False
+        self._powered, self._muted, self._cut, self._laser_broken = True, False, False, False
+        self._lights: list[Light] = []
         all_settings = {**BENCH_SETTINGS, **(settings or {})}
         self._firmware = GrblFirmware(
             all_settings, position_mm=position_mm, clock=self._now, say=self._say, speed_up=speed_up, **build
@@ -107,6 +121,19 @@ class GrblController:
             position, speed = self._firmware.stage_at((time_s - self._origin) * self._speed_up)
             return StageState(time_s, position, speed * self._speed_up, power > 0, power, self._port_open)
 
+    @property
+    def lights(self) -> tuple[Light, ...]:
+        """Periods of light so far, as the controller saw them, to some ms."""
+        with self._lock:
+            return tuple(self._lights)
+
+    def _log_light(self) -> None:
+        state, lit = self.state(), bool(self._lights) and self._lights[-1].off_s is None
+        if state.laser_on and not lit:
+            self._lights.append(Light(state.time_s))
+        elif lit and not state.laser_on:
+            self._lights[-1] = Light(self._lights[-1].on_s, state.time_s)
+
     def steps(self, state: StageState | None = None) -> int:
         """Count of an encoder on the axis, a step each, in a state; now unless given."""
         return round((state or self.state()).position_mm / self._firmware.step_mm)
@@ -118,11 +145,12 @@ class GrblController:
                 self._firmware.axis.stop(self._now())
                 self._powered = False
                 os.close(self._master)
+                self._log_light()
 
     def inject(self, fault: str, value: float = 1, *, noise: bytes = b"\xff\xfe<Id|MPos:1#\x80,0\r\n") -> None:
         """Let a fault of ``twin serve --fault`` happen, of as many steps or with the number ``value``.
 
-        A value of 0 repairs "mute" and "break-laser"; ``noise`` is what "garbage" puts on the line.
+        A value of 0 repairs "mute", "cut-line" and "break-laser"; ``noise`` is what "garbage" puts on the line.
         """
         firmware = self._firmware
         with self._lock:
@@ -131,6 +159,8 @@ class GrblController:
                     self.disconnect()
                 case "mute":  # the wire on which the controller answers breaks; it still receives
                     self._muted = bool(value)
+                case "cut-line":  # both wires break; the controller keeps its power
+                    self._muted = self._cut = bool(value)
                 case "stall":  # until a reset, while the controller reports that it runs
                     firmware.axis.stick(self._now())
                 case "stop-short":  # commands or pulses lost in the controller
@@ -169,11 +199,13 @@ class GrblController:
                     self._firmware.restart()
                 if events & select.POLLIN:
                     try:
-                        self._firmware.hear(os.read(self._master, 4096))
+                        heard = os.read(self._master, 4096)
+                        self._firmware.hear(b"" if self._cut else heard)
                     except OSError as error:
                         if error.errno != errno.EIO:  # the last program has closed the port
                             raise
                 self._firmware.work()
+                self._log_light()
             if events & select.POLLHUP:
                 # Polling a closed port does not wait.
                 time.sleep(_BUSY_MS / 1000)

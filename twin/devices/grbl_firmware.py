@@ -1,5 +1,6 @@
 """Grbl 1.1 for one axis: its answers, states and alarms, and its reading of G-code blocks."""
 
+import math
 import re
 from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
@@ -92,6 +93,8 @@ def _refuse_incomplete(commands: dict[str, str], values: dict[str, float], machi
 _DECIMALS = {11, 12, 24, 25, 27, *range(100, 133)}
 _PLANNER_BLOCKS, _RECEIVE_BYTES, _LONGEST_LINE = 15, 127, 79
 _WCO_IDLE, _WCO_BUSY = 10, 30
+_DWELL_STEP_S = 0.05
+"""DWELL_TIME_STEP: a dwell takes whole steps, at least what was asked for."""
 
 
 class GrblFirmware:
@@ -282,13 +285,18 @@ class GrblFirmware:
         return f"<{'|'.join(fields)}>"
 
     def _spindle(self, now: float) -> float:
-        """The S in force at the pin; laser mode darkens G0 and holds, and M4 while nothing moves."""
-        at_rest = self.axis.at(now)[1] == 0
-        held = self.axis.held and not self.axis.braking(now)
-        dark = self._modal["motion"] == "G0" or held or (self._modal["spindle"] == "M4" and at_rest)
-        if self._modal["spindle"] == "M5" or self._mode == "Alarm" or (self._settings[32] and dark):
+        """The S in force at the pin; laser mode darkens G0 and holds, and scales M4 by the share of the feed."""
+        if self._modal["spindle"] == "M5" or self._mode == "Alarm":
             return 0.0
-        return min(self._s, self._settings[30])
+        s = min(self._s, self._settings[30])
+        if not self._settings[32]:
+            return s
+        if self._modal["motion"] == "G0" or (self.axis.held and not self.axis.braking(now)):
+            return 0.0
+        if self._modal["spindle"] == "M3":
+            return s
+        speed = abs(self.axis.at(now)[1])
+        return s * min(speed / self.axis.commanded(now), 1.0) if speed else 0.0
 
     def _done(self) -> Generator[None, None, None]:
         """Wait until all movements are done."""
@@ -299,6 +307,14 @@ class GrblFirmware:
         end_s = self._now() + seconds
         while self._now() < end_s:
             yield
+
+    def _dwell(self, seconds: float) -> Generator[None, None, None]:
+        """A dwell in the controller's own steps, which a hold interrupts."""
+        left, last = math.ceil(round(seconds / _DWELL_STEP_S, 6)) * _DWELL_STEP_S * self._speed_up, self._now()
+        while left > 0:
+            yield
+            now = self._now()
+            left, last = left if self.axis.held else left - (now - last), now
 
     def _system_command(self, line: str) -> Generator[None, None, None]:
         idle = self._mode == "Alarm" or not self.axis.pending
@@ -382,7 +398,7 @@ class GrblFirmware:
         self._modal = {name: modal[name] for name in self._modal}
         if block.commands.get("once") == "G4":
             yield from self._done()
-            yield from self._pause(values["P"] * self._speed_up)
+            yield from self._dwell(values["P"])
         elif block.commands.get("once") in ("G92", "G92.1"):
             yield from self._done()
             machine = self.axis.at(self._now())[0]

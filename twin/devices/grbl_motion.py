@@ -1,51 +1,65 @@
-"""Motion of one axis in closed form: every movement from rest to rest under an acceleration limit, and braking.
+"""Motion of one axis in closed form: movements under an acceleration limit that end at rest, and braking.
 
-Times are in s of the simulated controller, positions in mm, speeds in mm/s. Grbl's planner drives through the joint of
-two movements of one direction; here each comes to rest, which is the same for a stage that measures at every stop.
+Times are in s of the simulated controller, positions in mm, speeds in mm/s. As in Grbl's planner, a movement of
+the same direction and speed as the one before continues it without a stop. Between others the axis comes to rest, which
+Grbl does only between opposite directions.
 """
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 
 @dataclass(frozen=True)
 class Ramp:
-    """From rest at ``start_mm`` to rest at ``end_mm``, beginning at ``start_s``."""
+    """From ``start_speed`` at ``start_mm`` to rest at ``end_mm``, beginning at ``start_s``.
+
+    ``blocks`` are the ends of the planner's blocks of which it consists, the last one ``end_mm``.
+    """
 
     start_mm: float
-    end_mm: float
+    blocks: tuple[float, ...]
     speed: float
     acceleration: float
     start_s: float
+    start_speed: float = 0.0
+
+    @property
+    def end_mm(self) -> float:
+        """Where it comes to rest."""
+        return self.blocks[-1]
 
     @property
     def peak(self) -> float:
         """Highest speed: a short way never reaches the full one."""
-        return min(self.speed, math.sqrt(self.acceleration * abs(self.end_mm - self.start_mm)))
+        way = abs(self.end_mm - self.start_mm)
+        return min(self.speed, math.sqrt(self.start_speed**2 / 2 + self.acceleration * way))
 
     @property
     def end_s(self) -> float:
         """When it comes to rest."""
         if self.peak == 0:
             return self.start_s
-        return self.start_s + abs(self.end_mm - self.start_mm) / self.peak + self.peak / self.acceleration
+        # At the peak all the way, but for what each of the two ramps takes longer.
+        late_s = ((self.peak - self.start_speed) ** 2 + self.peak**2) / (2 * self.acceleration * self.peak)
+        return self.start_s + abs(self.end_mm - self.start_mm) / self.peak + late_s
 
     def at(self, time_s: float) -> tuple[float, float]:
         """Position and signed speed."""
+        way, sign = abs(self.end_mm - self.start_mm), math.copysign(1.0, self.end_mm - self.start_mm)
         if time_s <= self.start_s:
-            return self.start_mm, 0.0
+            return self.start_mm, sign * self.start_speed
         if time_s >= self.end_s:
             return self.end_mm, 0.0
-        way, sign = abs(self.end_mm - self.start_mm), math.copysign(1.0, self.end_mm - self.start_mm)
         since, left = time_s - self.start_s, self.end_s - time_s
-        ramp_s = self.peak / self.acceleration
-        if since < ramp_s:
-            gone, speed = self.acceleration * since**2 / 2, self.acceleration * since
-        elif left < ramp_s:
+        up_s = (self.peak - self.start_speed) / self.acceleration
+        if since < up_s:
+            speed = self.start_speed + self.acceleration * since
+            gone = (self.start_speed + speed) / 2 * since
+        elif left < self.peak / self.acceleration:
             gone, speed = way - self.acceleration * left**2 / 2, self.acceleration * left
         else:
-            gone, speed = self.peak * (since - ramp_s / 2), self.peak
+            gone, speed = self.peak * since - self.acceleration * up_s**2 / 2, self.peak
         return self.start_mm + sign * gone, sign * speed
 
 
@@ -84,8 +98,8 @@ class Axis:
 
     @property
     def pending(self) -> int:
-        """Movements not yet done."""
-        return len(self._moves)
+        """Blocks not yet done."""
+        return sum(len(move.blocks) for move in self._moves)
 
     @property
     def planned_mm(self) -> float:
@@ -102,15 +116,36 @@ class Axis:
         return self._brake is not None and self._clock(time_s) < self._brake.end_s
 
     def add(self, end_mm: float, *, speed: float, time_s: float) -> None:
-        """Queue a movement; it starts when those before it are done, or at once."""
+        """Queue a block; it starts when those before it are done, or at once, and continues one of its kind."""
+        self.advance(time_s)
         start_mm, start_s = self.planned_mm, self._moves[-1].end_s if self._moves else time_s
-        if end_mm != start_mm:
-            self._moves.append(Ramp(start_mm, end_mm, speed, self.acceleration, start_s))
+        if end_mm == start_mm:
+            return
+        last = self._moves[-1] if self._moves else None
+        if last and last.speed == speed and (end_mm - start_mm) * (start_mm - last.start_mm) > 0:
+            clock = max(self._clock(time_s), last.start_s)
+            at_mm, at_speed = last.at(clock)
+            blocks = (*last.blocks, end_mm)
+            self._moves[-1] = Ramp(at_mm, blocks, speed, self.acceleration, clock, abs(at_speed))
+        else:
+            self._moves.append(Ramp(start_mm, (end_mm,), speed, self.acceleration, start_s))
 
     def advance(self, time_s: float) -> None:
-        """Retire the movements that are done."""
-        while self._moves and not self._brake and self._clock(time_s) >= self._moves[0].end_s:
+        """Retire the blocks that are done."""
+        if self._brake:
+            return
+        while self._moves and self._clock(time_s) >= self._moves[0].end_s:
             self.rest_mm = self._moves.popleft().end_mm
+        if self._moves and len(self._moves[0].blocks) > 1:
+            move, (at_mm, _) = self._moves[0], self.at(time_s)
+            ahead = math.copysign(1.0, move.end_mm - move.start_mm)
+            left = tuple(end_mm for end_mm in move.blocks if (end_mm - at_mm) * ahead > 0)
+            self._moves[0] = replace(move, blocks=left or move.blocks[-1:])
+
+    def commanded(self, time_s: float) -> float:
+        """Speed that the movement at hand was commanded with; 0 where there is none."""
+        self.advance(time_s)
+        return self._moves[0].speed if self._moves else 0.0
 
     def at(self, time_s: float) -> tuple[float, float]:
         """Position and signed speed."""
@@ -133,7 +168,8 @@ class Axis:
         """Go on with what is left, from rest."""
         if not self._brake or self.braking(time_s):
             return
-        ends, (self.rest_mm, _) = [(move.end_mm, move.speed) for move in self._moves], self.at(time_s)
+        ends = [(end_mm, move.speed) for move in self._moves for end_mm in move.blocks]
+        self.rest_mm, _ = self.at(time_s)
         self._brake = None
         self._moves.clear()
         for end_mm, speed in ends:

@@ -46,7 +46,7 @@ class _Kind:
 _KINDS = {
     **dict.fromkeys(("drop", "repeat", "cut"), _Kind(1)),
     "delay": _Kind(1.0, whole=False),
-    **dict.fromkeys(("camera-disconnect", "stage-disconnect", "mute", "stall"), _Kind()),
+    **dict.fromkeys(("camera-disconnect", "stage-disconnect", "mute", "cut-line", "stall"), _Kind()),
     "stop-short": _Kind(40),
     "lose-steps": _Kind(40, signed=True),
     "alarm": _Kind(1),
@@ -325,8 +325,8 @@ def serve(
         How much faster than real the stage moves.
     fault
         Faults as NAME[:ARGUMENT][@FRAME], each with the frame of that number, else with the first: drop, repeat or cut
-        (so many frames), delay (s), camera-disconnect, stage-disconnect, mute, stall, stop-short or lose-steps (steps),
-        alarm (number), hold, restart, garbage, break-laser.
+        (so many frames), delay (s), camera-disconnect, stage-disconnect, mute, cut-line, stall, stop-short or
+        lose-steps (steps), alarm (number), hold, restart, garbage, break-laser.
     report
         Called with a line of text for every fault, by the camera's thread.
     scene, as_built, medium, water, spp, seed, variant

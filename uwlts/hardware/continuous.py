@@ -5,6 +5,7 @@ through the reports of a pass gives the position at any time of it. Or an encode
 count with every frame. What the clocks differ by shows in a pass back over the same surface (`measure_latency`).
 """
 
+import math
 import threading
 import time
 from collections import deque
@@ -33,6 +34,8 @@ _TRIGGERS = 8
 """Triggered frames by which the camera's clock is compared; the one that is answered fastest counts."""
 _PATIENCE_S = 3.0
 """Longest wait for a frame beyond its exposure."""
+_GAP_S = 0.8
+"""Longest delay of a frame with the laser on, less the time to brake; the report that shows it takes 0.1 s more."""
 _SLOW_REPORT = 2.0
 """Reports that took so many times as long as the fastest say less exactly when they were made."""
 _FEWEST_REPORTS = 4
@@ -69,6 +72,11 @@ def ways_of(plan: ScanPlan, continuous: Continuous, stage: GrblStage) -> list[tu
     if 60 * speed > settings.max_feed_mm_per_min:
         raise RangeError(
             f"speed_mm_per_s is {speed:g}, the stage does at most {settings.max_feed_mm_per_min / 60:g} mm/s ($110)"
+        )
+    if speed > (fastest := stage.fastest_sweep_mm_per_s):
+        raise RangeError(
+            f"speed_mm_per_s is {speed:g}, too fast for a laser that is lit on the way: at most {fastest:.3g} mm/s, "
+            "from which the stage comes to rest by itself in time ($120)"
         )
     positions = plan.stage.positions_mm()
     ahead = 1.0 if positions[-1] >= positions[0] else -1.0
@@ -130,7 +138,8 @@ def record_continuously(
     kinds = {"centre_lines": lines, "moving": True}
     with CaptureWriter(out, header, dtype=dtype, **kinds, plan=plan.recorded(), overwrite=overwrite) as writer:
         reading = _Reading(camera, writer, clock, positions, exposure_ms, sensor, header.saturation_dn)
-        reading.patience_s += together / rate_hz
+        reading.frame_s = 1e-3 * exposure_ms + together / rate_hz
+        reading.gap_s = _GAP_S - continuous.speed_mm_per_s / stage.settings.acceleration_mm_per_s2
         reading.hears = lambda frame, stripe, number: (
             counted(stripe),
             progress(min(number + 1, expected), expected),
@@ -138,14 +147,13 @@ def record_continuously(
         )
         camera.start(faults="skip")
         thread = threading.Thread(target=reading.run, name="continuous-frames", daemon=True)
+        feed_mm_per_min = 60 * continuous.speed_mm_per_s
         try:
             thread.start()
-            stage.laser(True, power=plan.laser_power)
             for _, end in ways:
                 reading.begin_pass()
-                stage.move_to(end, feed_mm_per_min=60 * continuous.speed_mm_per_s, reported=reading.report)
+                stage.sweep(end, feed_mm_per_min=feed_mm_per_min, power=plan.laser_power, reported=reading.report)
             reading.end_s = time.monotonic()
-            stage.laser(False)
             report("waiting for the last frames")
             thread.join()
         finally:
@@ -207,24 +215,32 @@ class _Reading:
         self._began_s = time.monotonic()
         self.end_s: float | None = None
         self.ending = threading.Event()
-        self.patience_s = _PATIENCE_S + 1e-3 * exposure_ms
+        self.frame_s, self.gap_s = 0.0, _GAP_S
+        self._heard_s = math.inf
         self.error: Exception | None = None
 
     def begin_pass(self) -> None:
         """The reports from here on belong to another pass."""
         self._passes.append([])
+        self._heard_s = time.monotonic()
 
     def report(self, report: StageReport) -> None:
-        """Hear of the stage's position; raises what has ended the reading."""
+        """Hear of the stage's position; raises what has ended the reading, or that frames stay away."""
         self._passes[-1].append(report)
         if self.error is not None:
             raise self.error
+        if time.monotonic() - self._heard_s > (longest_s := self.frame_s + self.gap_s):
+            raise HardwareError(
+                f"the camera gave no frame for {longest_s:.2g} s while the laser was on: check power and cable, and "
+                "whether it is fast enough"
+            )
 
     def run(self) -> None:
         """Read frames until one was taken after the end of the last pass."""
         try:
             while not self.ending.is_set():
-                frame = self._camera.grab(self.patience_s)
+                frame = self._camera.grab(_PATIENCE_S + self.frame_s)
+                self._heard_s = time.monotonic()
                 middle_s = frame.time_s + self._clock.offset_s + 0.5e-3 * self._exposure_ms
                 self._pending.append((frame, middle_s))
                 self._store_what_is_known()

@@ -10,7 +10,11 @@ that a command or pulses were lost before the motor. Steps that the motor itself
 is found pressed away from its place, which every move checks, or in the pictures: return to the first position and
 compare.
 
-When the laser goes off:
+The controller itself ends the light, whatever becomes of the computer. At rest it has the dwell and the M5 that end the
+light before it lights the laser; light that shall last is renewed by `GrblStage.keep_lit`. On the way, in `sweep`, the
+laser is lit by M4, which Grbl's laser mode darkens at rest, and the controller knows of the next part of the way alone.
+
+The laser goes off sooner:
 
 - the ``with`` ends, normally or by an exception, Ctrl-C included: Ctrl-X, whose answer is awaited. Grbl's receiving
   interrupt obeys it, so it works while the controller moves, waits or is locked;
@@ -18,20 +22,18 @@ When the laser goes off:
 - the program is killed (SIGTERM, SIGKILL), crashes or ends without closing, is suspended or hangs: `laser_guard`, a
   process of its own, sends the Ctrl-X. It expects to hear of the program while the laser is on: every exchange with the
   controller is heard, and longer waits are announced by `GrblStage.keep_lit`;
-- program and guard are killed, or the computer freezes, during an image of a scan: the controller comes to the M5 that
-  it has been sent with the M3, behind a dwell (``at_most_s``);
 - the guard is gone: the driver finds out at the next exchange, or `keep_lit`, and sends the Ctrl-X;
 - the cable is pulled out: the Uno, fed by it, loses its power and the pull-down at the laser's transistor does the
-  rest. Grbl has no watchdog and no setting replaces one; an Uno with a supply of its own keeps the laser lit;
-- the controller itself hangs: only hardware helps, see docs/how-to/hardware-stage.md;
-- program and guard are killed while the laser is on without ``at_most_s``: only hardware helps. The Uno's reset through
-  DTR does not: it comes when the port is *opened*, not closed;
+  rest;
 - the controller restarts for any reason, the next opening of the port included: Grbl starts with the pin off.
+
+Where the controller itself hangs only hardware helps, see docs/how-to/hardware-stage.md.
 """
 
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Self
 
@@ -46,6 +48,17 @@ _MARGIN, _MARGIN_S = 1.5, 2.0
 _REPORTS_TO_OFFSET = 31
 # A limit switch opens this far from where it closes.
 _PIN_MARGIN_MM = 0.5
+LIVE_S = 0.4
+"""Dwell of a light that is renewed. Two are with the controller at most, so that the light ends within 0.9 s; and one
+at least after a call of `GrblStage.keep_lit`, which may take half a second to come again, as the guard allows 0.8 s."""
+_LIGHTS_S = 0.3
+"""The controller lights the laser within some ms after it got the command."""
+_SWEEP_S = 0.9
+"""A stage that gets no further part of its way comes to rest, and darkens the laser, in this time."""
+_LAG_S = 0.3
+"""Way at full speed that is left to it where the next part comes as late as a report and a busy computer allow."""
+_FULL = 0.9
+"""Share of the power that shows that the laser follows, as the speed is reported rounded."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +81,9 @@ class GrblStage:
 
     def __init__(self, port: str, *, baud: int = 115200, boot_s: float = 2.5):
         self._line = GrblLine(port, baud=baud, boot_s=boot_s)
-        self._power, self._timed_speed, self._held = 0.0, 0.0, False
+        self._power, self._held = 0.0, False
+        self._lighting: tuple[str, ...] = ()
+        self.lit_until_s = -math.inf
         try:
             self.port, self.version = port, self._line.version
             self.settings = parse_settings(self._line.settings())
@@ -138,7 +153,8 @@ class GrblStage:
         if line.fault is None and not self._held and not line.darkened_by_hand:
             return
         self._position_known = self._position_known and line.fault is None and not line.darkened_by_hand
-        self._power, self._timed_speed, self._held = 0.0, 0.0, False
+        self._forget_light()
+        self._held = False
         self._line.restart()
         # A reset that met a movement leaves an alarm behind.
         self._position_known = self._position_known and self._line.status().state != "Alarm"
@@ -158,6 +174,98 @@ class GrblStage:
         moved then. HardwareError where the position is not known, and for every fault: alarm, stall, hold, lost steps,
         restart, silence, noise, lost line.
         """
+        start_mm = self._start_of(position_mm, feed_mm_per_min)
+        self._go(position_mm, feed_mm_per_min)
+        in_motion = self._motion_watch(start_mm, feed_mm_per_min / 60)
+
+        def watch(report: Status) -> None:
+            in_motion(report)
+            if report.machine_mm is not None or report.work_mm is not None:
+                line = self._line
+                reported(StageReport(line.asked_s, line.answered_s, self._position_of(report)))
+
+        return self._arrive(position_mm, position_mm - start_mm, feed_mm_per_min, watch)
+
+    @property
+    def fastest_sweep_mm_per_s(self) -> float:
+        """Highest speed of `sweep`: faster, the stage takes too long to come to rest by itself."""
+        # With the ramps it rests in _SWEEP_S from a way that suffices to brake, and _LAG_S more.
+        return (_SWEEP_S - _LAG_S) / 1.5 * self.settings.acceleration_mm_per_s2
+
+    def sweep(
+        self,
+        position_mm: float,
+        *,
+        feed_mm_per_min: float,
+        power: float = 1.0,
+        reported: Callable[[StageReport], None] = lambda report: None,
+    ) -> float:
+        """Move as `move_to` does, with the laser on while the stage moves; below its full speed the light is weaker.
+
+        The controller gets the way part by part: where this program stops, the stage comes to rest and the laser goes
+        off within a second. Whatever ``reported`` raises brakes the stage, which is held then as by `stop`.
+
+        RangeError, HardwareError as by `move_to` and `laser`. HardwareError also where the next part came too late for
+        a constant speed.
+        """
+        speed = self._speed_of(power)
+        start_mm, feed_mm_s = self._start_of(position_mm, feed_mm_per_min), feed_mm_per_min / 60
+        if feed_mm_s > (fastest := self.fastest_sweep_mm_per_s):
+            raise RangeError(
+                f"{feed_mm_s:g} mm/s is too fast for a laser that is lit on the way: at most {fastest:.3g} mm/s, from "
+                "which the stage comes to rest by itself in time ($120)"
+            )
+        ramp_s = feed_mm_s / self.settings.acceleration_mm_per_s2
+        ahead_mm = math.copysign(feed_mm_s * (_SWEEP_S - ramp_s), position_mm - start_mm)
+        at_mm = sent_mm = start_mm
+        brightest = 0.0
+        in_motion = self._motion_watch(start_mm, feed_mm_s)
+
+        def hear(report: Status) -> None:
+            nonlocal at_mm, brightest
+            in_motion(report)
+            at_mm = self._position_of(report)
+            brightest = max(brightest, speed if report.spindle is None else report.spindle)
+            reported(StageReport(self._line.asked_s, self._line.answered_s, at_mm))
+
+        self._line.keep_lit()
+        self._power = power
+        try:
+            # Dark until the stage moves; G1 needs a feed to be accepted.
+            self._line.command(f"G21G90G94G1F{feed_mm_per_min:.2f}M4S{speed}")
+            while sent_mm != position_mm:
+                to_mm = at_mm + ahead_mm
+                if abs(to_mm - start_mm) >= abs(position_mm - start_mm):
+                    to_mm = position_mm
+                if abs(to_mm - start_mm) > abs(sent_mm - start_mm):
+                    self._go(to_mm, feed_mm_per_min)
+                    since_s = time.monotonic() - self._line.asked_s
+                    if sent_mm != start_mm and abs(sent_mm - at_mm) < feed_mm_s * (since_s + ramp_s / 2):
+                        raise self._line.failed(
+                            f"the stage slowed down near {sent_mm:.2f} mm, as this program was too late to send the "
+                            "next part of its way: the computer is too busy"
+                        )
+                    sent_mm = to_mm
+                time.sleep(POLL_S)
+                hear(self._line.status())
+            reached_mm = self._arrive(position_mm, position_mm - at_mm, feed_mm_per_min, hear)
+        except BaseException:
+            with suppress(HardwareError):
+                self._line.realtime(FEED_HOLD)
+            # A fault has stopped it otherwise.
+            self._held = not self.faulty
+            raise
+        reaches_speed = abs(position_mm - start_mm) > feed_mm_s * (ramp_s + 3 * POLL_S)
+        if reaches_speed and brightest < _FULL * speed:
+            raise self._line.failed(
+                f"the laser's pin does not follow: at most S{brightest:g} is reported where S{speed} was sent: an "
+                "override of the spindle, or $31 above it"
+            )
+        self.laser(False)
+        return reached_mm
+
+    def _start_of(self, position_mm: float, feed_mm_per_min: float) -> float:
+        """Position in mm from which a movement begins; its errors as of `move_to`."""
         low, high = self.limits_mm
         if not low <= position_mm <= high:
             raise RangeError(f"{position_mm:g} mm is outside the stage's travel of {low:g} to {high:g} mm")
@@ -168,19 +276,20 @@ class GrblStage:
             raise HardwareError("the stage is held since it was stopped: unlock or home it")
         if not self._position_known and self._line.fault is None:
             raise HardwareError("the stage does not know where it is: home it first")
-        start_mm = self.position_mm()
+        if self.laser_power:
+            raise HardwareError("the laser is on: switch it off before moving, or use sweep")
+        return self.position_mm()
+
+    def _go(self, position_mm: float, feed_mm_per_min: float) -> None:
+        self._line.command(f"G21G90G94G53G1X{self._origin_mm + position_mm:.4f}F{feed_mm_per_min:.2f}")
+
+    def _arrive(
+        self, position_mm: float, way_mm: float, feed_mm_per_min: float, watch: Callable[[Status], None]
+    ) -> float:
+        """Wait until the stage rests at the end of a way, and return the position read back in mm."""
         feed_mm_s = feed_mm_per_min / 60
         # Distance at full speed plus a ramp up and one down: never less than the real time, however short the way.
-        expected_s = abs(position_mm - start_mm) / feed_mm_s + feed_mm_s / self.settings.acceleration_mm_per_s2
-        self._line.command(f"G21G90G94G53G1X{self._origin_mm + position_mm:.4f}F{feed_mm_per_min:.2f}")
-        in_motion = self._motion_watch(start_mm, feed_mm_s)
-
-        def watch(report: Status) -> None:
-            in_motion(report)
-            if report.machine_mm is not None or report.work_mm is not None:
-                line = self._line
-                reported(StageReport(line.asked_s, line.answered_s, self._position_of(report)))
-
+        expected_s = abs(way_mm) / feed_mm_s + feed_mm_s / self.settings.acceleration_mm_per_s2
         # A dwell is acknowledged when all movements before it are done.
         self._line.command("G4P0.01", timeout_s=_MARGIN * expected_s + _MARGIN_S, watch=watch)
         reached_mm = self._rest()
@@ -261,64 +370,97 @@ class GrblStage:
             )
 
     def laser(self, on: bool, *, power: float = 1.0, at_most_s: float | None = None) -> None:
-        """Switch the laser at once and see that the controller says so; only the camera can show whether it is lit.
+        """Switch the laser at rest and see that the controller says so; only the camera can show whether it is lit.
 
         ``power``, 0 < power <= 1, is the share of the time in which the pin is on: below 1 it is pulsed at some kHz.
         RangeError where it is outside this range; HardwareError where the controller is locked or does not follow, the
         guard process is gone or has switched the laser off, and for every other fault.
 
-        With ``at_most_s`` the controller itself switches it off after this time, even if nothing is left that could
-        tell it to: the lines that do so are with it before the laser is lit. It does nothing else until the laser is
-        switched off.
+        The controller itself switches it off after ``at_most_s``, in whole steps of 0.05 s, even if nothing is left
+        that could tell it to: the lines that do so are with it before the laser is lit. Without ``at_most_s`` it does
+        so within 0.9 s after the last call of `keep_lit`, which has to come every half second.
 
-        While it is on, call something of the stage at least every half second, or `keep_lit` before: the guard switches
-        the laser off otherwise.
+        Until the laser is switched off the stage cannot move. The guard, too, switches it off if nothing of the stage
+        is called for more than half a second, unless `keep_lit` was told so.
         """
-        if not 0 < power <= 1:
-            raise RangeError(f"the laser's power {power:g} is not above 0 and up to 1")
-        if not on:
-            # The fault has switched it off already.
-            if self._line.fault is not None:
-                return
-            if self._timed_speed:
-                # Sees that it was on all the time; the reset would hide a hold, or that the time was over.
-                self._line.keep_lit()
-                self._see_spindle(self._timed_speed)
-                self._line.end()
-            else:
-                self._line.command("M5")
-            self._power = self._timed_speed = 0.0
+        speed = self._speed_of(power)
+        # A fault has switched it off already.
+        if self._line.fault is not None and not on:
+            return
+        if self._lighting:
+            self._line.keep_lit()
+            report = self._line.status()
+            self._refuse_stop(report)
+            # Light that ended before its time, and a hold, would be hidden by the reset. One that is renewed blinks.
+            if self._line.answered_s < self.lit_until_s < math.inf:
+                self._require_spindle(report, self._power)
+            self._line.end()
+        elif not on:
+            self._line.command("M5")
+        if not on or self._lighting:
+            self._forget_light()
             self._see_spindle(0.0)
             self._line.darkened()
+        if not on:
             return
         self._line.keep_lit()
-        speed = max(1, round(power * self.settings.spindle_max))
-        # In laser mode ($32=1) the pin stays off under G0, the mode after every reset; G1 needs a feed to be accepted.
+        # In laser mode the pin stays off under G0, the mode after every reset; G1 needs a feed to be accepted.
         self._line.command(f"G21G90G94G1F{min(100.0, self.settings.max_feed_mm_per_min):.2f}")
         self._power = power
+        dwell_s = LIVE_S if at_most_s is None else at_most_s
+        # Two lines, not three: a line that is cut off between them would keep the laser lit.
+        self._lighting = f"M3S{speed}G4P{dwell_s:.3f}", "M5"
+        self.lit_until_s = time.monotonic() + dwell_s
+        self._line.begin(*self._lighting)
+        self._see_spindle(power)
         if at_most_s is None:
-            self._line.command(f"M3S{speed}")
-        else:
-            self._timed_speed = float(speed)
-            self._line.begin(f"M3S{speed}", f"G4P{at_most_s:.2f}", "M5")
-        self._see_spindle(float(speed))
+            self.lit_until_s = math.inf
+            self.keep_lit()
+
+    def _speed_of(self, power: float) -> int:
+        """The S word of a power; RangeError, HardwareError where it cannot be set."""
+        if not 0 < power <= 1:
+            raise RangeError(f"the laser's power {power:g} is not above 0 and up to 1")
+        if not self.settings.laser_mode:
+            raise HardwareError("laser mode is off ($32=0): a hold would keep the laser lit; send $32=1")
+        return max(1, round(power * self.settings.spindle_max))
+
+    def _forget_light(self) -> None:
+        self._power, self._lighting, self.lit_until_s = 0.0, (), -math.inf
 
     def keep_lit(self, wait_s: float = 0.0) -> None:
         """Announce that ``wait_s`` may pass without a call while the laser is on; then the guard switches it off.
 
-        To be called again and again while something is waited for. HardwareError where the guard is gone, or has
-        switched the laser off already.
+        To be called again and again while something is waited for, every half second for a laser that is lit without
+        ``at_most_s``, as this renews its light. HardwareError where the guard is gone, or has switched the laser off
+        already, or the controller does not answer.
         """
-        if self.laser_power:
-            self._line.keep_lit(wait_s)
+        if not self.laser_power:
+            return
+        self._line.keep_lit(wait_s)
+        if self.lit_until_s == math.inf:
+            self._refuse_stop(self._line.status())
+            # The last light has begun.
+            if self._line.unacknowledged <= len(self._lighting):
+                self._line.begin(*self._lighting)
 
-    def _see_spindle(self, expected: float) -> None:
-        report = self._line.status()
+    def _see_spindle(self, power: float) -> None:
+        """See that the pin is as expected, for which the controller may take some ms."""
+        deadline = time.monotonic() + _LIGHTS_S
+        while not self._follows(report := self._line.status(), power) and time.monotonic() < deadline:
+            time.sleep(POLL_S / 20)
+        self._require_spindle(report, power)
+
+    def _follows(self, report: Status, power: float) -> bool:
+        return report.spindle is None or abs(report.spindle - power * self.settings.spindle_max) <= 1
+
+    def _require_spindle(self, report: Status, power: float) -> None:
         self._refuse_stop(report)
-        if report.spindle is not None and abs(report.spindle - expected) > 1:
+        if not self._follows(report, power):
             raise self._line.failed(
-                f"the laser's pin does not follow: S{report.spindle:g} is reported where S{expected:g} was sent "
-                f"(state {report.state}): a hold, an override of the spindle, $31 above it, or its time is over"
+                f"the laser's pin does not follow: S{report.spindle:g} is reported where "
+                f"S{power * self.settings.spindle_max:g} was sent (state {report.state}): a hold, an override of the "
+                "spindle, or $31 above it"
             )
 
     def stop(self, *, reset: bool = False) -> float:

@@ -118,6 +118,7 @@ class GrblSettings:
     homing_debounce_ms: float
     homing_pull_off_mm: float
     spindle_max: float
+    laser_mode: bool
 
     @property
     def step_mm(self) -> float:
@@ -151,6 +152,7 @@ def parse_settings(values: Mapping[int, float]) -> GrblSettings:
         homing_debounce_ms=values[26],
         homing_pull_off_mm=values[27],
         spindle_max=values[30],
+        laser_mode=values[32] != 0,
     )
 
 
@@ -249,7 +251,7 @@ class GrblLine:
         self.fault: str | None = None
         self.offset_mm: float | None = None
         self.asked_s = self.answered_s = -math.inf
-        self._received, self._unacknowledged = bytearray(), 0
+        self._received, self.unacknowledged = bytearray(), 0
         self._serial = _open(port, baud)
         self._guard: Heartbeat | None = None
         self._lit, self._beaten_s = False, -math.inf
@@ -332,12 +334,12 @@ class GrblLine:
         self._refuse_after_fault()
         # A line feed alone: with a carriage return as well Grbl acknowledges twice.
         self._write(line.encode("ascii") + b"\n")
-        self._unacknowledged += 1
+        self.unacknowledged += 1
         deadline, answers = time.monotonic() + timeout_s, []
-        while self._unacknowledged:
+        while self.unacknowledged:
             if watch is not None and time.monotonic() < deadline:
                 watch(self.status())
-                reply = self._next_reply(min(deadline, time.monotonic() + POLL_S)) if self._unacknowledged else None
+                reply = self._next_reply(min(deadline, time.monotonic() + POLL_S)) if self.unacknowledged else None
             else:
                 reply = self._next_reply(deadline)
                 if reply is None:
@@ -347,17 +349,13 @@ class GrblLine:
         return answers
 
     def begin(self, *lines: str) -> None:
-        """Send lines at once and wait for the first to be done only; `end` cuts the others short.
+        """Send lines at once and wait for nothing; `end` cuts them short.
 
         The controller does them by itself, whatever becomes of the computer meanwhile. HardwareError as by `command`.
         """
         self._refuse_after_fault()
-        self._unacknowledged += len(lines)
+        self.unacknowledged += len(lines)
         self._write("".join(f"{line}\n" for line in lines).encode("ascii"))
-        deadline, left = time.monotonic() + ANSWER_S, self._unacknowledged - 1
-        while self._unacknowledged > left:
-            if self._next_reply(deadline) is None:
-                raise self.failed(f"{lines[0]!r} was not done in {ANSWER_S:g} s: the controller hangs or is held")
 
     def end(self) -> None:
         """End what was begun, by Ctrl-X, which also switches the laser off; the position is kept if nothing moves."""
@@ -436,7 +434,7 @@ class GrblLine:
             pass
 
     def _reset(self) -> None:
-        self.fault, self._unacknowledged = None, 0
+        self.fault, self.unacknowledged = None, 0
         self._received.clear()
         self._write(SOFT_RESET)
         self._told_dark()
@@ -517,12 +515,12 @@ class GrblLine:
             self.offset_mm = self.offset_mm if reply.offset_mm is None else reply.offset_mm
             return reply
         match reply.kind:
-            case "ok" | "error" if self._unacknowledged == 0:
+            case "ok" | "error" if self.unacknowledged == 0:
                 raise self.failed(f"{line!r} came although nothing was sent: does another program use the port?")
             case "ok":
-                self._unacknowledged -= 1
+                self.unacknowledged -= 1
             case "error":
-                self._unacknowledged -= 1
+                self.unacknowledged -= 1
                 raise HardwareError(f"the stage on {self.port} refuses: {code_text('error', reply.number)}")
             case "ALARM":
                 raise self.failed(code_text("ALARM", reply.number))

@@ -7,6 +7,7 @@ with the brightest one.
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -133,9 +134,14 @@ def settled_exposure(
 _TRIES = 3
 """Attempts to get an image whose frame was lost on its way."""
 _PATIENCE_S = 3.0
-"""Longest wait for a frame beyond its exposure: several repeats of a lost GigE command."""
-_SPARE_S = 1.0
-"""Time of the commands between switching the laser on and waiting for a frame; then the controller switches it off."""
+"""Longest wait for a frame beyond its exposure, the last part in the dark: several repeats of a lost GigE command."""
+_LIGHT_S = 0.5
+"""Longest light beyond an exposure: what the camera takes to begin it and, as the light usually ends with the frame, to
+send it. The controller ends the light within 0.1 s more, so that a second is kept."""
+_LATENCIES = 8
+"""Frames by which a late one is judged: a few, as the clocks of camera and computer drift apart."""
+_PROMPT_S = 0.1
+"""A camera begins an exposure within this time after its trigger."""
 _RUN_UP_MM = 1.0
 """More than the play of a ball screw or belt."""
 
@@ -160,6 +166,7 @@ class HandSwitchedLaser:
     """In place of a stage where there is none: the operator is asked to switch the laser, and nothing moves."""
 
     limits_mm = (-math.inf, math.inf)
+    lit_until_s = math.inf
     faulty = False
 
     def __init__(self, ask: Callable[[str], object]):
@@ -189,6 +196,9 @@ LaserStage = GrblStage | HandSwitchedLaser
 class Rig:
     """Takes the images of a plan one by one. A switched laser is on while the camera exposes its images, and no longer.
 
+    A frame that comes late is waited for in the dark, and taken where the camera's time stamp says that it was exposed
+    in the light.
+
     ``ahead`` is the direction in which the stage reaches every position, 1 or -1, so that play of the drive does not
     show. ``repeated`` counts images that were asked for again, as their frames were lost or damaged on their way.
     """
@@ -209,6 +219,7 @@ class Rig:
         self._position_mm: float | None = None
         self._read_back_mm = stage.position_mm()
         self._exposure_ms: float | None = None
+        self._latencies_s: deque[float] = deque(maxlen=_LATENCIES)
         self.repeated = 0
 
     def move_to(self, position_mm: float) -> float:
@@ -250,7 +261,7 @@ class Rig:
 
     def _laser(self, on: bool) -> None:
         if (self._stage.laser_power > 0) != on:
-            longest_s = 1e-3 * (self._exposure_ms or 0.0) + _PATIENCE_S + _SPARE_S
+            longest_s = 1e-3 * (self._exposure_ms or 0.0) + _LIGHT_S
             self._stage.laser(on, power=self._plan.laser_power, at_most_s=longest_s)
 
     def _rest(self) -> None:
@@ -283,7 +294,29 @@ class Rig:
     def _one(self) -> GrabbedFrame:
         """Trigger and wait. The laser's guard hears of every step, so that a driver that hangs leaves no laser on."""
         exposure_s = 1e-3 * (self._exposure_ms or 0.0)
+        lit, lit_until_s = self._stage.laser_power > 0, self._stage.lit_until_s
         self._stage.keep_lit(exposure_s)
+        asked_s = time.monotonic()
         self._camera.trigger()
-        # The laser stays on until the frame is there, as a camera may begin its exposure late.
-        return self._camera.grab(_PATIENCE_S + exposure_s, waiting=self._stage.keep_lit)
+
+        def waiting() -> None:
+            if time.monotonic() < lit_until_s:
+                self._stage.keep_lit()
+            else:
+                self._rest()
+
+        frame = self._camera.grab(_PATIENCE_S + exposure_s, waiting=waiting)
+        came_s, known = time.monotonic(), len(self._latencies_s) > 0
+        # Includes the unknown difference of both clocks, which all frames share.
+        self._latencies_s.append(frame.time_s - asked_s)
+        began_s = asked_s + self._latencies_s[-1] - min(self._latencies_s)
+        if not lit or came_s <= lit_until_s:
+            return frame
+        # First of all, as this shows whether the guard, and not the controller's time, has ended the light.
+        self._rest()
+        if not (known and began_s + exposure_s + _PROMPT_S < lit_until_s):
+            raise HardwareError(
+                f"the camera {self._camera.address} gave a frame {came_s - asked_s:.2g} s after its trigger, and the "
+                f"laser was on for {exposure_s + _LIGHT_S:.2g} s: it may have been exposed in the dark"
+            )
+        return frame

@@ -13,6 +13,7 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from twin.devices.grbl_controller import GrblController
 from twin.devices.grbl_firmware import GrblError, parse_block
 from twin.devices.grbl_motion import Axis, Ramp
 from uwlts.errors import HardwareError, RangeError
-from uwlts.hardware.grbl import GrblStage
+from uwlts.hardware.grbl import GrblStage, StageReport
 from uwlts.hardware.grbl_line import Reply, Status, code_text, parse_reply, parse_settings
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -45,6 +46,26 @@ def controller() -> Iterator[GrblController]:
 def stage(controller: GrblController) -> Iterator[GrblStage]:
     """A homed stage. Faults are left to the test; whatever it leaves, the laser is off in the end."""
     with GrblStage(controller.port) as opened:
+        opened.home()
+        yield opened
+        opened._line.fault = opened._line.fault or "test over"
+
+
+REAL = {"boot_s": 0.2, "position_mm": 30.0, "settings": {24: 600, 25: 7200, 110: 7200, 120: 2000}}
+"""For light on the way, whose parts the driver sends in real time: 120 mm/s, reached after 0.06 s."""
+SWEEP = 4800.0
+
+
+@pytest.fixture
+def real() -> Iterator[GrblController]:
+    with GrblController(**REAL) as running:
+        yield running
+
+
+@pytest.fixture
+def sweeping(real: GrblController) -> Iterator[GrblStage]:
+    """A homed stage that moves in real time."""
+    with GrblStage(real.port) as opened:
         opened.home()
         yield opened
         opened._line.fault = opened._line.fault or "test over"
@@ -122,7 +143,7 @@ def test_settings_that_cannot_work_are_refused():
 
 @pytest.mark.parametrize("way_mm", [-200.0, 30.0, 0.5, STEP_MM])
 def test_a_movement_keeps_to_speed_and_acceleration_and_arrives(way_mm):
-    ramp = Ramp(5.0, 5.0 + way_mm, speed=10.0, acceleration=50.0, start_s=2.0)
+    ramp = Ramp(5.0, (5.0 + way_mm,), speed=10.0, acceleration=50.0, start_s=2.0)
     times = np.linspace(2.0, ramp.end_s, 20001)
     positions, speeds = np.array([ramp.at(time_s) for time_s in times]).T
     assert (positions[0], positions[-1]) == (5.0, 5.0 + way_mm)
@@ -138,12 +159,38 @@ def test_a_hold_brakes_and_a_resumption_arrives():
     axis.add(100.0, speed=10.0, time_s=0.0)
     axis.hold(3.0)
     # v^2 / 2a beyond the place where it was asked for.
-    held_mm = Ramp(0.0, 100.0, 10.0, 50.0, 0.0).at(3.0)[0] + 10**2 / (2 * 50)
+    held_mm = Ramp(0.0, (100.0,), 10.0, 50.0, 0.0).at(3.0)[0] + 10**2 / (2 * 50)
     assert axis.braking(3.1) and not axis.braking(3.3)
     assert axis.at(9.0) == (pytest.approx(held_mm), 0.0)
     axis.resume(10.0)
     axis.advance(100.0)
     assert axis.at(100.0) == (100.0, 0.0) and not axis.pending
+
+
+def test_blocks_of_one_direction_are_one_movement():
+    """As one block of the whole way, where each comes before the axis has to brake for the end of the one before."""
+    axis, whole = Axis(acceleration=50.0), Ramp(0.0, (100.0,), 10.0, 50.0, 0.0)
+    axis.add(10.0, speed=10.0, time_s=0.0)
+    for number in range(2, 11):
+        # 9 mm of the block before are left, and braking takes 1 mm.
+        axis.add(10.0 * number, speed=10.0, time_s=number - 1.8)
+        assert axis.pending == 2
+    for time_s in np.linspace(8.3, whole.end_s, 50).tolist():
+        assert axis.at(time_s) == pytest.approx(whole.at(time_s))
+    # Rounding of the times.
+    axis.advance(whole.end_s + 1e-9)
+    assert not axis.pending and axis.at(20.0) == (100.0, 0.0)
+    # One that comes while it brakes has it gain speed again, and its places follow from its speed.
+    axis.add(110.0, speed=10.0, time_s=20.0)
+    late_s = 20.0 + 1.1
+    assert axis.at(late_s)[1] == pytest.approx(5.0)
+    axis.add(120.0, speed=10.0, time_s=late_s)
+    times = np.linspace(late_s, 24.0, 20001)
+    places, speeds = np.array([axis.at(time_s) for time_s in times]).T
+    assert speeds[0] == pytest.approx(5.0) and speeds.max() == 10.0 and (places[-1], speeds[-1]) == (120.0, 0.0)
+    assert np.abs(np.diff(speeds)).max() <= 50 * np.diff(times).max() * (1 + 1e-6)
+    way = np.sum((speeds[1:] + speeds[:-1]) / 2 * np.diff(times))
+    assert way == pytest.approx(120 - places[0], abs=50 * np.diff(times).max() ** 2)
 
 
 # The twin's controller, spoken to directly
@@ -385,18 +432,87 @@ def test_without_homing_positions_count_from_the_start():
 
 
 def test_the_laser_follows_and_its_power_is_a_share(controller, stage):
-    for mode in (1, 0):
-        stage._line.command(f"$32={mode}")
-        stage.laser(True)
-        assert controller.state().power == 1.0
-        stage.move_to(5.0 + mode, feed_mm_per_min=900.0)
-        assert controller.state().laser_on and stage.laser_power == 1.0
-        stage.laser(True, power=0.25)
-        assert controller.state().power == 0.25
-        stage.laser(False)
-        assert not controller.state().laser_on and stage.laser_power == 0.0
+    for power in (1.0, 0.25):
+        stage.laser(True, power=power)
+        assert controller.state().power == power == stage.laser_power
+    with pytest.raises(HardwareError, match="switch it off before moving"):
+        stage.move_to(5.0, feed_mm_per_min=900.0)
+    stage.laser(False)
+    assert not controller.state().laser_on and stage.laser_power == 0.0
+    assert stage.move_to(5.0, feed_mm_per_min=900.0) == 5.0
     with pytest.raises(RangeError, match="power 1.5"):
         stage.laser(True, power=1.5)
+
+
+def test_light_that_is_kept_lasts_and_its_controller_never_has_much_of_it(controller, stage):
+    stage.laser(True)
+    began_s = time.monotonic()
+    while time.monotonic() - began_s < 3.0:
+        time.sleep(0.3)
+        stage.keep_lit()
+    stage.keep_lit()
+    kept_s = time.monotonic()
+    assert controller.state().laser_on
+    assert wait_for(lambda: not controller.state().laser_on, 1.0)
+    lit_s = sum(light.duration_s for light in controller.lights)
+    # Two dwells at most remained, in 8 steps of the controller's 0.05 s each; dark are some ms between two.
+    assert kept_s - began_s - 0.1 < lit_s < kept_s - began_s + 1.0
+
+
+def test_the_laser_is_lit_on_the_way_alone(real, sweeping):
+    seen, reports = [], []
+
+    def report(report: StageReport) -> None:
+        reports.append(report)
+        seen.append(real.state())
+
+    assert sweeping.sweep(300.0, feed_mm_per_min=SWEEP, power=0.5, reported=report) == 300.0
+    assert real.state().position_mm == 300.0 and not real.state().laser_on and sweeping.laser_power == 0.0
+    assert sum(state.power == 0.5 and state.speed_mm_per_s == 80.0 for state in seen) > 10
+    (light,) = real.lights
+    assert light.duration_s == pytest.approx(298 / 80, abs=0.3)
+    # At a constant speed all the way, but for the ramps of 1.6 mm.
+    fast = [each for each in reports if 10 < each.position_mm < 290]
+    speeds = [
+        (b.position_mm - a.position_mm) / (b.answered_s - a.answered_s)
+        for a, b in zip(fast, fast[3:], strict=False)
+        if b.answered_s - b.asked_s < 0.02 and a.answered_s - a.asked_s < 0.02
+    ]
+    assert np.median(speeds) == pytest.approx(80.0, rel=0.02)
+    # Back, and a way shorter than what is sent at once.
+    assert sweeping.sweep(290.0, feed_mm_per_min=SWEEP) == 290.0
+    with pytest.raises(RangeError, match="too fast for a laser that is lit on the way: at most"):
+        sweeping._line.command("$120=100")
+        sweeping.settings = replace(sweeping.settings, acceleration_mm_per_s2=100.0)
+        sweeping.sweep(200.0, feed_mm_per_min=SWEEP)
+
+
+def test_what_is_raised_on_the_way_brakes_the_stage_in_the_dark(real, sweeping):
+    def report(report: StageReport) -> None:
+        if report.position_mm > 60:
+            raise OSError(errno.ENOSPC, "disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        sweeping.sweep(700.0, feed_mm_per_min=SWEEP, reported=report)
+    assert wait_for(lambda: not real.state().laser_on and not real.state().moving, 0.3)
+    assert sweeping.unlock() == pytest.approx(real.state().position_mm, abs=STEP_MM)
+
+
+def test_a_computer_that_is_too_late_for_a_constant_speed_is_an_error(real, sweeping):
+    with pytest.raises(HardwareError, match="slowed down near .* the computer is too busy"):
+        sweeping.sweep(700.0, feed_mm_per_min=SWEEP, reported=lambda report: time.sleep(0.7))
+    assert wait_for(lambda: not real.state().laser_on, 0.3)
+
+
+def test_without_laser_mode_the_laser_is_not_lit():
+    """A hold would keep it lit."""
+    with GrblController(**FAST, settings={32: 0}) as controller, GrblStage(controller.port) as stage:
+        stage.home()
+        with pytest.raises(HardwareError, match=r"laser mode is off .* send \$32=1"):
+            stage.laser(True, at_most_s=0.5)
+        with pytest.raises(HardwareError, match=r"send \$32=1"):
+            stage.sweep(50.0, feed_mm_per_min=900.0)
+        assert not controller.lights
 
 
 def test_a_laser_that_gives_no_light_is_seen_by_the_twin_alone(controller, stage):
@@ -416,7 +532,6 @@ def interrupt_after(seconds: float) -> threading.Timer:
 
 @pytest.mark.parametrize("reset", [True, False])
 def test_an_interrupted_movement_can_be_stopped_without_losing_the_position(controller, stage, reset):
-    stage.laser(True)
     interrupt_after(0.3)
     with pytest.raises(KeyboardInterrupt):
         stage.move_to(700.0, feed_mm_per_min=900.0)
@@ -451,14 +566,14 @@ def test_an_interrupted_movement_can_be_stopped_without_losing_the_position(cont
         (lambda c: c.inject("lose-steps", -80 * 700), "missed steps: the limit switch at 0 mm is pressed", True),
     ],
 )
-def test_a_fault_while_moving_is_named_and_the_laser_is_off(controller, stage, fault, message, recovers):
-    stage.move_to(60.0, feed_mm_per_min=900.0)
-    stage.laser(True)
-    assert controller.state().laser_on
-    timer = threading.Timer(0.15, fault, (controller,))
+def test_a_fault_while_moving_is_named_and_the_laser_is_off(real, sweeping, fault, message, recovers):
+    controller, stage = real, sweeping
+    stage.move_to(60.0, feed_mm_per_min=SWEEP)
+    timer = threading.Timer(0.3, fault, (controller,))
     timer.start()
     with pytest.raises(HardwareError, match=message):
-        stage.move_to(700.0, feed_mm_per_min=900.0)
+        stage.sweep(700.0, feed_mm_per_min=SWEEP)
+    assert controller.lights
     assert wait_for(lambda: not controller.state().laser_on, 0.2)
     assert stage.laser_power == 0.0 and not stage.position_known
     with pytest.raises(HardwareError, match="has stopped after a fault"):
@@ -466,7 +581,7 @@ def test_a_fault_while_moving_is_named_and_the_laser_is_off(controller, stage, f
     stage.laser(False)
     if recovers:
         assert stage.home() == 2.0
-        assert stage.move_to(60.0, feed_mm_per_min=900.0) == 60.0
+        assert stage.move_to(60.0, feed_mm_per_min=SWEEP) == 60.0
         assert controller.state().position_mm == 60.0
 
 
@@ -519,9 +634,8 @@ def later(seconds: float, work: Callable[[], None]) -> threading.Thread:
 BY_HAND = "the laser was switched off by hand: unlock the stage if it stood still, else home it"
 
 
-def test_the_laser_goes_off_by_hand_while_the_stage_moves(controller, stage):
-    stage.move_to(60.0, feed_mm_per_min=900.0)
-    stage.laser(True)
+def test_the_laser_goes_off_by_hand_while_the_stage_moves(real, sweeping):
+    controller, stage = real, sweeping
     dark = []
 
     def press() -> None:
@@ -529,9 +643,9 @@ def test_the_laser_goes_off_by_hand_while_the_stage_moves(controller, stage):
         stage.darken()
         dark.append(wait_for(lambda: not controller.state().laser_on, 0.2))
 
-    pressing = later(0.2, press)
+    pressing = later(0.5, press)
     with pytest.raises(HardwareError, match=BY_HAND):
-        stage.move_to(700.0, feed_mm_per_min=900.0)
+        stage.sweep(700.0, feed_mm_per_min=SWEEP)
     pressing.join()
     assert dark == [True] and not controller.state().moving
     assert stage.faulty and stage.laser_power == 0.0 and not stage.position_known
@@ -654,7 +768,8 @@ LIT = """
         print(stage._line._guard.pid, flush=True)
         {then}
 """
-MOVES = "stage.move_to(740.0, feed_mm_per_min=60.0)"
+MOVES = """stage.laser(False)
+        stage.sweep(740.0, feed_mm_per_min=1200.0)"""
 
 
 def lit_program(controller: GrblController, then: str = MOVES) -> tuple[subprocess.Popen[str], int]:
@@ -673,9 +788,10 @@ def lit_program(controller: GrblController, then: str = MOVES) -> tuple[subproce
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGSEGV])
-def test_the_laser_goes_off_when_the_program_is_ended_while_moving(controller, ending):
+def test_the_laser_goes_off_when_the_program_is_ended_while_moving(real, ending):
+    controller = real
     program, _ = lit_program(controller)
-    assert wait_for(lambda: controller.state().moving)
+    assert wait_for(lambda: controller.state().moving and controller.state().laser_on)
     program.send_signal(ending)
     # The guard wakes at once when its pipe ends; 0.5 s is far beyond its 0.2 s of polling.
     assert wait_for(lambda: not controller.state().laser_on, 0.5)
@@ -693,18 +809,14 @@ def test_the_laser_goes_off_however_the_program_leaves(controller, then):
 
 
 @pytest.mark.parametrize("gated", [True, False])
-def test_without_the_guard_only_the_interlock_saves_a_killed_program(gated):
+def test_without_the_guard_the_interlock_and_else_the_controller_end_the_light(gated):
     with GrblController(**FAST, gated=gated) as controller:
-        program, guard = lit_program(controller)
+        program, guard = lit_program(controller, then="sys.stdin.readline()")
         os.kill(guard, signal.SIGKILL)
         program.kill()
         program.communicate(timeout=10)
         assert wait_for(lambda: not controller.state().port_open)
-        assert controller.state().laser_on is not gated
-        # The next opening restarts the controller, as on the Uno.
-        again = os.open(controller.port, os.O_RDWR | os.O_NOCTTY)
-        assert wait_for(lambda: not controller.state().laser_on)
-        os.close(again)
+        assert wait_for(lambda: not controller.state().laser_on, 0.0 if gated else 1.0)
 
 
 def test_the_laser_is_not_lit_without_its_guard(controller, stage):
@@ -715,7 +827,7 @@ def test_the_laser_is_not_lit_without_its_guard(controller, stage):
 
 
 def test_a_program_that_stands_still_loses_its_laser_and_can_go_on_after_homing(controller, stage):
-    stage.laser(True)
+    stage.laser(True, at_most_s=5.0)
     stage.keep_lit(0.6)
     time.sleep(1.2)
     assert controller.state().laser_on
@@ -725,9 +837,6 @@ def test_a_program_that_stands_still_loses_its_laser_and_can_go_on_after_homing(
     assert stage.faulty and stage.laser_power == 0.0
     stage.home()
     stage.laser(True)
-    # A movement is heard of.
-    stage.move_to(60.0, feed_mm_per_min=1.0 * 60)
-    assert controller.state().laser_on
     stage.laser(False)
     assert not controller.state().laser_on
 
@@ -741,11 +850,15 @@ def test_the_controller_ends_a_laser_with_a_time_by_itself(controller, stage):
     assert stage.position_known and stage.move_to(61.0, feed_mm_per_min=900.0) == 61.0
     stage.laser(True, at_most_s=0.3)
     stage.keep_lit(2.0)
-    assert wait_for(lambda: not controller.state().laser_on, 0.5)
-    # What was exposed meanwhile may be dark.
-    with pytest.raises(HardwareError, match="its time is over"):
+    lit_until_s = stage.lit_until_s
+    assert wait_for(lambda: not controller.state().laser_on, 0.5) and time.monotonic() > lit_until_s
+    stage.laser(False)
+    assert stage.position_known and stage.move_to(60.0, feed_mm_per_min=900.0) == 60.0
+    # Light that ends before its time is an error: what was exposed meanwhile may be dark.
+    stage.laser(True, at_most_s=5.0)
+    os.write(stage._line._serial.fileno(), b"\x18")
+    with pytest.raises(HardwareError, match="does not follow|restarted"):
         stage.laser(False)
-    assert stage.unlock() == 61.0
 
 
 def test_a_hold_while_the_laser_is_on_is_not_hidden_by_switching_it_off(controller, stage):
