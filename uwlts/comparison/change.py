@@ -36,7 +36,6 @@ _DEEP = 3.0
 _AREA_NEIGHBOURS = 12
 _FEWEST_OF_REGION = 4
 """Places of a region that is listed; discs of neighbouring places overlap, so that chance also makes pairs."""
-_MOST_REGIONS = 20
 
 
 @dataclass(frozen=True)
@@ -75,6 +74,8 @@ class SurfaceChange:
         Level of detection: 1.96 times the standard uncertainty of the distance.
     area_mm2 : (P,) float64
         Area of the surface that each place stands for.
+    apart_mm : float
+        Distance of the places from each other, about.
     disc_mm, deep_mm : float
         Diameter of the disc of which points are averaged, and how far along the normal they are looked for.
     registration : Registration or None
@@ -87,6 +88,7 @@ class SurfaceChange:
     distance_mm: np.ndarray
     level_mm: np.ndarray
     area_mm2: np.ndarray
+    apart_mm: float
     disc_mm: float
     deep_mm: float
     registration: Registration | None
@@ -103,19 +105,19 @@ class SurfaceChange:
         return np.abs(self.distance_mm) > self.level_mm
 
     def regions(self) -> list[ChangedRegion]:
-        """Regions of significant change of at least four places, the largest volumes first, at most twenty."""
+        """Regions of significant change of at least four places, the largest volumes first."""
         found = []
         for sign in (-1, 1):
             chosen = np.flatnonzero(self.significant & (np.sign(self.distance_mm) == sign))
             if not len(chosen):
                 continue
-            # Places stand about half a disc apart.
-            pairs = KDTree(self.points_mm[chosen]).query_pairs(self.disc_mm, output_type="ndarray")
+            # One place in each cube: those of neighbouring cubes are up to about two sides apart.
+            pairs = KDTree(self.points_mm[chosen]).query_pairs(2 * self.apart_mm, output_type="ndarray")
             links = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(chosen),) * 2)
             owner = connected_components(links, directed=False)[1]
             for number in np.flatnonzero(np.bincount(owner) >= _FEWEST_OF_REGION):
                 found.append(self._region(chosen[owner == number]))
-        return sorted(found, key=lambda region: -abs(region.volume_mm3))[:_MOST_REGIONS]
+        return sorted(found, key=lambda region: -abs(region.volume_mm3))
 
     def _region(self, own: np.ndarray) -> ChangedRegion:
         distance, area, points = self.distance_mm[own], self.area_mm2[own], self.points_mm[own]
@@ -149,6 +151,7 @@ class SurfaceChange:
             "level_median_mm": float(np.median(level)) if len(distance) else None,
             "largest_rise_mm": float(max(changed.max(initial=0.0), 0.0)),
             "largest_loss_mm": float(min(changed.min(initial=0.0), 0.0)),
+            "apart_mm": self.apart_mm,
             "disc_mm": self.disc_mm,
             "deep_mm": self.deep_mm,
             "regions": [region.record() for region in self.regions()],
@@ -166,7 +169,7 @@ class SurfaceChange:
 
     def lines(self) -> list[str]:
         """The summary as text."""
-        known = self.record()
+        known, regions = self.record(), self.regions()
         if not known["compared"]:
             return ["the cloud and the reference do not overlap anywhere"]
         lines = [
@@ -176,6 +179,8 @@ class SurfaceChange:
             f"level of detection, mm    {known['level_median_mm']:.4f} (median; 95 %)",
             f"significant change        {100 * float(str(known['significant_share'])):.1f} % of the area, "
             f"{known['largest_loss_mm']:+.3f} to {known['largest_rise_mm']:+.3f} mm",
+            f"regions of change          {len(regions)}, of {_FEWEST_OF_REGION} places or more, {self.apart_mm:.3g} mm "
+            f"apart; {np.count_nonzero(self.significant) - sum(each.places for each in regions)} places are in none",
         ]
         if (found := self.registration) is not None:
             before = np.linalg.inv(found.transform) @ np.append(found.middle_mm, 1)
@@ -277,15 +282,28 @@ def compare_clouds(
         )
     level, area = TWO_SIDED * np.sqrt(variance), _areas(sides.places)
     return SurfaceChange(
-        sides.places, sides.normals, sides.distance_mm, level, area, disc, deep, sides.moved, sides.reference
+        sides.places,
+        sides.normals,
+        sides.distance_mm,
+        level,
+        area,
+        sides.apart_mm,
+        disc,
+        deep,
+        sides.moved,
+        sides.reference,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Sides:
-    """Distances (P,) at places and their variance without that of the estimate; ``moved`` if it moved the cloud."""
+    """Distances (P,) at places that are ``apart_mm``, and their variance without that of the estimate.
+
+    ``moved`` is the registration if it moved the cloud.
+    """
 
     places: np.ndarray
+    apart_mm: float
     normals: np.ndarray
     distance_mm: np.ndarray
     variance_mm2: np.ndarray
@@ -315,7 +333,8 @@ def _against_points(
             # The cloud follows what the reference's points share.
             followed = [found.moves_mm(step, target) for step in found.by_reference]
             other = replace(other, patterns_mm=other.patterns_mm - np.array(followed, np.float32))
-    places = points[_spread(points, disc / 2)]
+    chosen, apart = _spread(points, disc / 2)
+    places = points[chosen]
     normals = local_normals(places, surface.points_mm, disc_mm=disc, given=surface.normals)
     here = local_means(places, normals, points, uncertainty=known, frame=new.frame, disc_mm=disc, deep_mm=deep)
     there = local_means(
@@ -327,7 +346,7 @@ def _against_points(
     if known is not None and other is not None:
         variance -= 2 * _common(here.patterns_mm, known, there.patterns_mm, other, same_water=same_water)
     words = "mesh" if surface.meshed else "cloud"
-    return _Sides(places, normals, here.mean_mm - there.mean_mm, variance, found, found, words)
+    return _Sides(places, apart, normals, here.mean_mm - there.mean_mm, variance, found, found, words)
 
 
 def _against_shape(
@@ -353,7 +372,8 @@ def _against_shape(
             points, placed, reach_mm=deep, uncertainty=known, frame=new.frame, datums=datums
         )
         points, known = _moved(points, known, found)
-    places = points[_spread(points, disc / 2)]
+    spread, apart = _spread(points, disc / 2)
+    places = points[spread]
     here: LocalMeans = local_means(
         places,
         normals := placed.nearest(places).normals,
@@ -365,7 +385,7 @@ def _against_shape(
         deep_mm=deep,
     )
     variance = here.variance_mm2 + np.sum(here.patterns_mm**2, axis=1)
-    return _Sides(places, normals, here.mean_mm, variance, found, moved, placed.words())
+    return _Sides(places, apart, normals, here.mean_mm, variance, found, moved, placed.words())
 
 
 def _common(
@@ -388,11 +408,15 @@ def _areas(places: np.ndarray) -> np.ndarray:
     return np.pi * away**2 / (count + 0.5)
 
 
-def _spread(points: np.ndarray, apart: float) -> np.ndarray:
-    """Indices of one point in each cube of a size, thinned to `_MOST_PLACES`."""
-    cells = np.floor((points - points.min(axis=0)) / apart).astype(np.int64)
-    first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
-    return first[:: -(-len(first) // _MOST_PLACES)]
+def _spread(points: np.ndarray, apart: float) -> tuple[np.ndarray, float]:
+    """Indices of one point in each cube of a size, and that size, larger where there would be too many places."""
+    while True:
+        cells = np.floor((points - points.min(axis=0)) / apart).astype(np.int64)
+        first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
+        if len(first) <= _MOST_PLACES:
+            return first, apart
+        # The number of cubes that a surface meets goes with the square of their size.
+        apart *= max(np.sqrt(len(first) / _MOST_PLACES), 1.02)
 
 
 def _matrices(pairs: np.ndarray) -> np.ndarray:

@@ -253,11 +253,16 @@ def _refined_cylinder(
 
 
 def _frame(axis: np.ndarray) -> np.ndarray:
-    """Right-handed unit directions (u, v, axis) in rows; the largest component of the axis becomes positive."""
+    """Right-handed unit directions (u, v, axis) in rows; the largest component of the axis becomes positive.
+
+    The first is square to the coordinate axis that follows the largest component's, so that noise of an axis along a
+    coordinate axis does not turn it.
+    """
     axis = axis / np.linalg.norm(axis)
-    if axis[np.argmax(np.abs(axis))] < 0:
+    largest = int(np.argmax(np.abs(axis)))
+    if axis[largest] < 0:
         axis = -axis
-    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    first = np.cross(axis, np.eye(3)[(largest + 1) % 3])
     first /= np.linalg.norm(first)
     return np.array([first, np.cross(axis, first), axis])
 

@@ -84,11 +84,24 @@ class Indication:
 
 
 @dataclass(frozen=True, eq=False)
+class Unresolved:
+    """A significant departure whose region was not found: the nearest point, its signed height, and why."""
+
+    point: int
+    height_mm: float
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
 class BlemishSearch:
-    """Indications, the outliers (N,) bool, the points (N,) bool that belong to no indication, and for each point the
-    depth from which the smallest size counts (``level_mm``) and the effective noise of one point (``noise_mm``)."""
+    """Indications, and significant departures that became none.
+
+    ``outliers`` (N,) bool are outliers, ``plain`` (N,) bool the points that are none and belong to no indication.
+    ``level_mm`` (N,) is the depth from which the smallest size counts, ``noise_mm`` (N,) a point's effective noise.
+    """
 
     indications: tuple[Indication, ...]
+    unresolved: tuple[Unresolved, ...]
     outliers: np.ndarray
     plain: np.ndarray
     level_mm: np.ndarray
@@ -113,10 +126,10 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float) -> Blemish
     area = float(np.prod(np.ptp(places, axis=0)))
     smallest = max(smallest, _CELLS_PER_RADIUS * float(np.sqrt(area / _MOST_CELLS)))
     radii = smallest * _RATIO ** np.arange(1 + max(0, int(np.log(largest / smallest) / np.log(_RATIO))))
-    plain, found = ~outliers, []
+    plain, found, unresolved = ~outliers, [], []
     maps: list[_Map] = []
     threshold = np.inf
-    for _ in range(_ROUNDS):
+    for number in range(_ROUNDS + 1):
         maps = [_matched(surface, plain, radius) for radius in radii]
         maps = [each for each in maps if each.area_mm2 > 0]
         if not maps:
@@ -126,15 +139,21 @@ def search_blemishes(surface: UnrolledSurface, *, false_alarm: float) -> Blemish
         if not peaks:
             break
         for peak in peaks:
-            indication = _indication(surface, plain, tree, maps, peak, smallest)
-            if indication is not None:
-                found.append(indication)
-                plain[indication.points] = False
+            try:
+                if number == _ROUNDS:
+                    raise EvaluationError(f"{_ROUNDS} rounds of the search did not come to an end there")
+                found.append(_indication(surface, plain, tree, maps, peak, smallest))
+                points = found[-1].points
+            except EvaluationError as error:
+                unresolved.append(Unresolved(int(tree.query(peak.place)[1]), peak.height, str(error)))
+                points = tree.query_ball_point(peak.place, peak.radius)
+            plain[points] = False
     level, noise = np.full(len(places), np.nan), np.full(len(places), np.nan)
     if maps:
         level = threshold * maps[0].level_at(places)
         noise = maps[0].noise_at(places)
-    return BlemishSearch(tuple(found), outliers, plain, level, noise, smallest, false_alarm)
+    known = tuple(found), tuple(unresolved), outliers, plain, level, noise
+    return BlemishSearch(*known, smallest, false_alarm)
 
 
 def _isolated(surface: UnrolledSurface, tree: KDTree) -> np.ndarray:
@@ -344,34 +363,35 @@ def _chosen(maps: Sequence[_Map], threshold: float) -> list[_Peak]:
 
 def _indication(
     surface: UnrolledSurface, plain: np.ndarray, tree: KDTree, maps: Sequence[_Map], peak: _Peak, smallest: float
-) -> Indication | None:
-    """A peak with its region: cells about it that depart from the surroundings in the same direction."""
+) -> Indication:
+    """A peak with its region: cells about it that depart from the surroundings in the same direction.
+
+    EvaluationError where too few points are in the region or around it.
+    """
     noise, reach, points = float(maps[0].noise_at(peak.place[None])[0]), 3.0 * peak.radius, np.zeros(0, int)
     for _ in range(_GROWN):
         near = np.array(tree.query_ball_point(peak.place, reach), int)
         near = near[plain[near]]
         places, heights = surface.places[near] - peak.place, surface.heights[near]
-        found = _region(places, heights, peak, noise=noise, reach=reach, step=max(smallest, peak.radius / 4))
-        if found is None:
-            return None
-        points, cut = near[found[0]], found[1]
+        inside, cut = _region(places, heights, peak, noise=noise, reach=reach, step=max(smallest, peak.radius / 4))
+        points = near[inside]
         if not cut:
             break
         reach *= _GROWTH
     if len(points) < _FEWEST:
-        return None
+        raise EvaluationError(f"it has {len(points)} points of its own; {_FEWEST} are needed")
     chance = min(1.0, sum(each.false_alarms(peak.z) for each in maps))
     return Indication(peak.place, peak.radius, peak.height, peak.z, chance, noise, points)
 
 
 def _region(
     places: np.ndarray, heights: np.ndarray, peak: _Peak, *, noise: float, reach: float, step: float
-) -> tuple[np.ndarray, bool] | None:
-    """Points (n,) bool of a peak at the origin, and whether its region reaches the window's edge; None for too few."""
+) -> tuple[np.ndarray, bool]:
+    """Points (n,) bool of a peak at the origin, and whether its region reaches the window's edge."""
     away = np.hypot(*places.T)
     ring = away > 0.5 * reach
     if np.count_nonzero(ring) < 2 * _FEWEST:
-        return None
+        raise EvaluationError(f"{np.count_nonzero(ring)} undamaged points are around it; {2 * _FEWEST} are needed")
     base = np.column_stack([np.ones(len(places)), places])
     left = heights - base @ _robust_plane(base[ring], heights[ring])
     side = int(np.ceil(2 * reach / step)) + 1

@@ -72,12 +72,9 @@ def measure_blemish(
     *,
     diameter_mm: float,
     wall_mm: float | None = None,
-) -> Blemish | None:
-    """Values of an indication, or None where too few points lie around it for an undamaged surface."""
-    try:
-        field = _Field.about(surface, search, indication)
-    except EvaluationError:
-        return None
+) -> Blemish:
+    """Values of an indication. EvaluationError where too few points lie around it for an undamaged surface."""
+    field = _Field.about(surface, search, indication)
     sign = float(np.sign(indication.height_mm))
     heights = sign * surface.heights[field.near]
     depths = field.depths(heights)
@@ -197,7 +194,7 @@ class _Field:
         around = np.flatnonzero(inside & search.plain)
         around = around[KDTree(own).query(surface.places[around])[0] <= reach]
         if len(around) < _FEWEST:
-            raise EvaluationError("too few points around")
+            raise EvaluationError(f"{len(around)} undamaged points are around it; {_FEWEST} are needed")
         near = np.concatenate([indication.points, around])
         middle = 0.5 * (low + high)
         places, heights = surface.places[near] - middle, surface.heights[near]

@@ -6,6 +6,7 @@ has left to the last point on a face, and are known to half a point's spacing.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -42,6 +43,8 @@ stripe end up to about a line beyond the edge."""
 _WHOLE_LINES = range(5, 12)
 """Lines from an edge whose brightness is that of the face."""
 _FEWEST_EDGES = 8
+_FEWEST_IMAGES = 2
+"""Images in which the lines of a hole are missing, from which it counts as one; in a single image lines are lost."""
 _ROUND_SHARE = 0.08
 """Of a hole's radius: scatter of its edge from which it is none."""
 _HOLE_ARC = 200.0
@@ -102,14 +105,27 @@ def inspect_flange(cloud: PointCloud, *, datum: PointCloud | None = None) -> Ins
     face = _face_of(cloud, on_face)
     used = on_face
     values = [_flatness(cloud, face, used)]
-    holes = [hole for edges in _gaps(cloud, face, used) if (hole := _hole(cloud, face, edges)) is not None]
-    features = []
+    holes, features, notes = [], [], []
+    for edges in _gaps(cloud, face, used):
+        try:
+            holes.append(_hole(edges))
+        except EvaluationError as error:
+            if len(np.unique(edges.frame)) >= _FEWEST_IMAGES:
+                notes.append(_left_out(face, edges.places.mean(axis=0), str(error)))
     if holes:
         largest = max(holes, key=lambda hole: hole.radius_mm)
         bolts = [hole for hole in holes if hole is not largest]
         if bolts:
             usual = float(np.median([hole.radius_mm for hole in bolts]))
-            bolts = [hole for hole in bolts if abs(hole.radius_mm - usual) < _SAME_SHARE * usual]
+            same = [abs(hole.radius_mm - usual) < _SAME_SHARE * usual for hole in bolts]
+            notes += [
+                _left_out(
+                    face, hole.middle, f"its diameter is {2 * hole.radius_mm:.4g} mm, the others' {2 * usual:.4g}"
+                )
+                for hole, alike in zip(bolts, same, strict=True)
+                if not alike
+            ]
+            bolts = [hole for hole, alike in zip(bolts, same, strict=True) if alike]
         if largest.radius_mm < 1.5 * max((hole.radius_mm for hole in bolts), default=0.0):
             bolts = holes
         else:
@@ -124,7 +140,7 @@ def inspect_flange(cloud: PointCloud, *, datum: PointCloud | None = None) -> Ins
         values.append(_parallelism(cloud, face, used, datum))
     extent = np.append(np.ptp((cloud.points_mm[used] - face.point_mm) @ face.axes[:2].T, axis=0), values[0].value)
     whole = Feature(FeatureKind.FLANGE, "flange", tuple(values), face.point_mm, face.axes, extent, used)
-    return _inspection("flange", cloud, (whole, *features), [(used, face)])
+    return _inspection("flange", cloud, (whole, *features), [(used, face)], notes)
 
 
 def inspect_gap(cloud: PointCloud) -> Inspection:
@@ -185,7 +201,12 @@ def inspect_gap(cloud: PointCloud) -> Inspection:
     axes = np.vstack([turn @ face.axes[:2], face.axes[2]])
     extent = np.array([float(np.ptp((edges.places - middle) @ along)), abs(float(width)), values[-1].value])
     feature = Feature(kind, "gap", tuple(values), place, axes, extent, edges.points)
-    return _inspection("gap", cloud, (feature,), [])
+    notes = [
+        _left_out(face, each.places.mean(axis=0), f"{number} profiles cross it, fewer than the gap")
+        for each in found
+        if each is not edges and (number := len(np.unique(each.frame))) >= _FEWEST_IMAGES
+    ]
+    return _inspection("gap", cloud, (feature,), [], notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,15 +316,24 @@ def _angle(kind: FeatureKind, slopes: np.ndarray, random: np.ndarray, common: np
 
 
 def _inspection(
-    kind: str, cloud: PointCloud, features: tuple[Feature, ...], faces: list[tuple[np.ndarray, _Face]]
+    kind: str,
+    cloud: PointCloud,
+    features: tuple[Feature, ...],
+    faces: list[tuple[np.ndarray, _Face]],
+    notes: Sequence[str] = (),
 ) -> Inspection:
     deviation = np.full(len(cloud), np.nan)
     for own, face in faces:
         deviation[own] = face.residuals_mm
-    notes = ()
     if cloud.uncertainty is None:
-        notes = ("the cloud states no uncertainty: intervals are of the scatter of its points alone",)
-    return Inspection(kind, features, deviation, np.full(len(cloud), np.nan), notes)
+        notes = "the cloud states no uncertainty: intervals are of the scatter of its points alone", *notes
+    return Inspection(kind, features, deviation, np.full(len(cloud), np.nan), tuple(notes))
+
+
+def _left_out(face: _Face, place: np.ndarray, reason: str) -> str:
+    """Note on a hole at a place (2,) of a face that is not listed."""
+    x, y, z = face.point_mm + place @ face.axes[:2]
+    return f"a hole at ({x:.1f}, {y:.1f}, {z:.1f}) mm is not listed: {reason}"
 
 
 def _flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> FeatureValue:
@@ -415,10 +445,10 @@ def _beyond_last(cloud: PointCloud, own: np.ndarray, row: np.ndarray, face: _Fac
     return result
 
 
-def _hole(cloud: PointCloud, face: _Face, edges: _Edges) -> _Hole | None:
-    """A round hole by least squares of its edge, or None where the edge is not round or not seen all around."""
+def _hole(edges: _Edges) -> _Hole:
+    """A round hole by least squares of its edge. EvaluationError where that is not round or not seen all around."""
     if len(edges.places) < _FEWEST_EDGES:
-        return None
+        raise EvaluationError(f"its edge has {len(edges.places)} points; at least {_FEWEST_EDGES} are needed")
     solved = _circle(edges.places)
     away = edges.places - solved[:2]
     distance = np.linalg.norm(away, axis=1)
@@ -426,8 +456,10 @@ def _hole(cloud: PointCloud, face: _Face, edges: _Edges) -> _Hole | None:
     angle = np.sort(np.degrees(np.arctan2(away[:, 1], away[:, 0])))
     seen = 360 - float(np.max(np.diff(np.append(angle, angle[0] + 360))))
     scatter = float(np.sqrt(np.sum(left**2) / (len(left) - 3)))
-    if scatter > max(_ROUND_SHARE * solved[2], 1.5 * edges.spacing) or seen < _HOLE_ARC:
-        return None
+    if scatter > (limit := max(_ROUND_SHARE * solved[2], 1.5 * edges.spacing)):
+        raise EvaluationError(f"it is not round: its edge is off a circle by {scatter:.2g} mm, more than {limit:.2g}")
+    if seen < _HOLE_ARC:
+        raise EvaluationError(f"{seen:.0f} deg of its edge were seen; {_HOLE_ARC:.0f} are needed")
     rows = np.linalg.pinv(np.column_stack([away / distance[:, None], np.ones(len(left))]))
     random = max(scatter, edges.spacing * _EDGE_STD) ** 2 * rows @ rows.T
     moved = None

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import MAD_TO_STD
 from uwlts.fitting.point_spacing import footprint_on
-from uwlts.inspection.blemish_search import BlemishSearch, UnrolledSurface, search_blemishes
+from uwlts.inspection.blemish_search import BlemishSearch, Indication, UnrolledSurface, search_blemishes
 from uwlts.inspection.blemishes import Blemish, measure_blemish
 from uwlts.inspection.features import Feature, FeatureKind, Inspection
-from uwlts.inspection.pipe_form import LARGEST_OVALITY, MOST_OFF_SHARE, PipeForm, fit_pipe, pipe_features
+from uwlts.inspection.pipe_form import LARGEST_OVALITY, MOST_OFF_SHARE, PipeForm, fit_pipe, pipe_features, refit_pipe
 from uwlts.inspection.propagation import normal_errors
 from uwlts.storage.cloud import PointCloud
 
-_OPEN, _OVERLAP = 0.05, 0.3
-"""Radians without a point that part the two sides of a pipe, and by which they overlap where nothing parts them."""
+_OVERLAP, _SEARCHED = 0.6, 0.1
+"""Radians by which both sides of a pipe that is cut open overlap, unless as many without a point part them; and by
+which findings count beyond the cut. Farther beyond it points are surroundings alone: findings there have less of these
+than on the other side, where they are found, too."""
 _FEWEST = 500
 """Points from which a pipe's surface can be searched."""
 
@@ -75,98 +77,127 @@ def inspect_pipe(
     if len(cloud) < _FEWEST:
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST} are needed for a pipe")
     form = fit_pipe(cloud, largest_ovality=largest_ovality)
-    # Farther off lies what is not the pipe.
-    seam = _cut_open(form, np.flatnonzero(np.abs(form.distance_mm) < MOST_OFF_SHARE * form.radius_mm))
-    chosen, surface = seam.points, _unrolled(cloud, form, seam)
-    search = search_blemishes(surface, false_alarm=false_alarm)
+    chosen = np.flatnonzero(np.abs(form.distance_mm) < MOST_OFF_SHARE * form.radius_mm)
+    off = _off_notes(form, chosen)
+    search = _searched(cloud, form, chosen, false_alarm)
     if search.indications:
         # Once more without what was found, which pulls the form towards it.
         damaged = np.ones(len(cloud), bool)
         damaged[chosen[search.plain]] = False
-        form = fit_pipe(cloud, left_out=damaged, largest_ovality=largest_ovality)
-        surface = _unrolled(cloud, form, seam)
-    features = pipe_features(cloud, form, section_mm=section_mm)
-    features += _blemish_features(cloud, form, surface, search, seam, wall_mm)
+        form = refit_pipe(cloud, form, left_out=damaged)
+    features, of_sections = pipe_features(cloud, form, section_mm=section_mm)
+    blemishes, of_blemishes = _blemish_features(cloud, form, chosen, search, wall_mm)
     deviation, level = np.full(len(cloud), np.nan), np.full(len(cloud), np.nan)
     deviation[chosen[~search.outliers]] = form.distance_mm[chosen[~search.outliers]]
     level[chosen] = search.level_mm
-    return Inspection("pipe", tuple(features), deviation, level, _notes(cloud, form, search, false_alarm))
+    notes = *_notes(cloud, form, search), *off, *of_sections, *of_blemishes
+    return Inspection("pipe", (*features, *blemishes), deviation, level, notes)
 
 
-@dataclass(frozen=True, eq=False)
-class _Seam:
-    """Where the pipe is cut open: an angle, and the points (M,) with their angles from there.
-
-    Of a pipe that was seen all around, those near the cut appear on both sides; ``end`` is the angle from which they
-    are the second ones.
-    """
-
-    cut: float
-    points: np.ndarray
-    angle: np.ndarray
-    end: float
-
-
-def _cut_open(form: PipeForm, chosen: np.ndarray) -> _Seam:
-    """Cut in the middle of the widest range of angles without a point, or anywhere with both sides overlapping."""
-    inside = np.sort(np.unique(np.round(form.angle[chosen], 3)))
+def _searched(cloud: PointCloud, form: PipeForm, chosen: np.ndarray, false_alarm: float) -> BlemishSearch:
+    """Search the pipe, cut open where it was not seen or, if it was seen all around, with both sides overlapping."""
+    angle = form.angle[chosen]
+    inside = np.sort(np.unique(np.round(angle, 3)))
     gaps = np.diff(np.append(inside, inside[0] + 2 * np.pi))
     widest = int(np.argmax(gaps))
-    cut = float(inside[widest] + 0.5 * gaps[widest])
-    angle = np.mod(form.angle[chosen] - cut, 2 * np.pi)
-    if gaps[widest] > _OPEN:
-        return _Seam(cut, chosen, angle, 2 * np.pi)
-    first, last = angle < _OVERLAP, angle > 2 * np.pi - _OVERLAP
-    points = np.concatenate([chosen, chosen[first], chosen[last]])
-    angle = np.concatenate([angle, angle[first] + 2 * np.pi, angle[last] - 2 * np.pi])
-    return _Seam(cut, points, angle, 2 * np.pi)
+    angle = np.mod(angle - inside[widest] - 0.5 * gaps[widest], 2 * np.pi)
+    copied = np.arange(len(chosen))
+    if gaps[widest] < _OVERLAP:
+        first, last = np.flatnonzero(angle < _OVERLAP), np.flatnonzero(angle > 2 * np.pi - _OVERLAP)
+        copied = np.concatenate([copied, first, last])
+        angle = np.concatenate([angle, angle[first] + 2 * np.pi, angle[last] - 2 * np.pi])
+    surface = _unrolled(cloud, form, chosen[copied], angle)
+    search = search_blemishes(surface, false_alarm=false_alarm)
+    beyond = np.abs(surface.places[:, 1] / form.radius_mm - np.pi) - np.pi
+    found = [each for each in search.indications if np.median(beyond[each.points]) <= _SEARCHED]
+    unresolved = tuple(
+        replace(each, point=int(copied[each.point])) for each in search.unresolved if beyond[each.point] <= _SEARCHED
+    )
+    return _joined(replace(search, indications=tuple(found), unresolved=unresolved), copied, len(chosen))
 
 
-def _unrolled(cloud: PointCloud, form: PipeForm, seam: _Seam) -> UnrolledSurface:
-    """The surface of the points of a seam."""
-    angle = form.angle[seam.points] - seam.cut
-    # The form may have moved a little since it was cut open.
-    angle = angle + 2 * np.pi * np.round((seam.angle - angle) / (2 * np.pi))
-    errors = normal_errors(cloud, seam.points, form.outwards[seam.points])
-    heights = form.distance_mm[seam.points]
+def _joined(search: BlemishSearch, copied: np.ndarray, count: int) -> BlemishSearch:
+    """A search of copies of points, those ``copied`` (N,) of (M,), the first of them in order, as one of the points.
+
+    What was found on both sides of the cut is one indication: of the same sign, with half of its points in common.
+    """
+    joined: list[Indication] = []
+    for indication in sorted(search.indications, key=lambda each: len(each.points), reverse=True):
+        own = replace(indication, points=np.unique(copied[indication.points]))
+        for number, other in enumerate(joined):
+            shared = np.count_nonzero(np.isin(own.points, other.points, assume_unique=True))
+            if own.height_mm * other.height_mm > 0 and shared > 0.5 * len(own.points):
+                joined[number] = replace(other, points=np.union1d(own.points, other.points))
+                break
+        else:
+            joined.append(own)
+    plain = search.plain[:count].copy()
+    for indication in joined:
+        plain[indication.points] = False
+    return replace(
+        search,
+        indications=tuple(joined),
+        outliers=search.outliers[:count],
+        plain=plain,
+        level_mm=search.level_mm[:count],
+        noise_mm=search.noise_mm[:count],
+    )
+
+
+def _unrolled(cloud: PointCloud, form: PipeForm, chosen: np.ndarray, angle: np.ndarray) -> UnrolledSurface:
+    """The surface of the chosen points (M,), unrolled by angles (M,), which may count from anywhere."""
+    errors = normal_errors(cloud, chosen, form.outwards[chosen])
+    heights = form.distance_mm[chosen]
     spread = max(MAD_TO_STD * float(np.median(np.abs(heights - np.median(heights)))), 1e-9)
     std = errors.single_mm if np.all(errors.single_mm > 0) else np.full(len(heights), spread)
-    axis = np.broadcast_to(form.axes[2], (len(seam.points), 3))
-    tangents = np.stack([axis, np.cross(axis, form.outwards[seam.points])], axis=1)
-    places = np.column_stack([form.along_mm[seam.points], form.radius_mm * angle])
-    return UnrolledSurface(places, heights, std, *footprint_on(cloud, seam.points, tangents))
+    axis = np.broadcast_to(form.frame.axes[2], (len(chosen), 3))
+    tangents = np.stack([axis, np.cross(axis, form.outwards[chosen])], axis=1)
+    places = np.column_stack([form.along_mm[chosen], form.radius_mm * angle])
+    return UnrolledSurface(places, heights, std, *footprint_on(cloud, chosen, tangents))
 
 
 def _blemish_features(
-    cloud: PointCloud,
-    form: PipeForm,
-    surface: UnrolledSurface,
-    search: BlemishSearch,
-    seam: _Seam,
-    wall_mm: float | None,
-) -> list[Feature]:
-    chosen = seam.points
+    cloud: PointCloud, form: PipeForm, chosen: np.ndarray, search: BlemishSearch, wall_mm: float | None
+) -> tuple[list[Feature], list[str]]:
+    """What was found, as features, and a note for each that became none."""
     errors = normal_errors(cloud, chosen, form.outwards[chosen])
-    measured: list[tuple[Blemish, float]] = []
+    flat = _unrolled(cloud, form, chosen, form.angle[chosen])
+    measured: list[tuple[Blemish, float, float]] = []
+    notes = [_left_out(cloud, chosen[[each.point]], each.height_mm, each.reason) for each in search.unresolved]
     for indication in search.indications:
-        blemish = measure_blemish(surface, search, indication, errors, diameter_mm=2 * form.radius_mm, wall_mm=wall_mm)
-        if blemish is not None and 0 <= blemish.place[1] / form.radius_mm < seam.end:
-            measured.append((blemish, indication.false_alarm))
+        # Unrolled about itself, so that it is never cut.
+        middle = float(np.angle(np.mean(np.exp(1j * form.angle[chosen[indication.points]]))))
+        angle = np.mod(form.angle[chosen] - middle + np.pi, 2 * np.pi) - np.pi
+        surface = replace(flat, places=np.column_stack([flat.places[:, 0], form.radius_mm * angle]))
+        try:
+            blemish = measure_blemish(
+                surface, search, indication, errors, diameter_mm=2 * form.radius_mm, wall_mm=wall_mm
+            )
+            if (size := blemish.values[0]).low <= 0:
+                raise EvaluationError(f"over its surroundings it is not significant: {size.text()}")
+        except EvaluationError as error:
+            notes.append(_left_out(cloud, chosen[indication.points], indication.height_mm, str(error)))
+        else:
+            measured.append((blemish, middle, indication.false_alarm))
     measured.sort(key=lambda each: each[0].extent_mm[2], reverse=True)
     features, numbers = [], dict.fromkeys(FeatureKind, 0)
-    for blemish, chance in measured:
+    for blemish, middle, chance in measured:
         numbers[blemish.kind] += 1
-        angle = np.array([blemish.place[1] / form.radius_mm + seam.cut])
-        place = form.at(blemish.place[:1], angle)[0]
-        out = np.cos(angle) * form.axes[0] + np.sin(angle) * form.axes[1]
-        axes = np.array([form.axes[2], np.cross(out, form.axes[2]), out])
-        name = f"{blemish.kind} {numbers[blemish.kind]}"
-        points = np.unique(chosen[blemish.points])
+        angle = np.array([blemish.place[1] / form.radius_mm + middle])
+        place, out = form.at(blemish.place[:1], angle)[0], form.frame.outwards(angle)[0]
+        axes = np.array([form.frame.axes[2], np.cross(out, form.frame.axes[2]), out])
+        name, points = f"{blemish.kind} {numbers[blemish.kind]}", chosen[blemish.points]
         features.append(Feature(blemish.kind, name, blemish.values, place, axes, blemish.extent_mm, points, chance))
-    return features
+    return features, notes
 
 
-def _notes(cloud: PointCloud, form: PipeForm, search: BlemishSearch, false_alarm: float) -> tuple[str, ...]:
+def _left_out(cloud: PointCloud, points: np.ndarray, height_mm: float, reason: str) -> str:
+    """Note on an indication at some points that is no feature."""
+    x, y, z = cloud.points_mm[points].mean(axis=0)
+    return f"an indication of {height_mm:.2g} mm at ({x:.1f}, {y:.1f}, {z:.1f}) mm is not listed: {reason}"
+
+
+def _notes(cloud: PointCloud, form: PipeForm, search: BlemishSearch) -> list[str]:
     notes = []
     if cloud.uncertainty is None:
         notes.append("the cloud states no uncertainty: intervals are of the scatter of its points alone")
@@ -179,6 +210,18 @@ def _notes(cloud: PointCloud, form: PipeForm, search: BlemishSearch, false_alarm
     level = float(np.nanmedian(search.level_mm)) if np.isfinite(search.level_mm).any() else np.nan
     notes.append(
         f"blemishes of {2 * search.smallest_mm:.2g} mm diameter count from {level:.2g} mm depth (median), larger ones "
-        f"from less; the probability of any false one is {false_alarm:g}"
+        f"from less; the probability of any false one is {search.false_alarm:g}"
     )
-    return tuple(notes)
+    return notes
+
+
+def _off_notes(form: PipeForm, chosen: np.ndarray) -> list[str]:
+    """Note on the points that are not chosen (M,), if there are any."""
+    count, limit = len(form.distance_mm), MOST_OFF_SHARE * form.radius_mm
+    if len(chosen) == count:
+        return []
+    inside = int(np.count_nonzero(form.distance_mm <= -limit))
+    return [
+        f"{count - len(chosen)} of {count} points are {limit:.2g} mm or more off the pipe ({inside} inside) and "
+        "are left out: what is deeper or higher is not found, or is cut off there"
+    ]

@@ -9,7 +9,7 @@ import numpy as np
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import MAD_TO_STD, evenly_thinned, fit_robustly
-from uwlts.fitting.shapes import fit_cylinder
+from uwlts.fitting.shapes import CylinderFit, fit_cylinder
 from uwlts.inspection.features import Feature, FeatureKind, FeatureValue
 from uwlts.inspection.propagation import NormalErrors, amplitude_value, normal_errors, plain_value
 from uwlts.storage.cloud import PointCloud
@@ -30,26 +30,61 @@ LARGEST_OVALITY = 0.02
 specification is given. A choice: pipes bent in the yard or dented by handling are less round than new line pipe."""
 _WHOLE_ARC = np.radians(300.0)
 """Arc from which the third and fourth harmonics are fitted too, so that they do not pass for others."""
-_FEWEST_OF_SECTION = 60
+_FEWEST_OF_SECTION, _LEAST_SHARE = 60, 0.8
+"""Points of a section, and the part of the whole pipe's arc (up to half of its circumference) that it shows."""
 _MOST_SECTIONS = 12
 MOST_OFF_SHARE = 0.06
 """Of the radius: the deepest blemish or ovality that still counts as the pipe's surface."""
 
 
 @dataclass(frozen=True, eq=False)
+class PipeFrame:
+    """Cylindrical frame of a pipe: a point (3,) of the axis, and two directions across and the axis as rows (3, 3).
+
+    Places along count from the point, angles from the first direction towards the second. Only `PipeFrame.about` and
+    `PipeFrame.moved` make one; the second keeps the directions across, so that places and angles stay comparable.
+    """
+
+    point_mm: np.ndarray
+    axes: np.ndarray
+
+    @classmethod
+    def about(cls, cylinder: CylinderFit, points_mm: np.ndarray) -> PipeFrame:
+        """Frame of a cylinder, with its point in the middle of points (N, 3)."""
+        point, axis = cylinder.point_mm, cylinder.axis
+        return cls(point + axis * np.median((points_mm - point) @ axis), np.array([*cylinder.across, axis]))
+
+    def moved(self, shift: np.ndarray, slopes: np.ndarray) -> PipeFrame:
+        """The frame shifted (2,), mm, and its axis turned by slopes (2,), both along the directions across."""
+        across = self.axes[:2]
+        third = self.axes[2] + slopes @ across
+        third = third / np.linalg.norm(third)
+        first = across[0] - (across[0] @ third) * third
+        first = first / np.linalg.norm(first)
+        return PipeFrame(self.point_mm + shift @ across, np.array([first, np.cross(third, first), third]))
+
+    def places(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Places (N,) along and angles around the axis of points (N, 3), and their distances from it."""
+        x, y, along = ((points_mm - self.point_mm) @ self.axes.T).T
+        return along, np.arctan2(y, x), np.hypot(x, y)
+
+    def outwards(self, angle: np.ndarray) -> np.ndarray:
+        """Unit normals (N, 3) of a round pipe at angles (N,)."""
+        return np.cos(angle)[:, None] * self.axes[0] + np.sin(angle)[:, None] * self.axes[1]
+
+
+@dataclass(frozen=True, eq=False)
 class PipeForm:
     """The undamaged pipe.
 
-    ``point_mm`` (3,) lies on the axis in the middle of the points, ``axes`` (3, 3) are two directions across and the
-    axis. ``along_mm``, ``angle``, ``distance_mm`` (N,) are places of all points along the axis from there, around it in
-    rad from the first direction, and their distances from the form, positive outwards. ``used`` (U,) are the points
+    ``along_mm``, ``angle``, ``distance_mm`` (N,) are places of all points in its ``frame``, and their distances from
+    the form, positive outwards. ``used`` (U,) are the points
     that determine it, ``weights`` (K, U) those of the points in its ``coefficients`` (K,)
     called ``terms``; places along the axis count in units of ``scale_mm``. ``largest_ovality`` is that, over the
     diameter, which it may have where it was not seen.
     """
 
-    point_mm: np.ndarray
-    axes: np.ndarray
+    frame: PipeFrame
     radius_mm: float
     along_mm: np.ndarray
     angle: np.ndarray
@@ -65,13 +100,13 @@ class PipeForm:
     @property
     def outwards(self) -> np.ndarray:
         """Unit normals (N, 3) of the round pipe at the points."""
-        return np.cos(self.angle)[:, None] * self.axes[0] + np.sin(self.angle)[:, None] * self.axes[1]
+        return self.frame.outwards(self.angle)
 
     def at(self, along_mm: np.ndarray, angle: np.ndarray) -> np.ndarray:
         """Points (M, 3) of the form."""
         radius = self.radius_mm + _design(along_mm, angle, self.scale_mm, self.terms) @ self.coefficients
-        across = np.cos(angle)[:, None] * self.axes[0] + np.sin(angle)[:, None] * self.axes[1]
-        return self.point_mm + np.asarray(along_mm)[:, None] * self.axes[2] + radius[:, None] * across
+        along = np.asarray(along_mm)[:, None] * self.frame.axes[2]
+        return self.frame.point_mm + along + radius[:, None] * self.frame.outwards(angle)
 
     @property
     def is_seen_round(self) -> bool:
@@ -79,27 +114,37 @@ class PipeForm:
         return self.arc >= _LEAST_ARC
 
 
-def fit_pipe(
-    cloud: PointCloud, *, left_out: np.ndarray | None = None, largest_ovality: float = LARGEST_OVALITY
-) -> PipeForm:
-    """Form of the pipe that most points of a cloud lie on; ``left_out`` (N,) bool are damaged places.
+def fit_pipe(cloud: PointCloud, *, largest_ovality: float = LARGEST_OVALITY) -> PipeForm:
+    """Form of the pipe that most points of a cloud lie on.
 
     A cylinder by orthogonal distances, then harmonics of the radial distance around (out of roundness) and along (bow,
     taper), all at once by iterated weights (Tukey's biweight). EvaluationError where the points determine no pipe.
     """
-    whole = np.arange(len(cloud)) if left_out is None else np.flatnonzero(~left_out)
-    fitted = evenly_thinned(whole, _MOST_POINTS)
+    fitted = evenly_thinned(np.arange(len(cloud)), _MOST_POINTS)
+    points = cloud.points_mm[fitted]
+    start = fit_robustly(fit_cylinder, evenly_thinned(points, _TO_START)).fit
+    return _fitted(cloud, fitted, PipeFrame.about(start, points), start.radius_mm, largest_ovality)
+
+
+def refit_pipe(cloud: PointCloud, form: PipeForm, *, left_out: np.ndarray) -> PipeForm:
+    """The form fitted again without damaged points ``left_out`` (N,) bool, in the frame that it has, moved a little.
+
+    EvaluationError where the points that are left determine no pipe.
+    """
+    fitted = evenly_thinned(np.flatnonzero(~left_out), _MOST_POINTS)
+    return _fitted(cloud, fitted, form.frame, form.radius_mm, form.largest_ovality)
+
+
+def _fitted(cloud: PointCloud, fitted: np.ndarray, frame: PipeFrame, radius: float, largest_ovality: float) -> PipeForm:
+    """Form of the ``fitted`` (M,) points, from a frame and a radius that are nearly right."""
     if len(fitted) < _FEWEST_OF_SECTION:
         raise EvaluationError(f"only {len(fitted)} of {len(cloud)} points are left for a pipe")
     points = cloud.points_mm[fitted]
-    start = fit_robustly(fit_cylinder, evenly_thinned(points, _TO_START)).fit
-    point, radius = start.point_mm, start.radius_mm
-    axes = np.array([*start.across, start.axis])
-    scale = max(0.5 * float(np.ptp((points - point) @ axes[2])), 1e-9)
+    scale = max(0.5 * float(np.ptp(frame.places(points)[0])), 1e-9)
     arc, terms, coefficients, weight, design = 0.0, (), np.zeros(0), np.zeros(0), np.zeros((0, 0))
     for number in range(_ROUNDS):
-        point = point + axes[2] * np.median((points - point) @ axes[2])
-        along, angle, off = _cylindrical(points, point, axes, radius)
+        along, angle, away = frame.places(points)
+        off = away - radius
         near = np.abs(off - np.median(off)) < MOST_OFF_SHARE * radius
         arc = _arc(angle[near])
         terms = _terms(arc)
@@ -107,11 +152,10 @@ def fit_pipe(
         coefficients, weight = _biweight(design, off, near)
         known = dict(zip(terms, coefficients, strict=True))
         # Offset and tilt go into the axis, so that the distances stay linear in them.
-        shift = known["cos"] * axes[0] + known["sin"] * axes[1]
-        slope = (known["along cos"] * axes[0] + known["along sin"] * axes[1]) / scale
-        point, radius = point + shift, radius + known["1"]
-        axes = _turned_to(axes, axes[2] + slope)
-        if number and np.linalg.norm(shift) + abs(known["1"]) + scale * np.linalg.norm(slope) < _STILL_MM:
+        shift = np.array([known["cos"], known["sin"]])
+        slopes = np.array([known["along cos"], known["along sin"]]) / scale
+        frame, radius = frame.moved(shift, slopes), radius + known["1"]
+        if number and np.linalg.norm(shift) + abs(known["1"]) + scale * np.linalg.norm(slopes) < _STILL_MM:
             break
     counted = weight > 0
     if np.count_nonzero(counted) < 3 * len(terms):
@@ -121,27 +165,11 @@ def fit_pipe(
     # What moved into the axis is no part of the form any more.
     moved = np.array([term in ("1", "cos", "sin", "along cos", "along sin") for term in terms])
     coefficients = np.where(moved, 0.0, coefficients)
-    along, angle, off = _cylindrical(cloud.points_mm, point, axes, radius)
-    distance = off - _design(along, angle, scale, terms) @ coefficients
+    along, angle, away = frame.places(cloud.points_mm)
+    distance = away - radius - _design(along, angle, scale, terms) @ coefficients
     used = fitted[counted]
-    known = point, axes, radius, along, angle, distance, used, arc, terms, coefficients, weights, scale
+    known = frame, radius, along, angle, distance, used, arc, terms, coefficients, weights, scale
     return PipeForm(*known, largest_ovality)
-
-
-def _cylindrical(
-    points: np.ndarray, point: np.ndarray, axes: np.ndarray, radius: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places (N,) along and angles around the axis of points, and their distances from a cylinder."""
-    local = (points - point) @ axes.T
-    return local[:, 2], np.arctan2(local[:, 1], local[:, 0]), np.hypot(local[:, 0], local[:, 1]) - radius
-
-
-def _turned_to(axes: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """The axes (3, 3) with the third along another direction."""
-    third = axis / np.linalg.norm(axis)
-    first = axes[0] - (axes[0] @ third) * third
-    first /= np.linalg.norm(first)
-    return np.array([first, np.cross(third, first), third])
 
 
 def _biweight(design: np.ndarray, values: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -156,8 +184,10 @@ def _biweight(design: np.ndarray, values: np.ndarray, near: np.ndarray) -> tuple
     return coefficients, weight
 
 
-def pipe_features(cloud: PointCloud, form: PipeForm, *, section_mm: float | None = None) -> list[Feature]:
-    """The pipe and its sections, each ``section_mm`` long, with uncertainty.
+def pipe_features(
+    cloud: PointCloud, form: PipeForm, *, section_mm: float | None = None
+) -> tuple[list[Feature], list[str]]:
+    """The pipe and its sections, each ``section_mm`` long, with uncertainty; and notes on sections that are left out.
 
     Without a ``section_mm`` the length is divided into up to twelve sections of at least 60 points.
     """
@@ -165,7 +195,7 @@ def pipe_features(cloud: PointCloud, form: PipeForm, *, section_mm: float | None
     errors = normal_errors(cloud, used, form.outwards[used])
     whole = _values(form, errors)
     extent = np.array([2 * form.radius_mm, 2 * form.radius_mm, np.ptp(form.along_mm[used])])
-    features = [Feature(FeatureKind.PIPE, "pipe", whole, form.point_mm, form.axes, extent, used)]
+    features = [Feature(FeatureKind.PIPE, "pipe", whole, form.frame.point_mm, form.frame.axes, extent, used)]
     along = form.along_mm[used]
     low, length = float(along.min()), float(np.ptp(along))
     if section_mm is not None and not 0 < section_mm < np.inf:
@@ -174,27 +204,32 @@ def pipe_features(cloud: PointCloud, form: PipeForm, *, section_mm: float | None
     edges = low + length * np.arange(count + 1) / count
     terms = _section_terms(form)
     raw = form.distance_mm + _design(form.along_mm, form.angle, form.scale_mm, form.terms) @ form.coefficients
-    number = 0
+    notes: list[str] = []
     for start, end in pairwise(edges):
         inside = (along >= start) & ((along < end) | (end == edges[-1]))
         own = used[inside]
-        if len(own) < _FEWEST_OF_SECTION or _arc(form.angle[own]) < min(form.arc, _LEAST_ARC) * 0.8:
+        arc, least = _arc(form.angle[own]), _LEAST_SHARE * min(form.arc, _LEAST_ARC)
+        if len(own) < _FEWEST_OF_SECTION or arc < least:
+            notes.append(
+                f"no section from {start:.4g} to {end:.4g} mm along the axis: {len(own)} points over "
+                f"{np.degrees(arc):.0f} deg; {_FEWEST_OF_SECTION} over {np.degrees(least):.0f} deg are needed"
+            )
             continue
-        number += 1
         design = _design(np.zeros(len(own)), form.angle[own], 1.0, terms)
         weights = np.linalg.pinv(design, rcond=1e-6)
         coefficients = weights @ raw[own]
-        middle = form.point_mm + 0.5 * (start + end) * form.axes[2]
+        middle = form.frame.point_mm + 0.5 * (start + end) * form.frame.axes[2]
         if "sin" in terms:
-            middle = middle + coefficients[1] * form.axes[0] + coefficients[2] * form.axes[1]
+            middle = middle + coefficients[1] * form.frame.axes[0] + coefficients[2] * form.frame.axes[1]
         if "sin" in terms:
             left = raw[own] - design @ coefficients
             values = _section_values(form, errors[inside], weights, coefficients, terms, left)
         else:
             values = (_diameter_of_arc(form, errors, inside, weights[0], float(coefficients[0])),)
         size = np.array([extent[0], extent[1], end - start])
-        features.append(Feature(FeatureKind.SECTION, f"section {number}", values, middle, form.axes, size, own))
-    return features
+        name = f"section {len(features)}"
+        features.append(Feature(FeatureKind.SECTION, name, values, middle, form.frame.axes, size, own))
+    return features, notes
 
 
 def _values(form: PipeForm, errors: NormalErrors) -> tuple[FeatureValue, ...]:
@@ -230,11 +265,11 @@ def _values(form: PipeForm, errors: NormalErrors) -> tuple[FeatureValue, ...]:
             kind, "straightness", vector, *covariances("along2 cos", "along2 sin"), scale=(0.5 * length / scale) ** 2
         )
     )
-    stated = int(np.argmax(np.abs(form.axes[2])))
+    stated = int(np.argmax(np.abs(form.frame.axes[2])))
     for number, term in ((1, "cos"), (2, "sin")):
-        across = form.axes[number - 1]
-        values.append(plain(f"axis place {number}", float(across @ form.point_mm), term, 1.0))
-        slope = float(np.degrees(np.arctan2(form.axes[2] @ _level(across, stated), form.axes[2, stated])))
+        across = form.frame.axes[number - 1]
+        values.append(plain(f"axis place {number}", float(across @ form.frame.point_mm), term, 1.0))
+        slope = float(np.degrees(np.arctan2(form.frame.axes[2] @ _level(across, stated), form.frame.axes[2, stated])))
         values.append(plain(f"axis slope {number}", slope, f"along {term}", float(np.degrees(1 / scale))))
     return tuple(values)
 

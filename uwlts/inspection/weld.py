@@ -9,7 +9,6 @@ so that the points' errors run through to every value: by each pattern that all 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy import ndimage, sparse
@@ -53,6 +52,8 @@ _WHOLE_SHARE = 0.7
 """Of the usual height: lower sections are the bead's ends."""
 _SIGNIFICANT = 4.0
 """Standard deviations of the plates' points that a bead must stand out."""
+_APART = 0.1
+"""Of the width over all beads side by side: how far apart these are at half their height, at least."""
 _TUKEY = 4.685
 _NOTHING = 1e-9
 
@@ -68,14 +69,18 @@ def inspect_weld(cloud: PointCloud, *, section_mm: float | None = None) -> Inspe
         raise EvaluationError(f"section_mm is {section_mm:g}; expected a positive length in mm")
     if len(cloud) < _FEWEST:
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST} are needed for a weld")
-    bead = _bead_of(cloud, section_mm)
+    bead, notes = _bead_of(cloud, section_mm)
     errors = normal_errors(cloud, bead.chosen, np.broadcast_to(bead.axes[2], (len(bead.chosen), 3)))
-    values, extent = _values(bead, errors)
+    values, extent, left_out = _values(bead, errors)
     feature = Feature(FeatureKind.WELD, "weld", values, bead.middle_mm, bead.axes, extent, bead.chosen[bead.on_bead])
     deviation = np.full(len(cloud), np.nan)
     deviation[bead.chosen] = bead.heights_mm
     count = bead.profiles.sections
-    notes = [f"{count} sections of {bead.length_mm / count:.2g} mm; left is where the second axis points away from"]
+    notes = [
+        f"{count} sections of {bead.length_mm / count:.2g} mm; left is where the second axis points away from",
+        *notes,
+        *left_out,
+    ]
     if cloud.uncertainty is None:
         notes.append("the cloud states no uncertainty: intervals are of the scatter of its points alone")
     return Inspection("weld", (feature,), deviation, np.full(len(cloud), np.nan), tuple(notes))
@@ -141,8 +146,10 @@ class _Bead:
     footprint_std: float
 
 
-def _bead_of(cloud: PointCloud, section_mm: float | None) -> _Bead:
-    axes, middle, half, ends = _found(cloud.points_mm)
+def _bead_of(cloud: PointCloud, section_mm: float | None) -> tuple[_Bead, list[str]]:
+    """The bead, and a note on others that are not measured."""
+    axes, middle, half, ends, others = _found(cloud.points_mm)
+    notes = [f"{others} more of what stands out beside the bead is not measured: cut the cloud to it"] * (others > 0)
     local = (cloud.points_mm - middle) @ axes.T
     reach = half * (1 + 2 * _PLATE_SHARE)
     chosen = np.flatnonzero((np.abs(local[:, 1]) < reach) & (local[:, 0] >= ends[0]) & (local[:, 0] <= ends[1]))
@@ -154,7 +161,7 @@ def _bead_of(cloud: PointCloud, section_mm: float | None) -> _Bead:
     rows = [_robust_rows(design, raw, side) for side in sides]
     # Between the toes the reference runs from one plate to the other.
     share = np.clip((across + half) / (2 * half), 0, 1)
-    heights = raw - (1 - share) * (design @ rows[0] @ raw) - share * (design @ rows[1] @ raw)
+    heights = raw - (1 - share) * (design @ (rows[0] @ raw)) - share * (design @ (rows[1] @ raw))
     length, images = float(np.ptp(along)), len(np.unique(cloud.frame[chosen]))
     count = max(1, len(along) // _POINTS_IN_SECTION)
     # Several sections to an image would hold its points by chance.
@@ -183,7 +190,7 @@ def _bead_of(cloud: PointCloud, section_mm: float | None) -> _Bead:
     scatter = _local_scatter(profiles, raw, across, bandwidth)
     seen = seen * np.maximum(scatter / float(np.median(scatter[np.abs(across) > half * (1 + _BEYOND_SHARE)])), 1)
     on_bead = np.abs(across) < half
-    return _Bead(axes, middle, chosen, raw, heights, on_bead, half, length, seen, profiles, footprint_std)
+    return _Bead(axes, middle, chosen, raw, heights, on_bead, half, length, seen, profiles, footprint_std), notes
 
 
 def _local_scatter(profiles: _Profiles, raw: np.ndarray, across: np.ndarray, bandwidth: float) -> np.ndarray:
@@ -201,8 +208,11 @@ def _local_scatter(profiles: _Profiles, raw: np.ndarray, across: np.ndarray, ban
     return np.maximum(spread[cell], 1e-12)
 
 
-def _found(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """Axes (3, 3), middle (3,), about half of the width and ends (2,) of what stands out highest of a plane."""
+def _found(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray, int]:
+    """Axes (3, 3), middle (3,), about half of the width and ends (2,) of the bead, and the number of others beside it.
+
+    The bead is what stands out highest of a plane.
+    """
     start = fit_robustly(lambda p: fit_plane(p, towards=TOWARDS_SENSOR), evenly_thinned(points, _TO_START))
     up, heights = start.fit.normal, start.fit.distances_mm(points)
     noise = MAD_TO_STD * float(np.median(np.abs(heights - np.median(heights))))
@@ -219,16 +229,16 @@ def _found(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarra
     # Of several beads side by side the one with most points at half the height.
     across = crown @ axes[1]
     count, edges = np.histogram(across, bins=max(10, int(np.sqrt(len(crown)))))
-    filled = count > 0.05 * count.max()
-    labelled: Any = ndimage.label(filled)
-    labels = labelled[0]
-    best = int(np.argmax(np.bincount(labels, count * (labels > 0))))
-    low, high = edges[:-1][labels == best].min(), edges[1:][labels == best].max()
+    filled = np.flatnonzero(count > 0.05 * count.max())
+    # Between the lines of the profiles there may be no points.
+    beads = np.split(filled, np.flatnonzero(np.diff(filled) > 1 + _APART * len(count)) + 1)
+    best = max(beads, key=lambda own: count[own].sum())
+    low, high = edges[best[0]], edges[best[-1] + 1]
     crown = crown[(across >= low) & (across <= high)]
     middle = np.median(crown, axis=0)
     half = _HALF_FROM_CROWN * 0.5 * float(high - low)
     ends = np.quantile((crown - middle) @ along, [0.005, 0.995])
-    return axes, middle, half, ends
+    return axes, middle, half, ends, len(beads) - 1
 
 
 def _robust_rows(design: np.ndarray, heights: np.ndarray, side: np.ndarray) -> np.ndarray:
@@ -310,14 +320,27 @@ class _Figures:
     grooves: tuple[np.ndarray, np.ndarray]
 
 
-def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...], np.ndarray]:
+def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...], np.ndarray, list[str]]:
+    """Values, extent (3,), and notes on sections and values that are left out."""
     profiles = bead.profiles.of(bead.raw_mm)
     tops = _tops(bead, profiles)
     high = tops > _WHOLE_SHARE * float(np.median(tops[np.isfinite(tops)]))
     whole = np.flatnonzero(high & np.isfinite(tops))
+    unseen, low = np.count_nonzero(~np.isfinite(tops)), np.count_nonzero(np.isfinite(tops) & ~high)
+    notes = []
+    if unseen + low:
+        notes.append(
+            f"{unseen + low} of {len(tops)} sections are left out: {unseen} without points on the bead, {low} lower "
+            f"than {100 * _WHOLE_SHARE:.0f} % of the usual height"
+        )
     # A toe beside lost lines may be far off: the middle one of neighbours.
     toes = ndimage.generic_filter(_toes_and_slopes(bead, profiles, whole)[:, :2], np.nanmedian, (_TOGETHER_DEEP, 1))
     first = _figures(bead, bead.raw_mm, whole, toes)
+    for side, groove in zip(("left", "right"), first.grooves, strict=True):
+        if lost := np.count_nonzero(~np.isfinite(groove)):
+            notes.append(
+                f"the undercut {side} is not known in {lost} of {len(whole)} sections: too few lines were seen there"
+            )
     rng = np.random.default_rng(_SEED)
     noise = np.maximum(bead.noise_mm, errors.single_mm)
     noisy = []
@@ -363,6 +386,7 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
     values = []
     for k, (name, value) in enumerate(zip(_NAMES, plain, strict=True)):
         if not np.isfinite(value):
+            notes.append(f"no {name}: no section shows it")
             continue
         shared, top = None if common is None else float(common[k]), largest.get(name)
         if top is None:
@@ -370,7 +394,7 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
             values.append(plain_value(FeatureKind.WELD, name, float(value), by_noise, shared, least=0))
         else:
             values.append(_widened(name, float(value), top, float(fixed[k]), shared))
-    return tuple(values), np.array([bead.length_mm, float(plain[2]), float(plain[1])])
+    return tuple(values), np.array([bead.length_mm, float(plain[2]), float(plain[1])]), notes
 
 
 def _widened(name: str, value: float, top: Largest, fixed: float, shared: float | None) -> FeatureValue:

@@ -27,6 +27,8 @@ _COLUMNS = (
     "level / mm",
     "volume / mm³",
 )
+_MOST_ROWS = 20
+"""Regions that the page lists and numbers; the file beside it has all."""
 _CLIPPED = 0.995
 """Share of the places within the colours' range."""
 
@@ -52,7 +54,8 @@ def write_change(
         software=f"uwlts {__version__}",
         summary=change.lines(),
         columns=_COLUMNS,
-        regions=_rows(change),
+        regions=_rows(change)[:_MOST_ROWS],
+        more=max(len(change.regions()) - _MOST_ROWS, 0),
         map=_map(change),
         histogram=_histogram(change),
     )
@@ -117,7 +120,7 @@ def _map(change: SurfaceChange) -> str:
         linewidths=0,
     )
     figure.colorbar(colours, ax=axes, label="distance / mm (grey: within its level of detection)")
-    for number, region in enumerate(change.regions(), start=1):
+    for number, region in enumerate(change.regions()[:_MOST_ROWS], start=1):
         place = region.centre_mm[first], region.centre_mm[second]
         axes.annotate(str(number), place, xytext=(6, 6), textcoords="offset points", fontsize=8, color=INK)
     axes.set(xlabel=f"{'XYZ'[first]} / mm", ylabel=f"{'XYZ'[second]} / mm", aspect="equal")

@@ -327,3 +327,30 @@ def test_the_command_writes_page_figures_and_cloud(ball, tmp_path, monkeypatch):
     assert "level of detection" in page and "ball.ply against ball.stl" in page
     with pytest.raises(OutputError, match="exists already"):
         uwlts.write_change("change.html", uwlts.compare_clouds(cloud, path))
+
+
+def test_all_regions_are_listed_whatever_the_size_of_the_cloud(monkeypatch, tmp_path):
+    """25 losses of one size on a cloud of which every fourth place alone can be looked at."""
+    rng = np.random.default_rng(31)
+    x, y = np.meshgrid(np.arange(200.0), np.arange(200.0), indexing="ij")
+    frame, line = np.indices(x.shape)
+    middles = 20.0 + 40.0 * np.indices((5, 5)).reshape(2, -1).T
+    lost = np.any([np.hypot(x - a, y - b) < 13 for a, b in middles], axis=0)
+
+    def seen(depth):
+        points = np.column_stack([x.ravel(), y.ravel(), (depth + 0.01 * rng.normal(size=x.shape)).ravel()])
+        return PointCloud(points, np.ones(x.size), frame.ravel(), line.ravel())
+
+    monkeypatch.setattr("uwlts.comparison.change._MOST_PLACES", 1000)
+    change = uwlts.compare_clouds(seen(0.5 * lost), seen(0.0 * lost))
+    assert 500 < len(change.distance_mm) <= 1000
+    regions = [region for region in change.regions() if region.mean_mm < -0.1]
+    assert len(regions) == 25
+    for region in regions:
+        assert np.min(np.hypot(*(middles - region.centre_mm[:2]).T)) < change.apart_mm
+        # The disc about a place at the border holds a part of the loss, too.
+        assert region.area_mm2 == pytest.approx(np.pi * 16**2, rel=0.35)
+    uwlts.write_change(tmp_path / "change.html", change)
+    assert "more regions of smaller volume" in (tmp_path / "change.html").read_text(encoding="utf-8")
+    assert len(json.loads((tmp_path / "change.json").read_text())["regions"]) == len(change.regions())
+    assert any(line.startswith("regions of change") for line in change.lines())

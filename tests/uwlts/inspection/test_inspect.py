@@ -72,7 +72,7 @@ def test_the_form_of_a_pipe_is_within_its_intervals():
     inside = dict.fromkeys(truth, 0)
     for _ in range(20):
         cloud = pipe_scan(rng, radius=oval, bow=0.5, around_mm=3.0, correlated=True)
-        pipe, *sections = pipe_features(cloud, fit_pipe(cloud))
+        pipe, *sections = pipe_features(cloud, fit_pipe(cloud))[0]
         for name, value in truth.items():
             inside[name] += pipe[name].low <= value <= pipe[name].high
         assert pipe["ovality"].uncertainty < 0.03
@@ -96,13 +96,13 @@ def test_the_diameter_of_an_arc_may_be_that_of_an_oval():
             return RADIUS_MM + amplitude * np.cos(2 * (angle - turn))
 
         cloud = pipe_scan(rng, half_arc=np.pi / 4, along=(-20, 20.5, 2.0), around_mm=3.0, radius=oval)
-        pipe, section, *_ = pipe_features(cloud, fit_pipe(cloud))
+        pipe, section, *_ = pipe_features(cloud, fit_pipe(cloud))[0]
         values = pipe["diameter"], section["diameter"]
         assert values[0].uncertainty < 4.0
         inside += [value.low <= 300.0 <= value.high for value in values]
     assert inside.min() >= 14, inside
     # Of a pipe that is known to be round only the points' own uncertainty is left.
-    round_one = pipe_features(cloud, fit_pipe(cloud, largest_ovality=0.0))[0]["diameter"]
+    round_one = pipe_features(cloud, fit_pipe(cloud, largest_ovality=0.0))[0][0]["diameter"]
     assert round_one.uncertainty < 0.1 * values[0].uncertainty
 
 
@@ -113,7 +113,7 @@ def test_a_round_pipe_may_be_round():
     lows = []
     for _ in range(20):
         cloud = pipe_scan(rng, around_mm=3.0)
-        lows.append(pipe_features(cloud, fit_pipe(cloud))[0]["ovality"].low)
+        lows.append(pipe_features(cloud, fit_pipe(cloud))[0][0]["ovality"].low)
     assert np.count_nonzero(np.array(lows) == 0) >= 14
 
 
@@ -364,6 +364,49 @@ def test_a_weld_is_measured(undercut, offset):
         assert weld["toe angle left"].value == pytest.approx(angle, abs=1.0)
         assert weld["toe angle right"].value == pytest.approx(angle, abs=1.0)
     assert np.abs(weld.axes[0]) == pytest.approx([1, 0, 0], abs=0.02)
+
+
+def test_a_weld_of_many_even_profiles_is_measured_and_what_is_left_out_is_named():
+    """More points on the bead than a square matrix of them would fit in memory, all on the same few lines.
+
+    Beside the bead is a shorter one, and a tenth of the bead is missing.
+    """
+
+    def height(x, y):
+        second = 2.0 * np.square(np.maximum(1 - np.square((y - 30) / 4), 0)) * (np.abs(x) < 10)
+        return weld_height(x, y, undercut=0.0, offset=0.0) * (np.abs(x - 20) > 3) + second
+
+    cloud = flat_scan(np.random.default_rng(17), height, everywhere, along=(-30, 30, 0.3), across=(-40, 40, 500))
+    found = uwlts.inspect(cloud, "weld")
+    within(found.features[0], {"height": 2.0})
+    assert found.features[0].extent_mm[0] > 55
+    assert any(note.startswith("1 more of what stands out") for note in found.notes)
+    number = next(int(note.split()[0]) for note in found.notes if "sections are left out" in note)
+    assert number == pytest.approx(10, abs=3)
+
+
+def test_holes_that_are_not_measured_are_named():
+    """A bolt hole of another diameter, a slot, and a second gap."""
+
+    def face(x, y):
+        inside = (np.hypot(x, y) < 55) & (np.hypot(x, y) > 18)
+        for k, angle in enumerate(2 * np.pi * np.arange(6) / 6 + 0.2):
+            inside &= np.hypot(x - 38 * np.cos(angle), y - 38 * np.sin(angle)) > (9 if k == 2 else 5)
+        return inside & ((np.abs(x - 48) > 4) | (np.abs(y + 8) > 1.5))
+
+    cloud = flat_scan(np.random.default_rng(18), lambda x, y: 0 * x, face, along=(-60, 60, 0.5))
+    flange = uwlts.inspect(cloud, "flange")
+    assert len(flange.of(FeatureKind.HOLE)) == 5
+    left_out = [note for note in flange.notes if "is not listed" in note]
+    assert any("its diameter is" in note for note in left_out), flange.notes
+    assert any("not round" in note for note in left_out), flange.notes
+
+    def gapped(x, y):
+        return (np.abs(y) > 1.5) & ((np.abs(y - 30) > 1) | (x > 0))
+
+    gap = uwlts.inspect(flat_scan(np.random.default_rng(19), lambda x, y: 0 * x, gapped), "gap")
+    within(gap.features[0], {"width": 3.0})
+    assert sum("profiles cross it, fewer than the gap" in note for note in gap.notes) == 1
 
 
 def test_clouds_without_covariance_say_so(tmp_path, monkeypatch, capsys):
