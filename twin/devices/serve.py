@@ -188,6 +188,13 @@ class Bench:
         self._travelled_mm = math.nan
         self._seen: dict[str, np.ndarray] = {}
 
+    def prepare(self, exposure_ms: float) -> None:
+        """Compile what renders a laser image, which takes longer than a laser is lit for one, and forget the image."""
+        state = replace(self._state(), laser_on=True, power=1.0)
+        light = self._electrons_per_ms(state, None)
+        self._studio.detected(exposure_ms * light, exposure_ms=exposure_ms, noise_seed=[self._studio.options.seed])
+        self._travelled_mm = math.nan
+
     def frame(self, exposure_ms: float, state: StageState | None = None) -> np.ndarray:
         """Image (height_px, width_px) of uint8 of a moment, now unless given; noise differs from call to call.
 
@@ -410,5 +417,6 @@ def serve(
         expose=expose,
     )
     inject(1, ahead=True)
+    bench.prepare(studio.exposure_ms["laser"])
     with controller, camera:
         yield ServedTwin(controller, camera, track, studio.exposure_ms, lambda: bench.rates)
