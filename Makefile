@@ -3,6 +3,7 @@
 VENV := .venv
 PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
+OLDEST := .venv-oldest
 
 # An activated environment, or settings that redirect Python or pip, must not reach into .venv.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIRE_VIRTUALENV
@@ -11,19 +12,20 @@ export PIP_NO_INPUT := 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-full check style types fuzz soak bench docs setup clean
+.PHONY: help demo test test-full oldest check style types fuzz soak bench docs setup clean
 
 help:
 	@echo "make demo    scan with the simulated sensor and show the result"
 	@echo "make test    check the code and run the tests, without the slow ones"
 	@echo "make test-full   check the code and run all tests, slow studies of statistics and campaigns included"
+	@echo "make oldest  run documented commands with the oldest allowed libraries, in $(OLDEST) (make test-full does it too)"
 	@echo "make check   only check the code: format, lint, layers of imports, types"
 	@echo "make fuzz    read many damaged files; CASES=5000 of each kind, READERS=\"capture sensor\" only these"
 	@echo "make soak    record 100,000 images by the desk and watch its memory; IMAGES=1000 only so many"
 	@echo "make bench   measure speed"
 	@echo "make docs    build the documentation site in docs/_build/html"
 	@echo "make setup   only prepare .venv and libLLVM (the targets above do it too)"
-	@echo "make clean   remove .venv, caches and build results"
+	@echo "make clean   remove .venv, $(OLDEST), caches and build results"
 
 demo: setup
 	@$(PYTHON) -m twin.cli demo
@@ -40,6 +42,17 @@ test test-full: style
 	trap 'kill $$checking 2>/dev/null; rm -f $$found' EXIT; trap 'exit 130' INT TERM; \
 	$(PYTHON) -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10 $(PYTEST_OPTIONS); tested=$$?; \
 	wait $$checking; typed=$$?; echo "types:"; cat $$found; exit $$((tested ? tested : typed))
+
+test-full: oldest
+
+# Compiled loops are kept apart: both environments would replace those of the other.
+oldest: export NUMBA_CACHE_DIR := $(CURDIR)/$(OLDEST)/numba
+oldest: export OPENBLAS_NUM_THREADS := 1
+oldest: setup $(OLDEST)/.installed
+	@$(PYTHON) -m twin.devices.aravis_install
+	@echo "oldest: documented commands with the oldest allowed libraries"
+	@$(OLDEST)/bin/python -m pytest -q -n 2 tests/test_documentation.py tests/system/test_documented_commands.py \
+		-k "test_documentation or README or api.md or calibrate-a-mount or large-clouds"
 
 check: style types
 
@@ -71,26 +84,37 @@ setup: $(INSTALLED)
 	@$(PYTHON) -m twin.backend.llvm --install
 
 $(INSTALLED): pyproject.toml
-	@$(PYTHON) -m pip --version >/dev/null 2>&1 || { rm -rf $(VENV) && $(create_venv); }
+	@$(PYTHON) -m pip --version >/dev/null 2>&1 || { \
+		rm -rf $(VENV) && $(call create_venv,$(VENV),python3.13 python3.12 python3.11 python3); }
 	@echo "setup: installing the project and its libraries into $(VENV) (about a minute)"
 	@$(PYTHON) -m pip install --quiet --editable '.[test]'
 	@touch $@
 
+# Their wheels are for Python 3.11 and 3.12.
+$(OLDEST)/.installed: pyproject.toml tests/oldest.py | $(INSTALLED)
+	@rm -rf $(OLDEST)
+	@$(call create_venv,$(OLDEST),python3.11 python3.12)
+	@echo "setup: installing the oldest allowed libraries into $(OLDEST) (about a minute)"
+	@$(PYTHON) -m tests.oldest test >$(OLDEST)/oldest.txt
+	@$(OLDEST)/bin/python -m pip install --quiet --only-binary :all: --editable . --requirement $(OLDEST)/oldest.txt
+	@touch $@
+
 clean:
-	@rm -rf $(VENV) build dist docs/_build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) $(OLDEST) build dist docs/_build *.egg-info .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# Takes the first Python that is new enough and brings pip along; on Debian pip comes with an extra package.
+# Makes the environment $(1) with the first of the Pythons $(2) that is new enough and brings pip along; on Debian pip
+# comes with an extra package.
 define create_venv
 { \
 	python=; incomplete=; \
-	for name in python3.13 python3.12 python3.11 python3; do \
+	for name in $(2); do \
 		$$name -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || continue; \
 		if $$name -c 'import venv, ensurepip' 2>/dev/null; then python=$$name; break; fi; \
 		incomplete=$${incomplete:-$$name}; \
 	done; \
 	if [ -z "$$python$$incomplete" ]; then \
-		echo "error: no Python 3.11 or newer: tried python3.13, python3.12, python3.11 and python3. Install one" \
+		echo "error: none of the Pythons tried is there, in version 3.11 or newer: $(2). Install one" \
 			"(Debian, Ubuntu: apt-get install python3 python3-venv) and run make again." >&2; \
 		exit 2; \
 	fi; \
@@ -108,11 +132,11 @@ define create_venv
 		rm -f "$$log"; \
 	fi; \
 	if [ -n "$$python" ]; then \
-		echo "setup: creating $(VENV) with $$python"; \
-		"$$python" -m venv $(VENV); \
+		echo "setup: creating $(1) with $$python"; \
+		"$$python" -m venv $(1); \
 	elif command -v virtualenv >/dev/null; then \
-		echo "setup: creating $(VENV) with virtualenv and $$incomplete"; \
-		virtualenv --quiet --python "$$incomplete" $(VENV); \
+		echo "setup: creating $(1) with virtualenv and $$incomplete"; \
+		virtualenv --quiet --python "$$incomplete" $(1); \
 	else \
 		echo "error: $$incomplete has no venv with pip. Install it (Debian, Ubuntu: apt-get install python3-venv) or" \
 			"install virtualenv, and run make again." >&2; \

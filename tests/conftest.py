@@ -84,6 +84,7 @@ SERVING = {
     "test_live_view.py",
     "test_cameras.py",
     "test_doctor.py",
+    "test_documented_hardware.py",
 }
 
 

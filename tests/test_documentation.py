@@ -1,54 +1,73 @@
-"""Documentation that can be checked without building it: links, the commands that the README names, and its length."""
+"""Documentation that can be checked without building it: links, the commands that it shows, and the README's length."""
 
+import importlib.util
+import os
 import re
-import shlex
+import subprocess
+import tomllib
 from pathlib import Path
 
 import cyclopts
 import pytest
 
+from tests.documented import APPS, PAGES, README, ROOT, blocks, mentioned_commands, name_of, words_of
 from twin.cli import app as twin_app
 from uwlts.cli import app as uwlts_app
 
-ROOT = Path(__file__).resolve().parents[1]
-README = ROOT / "README.md"
-PAGES = (
-    README,
-    ROOT / "CONTRIBUTING.md",
-    *sorted(path for path in (ROOT / "docs").rglob("*.md") if "_build" not in path.relative_to(ROOT).parts),
-)
-APPS = {"twin": twin_app, "uwlts": uwlts_app}
 MOST_README_LINES = 120
 """A README is read on one's way in; everything longer has a page under docs."""
 FOLDERS = ("uwlts", "twin", "tests", "docs", "scenes")
 WRITTEN_LATER = {"docs/_build/html", "uwlts/targets/plain_circles.py"}
 """Named by the documentation, but made by its reader: the built site, and the example of a new target."""
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["optional-dependencies"]
 
 
-def _commands(page: Path) -> list[str]:
-    """Lines of indented blocks that call a command, without comments."""
-    text = page.read_text(encoding="utf-8")
-    code = [line.strip().removeprefix("$ ") for line in text.splitlines() if line.startswith("    ")]
-    return [line.split(" #")[0].strip() for line in code if line.split(" ")[0] in APPS]
+def _check(command: str, *, folder: Path = ROOT, abridged: bool = False) -> None:
+    """Fail unless the program takes all words of a command line, of which arguments may lack where it is abridged."""
+    program, *words = words_of(command)
+    match Path(program).name:
+        case "uwlts" | "twin":
+            app = {"uwlts": uwlts_app, "twin": twin_app}[program]
+            try:
+                app.parse_args(words, exit_on_error=False, print_error=False)
+            except cyclopts.MissingArgumentError:
+                if not abridged:
+                    raise
+                known = {name for argument in app[words[0]].assemble_argument_collection() for name in argument.names}
+                assert {word.split("=")[0] for word in words if word.startswith("--")} <= known
+        case "make":
+            # A test that make has started must not hand on its settings.
+            plain = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+            done = subprocess.run(["make", "--dry-run", *words], cwd=ROOT, env=plain, capture_output=True, text=True)
+            assert done.returncode == 0, done.stderr
+        case "python" | "python3" if words[0] == "-m":
+            assert importlib.util.find_spec(words[1]), f"no module {words[1]}"
+        case "python" | "python3":
+            assert (folder / words[0]).is_file(), f"no file {words[0]}"
+        case "cd":
+            assert (ROOT / words[0]).is_dir(), f"no folder {words[0]}"
+        case "pip":
+            assert set(re.findall(r"\[(\w+)\]", command)) <= set(EXTRAS)
+        case "pytest":
+            # Wrong options, or files that do not exist, end it before any test is collected.
+            files = [word for word in words if word.endswith(".py")]
+            assert all((ROOT / file).is_file() for file in files)
+        case other:
+            pytest.fail(f"no way to check calls of {other}")
 
 
-def _parsed(line: str) -> None:
-    program, *arguments = shlex.split(line)
-    APPS[program].parse_args(arguments, exit_on_error=False, print_error=False)
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_links_lead_to_files(page):
     links = re.findall(r"\]\(([^)\s#]+)", page.read_text(encoding="utf-8"))
     missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
-    assert not missing, f"{page.relative_to(ROOT)} links to files that do not exist: {missing}"
+    assert not missing, f"{name_of(page)} links to files that do not exist: {missing}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_named_files_exist(page):
     named = re.findall(rf"`((?:{'|'.join(FOLDERS)})/[\w/.-]+)`", page.read_text(encoding="utf-8"))
     missing = [name for name in named if name not in WRITTEN_LATER and not (ROOT / name).exists()]
-    assert not missing, f"{page.relative_to(ROOT)} names files that do not exist: {missing}"
+    assert not missing, f"{name_of(page)} names files that do not exist: {missing}"
 
 
 def test_every_page_is_in_a_table_of_contents():
@@ -61,24 +80,64 @@ def test_every_page_is_in_a_table_of_contents():
     assert pages == listed
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_commands_and_options_exist(page):
-    for line in _commands(page):
-        if "..." in line:  # an example that is not complete
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_commands_are_complete(page):
+    """Every option is known and every value of the right type; the slow tests run the commands."""
+    for block in blocks(page):
+        if block.kind != "commands":
             continue
+        folder = ROOT
+        for command in block.commands:
+            try:
+                _check(command, folder=folder)
+            except (cyclopts.CycloptsError, AssertionError) as error:
+                pytest.fail(f"{block}: '{command}': {error}")
+            folder = ROOT / command.split()[1] if command.startswith("cd ") else folder
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_mentioned_commands_and_options_exist(page):
+    for line, command in mentioned_commands(page):
         try:
-            _parsed(line)
-        except cyclopts.CycloptsError as error:
-            pytest.fail(f"{page.relative_to(ROOT)}: '{line}': {error}")
+            _check(command, abridged=True)
+        except (cyclopts.CycloptsError, AssertionError) as error:
+            pytest.fail(f"{name_of(page)}:{line}: '{command}': {error}")
 
 
 def test_the_readme_shows_commands():
-    assert {line.split()[0] for line in _commands(README)} == {"twin", "uwlts"}
+    shown = {command.split()[0] for block in blocks(README) if block.kind == "commands" for command in block.commands}
+    assert shown == {"make", "twin", "uwlts"}
 
 
-def test_a_wrong_option_is_noticed():
-    with pytest.raises(cyclopts.CycloptsError):
-        _parsed("uwlts evaluate cloud.ply --out evaluation.json --colored cloud.ply")
+@pytest.mark.parametrize(
+    "command",
+    [
+        "uwlts evaluate cloud.ply --out evaluation.json --colored cloud.ply",
+        "uwlts evaluate",
+        "uwlts gauge table.csv --tolerance wide",
+        "uwlts info one.h5 two.h5 three.h5",
+        "make testfull",
+        "python -m tests.benches",
+        "python docs/studies/nothing.py",
+        "pip install 'uwlts[lidar]'",
+    ],
+)
+def test_a_wrong_command_is_noticed(command):
+    with pytest.raises((cyclopts.CycloptsError, AssertionError)):
+        _check(command)
+
+
+@pytest.mark.parametrize("command", ["uwlts calibrate --jointly", "twin render"])
+def test_a_wrong_option_of_an_abridged_command_is_noticed(command):
+    with pytest.raises((cyclopts.CycloptsError, AssertionError)):
+        _check(command, abridged=True)
+
+
+@pytest.mark.parametrize("app", [uwlts_app, twin_app], ids=APPS[::-1])
+def test_all_commands_explain_themselves(app, capsys):
+    for command in [name for name in app if not name.startswith("-")]:
+        app([command, "--help"], exit_on_error=False, result_action="return_value")
+        assert f"Usage: {app.name[0]} {command}" in capsys.readouterr().out
 
 
 def test_the_readme_is_short():

@@ -221,21 +221,10 @@ class _Route(Platform):
         assert self.frame_rate_hz is not None
         return 1 + int(self._knots[0][-1] * self.frame_rate_hz + 1e-9)
 
-    @cached_property
+    @property
     def _knots(self) -> tuple[np.ndarray, np.ndarray]:
         """Times (K,), s, and ``T_scene_sensor`` (K, 4, 4) through which the path goes."""
-        if self.trajectory is not None:
-            read = read_trajectory(self.trajectory, pose_format=self.trajectory_format, unit=self.trajectory_unit)
-            return read.times_s - read.times_s[0], np.array(read.poses)
-        poses = np.array([waypoint.matrix() for waypoint in self.waypoints])
-        if self.stops:
-            return self.stop_s * np.arange(len(poses)), poses
-        ways = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / self.speed_mm_per_s
-        turns = Rotation.from_matrix(poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2)).magnitude()
-        lasting = np.maximum(ways, turns / np.radians(self.turn_deg_per_s))
-        if (lasting < _SPOT_MM).any():
-            raise DescriptionError(f"waypoint {int(np.argmin(lasting)) + 2} is at the same place as the one before")
-        return np.append(0.0, np.cumsum(lasting)), poses
+        return _knots(self)  # pyright: ignore[reportArgumentType]
 
     def commanded(self) -> Poses:
         """``T_scene_platform`` by the path and the mount's drawing."""
@@ -475,6 +464,23 @@ class Vehicle(_Route):
 
 
 AnyPlatform = IdealPath | LinearGuide | RotaryTable | Robot | Vehicle
+
+
+# Kept beside the descriptions, not in them: arrays in them would make the comparison of equal ones fail.
+@lru_cache(maxsize=8)
+def _knots(route: _Route) -> tuple[np.ndarray, np.ndarray]:
+    if route.trajectory is not None:
+        read = read_trajectory(route.trajectory, pose_format=route.trajectory_format, unit=route.trajectory_unit)
+        return read.times_s - read.times_s[0], np.array(read.poses)
+    poses = np.array([waypoint.matrix() for waypoint in route.waypoints])
+    if route.stops:
+        return route.stop_s * np.arange(len(poses)), poses
+    ways = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) / route.speed_mm_per_s
+    turns = Rotation.from_matrix(poses[1:, :3, :3] @ np.swapaxes(poses[:-1, :3, :3], 1, 2)).magnitude()
+    lasting = np.maximum(ways, turns / np.radians(route.turn_deg_per_s))
+    if (lasting < _SPOT_MM).any():
+        raise DescriptionError(f"waypoint {int(np.argmin(lasting)) + 2} is at the same place as the one before")
+    return np.append(0.0, np.cumsum(lasting)), poses
 
 
 @lru_cache(maxsize=8)

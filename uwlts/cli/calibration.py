@@ -353,7 +353,7 @@ def models(
     One refraction or two, window tilted or not, sheet with bow or turned by the laser's window or not, distortion:
     each model is calibrated without every fourth image, and without the nearest and the farthest ones.
 
-    Example: uwlts models --air target-air.h5 --water target-water.h5 --step step-*.h5 --out models.html
+    Example: uwlts models --air target-air.h5 --water target-water.h5 --step step-near.h5 step-far.h5 --out models.html
 
     Args:
         air: Captures of the target in air, as for uwlts calibrate.

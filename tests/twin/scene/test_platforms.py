@@ -40,6 +40,15 @@ def test_a_path_is_travelled_at_its_speed_with_the_sensor_where_the_waypoints_sa
     np.testing.assert_allclose([shot.travelled_mm for shot in course.shots], 100 * times, atol=1e-9)
 
 
+def test_the_same_path_is_described_again():
+    described = {"kind": "path", "frame_rate_hz": 10.0, "speed_mm_per_s": 100.0}
+    described["waypoints"] = [{"position_mm": (0.0, 0.0, 0.0)}, {"position_mm": (30.0, 0.0, 0.0)}]
+    first, again = IdealPath.model_validate(described), IdealPath.model_validate(described)
+    assert first.images() == again.images() == 4
+    assert first.shots() == again.shots()
+    assert first == again
+
+
 def test_the_clock_of_the_platform_is_ahead():
     """By the platform's clock the pose at a time is that of the camera's time less the offset."""
     path = IdealPath(kind="path", waypoints=ALONG, speed_mm_per_s=100.0, frame_rate_hz=20.0, clock_offset_s=0.02)

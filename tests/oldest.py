@@ -1,0 +1,40 @@
+"""Print the oldest allowed version of each dependency as requirements of pip: ``python -m tests.oldest test``.
+
+The arguments name the extras whose dependencies count besides the project's own, those that they include in turn too.
+Versions that are pinned have no oldest one, and are left out.
+"""
+
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from packaging.requirements import Requirement
+
+PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
+
+
+def oldest(*extras: str) -> list[str]:
+    """Requirements ``name==version`` of the project's dependencies and those of its extras, sorted by name."""
+    project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
+    lowest = {}
+    for one in _requirements(project, extras):
+        name = f"{one.name}[{','.join(one.extras)}]" if one.extras else one.name
+        for part in one.specifier:
+            if part.operator == ">=":
+                lowest[name] = part.version
+    return sorted(f"{name}=={version}" for name, version in lowest.items())
+
+
+def _requirements(project: dict[str, Any], extras: tuple[str, ...]) -> Iterator[Requirement]:
+    lists = [project["dependencies"], *(project["optional-dependencies"][extra] for extra in extras)]
+    for one in (Requirement(line) for lines in lists for line in lines):
+        if one.name == project["name"]:
+            yield from _requirements(project | {"dependencies": []}, tuple(one.extras))
+        else:
+            yield one
+
+
+if __name__ == "__main__":
+    print("\n".join(oldest(*sys.argv[1:])))

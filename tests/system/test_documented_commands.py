@@ -1,0 +1,280 @@
+"""Every command line and Python block of the documentation runs, in the order of its page, or is listed with a reason.
+
+Pages that take recordings for granted share one small campaign, made by the same commands: fewer pixels, places of the
+stage and samples. `test_documented_hardware.py` runs the pages that need a camera and a stage, with the twin as both.
+"""
+
+import csv
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import uwlts
+from tests.documented import PAGES, ROOT, blocks, name_of
+from tests.system.documented_runs import Page, Runner, run_page, write_small_descriptions
+from tests.system.test_documented_hardware import PAGES_RUN as HARDWARE_PAGES
+from tests.uwlts.mount_views import RADIUS_MM, SPHERE_MM, STANDOFF_MM, profile_of, sphere_campaign
+
+pytestmark = pytest.mark.slow
+
+CAMPAIGN = """
+twin simulate target --as-built thesis-as-built --out target-air.h5
+twin simulate target-through-window --medium water --as-built thesis-as-built --out target-water.h5
+twin simulate step --placement near far --as-built thesis-as-built --out 'step-{placement}.h5'
+twin simulate step --placement near --seed 1 --as-built thesis-as-built --out step-today.h5
+twin simulate spheres --placement near --as-built thesis-as-built --out spheres.h5
+twin simulate spheres --placement standoff --seed 1 --as-built thesis-as-built --out today.h5
+twin simulate pipe --as-built thesis-as-built --out pipe.h5
+twin simulate plane --as-built thesis-as-built --out plane.h5
+twin simulate weld --as-built thesis-as-built --out weld.h5
+twin simulate flange --as-built thesis-as-built --out flange.h5
+twin simulate step-scan --as-built thesis-as-built --out step-scan.h5
+uwlts calibrate --air target-air.h5 --water target-water.h5 --step step-near.h5 step-far.h5 --out calibration.json
+uwlts certificate calibration.json --out certificate.html
+uwlts reconstruct spheres.h5 --calibration calibration.json --out spheres.ply
+uwlts reconstruct pipe.h5 --calibration calibration.json --out pipe.ply
+uwlts reconstruct weld.h5 --calibration calibration.json --out weld.ply
+uwlts reconstruct flange.h5 --calibration calibration.json --out flange.ply
+uwlts reconstruct step-scan.h5 --calibration calibration.json --out step-scan.ply
+uwlts mesh pipe.ply --out pipe.stl
+"""
+
+MAKE = {"make ": "`make test-full` runs this test, and demo, bench, docs and check take minutes each"}
+HARDWARE = "needs hardware: docs/how-to/scan.md and desk.md run it with the twin"
+NEEDS_LEARN = "needs the extra learn, with some 1 GB of libraries, and minutes of training"
+THREE_VIEWS = {"top.ply": "pipe.ply", "left.ply": "pipe.ply", "right.ply": "pipe.ply"}
+NO_MOVEMENT = "1,0,0,0,0,1,0,0,0,0,1,0\n" * 3
+GAUGE = "part,operator,value\n" + "".join(
+    f"pipe {part},{operator},{299.8 + 0.05 * part + 0.01 * (7 * part * turn % 5):.2f}\n"
+    for part in range(1, 6)
+    for operator in ("Ana", "Ben")
+    for turn in (1, 2, 3)
+)
+PLATES = """
+title = "Two plates with a gap of 3 mm along the scan"
+medium = "water"
+[motion]
+start_mm = -11.0
+step_mm = 2.0
+count = 12
+[[objects]]
+kind = "plate"
+width_mm = 100.0
+height_mm = 50.0
+position_mm = [0.0, 26.5, 0.0]
+[[objects]]
+kind = "plate"
+width_mm = 100.0
+height_mm = 50.0
+position_mm = [0.0, -26.5, 0.0]
+"""
+ROBOT = """
+twin simulate robot-sphere --out robot.h5
+uwlts nominal thesis --medium water --out calibration.json
+uwlts mount robot.h5 --calibration calibration.json --radius-mm 19.05 --out mount.json
+"""
+
+
+def write_profiles(folder: Path, profiles: list[np.ndarray]) -> None:
+    """One CSV file for each profile, as a profiler of any make gives them."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    for number, profile in enumerate(profiles):
+        np.savetxt(folder / f"{number}.csv", profile, fmt="%.4f", delimiter=",", header="x,z", comments="")
+
+
+def profiles_of_a_robot(runner: Runner) -> None:
+    """Drawn profiles of a sphere of 19.05 mm radius, and the robot's poses."""
+    views = sphere_campaign(np.random.default_rng(1), poses=15)
+    write_profiles(runner.folder / "profiles", [profile * 19.05 / RADIUS_MM for profile in views.profiles])
+    turns = Rotation.from_matrix(views.poses[:, :3, :3]).as_quat(scalar_first=True)
+    places = views.poses[:, :3, 3] * 19.05 / RADIUS_MM
+    np.savetxt(runner.folder / "poses.csv", np.hstack([places, turns]), fmt="%.9f", delimiter=",")
+
+
+def profiles_of_a_table(runner: Runner) -> None:
+    """Drawn profiles of the same sphere 9 mm off the axis of a table, along which the sensor looks down."""
+    rng, angles = np.random.default_rng(2), np.arange(0.0, 360.0, 15.0)
+    profiles = []
+    for angle in angles:
+        # Seen from the table the sensor turns the other way, about an axis beside the sphere.
+        base_sensor = np.eye(4)
+        base_sensor[:3, :3] = (
+            Rotation.from_euler("z", -angle, degrees=True) * Rotation.from_euler("x", np.pi)
+        ).as_matrix()
+        base_sensor[:3, 3] = SPHERE_MM + [9.0, 0.0, STANDOFF_MM]
+        profiles.append(profile_of(base_sensor, rng, noise_mm=0.03, background=False) * 19.05 / RADIUS_MM)
+    write_profiles(runner.folder / "profiles", profiles)
+    np.savetxt(runner.folder / "angles.csv", angles, fmt="%.1f", header="angle", comments="")
+
+
+def poses_of_a_capture(runner: Runner) -> None:
+    """The robot's poses at the images of board.h5, m, as its controller prints them."""
+    with uwlts.open_capture(runner.folder / "board.h5") as capture:
+        poses = np.array([frame.pose for frame in capture])
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+    np.savetxt(runner.folder / "poses.csv", np.hstack([poses[:, :3, 3] / 1e3, turns]), fmt="%.12f", delimiter=",")
+
+
+def trajectory_for_tum(runner: Runner) -> None:
+    """The vehicle's trajectory as the benchmark of TU Munich writes them: s, m, quaternion x y z w."""
+    with (runner.folder / "vehicle.trajectory.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    names = list(rows[0])
+    time = names.index("time_s")
+    values = np.array(
+        [
+            [float(row[name]) for name in [*names[time : time + 1], *names[:time], *names[time + 1 :]][:8]]
+            for row in rows
+        ]
+    )
+    values[:, 1:4] /= 1e3
+    np.savetxt(runner.folder / "path.tum", values, fmt="%.9f")
+    shutil.copy(runner.folder / "vehicle.h5", runner.folder / "scan.h5")
+
+
+def study_of_the_page(runner: Runner) -> None:
+    shutil.copy(runner.names["folder"] / "study.toml", runner.folder)
+
+
+def photographs_of_the_page(runner: Runner) -> None:
+    shutil.copytree(runner.names["folder"], runner.folder / "photographs")
+
+
+def photographs_with_description(runner: Runner) -> None:
+    shutil.copytree(ROOT / "tests" / "data" / "etna", runner.folder / "photographs")
+    shutil.copy(runner.names["folder"] / "board.toml", runner.folder)
+    shutil.copy(runner.names["folder"] / "whole.toml", runner.folder / "photographs" / "import.toml")
+
+
+PAGES_RUN = {
+    "README.md": Page(
+        given=THREE_VIEWS | {"after.ply": "pipe.ply", "before.ply": "pipe.ply"},
+        small_python=True,
+        instead={"--scenes 200": "--scenes 1"},
+        again=("twin simulate spheres",),
+        not_run=MAKE | {"uwlts scan": HARDWARE, "uwlts desk": HARDWARE},
+    ),
+    "CONTRIBUTING.md": Page(not_run=MAKE),
+    "docs/install.md": Page(not_run=MAKE | {"python3 -m venv": "make does it", ".venv/bin/": "make does it"}),
+    "docs/getting-started.md": Page(
+        not_run=MAKE
+        | {"pip install": "make does it", "twin demo": "takes a minute; tests/system/test_campaign.py runs it"},
+        small_python=True,
+        again=("twin simulate spheres",),
+    ),
+    "docs/explanation/design-studies.md": Page(),
+    "docs/explanation/joint-calibration.md": Page(
+        given={name: name for name in ("target-air.h5", "target-water.h5", "step-near.h5", "step-far.h5", "spheres.h5")}
+        | {"pipe.h5": "pipe.h5", "plane.h5": "plane.h5", "target.h5": "target-water.h5", "today.h5": "today.h5"}
+        | {"step-today.h5": "step-today.h5", "last-year.json": "calibration.json"},
+        again=("uwlts calibrate --air", "uwlts calibrate --joint", "uwlts calibrate --water target.h5")
+        + ("uwlts certificate calibration.json --before",),
+    ),
+    "docs/explanation/learned-stripe.md": Page(
+        instead={"--scenes 80": "--scenes 2"},
+        not_run={"python train.py": NEEDS_LEARN, "python compare.py": NEEDS_LEARN, "uwlts reconstruct": NEEDS_LEARN},
+    ),
+    "docs/explanation/light.md": Page(),
+    "docs/explanation/tests.md": Page(
+        instead={"pytest": f"pytest --collect-only -q {ROOT / 'tests/test_public_api.py'}"}
+    ),
+    "docs/how-to/add-a-target.md": Page(
+        instead={'kind: Literal["plain circles"] = "plain circles"': 'kind: Literal["plain"] = "plain"'}
+    ),
+    "docs/how-to/calibrate-a-mount.md": Page(
+        before=ROBOT.replace("mount.json", "robot-mount.json")
+        + "twin simulate robot-target --out board.h5\ncp robot.h5 scan.h5\n"
+        + "twin simulate vehicle-pipe --out vehicle.h5",
+        prepare={
+            "uwlts mount profiles poses.csv": profiles_of_a_robot,
+            "uwlts mount board.h5": poses_of_a_capture,
+            "uwlts mount profiles angles.csv": profiles_of_a_table,
+            "uwlts reconstruct scan.h5 --calibration calibration.json --mount mount.json --traj": trajectory_for_tum,
+        },
+        again=("uwlts mount board.h5", "uwlts mount robot.h5")
+        + ("uwlts reconstruct scan.h5 --calibration calibration.json --mount mount.json --traj",),
+    ),
+    "docs/how-to/compare-scans.md": Page(
+        given=dict.fromkeys(("after.ply", "before.ply", "scan.ply", "pipe.ply"), "pipe.ply") | {"part.stl": "pipe.stl"},
+        again=("uwlts compare scan.ply", "uwlts compare pipe.ply"),
+    ),
+    "docs/how-to/gauge-study.md": Page(
+        texts={"diameters.csv": GAUGE, "runs/gauge/heights.csv": GAUGE},
+        not_run={"python docs/studies/gauge_twin.py": "renders 18 scans"},
+    ),
+    "docs/how-to/inspect-a-pipe.md": Page(
+        given={name: name for name in ("pipe.ply", "pipe.h5", "weld.ply", "flange.ply")}
+        | {"other-flange.ply": "flange.ply", "plate.ply": "step-scan.ply"}
+        | {"water.json": "calibration.json", "water.certificate.json": "certificate.json"},
+        texts={"gap.toml": PLATES},
+        before="""
+            twin simulate gap.toml --out plates.h5
+            uwlts nominal thesis --medium water --out nominal.json
+            uwlts reconstruct plates.h5 --calibration nominal.json --out plates.ply
+        """,
+    ),
+    "docs/how-to/large-clouds.md": Page(
+        given={"scan.ply": "pipe.ply"}, instead={"1000 -50 300 1100 50 600": "-10 -50 300 10 50 600"}
+    ),
+    "docs/how-to/make-a-data-set.md": Page(
+        tables={"mine.toml": 0}, instead={"--scenes 200": "--scenes 1", "scenes = 40 ": "scenes = 2 "}
+    ),
+    "docs/how-to/make-a-mesh.md": Page(given=THREE_VIEWS | {"merged.ply": "pipe.ply"}),
+    "docs/how-to/register-scans.md": Page(
+        given=THREE_VIEWS, texts={"start.csv": NO_MOVEMENT}, before=ROBOT + "twin simulate vehicle-pass --out pass.h5"
+    ),
+    "docs/how-to/scan-from-a-moving-platform.md": Page(
+        before=ROBOT.replace("robot.h5", "first.h5")
+        + "twin simulate vehicle-pipe --out scan.h5\ncp scan.trajectory.csv path.csv",
+        again=("uwlts reconstruct scan.h5 --calibration calibration.json --mount mount.json --traj",),
+    ),
+    "docs/reference/api.md": Page(given={name: name for name in ("target-air.h5", "target-water.h5", "spheres.h5")}),
+    "docs/tutorials/calibrate-a-sensor.md": Page(small_python=True),
+    "docs/tutorials/choose-a-design.md": Page(
+        prepare={"twin sweep study.toml --out runs/study": study_of_the_page},
+        again=("twin sweep study.toml --out runs/study --verify 2",),
+        instead={"--verify 2": "--verify 1", "steps = 26": "steps = 6", "steps = 24": "steps = 5"},
+    ),
+    "docs/tutorials/import-foreign-images.md": Page(prepare={"uwlts import photographs": photographs_of_the_page}),
+    "docs/tutorials/learn-from-a-data-set.md": Page(
+        instead={"scenes=50": "scenes=6"}, not_run={"example = next(": NEEDS_LEARN, "methods = {": NEEDS_LEARN}
+    ),
+    "docs/tutorials/photographs-to-sensor.md": Page(
+        prepare={"uwlts camera photographs": photographs_with_description},
+        instead={"Path.cwd().parents": "Path(uwlts.__file__).parents"},
+    ),
+    "docs/tutorials/simulate-and-measure.md": Page(),
+}
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("small")
+    write_small_descriptions(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory, small: Path) -> Path:
+    folder = tmp_path_factory.mktemp("campaign")
+    runner = Runner(folder, small)
+    for line in CAMPAIGN.strip().splitlines():
+        runner.command(line)
+    return folder
+
+
+def test_every_page_with_commands_is_run():
+    with_blocks = {
+        name_of(page) for page in PAGES if any(block.kind in ("commands", "python") for block in blocks(page))
+    }
+    assert with_blocks == set(PAGES_RUN) | set(HARDWARE_PAGES)
+
+
+@pytest.mark.parametrize("name", PAGES_RUN)
+def test_page_runs(name, shared, small, tmp_path, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    run_page(ROOT / name, PAGES_RUN[name], shared=shared, folder=tmp_path, small=small)
