@@ -6,7 +6,6 @@ Source: ``doc/markdown/interface.md``, ``doc/csv`` and the C code of https://git
 import errno
 import math
 import re
-import termios
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -19,6 +18,11 @@ from serial.tools.list_ports import comports
 
 from uwlts.errors import HardwareError
 from uwlts.hardware.heartbeat import BEAT_S, GRACE_S, Heartbeat
+
+try:
+    import termios
+except ImportError:
+    termios = None  # Windows, where no stage can be used
 
 _NUMBER = r"-?\d+(?:\.\d+)?"
 _STATE = re.compile(r"(Idle|Run|Hold|Jog|Alarm|Door|Check|Home|Sleep)(?::(\d+))?")
@@ -267,6 +271,8 @@ class GrblLine:
 
     def _hang_up_on_close(self) -> None:
         """Have DTR drop when the port is closed by any process; docs/how-to/hardware-stage.md explains why."""
+        if termios is None:
+            raise HardwareError("a stage with a laser needs Linux or macOS: the laser's guard cannot work here")
         try:
             attributes = termios.tcgetattr(self._serial.fileno())
             attributes[2] |= termios.HUPCL

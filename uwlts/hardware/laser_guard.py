@@ -13,8 +13,12 @@ import select
 import signal
 import struct
 import sys
-import termios
 import time
+
+try:
+    import termios
+except ImportError:
+    termios = None  # Windows, where no stage can be used
 
 BEAT = struct.Struct("d")
 """Until when the laser may stay on, by the monotonic clock, which all processes share; inf while it is off."""
@@ -56,6 +60,7 @@ def watch(parent: int, port: int) -> None:
 
 def switch_off(port: int) -> None:
     """Send the reset and see it out of the computer; a port that is gone has no laser to switch off."""
+    assert termios is not None
     deadline = time.monotonic() + _GIVE_UP_S
     while time.monotonic() < deadline:
         try:
