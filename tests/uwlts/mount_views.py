@@ -42,11 +42,14 @@ def sphere_campaign(
     background: bool = True,
     scale: float = 1.0,
     plane_only: bool = False,
+    smooth_mm: float = 0.0,
+    rays: int = RAYS,
 ) -> Campaign:
     """A campaign: the sensor looks down from all sides, the sphere anywhere in the middle of its field of view.
 
     The robot reports other positions than it has, by ``robot_mm`` in each coordinate, and lengths too short by
-    ``scale``. The plane lies 1.1 radius below the sphere's centre, square to z of the base.
+    ``scale``. The plane lies 1.1 radius below the sphere's centre, square to z of the base. The profiler errs along
+    each profile by ``smooth_mm`` (rms) as well, alike within some 8 mm.
     """
     profiles, reported = [], []
     for _ in range(poses):
@@ -58,21 +61,39 @@ def sphere_campaign(
         base_sensor[:3, :3] = looking_down.as_matrix()
         base_sensor[:3, 3] = SPHERE_MM - base_sensor[:3, :3] @ place
         base_platform = base_sensor @ np.linalg.inv(MOUNT)
-        profiles.append(profile_of(base_sensor, rng, noise_mm=noise_mm, background=background, sphere=not plane_only))
+        profile = profile_of(
+            base_sensor, rng, noise_mm=noise_mm, background=background, sphere=not plane_only, count=rays
+        )
+        if smooth_mm:
+            profile[:, 1] += smooth_mm * _smooth_errors(profile[:, 0], rng)
+        profiles.append(profile)
         pose = base_platform.copy()
         pose[:3, 3] = (pose[:3, 3] + robot_mm * rng.standard_normal(3)) / scale
         reported.append(pose)
     return Campaign(profiles, np.array(reported))
 
 
+def _smooth_errors(x: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Normal errors (N,) with unit variance at x (N,), mm: noise averaged by a Gaussian kernel 8 mm wide."""
+    knots = np.arange(-150.0, 150.0, 1.0)
+    weights = np.exp(-(((x[:, None] - knots) / 8.0) ** 2))
+    return weights @ rng.standard_normal(len(knots)) / np.sqrt(np.sum(weights**2, axis=1))
+
+
 def profile_of(
-    base_sensor: np.ndarray, rng: np.random.Generator, *, noise_mm: float, background: bool = True, sphere: bool = True
+    base_sensor: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    noise_mm: float,
+    background: bool = True,
+    sphere: bool = True,
+    count: int = RAYS,
 ) -> np.ndarray:
     """What the fan of a sensor at ``T_base_sensor`` sees: x and z (N, 2), with noise along z and gaps, mm."""
-    angles = np.radians(np.linspace(-18, 18, RAYS))
-    rays = np.column_stack([np.sin(angles), np.zeros(RAYS), np.cos(angles)])
+    angles = np.radians(np.linspace(-18, 18, count))
+    rays = np.column_stack([np.sin(angles), np.zeros(count), np.cos(angles)])
     directions, origin = rays @ base_sensor[:3, :3].T, base_sensor[:3, 3]
-    length = np.full(RAYS, np.inf)
+    length = np.full(count, np.inf)
     if background:
         length = (SPHERE_MM[2] - 1.1 * RADIUS_MM - origin[2]) / directions[:, 2]
     if sphere:
@@ -82,11 +103,11 @@ def profile_of(
         with np.errstate(invalid="ignore"):
             length = np.where(under > 0, np.minimum(length, -half - np.sqrt(under)), length)
     seen = np.where(np.isfinite(length), length, np.nan)
-    profile = np.column_stack([rays[:, 0] * seen, rays[:, 2] * seen + noise_mm * rng.standard_normal(RAYS)])
+    profile = np.column_stack([rays[:, 0] * seen, rays[:, 2] * seen + noise_mm * rng.standard_normal(count)])
     # A gap somewhere, and single points without an echo.
-    gap = int(rng.integers(RAYS - 25))
+    gap = int(rng.integers(count - 25))
     profile[gap : gap + 25] = np.nan
-    profile[rng.random(RAYS) < 0.03] = np.nan
+    profile[rng.random(count) < 0.03] = np.nan
     return profile
 
 

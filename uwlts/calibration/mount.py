@@ -9,9 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount_artefacts import SHAPES
 from uwlts.calibration.mount_board import mount_by_board
+from uwlts.calibration.mount_estimate import Estimate, settle
 from uwlts.calibration.mount_model import Motion, MountState, Problem, Scatter
 from uwlts.calibration.mount_next_pose import axis_words, missing_turns, next_pose
-from uwlts.calibration.mount_prediction import coverage_factor, held_out_mm, inverse, left_out_excess, misfits
+from uwlts.calibration.mount_prediction import misfits
 from uwlts.calibration.mount_profiles import LEAST_POINTS
 from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of, with_sensor
 from uwlts.calibration.mount_start import NoFit, require_surfaces, start
@@ -26,13 +27,15 @@ from uwlts.storage.pose_files import PoseFormat, Unit, read_poses
 
 _MOST_POINTS = 100_000
 """Points of all profiles together; more take time and hardly lower the uncertainty, as poses err too."""
-_ROUNDS = 8
 _LARGEST_ROUGH = 6.0
 """Times the median misfit of a pose: of 45 normal poses one in millions lies farther out."""
 _FALSE_ALARM = 1e-3
 """Probability that any pose of a campaign without wrong ones is left out."""
 _NO_FIT = 0.1
 """Share of a sphere's radius by which platforms do not err; a wrong format of the poses gives more."""
+_OTHER_SIZE, _SURE = 0.03, 5.0
+"""Share of the given size by which profiles show another one for sure, as profilers' scales err by less, and standard
+uncertainties, beyond which lies one normal error in a million."""
 _OPEN_MM, _OPEN_RAD = 5.0, np.radians(1.0)
 """Standard uncertainties from which a mount counts as not determined; a ruler and a protractor do better."""
 _WEAK = 5.0
@@ -60,7 +63,8 @@ def calibrate_mount(
 
     The platform's poses ``T_base_platform`` are known, as a robot's flange's. The artefact's place and the mount are
     estimated together by least squares of the distances of all points from the artefact, weighted by the noise of the
-    points and the scatter of the poses, which are estimated too (restricted maximum likelihood). Background beside
+    points, the smooth error along each profile and the scatter of the poses, which are estimated too (restricted
+    maximum likelihood). Background beside
     the artefact, and poses that contradict the others, are left out.
 
     Parameters
@@ -211,12 +215,15 @@ class _Calibration:
         misfit = misfits(problem, state)
         noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
         good = misfit < max(_LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
-        scatter = Scatter(max(noise, 1e-6), max(float(np.median(misfit)), noise), 1e-3)
+        typical = max(float(np.median(misfit)), noise, 1e-6)
+        scatter = Scatter(max(noise, 1e-6), typical, typical, typical, 1e-3)
         # What the first search got wrong in single profiles is searched again near the artefact that the others show.
         for _ in range(2):
             require_surfaces(problem.selected(good))
-            state, scatter = _refined(problem.selected(good), state, scatter)
-            reach = 4 * float(np.hypot(scatter.point_mm, 2 * scatter.pose_mm))
+            found = settle(problem.selected(good), [(state, np.array(scatter))])
+            scatter = Scatter(*found.scatter)
+            reach = 4 * float(np.hypot(np.hypot(scatter.point_mm, scatter.smooth_mm), 2 * scatter.pose_mm))
+            state = found.state
             shapes = whole.seen_again(state, self.flat, reach, self.rng)
             kept = np.array([shape is not None for shape in shapes])
             problem = whole.of_seen(shapes)
@@ -225,8 +232,10 @@ class _Calibration:
         while True:
             used = problem.selected(good)
             require_surfaces(used)
-            state, scatter = _refined(used, state, scatter)
-            excess = left_out_excess(used, state, scatter, probability=_FALSE_ALARM / len(kept))
+            # The likelier of the estimates from here and from the least squares of all distances alike.
+            found = settle(used, [(start, np.array(scatter)) for start in (state, used.plain(state))])
+            state, scatter = found.state, Scatter(*found.scatter)
+            excess = found.excess(probability=_FALSE_ALARM / len(kept))
             if excess.max() <= 1:
                 break
             good[np.flatnonzero(good)[np.argmax(excess)]] = False
@@ -241,10 +250,10 @@ class _Calibration:
                 self.reasons[number] = f"contradicts the other poses: {off:.3g} mm off"
             else:
                 self.reasons.setdefault(number, f"no {self.evidence.artefact} found where the other poses show it")
-        self._require_fit(used, state, scatter)
+        self._require_fit(used, found)
         empty = [np.zeros(len(each), dtype=bool) for each in self.flat]
         members = [own if shape is None else shape.members for own, shape in zip(empty, shapes, strict=True)]
-        return self._summary(used, state, scatter, members)
+        return self._summary(used, found, members)
 
     def _require_enough(self, numbers: np.ndarray | None = None) -> None:
         poses, needed = len(self.profiles), self.shape.fewest_poses
@@ -255,24 +264,39 @@ class _Calibration:
                 "needed. Record more poses, or check artefact, size and units"
             )
 
-    def _require_fit(self, used: Problem, state: MountState, scatter: Scatter) -> None:
+    def _require_fit(self, used: Problem, estimate: Estimate[MountState]) -> None:
+        state, scatter = estimate.state, Scatter(*estimate.scatter)
         extent = float(np.median([np.linalg.norm(np.ptp(each, axis=0)) for each in self.flat if len(each)]))
         limit = _NO_FIT * (0.1 * extent if self.shape.flat else state.artefact[3])
-        if scatter.pose_mm > limit:
+        wrong = float(np.hypot(scatter.pose_mm, scatter.smooth_mm))
+        if wrong > limit:
             raise NoFit(
                 f"no mount makes the profiles fit: {len(used.points)} of {len(self.profiles)} poses would be wrong by "
-                f"{scatter.pose_mm:.3g} mm (rms)"
+                f"{wrong:.3g} mm (rms)"
+            )
+        if self.shape.size_mm is None:
+            return
+        free = replace(used, shape=SHAPES[self.evidence.artefact]())
+        other = Estimate(free, state, estimate.scatter)
+        at = 5 + free.shape.count
+        step, std = float(other.by(other.residuals[:, :, None])[at, 0]), float(np.sqrt(other.covariance[at, at]))
+        if abs(step) > max(_OTHER_SIZE * self.shape.size_mm, _SURE * std):
+            raise NoFit(
+                f"no mount makes the profiles fit a {self.evidence.artefact} of {self.evidence.size} "
+                f"{self.shape.size_mm:g} mm: they show one that differs by {step:.2g} mm (standard uncertainty "
+                f"{std:.2g} mm)"
             )
 
-    def _summary(self, used: Problem, state: MountState, scatter: Scatter, members: list[np.ndarray]) -> Mount:
-        information = used.information(state, scatter)
-        own = used.of_all(inverse(information.sum(axis=0)))
+    def _summary(self, used: Problem, estimate: Estimate[MountState], members: list[np.ndarray]) -> Mount:
+        state, scatter = estimate.state, Scatter(*estimate.scatter)
+        own = used.of_all(estimate.covariance)
         covariance, share = own, None
         if self.captured is not None and self.captured.known is not None:
-            by_sensor = self._by_sensor(used, state, scatter, members)
+            by_sensor = self._by_sensor(used, estimate, members)
             covariance, share = with_sensor(own, by_sensor, state.rotation, self.captured.known)
         self._require_determined(used, state, scatter, covariance)
-        held = held_out_mm(used, state, scatter, information)
+        moved = [used.stepped(state, step) for step, _ in estimate.without_each]
+        held = np.array([misfits(used, each)[place] for place, each in enumerate(moved)])
         rms, numbers = misfits(used, state), [n for n in range(len(members)) if n not in self.reasons]
         order = {number: place for place, number in enumerate(numbers)}
         poses = []
@@ -293,10 +317,13 @@ class _Calibration:
         transform = np.eye(4)
         transform[:3, :3], transform[:3, 3] = Rotation.from_matrix(state.rotation).as_matrix(), state.translation
         weights = used.counts / used.counts.sum()
+        own_values = np.flatnonzero(np.diag(own)[:6] > 0)
         return Mount(
             T_platform_sensor=tuple(tuple(row) for row in transform.tolist()),
             covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
-            coverage_factor=coverage_factor(used, state, scatter, own, covariance),
+            coverage_factor=estimate.coverage_factor(
+                (np.diag(own) / np.diag(covariance))[own_values], used.free[own_values]
+            ),
             artefact=found,
             robot_scale=state.scale if used.scale else None,
             robot_scale_std=float(std[at]) if used.scale else None,
@@ -314,21 +341,15 @@ class _Calibration:
             inputs=self.evidence.digests,
         )
 
-    def _by_sensor(self, used: Problem, state: MountState, scatter: Scatter, members: list[np.ndarray]) -> np.ndarray:
-        """Derivatives (K, Q) of all values by the parameters of the sensor's calibration, which move the profiles.
-
-        The solution of weighted least squares moves by -(J^T W J)^-1 J^T W d where the distances move by d.
-        """
+    def _by_sensor(self, used: Problem, estimate: Estimate[MountState], members: list[np.ndarray]) -> np.ndarray:
+        """Derivatives (K, Q) of all values by the parameters of the sensor's calibration, which move the profiles."""
         assert self.captured is not None
-        normals, moved = used.normals(state), []
+        normals, moved = used.normals(estimate.state), []
         numbers = [n for n in range(len(members)) if n not in self.reasons]
         for number, own in zip(numbers, np.split(normals, np.cumsum(used.counts)[:-1]), strict=True):
             by = self.captured.moved(number, self.rows[number][members[number]])
             moved.append(np.einsum("ni,niq->nq", own, by))
-        whitened = used.whitening(state, scatter)
-        derivatives, together = whitened(used.derivatives(state)), np.vstack(moved)
-        off = whitened(used.on_lines(together))
-        return -used.free @ inverse(derivatives.T @ derivatives) @ derivatives.T @ off
+        return used.free @ estimate.by(used.means(used.on_lines(np.vstack(moved))))
 
     def _require_determined(self, used: Problem, state: MountState, scatter: Scatter, covariance: np.ndarray) -> None:
         shift = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
@@ -336,7 +357,7 @@ class _Calibration:
         if shift <= _OPEN_MM and turn <= _OPEN_RAD:
             return
         # A wrong radius or format also makes the scatter large.
-        if not self.shape.flat and scatter.pose_mm > 0.2 * _NO_FIT * state.artefact[3]:
+        if not self.shape.flat and np.hypot(scatter.pose_mm, scatter.smooth_mm) > 0.2 * _NO_FIT * state.artefact[3]:
             raise NoFit(f"no mount makes the profiles fit: the poses would be wrong by {scatter.pose_mm:.3g} mm (rms)")
         numbers = [name for n, name in enumerate(self.evidence.names) if n not in self.reasons]
         advised = next_pose(used, state, scatter, self.sheet, numbers)
@@ -388,16 +409,6 @@ def _motion(evidence: MountEvidence) -> Motion:
         return poses[:, :3, :3], poses[:, :3, 3]
 
     return motion
-
-
-def _refined(problem: Problem, state: MountState, scatter: Scatter) -> tuple[MountState, Scatter]:
-    """Solution and scatter by turns, until the scatter stays."""
-    for _ in range(_ROUNDS):
-        state = problem.solved(state, scatter)
-        before, scatter = scatter, problem.scatter_at(state, scatter)
-        if abs(scatter.pose_mm - before.pose_mm) <= 0.02 * before.pose_mm + 0.02 * before.point_mm:
-            break
-    return problem.solved(state, scatter), scatter
 
 
 def _weaknesses(problem: Problem, state: MountState, covariance: np.ndarray) -> list[str]:

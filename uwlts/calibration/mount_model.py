@@ -3,20 +3,27 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares, minimize
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount_artefacts import Seen, Shape
+from uwlts.calibration.mount_estimate import solved_step
 from uwlts.calibration.mount_profiles import LEAST_POINTS
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 """Rotations (P, 3, 3) and positions (P, 3) of the platform in the base frame for a time offset, s."""
 
 _TIME_STEP_S = 1e-4
-_SMALLEST_SHARE = 1e-3
-"""Of the points' noise; smaller scatter of the poses does not show."""
+_POINT_MM, _TURN_RAD = (1e-5, 1e2), (1e-8, 1.0)
+"""Bounds of scatter: from far below what any profiler resolves to far above what any platform errs."""
+_ROUNDING = 1e-12
+"""Of the largest variance: more than rounding errors change, which make covariances singular."""
+_BINS = 32
+"""Of a profile: an arc of 60 deg then bends by less than a thousandth of its radius in each."""
+_LEAST_SPAN = 1e-6
+"""Of the largest thing that a pose's errors do to its profile: less counts as nothing."""
 _LEAST_SHARE = 1e-3
 """Of the noise that the distances from a plane have: it leans by less than 0.06 deg from the sheet."""
 
@@ -32,13 +39,18 @@ class MountState:
     offset_s: float = 0.0
 
 
-@dataclass(frozen=True)
-class Scatter:
-    """Standard deviations: of a point, of each coordinate of a pose, and of its turn (rad; flat artefacts only)."""
+class Scatter(NamedTuple):
+    """Standard deviations: of a point, of the smooth error along a profile, of a pose's coordinates, and of its turn.
+
+    The covariance of the smooth error falls exponentially along the profile, to 1/e at ``length_mm``. The turn (rad)
+    counts for flat artefacts only.
+    """
 
     point_mm: float
+    smooth_mm: float
+    length_mm: float
     pose_mm: float
-    turn_rad: float = 0.0
+    turn_rad: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,96 +257,114 @@ class Problem:
         out_of_sheet = self.normals(state) @ self.across
         return np.sqrt(np.maximum(1 - out_of_sheet**2, _LEAST_SHARE**2))[:, None]
 
-    def whitening(self, state: MountState, scatter: Scatter) -> Callable[[np.ndarray], np.ndarray]:
-        """Function that gives distances (N,) or their derivatives (N, ...) near a state the unit covariance."""
-        share = self.noise_along(state)
-        errors = self.errors(state) / share
-        sizes = sizes_of(errors.shape[1], scatter)
-        parts = []
-        for own in np.split(np.arange(len(errors)), np.cumsum(self.counts)[:-1]):
-            basis, upper = np.linalg.qr(errors[own] * sizes)
-            values, vectors = np.linalg.eigh(upper @ upper.T)
-            shrink = 1 - scatter.point_mm / np.sqrt(scatter.point_mm**2 + np.maximum(values, 0))
-            parts.append((own, basis @ vectors, shrink))
+    @cached_property
+    def _bins(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Order (N,) of the points by pose and surface, where bins (B,) begin in it, their poses and places there."""
+        order, starts, poses, places, first = [], [], [], [], 0
+        for pose, part in enumerate(self.part):
+            rows = np.argsort(part, kind="stable")
+            ends = np.flatnonzero(np.diff(part[rows])) + 1
+            place = 0
+            for run in np.split(rows, ends):
+                count = min(max(round(_BINS * len(run) / len(part)), 1), len(run))
+                begins = np.linspace(0, len(run), count, endpoint=False).astype(int)
+                starts.append(first + begins)
+                poses.append(np.full(count, pose))
+                places.append(place + np.arange(count))
+                place += count
+                order.append(int(self.counts[:pose].sum()) + run)
+                first += len(run)
+        return np.concatenate(order), np.concatenate(starts), np.concatenate(poses), np.concatenate(places)
 
-        def whitened(values: np.ndarray) -> np.ndarray:
-            result = values / (scatter.point_mm * (share if values.ndim > 1 else share[:, 0]))
-            for own, basis, shrink in parts:
-                result[own] -= (basis * shrink) @ (basis.T @ result[own])
-            return result
+    def means(self, values: np.ndarray, fill: float = 0.0) -> np.ndarray:
+        """Means (P, K, ...) of values (N, ...) of the points in bins along the profiles; ``fill`` beyond the bins."""
+        order, starts, poses, places = self._bins
+        counts = np.diff(starts, append=len(order)).reshape(-1, *[1] * (values.ndim - 1))
+        result = np.full((len(self.points), int(places.max()) + 1, *values.shape[1:]), fill)
+        result[poses, places] = np.add.reduceat(values[order], starts, axis=0) / counts
+        return result
 
-        return whitened
+    @cached_property
+    def _apart(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Masks (P, K) of the bins with points, numbers of these (P, K), and distances (P, K, K) of bins, mm."""
+        order, starts, poses, places = self._bins
+        middles = self.means(self._all)
+        counts = np.zeros(middles.shape[:2])
+        counts[poses, places] = np.diff(starts, append=len(order))
+        return counts > 0, counts, np.linalg.norm(middles[:, :, None] - middles[:, None], axis=3)
 
-    def solved(self, state: MountState, scatter: Scatter, *, loss: str = "linear") -> MountState:
-        """The state of least weighted squares of the distances."""
-        whitened = self.whitening(state, scatter)
+    def bounds(self) -> np.ndarray:
+        """Bounds (5, 2) of `Scatter`."""
+        there, _, apart = self._apart
+        both = (there[:, :, None] & there[:, None])[:, 1:, :-1]
+        beside = float(np.median(np.diagonal(apart[:, 1:, :-1], axis1=1, axis2=2)[np.diagonal(both, axis1=1, axis2=2)]))
+        longest = max(float(np.max(apart[:, 1:, :-1][both])), 2 * beside)
+        turn = _TURN_RAD if self.shape.flat else (_TURN_RAD[0],) * 2
+        return np.array([_POINT_MM, _POINT_MM, (beside / 2, longest), _POINT_MM, turn])
 
-        def jacobian(step: np.ndarray) -> np.ndarray:
-            derivatives = self._derivatives(self.stepped(state, step))
-            derivatives[:, 3:6] = derivatives[:, 3:6] @ _left_jacobian((self.free @ step)[3:6])
-            return whitened(derivatives @ self.free)
+    def residuals(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
+        """Mean distances (P, K) of bins after a step; beside a flat artefact what is off the lines stays as it is."""
+        here = self.distances(state)
+        return self.means(here if step is None else here + self.on_lines(self.distances(state, step) - here))
 
-        def misfit(step: np.ndarray) -> np.ndarray:
-            return whitened(self.on_lines(self.distances(state, step)))
+    def jacobian(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
+        """Derivatives (P, K, size) of `residuals` by the step."""
+        if step is None:
+            return self.means(self.derivatives(state))
+        derivatives = self._derivatives(self.stepped(state, step))
+        derivatives[:, 3:6] = derivatives[:, 3:6] @ _left_jacobian((self.free @ step)[3:6])
+        return self.means(derivatives @ self.free)
 
-        found = least_squares(
-            misfit,
-            np.zeros(self.size),
-            jacobian,  # pyright: ignore[reportArgumentType]
-            loss=loss,
-            x_scale="jac",
-            max_nfev=60,
-        )
-        return self.stepped(state, found.x)
+    def covariance(self, state: MountState) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+        """Function that returns the covariances (P, K, K) of `residuals` and their derivatives by logs of `Scatter`."""
+        there, counts, apart = self._apart
+        share = self.means(self.noise_along(state)[:, 0])
+        both, errors = share[:, :, None] * share[:, None], self.means(self.errors(state))
+        noise = np.eye(there.shape[1]) * (share**2 / np.maximum(counts, 1))[:, :, None]
+        filled = np.eye(there.shape[1]) * ~there[:, :, None]
+        shifts, turns = (own @ np.swapaxes(own, 1, 2) for own in (errors[:, :, :3], errors[:, :, 3:]))
 
-    def information(self, state: MountState, scatter: Scatter) -> np.ndarray:
-        """Information (P, size, size) that the profile of each pose holds on the parameters."""
-        weighted = np.split(self.whitening(state, scatter)(self.derivatives(state)), np.cumsum(self.counts)[:-1])
-        return np.array([each.T @ each for each in weighted])
+        def covariances(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            scatter = Scatter(*np.exp(logs))
+            far = apart / scatter.length_mm
+            falling = scatter.smooth_mm**2 * both * np.exp(-far)
+            smooth = falling * (1 + far)
+            parts = scatter.point_mm**2 * noise, smooth, scatter.pose_mm**2 * shifts, scatter.turn_rad**2 * turns
+            changes = [2 * parts[0], 2 * smooth, falling * far**2, 2 * parts[2], 2 * parts[3]]
+            total = filled + sum(parts)
+            largest = np.max(np.diagonal(total, axis1=1, axis2=2), axis=1)
+            return total + _ROUNDING * largest[:, None, None] * np.eye(total.shape[1]), np.array(changes)
 
-    def scatter_at(self, state: MountState, start: Scatter) -> Scatter:
-        """Scatter of points and poses by restricted maximum likelihood at a solution.
+        return covariances
 
-        Patterson and Thompson 1971: minus twice the likelihood of what is left of the distances after the parameters.
-        """
-        share = self.noise_along(state)
-        errors = self.errors(state) / share
-        # Any basis of the derivatives has the same likelihood. They are nearly dependent where the base is far away.
-        derivatives = np.linalg.qr(self.derivatives(state) / share)[0]
-        k, size = errors.shape[1], derivatives.shape[1]
-        columns = np.hstack([errors, derivatives, self.distances(state)[:, None] / share])
-        grams = np.array([each.T @ each for each in np.split(columns, np.cumsum(self.counts)[:-1])])
-        total, poses = int(self.counts.sum()), len(self.counts)
+    def repeated(self, state: MountState) -> tuple[int, float]:
+        """Degrees of freedom and sum of squares of the points' noise within the bins."""
+        order, starts, _, _ = self._bins
+        values = (self.distances(state) / self.noise_along(state)[:, 0])[order]
+        counts = np.diff(starts, append=len(order))
+        means = np.repeat(np.add.reduceat(values, starts) / counts, counts)
+        return len(order) - len(starts), float(np.sum((values - means) ** 2))
 
-        def scatter_of(logs: np.ndarray) -> Scatter:
-            point, *others = np.exp(np.clip(logs, -20, 5))
-            return Scatter(
-                point, *(max(each, _SMALLEST_SHARE * point * unit) for each, unit in zip(others, units, strict=True))
-            )
+    def pose_directions(self, state: MountState) -> list[np.ndarray]:
+        """Orthonormal bases (K, q) of all that poses, mount and artefact can do to each profile."""
+        bases = []
+        for errors in self.means(self.errors(state)):
+            sizes = np.linalg.norm(errors, axis=0).clip(1e-30)
+            basis, spans, _ = np.linalg.svd(errors / sizes, full_matrices=False)
+            bases.append(basis[:, spans > _LEAST_SPAN * spans[0]])
+        return bases
 
-        units = [1.0, 1e-3] if self.shape.flat else [1.0]
+    def plain(self, state: MountState) -> MountState:
+        """The state of least squares of all distances, which count alike."""
+        return self._solved(state, Scatter(1.0, *np.full(4, _POINT_MM[0])), "linear")
 
-        def minus_twice_likelihood(logs: np.ndarray) -> float:
-            scatter = scatter_of(logs)
-            sizes, variance = sizes_of(k, scatter), scatter.point_mm**2
-            inner = np.eye(k) * variance + sizes[:, None] * grams[:, :k, :k] * sizes
-            cross = sizes[:, None] * grams[:, :k, k:]
-            left = (grams[:, k:, k:] - np.swapaxes(cross, 1, 2) @ np.linalg.solve(inner, cross)).sum(axis=0) / variance
-            information = left[:size, :size]
-            squares = left[size, size] - left[size, :size] @ np.linalg.solve(information, left[:size, size])
-            weights = (total - poses * k) * np.log(variance) + np.linalg.slogdet(inner)[1].sum()
-            return float(weights + np.linalg.slogdet(information)[1] + squares)
+    def rough(self, state: MountState, scatter: Scatter) -> MountState:
+        """The state of least weighted squares with a robust loss (Cauchy's)."""
+        return self._solved(state, scatter, "cauchy")
 
-        begin = np.log([start.point_mm, start.pose_mm, *([start.turn_rad] if self.shape.flat else [])])
-        found = minimize(
-            minus_twice_likelihood, begin, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-3, "maxiter": 300}
-        )
-        return scatter_of(found.x)
-
-
-def sizes_of(k: int, scatter: Scatter) -> np.ndarray:
-    """Standard deviations (K,) of the errors of a pose: three shifts, and three turns of a flat artefact."""
-    return np.repeat([scatter.pose_mm, scatter.turn_rad], 3)[:k]
+    def _solved(self, state: MountState, scatter: Scatter, loss: str) -> MountState:
+        covariances, _ = self.covariance(state)(np.log(scatter))
+        return self.stepped(state, solved_step(self, state, covariances, loss=loss))
 
 
 def cross_matrix(vector: np.ndarray) -> np.ndarray:

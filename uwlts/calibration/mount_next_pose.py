@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount_artefacts import SphereShape
+from uwlts.calibration.mount_estimate import Estimate
 from uwlts.calibration.mount_model import MountState, Problem, Scatter, cross_matrix
 from uwlts.model.mount import NextPose
 
@@ -36,7 +37,7 @@ def next_pose(
     middle = np.vstack(problem.points).mean(axis=0)
     prior = np.zeros(problem.size)
     prior[:3], prior[3:6] = _UNKNOWN_MM**-2.0, _UNKNOWN_RAD**-2.0
-    known = problem.information(state, scatter).sum(axis=0) + np.diag(prior)
+    known = Estimate(problem, state, np.array(scatter)).information.sum(axis=0) + np.diag(prior)
     to_point = np.hstack([np.eye(3), -cross_matrix(state.rotation @ middle)])
 
     def point_std(information: np.ndarray) -> float:
@@ -59,7 +60,7 @@ def next_pose(
                 points = _on_plane(points, seen, turned @ state.rotation, normal, sheet)
             if points is None:
                 continue
-            added = _one_pose(problem, points, turned, position).information(state, scatter)[0]
+            added = Estimate(_one_pose(problem, points, turned, position), state, np.array(scatter)).information[0]
             after = point_std(known + added)
             if best is None or after < best[0]:
                 words = (

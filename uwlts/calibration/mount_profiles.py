@@ -14,6 +14,9 @@ _TRIALS = 400
 """Curves proposed for a profile: with a tenth of it on the artefact, and neighbours as proposals, some 40 are right."""
 _REJECTED_BEYOND = 4.0
 """Robust standard deviations; of normal noise six points in a hundred thousand lie farther out."""
+_DOUBLINGS, _FEW_MORE = 3, 1.1
+"""Doublings of the distance at which points count as near, up to 30 times the noise: profilers err smoothly by less.
+Where one brings fewer than a tenth more points, those near the curve have been found."""
 _LEAST_ARC = np.radians(30)
 """Smaller arcs are like straight lines, and their centres move by more than the noise along the sagitta."""
 LEAST_WALL = 6
@@ -107,11 +110,27 @@ def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generat
         return None
     centres, radii = centres[fits], radii[fits]
     off = np.abs(np.linalg.norm(points - centres[:, None], axis=2) - radii[:, None])
+    tolerance = _widened(off, tolerance)
+    if radius_mm is not None:
+        largest = radius_mm + 2 * tolerance
     for best in np.argsort(-np.count_nonzero(off < tolerance, axis=1))[:5]:
         arc = _refined_arc(points, off[best] < tolerance, tolerance)
         if arc is not None and arc.radius_mm < largest:
             return arc
     return None
+
+
+def _widened(off: np.ndarray, tolerance: float) -> float:
+    """Tolerance at which a wider one would find few points more, given distances (M, N) from the curves proposed.
+
+    A profiler's smooth error shifts points by more than their noise.
+    """
+    for _ in range(_DOUBLINGS):
+        near, wider = (int(np.count_nonzero(off < each, axis=1).max()) for each in (tolerance, 2 * tolerance))
+        if wider < _FEW_MORE * near:
+            break
+        tolerance *= 2
+    return tolerance
 
 
 def circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -172,6 +191,7 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
     proper = length > 0
     normals = np.column_stack([-along[:, 1], along[:, 0]])[proper] / length[proper, None]
     off = np.abs(points @ normals.T - np.sum(points[first[proper]] * normals, axis=1)).T
+    tolerance = _widened(off, tolerance)
     members = off[np.argmax(np.count_nonzero(off < tolerance, axis=1))] < tolerance
     middle, direction, std = np.zeros(2), np.zeros(2), 0.0
     for _ in range(_LARGEST_ROUNDS):

@@ -7,8 +7,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount_artefacts import PlaneShape, RingShape, Seen, SphereShape, StepShape, square_to
+from uwlts.calibration.mount_estimate import Estimate
 from uwlts.calibration.mount_model import MountState, Problem, Scatter, cross_matrix
-from uwlts.calibration.mount_prediction import inverse, misfits
+from uwlts.calibration.mount_prediction import misfits
 from uwlts.calibration.mount_profiles import ProfileArc, ProfileLine, circles_through
 from uwlts.errors import CalibrationError
 
@@ -27,7 +28,7 @@ _CLEAR = 6.0
 """Least radius over the width within which a circle's points are sought: a smaller one cannot be distinguished."""
 _CIRCLES, _JUDGED = 3000, 1500
 """Circles tried, and points by which each is judged: where a fifth of the points are on the wall, 24 circles are."""
-_ROUGH = Scatter(point_mm=0.1, pose_mm=0.3, turn_rad=3e-3)
+_ROUGH = Scatter(point_mm=0.1, smooth_mm=1e-4, length_mm=1.0, pose_mm=0.3, turn_rad=3e-3)
 """Scatter for the weights of the search, whose robust loss begins beyond it."""
 
 
@@ -241,10 +242,10 @@ def _start_of_ring(
     state = _start_of_plane(plane, lines, sheet, rng)
     off = misfits(plane, state)
     noise = float(np.median([line.std_mm for line in lines]))
-    scatter = Scatter(max(noise, 1e-6), max(float(np.median(off)), noise), 1e-3)
+    scatter = Scatter(max(noise, 1e-6), noise, 1.0, max(float(np.median(off)), noise), 1e-3)
     used = plane.selected(off < _FAR * np.median(off) + 5 * noise)
-    state = used.solved(state, scatter)
-    covariance = inverse(used.information(state, scatter).sum(axis=0))[:6, :6]
+    state = used.rough(state, scatter)
+    covariance = Estimate(used, state, np.array(scatter)).covariance[:6, :6]
     middle = state.rotation @ np.vstack(used.points).mean(axis=0)
     to_point = np.hstack([np.eye(3), -cross_matrix(middle)])
     known = float(np.sqrt(np.linalg.eigvalsh(to_point @ covariance @ to_point.T)[-1]))
@@ -269,7 +270,7 @@ def _start_of_ring(
     for narrower in (1.0, 3.0, 9.0):
         problem = whole.of_seen(whole.seen_again(state, flat, max(reach / narrower, 5 * noise), rng))
         require_surfaces(problem)
-        state = problem.solved(state, scatter, loss="cauchy")
+        state = problem.rough(state, scatter)
     return state, problem
 
 
@@ -318,5 +319,5 @@ def _in_space(flat: np.ndarray) -> np.ndarray:
 def _best(rough: Problem, states: list[MountState]) -> MountState:
     """The state of smallest median distance after a robust refinement from each, scale and time left as they are."""
     fixed = replace(rough, scale=False, time=False)
-    refined = [fixed.solved(state, _ROUGH, loss="cauchy") for state in states]
+    refined = [fixed.rough(state, _ROUGH) for state in states]
     return min(refined, key=lambda state: float(np.median(misfits(fixed, state))))

@@ -4,8 +4,9 @@ import json
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from scipy.stats import binom
+from scipy.stats import binom, chi2
 
 import uwlts
 from tests.uwlts.mount_views import (
@@ -78,6 +79,52 @@ def test_wrong_poses_and_empty_profiles_are_left_out(rng):
     reasons = {number for number, pose in enumerate(mount.poses) if pose.reason is not None}
     assert {3, 7, 11} <= reasons and len(reasons) < 6
     assert "no sphere found" in mount.poses[11].reason
+
+
+def least_scatter_mm(campaign: Campaign) -> float:
+    """Root mean square distance from the sphere where SciPy's plain least squares ends, from the true values."""
+    seen = [np.isfinite(profile).all(axis=1) for profile in campaign.profiles]
+    flat = np.vstack([profile[own] for profile, own in zip(campaign.profiles, seen, strict=True)])
+    points = np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
+    poses = np.repeat(campaign.poses, [np.count_nonzero(own) for own in seen], axis=0)
+
+    def distances(values: np.ndarray) -> np.ndarray:
+        turn = Rotation.from_rotvec(values[3:6]).as_matrix() @ MOUNT[:3, :3]
+        platform = points @ turn.T + MOUNT[:3, 3] + values[:3]
+        base = np.einsum("nij,nj->ni", poses[:, :3, :3], platform) + poses[:, :3, 3]
+        return np.linalg.norm(base - SPHERE_MM - values[6:9], axis=1) - RADIUS_MM - values[9]
+
+    return float(np.sqrt(np.mean(least_squares(distances, np.zeros(10), x_scale="jac").fun ** 2)))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("radius", [RADIUS_MM, None])
+def test_smooth_errors_of_the_profiler_are_weighed(seed, radius):
+    """2,000 points with little noise, along which the profiler errs smoothly by more, as real ones do.
+
+    Points that count as independent outweigh the robot then: the estimate flips between states millimetres apart.
+    """
+    campaign = sphere_campaign(
+        np.random.default_rng([5, seed]),
+        poses=30,
+        noise_mm=0.009,
+        robot_mm=0.05,
+        smooth_mm=0.07,
+        rays=2000,
+        background=False,
+    )
+    mount = mount_of(campaign, radius_mm=radius)
+    within(mount)
+    assert all(pose.reason is None for pose in mount.poses)
+    # The optimum adapts to the errors a little more than any estimate that weighs them.
+    assert mount.rms_mm < 1.1 * least_scatter_mm(campaign)
+    # Halves of the poses differ by what both state, but for one in 10,000.
+    halves = [uwlts.calibrate_mount(campaign.profiles[k::2], campaign.poses[k::2], radius_mm=radius) for k in range(2)]
+    one, other = (half.transform() for half in halves)
+    turn = Rotation.from_matrix(one[:3, :3] @ other[:3, :3].T).as_rotvec()
+    apart = np.append(one[:3, 3] - other[:3, 3], turn)
+    spread = sum(np.array(half.covariance) for half in halves)
+    assert apart @ np.linalg.solve(spread, apart) < chi2.isf(1e-4, 6)
 
 
 def test_a_plane_gives_the_mount(rng):

@@ -1,0 +1,55 @@
+"""Least squares with variance components: steps that oscillate, and estimates that cannot settle."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from uwlts.calibration.mount_estimate import NotSettled, settle
+
+
+@dataclass(frozen=True)
+class TwoReadings:
+    """Two readings of one number, at -1 and at 1; the first counts with a weight that depends on the number itself.
+
+    Where the weight is ``share`` the solution is 1 - 2 share.
+    """
+
+    slope: float
+
+    size = 1
+
+    def bounds(self):
+        return np.array([(1.0, 1.0)])
+
+    def stepped(self, state, step):
+        return state + float(step[0])
+
+    def residuals(self, state, step=None):
+        return np.array([[state + 1.0], [state - 1.0]]) + (0.0 if step is None else step[0])
+
+    def jacobian(self, state, step=None):
+        return np.ones((2, 1, 1))
+
+    def covariance(self, state):
+        share = np.clip(0.5 + self.slope * (state - 0.3), 0.05, 0.95)
+        both = np.array([1 / share, 1 / (1 - share)]).reshape(2, 1, 1)
+        return lambda logs: (both, np.zeros((1, 2, 1, 1)))
+
+    def repeated(self, state):
+        return 0, 0.0
+
+    def pose_directions(self, state):
+        return [np.eye(1)] * 2
+
+
+def test_steps_that_overshoot_are_damped():
+    """The map x -> 1 - 2 share(x) has the slope -3: undamped it flips between two states; it is fixed at 0.225."""
+    found = settle(TwoReadings(slope=1.5), [(-0.9, np.ones(1))])
+    assert found.state == pytest.approx(0.225, abs=0.01)
+
+
+def test_an_estimate_that_cannot_settle_is_an_error():
+    """A weight that jumps where the number crosses 0.3 leaves no state that is its own solution."""
+    with pytest.raises(NotSettled, match=r"does not settle: after \d+ rounds it still moves by .* Record more poses"):
+        settle(TwoReadings(slope=1e6), [(-0.9, np.ones(1)), (0.9, np.ones(1))])
