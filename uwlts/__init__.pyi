@@ -7,7 +7,7 @@ from .calibration.camera.photographs import (
 )
 from .calibration.joint.refresh import Refreshed as Refreshed, refresh as refresh
 from .calibration.model_comparison.comparison import Comparison as Comparison, compare_models as compare_models
-from .calibration.mount import calibrate_mount as calibrate_mount
+from .calibration.mount.calibrate import calibrate_mount as calibrate_mount
 from .calibration.polynomial.polynomial_calibration_fit import (
     PolynomialResult as PolynomialResult,
     calibrate_polynomials as calibrate_polynomials,

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from tests.uwlts.mount_views import MOUNT, RADIUS_MM, Campaign, errors_of, ring_campaign, sphere_campaign, step_campaign
 from tests.uwlts.sensor_profiles import captured_by, joint_estimate
-from uwlts.calibration.mount import calibrate_mount
+from uwlts.calibration.mount.calibrate import calibrate_mount
 from uwlts.model.library import load_sensor
 from uwlts.model.mount import Mount, SphereFound
 

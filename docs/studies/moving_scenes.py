@@ -20,7 +20,7 @@ from scipy.optimize import least_squares
 import uwlts
 from twin.scene.description import Scene
 from twin.scene.platforms import Platform
-from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of
+from uwlts.calibration.mount.sensor import CapturedProfiles, profiles_of
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount
 from uwlts.storage.truth import Truth, read_truth, truth_path

@@ -25,7 +25,7 @@ from twin.scene.description import Mesh, load_scene
 from twin.scene.finish import read_grey
 from twin.scene.objects import _surface_from_file
 from uwlts.calibration.joint.procedure import solve_jointly
-from uwlts.calibration.mount import calibrate_mount
+from uwlts.calibration.mount.calibrate import calibrate_mount
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.evaluation.evaluate import read_evaluation
 from uwlts.hardware.guided.plan import load_guided_plan

@@ -481,8 +481,8 @@ def _circle(places: np.ndarray) -> np.ndarray:
         step = np.linalg.lstsq(design, distance - result[2], rcond=None)[0]
         result = result + step
         if np.abs(step).max() < 1e-9:
-            break
-    return result
+            return result
+    raise EvaluationError(f"no circle fits the {len(places)} places: the least squares do not settle")
 
 
 def _diameter(kind: FeatureKind, name: str, hole: _Hole) -> FeatureValue:

@@ -141,7 +141,7 @@ def _fitted(cloud: PointCloud, fitted: np.ndarray, frame: PipeFrame, radius: flo
         raise EvaluationError(f"only {len(fitted)} of {len(cloud)} points are left for a pipe")
     points = cloud.points_mm[fitted]
     scale = max(0.5 * float(np.ptp(frame.places(points)[0])), 1e-9)
-    arc, terms, coefficients, weight, design = 0.0, (), np.zeros(0), np.zeros(0), np.zeros((0, 0))
+    arc, moved, terms, coefficients, weight, design = 0.0, np.inf, (), np.zeros(0), np.zeros(0), np.zeros((0, 0))
     for number in range(_ROUNDS):
         along, angle, away = frame.places(points)
         off = away - radius
@@ -155,16 +155,23 @@ def _fitted(cloud: PointCloud, fitted: np.ndarray, frame: PipeFrame, radius: flo
         shift = np.array([known["cos"], known["sin"]])
         slopes = np.array([known["along cos"], known["along sin"]]) / scale
         frame, radius = frame.moved(shift, slopes), radius + known["1"]
-        if number and np.linalg.norm(shift) + abs(known["1"]) + scale * np.linalg.norm(slopes) < _STILL_MM:
+        moved = float(np.linalg.norm(shift) + abs(known["1"]) + scale * np.linalg.norm(slopes))
+        if number and moved < _STILL_MM:
             break
     counted = weight > 0
     if np.count_nonzero(counted) < 3 * len(terms):
         raise EvaluationError(f"only {np.count_nonzero(counted)} of {len(cloud)} points lie on one pipe")
+    scatter = float(np.std((off - design @ coefficients)[counted]))
+    if moved > scatter / np.sqrt(np.count_nonzero(counted)):
+        raise EvaluationError(
+            f"the pipe's axis does not settle: after {_ROUNDS} rounds it still moves by {moved:.2g} mm, more than a "
+            "mean of all points scatters. Leave out points beside the pipe"
+        )
     normal = (design * weight[:, None]).T @ design
     weights = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ (design[counted] * weight[counted, None]).T
     # What moved into the axis is no part of the form any more.
-    moved = np.array([term in ("1", "cos", "sin", "along cos", "along sin") for term in terms])
-    coefficients = np.where(moved, 0.0, coefficients)
+    inside = np.array([term in ("1", "cos", "sin", "along cos", "along sin") for term in terms])
+    coefficients = np.where(inside, 0.0, coefficients)
     along, angle, away = frame.places(cloud.points_mm)
     distance = away - radius - _design(along, angle, scale, terms) @ coefficients
     used = fitted[counted]

@@ -242,6 +242,7 @@ def register(
     progress(steps, steps)
     pairs = joint.evidence(reach)
     solved = joint.solved(list(pairs.values()))
+    _require_settled(solved, joint.unknown_poses)
     amounts = np.concatenate(joint.patterns)
     covariance = np.zeros((6 * len(scans),) * 2)
     covariance[6:, 6:] = solved.covariance[: joint.unknown_poses, : joint.unknown_poses]
@@ -256,6 +257,17 @@ def register(
         scale=float(np.sqrt(np.mean(amounts**2))) if len(amounts) else np.nan,
         cloud=merged_cloud(scans, names, joint, solved.covariance),
     )
+
+
+def _require_settled(solved: Solved, unknown: int) -> None:
+    """EvaluationError where a further step would move the poses by more than their uncertainty."""
+    std = np.sqrt(np.diag(solved.covariance)[:unknown])
+    moves = float(np.max(np.abs(solved.step[:unknown]) / np.where(std > 0, std, np.inf), initial=0.0))
+    if moves > 1:
+        raise EvaluationError(
+            f"the registration does not settle: after {_ROUNDS} rounds the next one would move a scan by {moves:.2g} "
+            "standard uncertainties. Give poses nearer to the true ones, or scans that overlap more"
+        )
 
 
 def _fit_of(

@@ -18,6 +18,7 @@ from uwlts.cli import app
 from uwlts.errors import EvaluationError
 from uwlts.inspection.blemish_search import UnrolledSurface, search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
+from uwlts.inspection.flat import _circle
 from uwlts.inspection.pipe_form import fit_pipe, pipe_features
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty
 
@@ -58,6 +59,23 @@ def pipe_scan(rng, *, half_arc=np.pi, along=(-20, 20.5, 1.0), around_mm=0.8, rad
     # Scale, and a shift that depends on the place along the stripe: what a calibration leaves open.
     patterns = [2e-5 * points, 0.01 * np.sin(turn / 2)[:, None] * normals]
     return cloud_of(rng, points, normals, frame, line, patterns=patterns, **options)
+
+
+def test_fits_that_do_not_settle_are_errors(monkeypatch):
+    """A pipe of 1.5 mm ovality seen from one side, in one round; and a circle through places on a line."""
+    cloud = pipe_scan(
+        np.random.default_rng(2),
+        radius=lambda x, angle: RADIUS_MM * (1 + 0.0025 * np.cos(2 * angle - 0.6)),
+        half_arc=1.2,
+        around_mm=3.0,
+    )
+    assert fit_pipe(cloud).radius_mm == pytest.approx(RADIUS_MM, abs=1.0)
+    monkeypatch.setattr("uwlts.inspection.pipe_form._ROUNDS", 1)
+    with pytest.raises(EvaluationError, match="axis does not settle: after 1 rounds it still moves by"):
+        fit_pipe(cloud)
+    places = np.array([[0.0, 0.0], [1.0, 1e-12], [2.0, -1e-12], [3.0, 0.0]])
+    with pytest.raises(EvaluationError, match="no circle fits the 4 places"):
+        _circle(places)
 
 
 def test_the_form_of_a_pipe_is_within_its_intervals():

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 import uwlts
 from tests.uwlts.pipe_views import OVALITY_MM, RADIUS_MM, oval, pitted, plain, pose_errors, scan_from, side_pose, views
 from uwlts.cli import app
+from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import evaluate_pipe
 from uwlts.fitting.patches import distances_between, surface_patches
 from uwlts.model.artefacts import PipeStandard
@@ -61,6 +62,14 @@ def test_a_pipe_with_pits_is_closed(pits):
     errors = pose_errors(found.poses, true, found.middles_mm)
     assert np.abs(errors[:, :3]).max() < 0.1 and np.degrees(np.abs(errors[:, 3:]).max()) < 0.05
     assert max(pair.closure_mm for pair in found.pairs) < 0.1
+
+
+def test_a_registration_that_does_not_settle_is_an_error(monkeypatch):
+    """One round from poses that are wrong by 2 mm, where some ten are needed."""
+    scans, _, wrong = views(np.random.default_rng(SEED), radius=pitted)
+    monkeypatch.setattr("uwlts.registration.register._ROUNDS", 1)
+    with pytest.raises(EvaluationError, match="after 1 rounds the next one would move a scan by"):
+        uwlts.register(scans, poses=wrong)
 
 
 @pytest.mark.slow

@@ -1,20 +1,26 @@
-"""The motions that a mount calibration lacks, and the further pose that would lower its uncertainty most."""
+"""Directions of a mount that are known badly, motions that are missing, and the pose to add next."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount_artefacts import SphereShape
-from uwlts.calibration.mount_estimate import Estimate
-from uwlts.calibration.mount_model import MountState, Problem, Scatter, cross_matrix
+from uwlts.calibration.mount.artefacts import SphereShape
+from uwlts.calibration.mount.estimate import Estimate
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, cross_matrix
+from uwlts.errors import CalibrationError
 from uwlts.model.mount import NextPose
 
 _TURN_RAD = np.radians(30)
 """A robot turns so far easily with the artefact in view."""
 _LEAST_TURN_RAD = np.radians(5.0)
 """Root mean square of turns about an axis below which a note says that there are too few."""
+_OPEN_MM, OPEN_RAD = 5.0, np.radians(1.0)
+"""Standard uncertainties from which a mount counts as not determined; a ruler and a protractor do better."""
+_WEAK, _LEAST_MM, _LEAST_RAD = 5.0, 0.01, np.radians(0.005)
+"""Times the best determined direction, and standard uncertainty, mm and rad: so much worse is worth a further pose."""
 _POINTS = 100
 _UNKNOWN_MM, _UNKNOWN_RAD = 100.0, 0.5
 """Standard uncertainty of a mount of which nothing is known, so that open directions can be compared."""
@@ -131,6 +137,46 @@ def _on_plane(
     if abs(steep) < 0.5:  # 60 deg
         return None
     return points - np.outer((points - seen) @ inside / steep, down)
+
+
+def require_determined(covariance: np.ndarray, weak: Sequence[str], advised: NextPose | None = None) -> None:
+    """CalibrationError where the covariance (6, 6) of a mount leaves a direction open; ``weak`` says which."""
+    if is_determined(covariance):
+        return
+    raise CalibrationError(
+        f"the poses do not determine the mount: {'; '.join(weak)}"
+        f"{'' if advised is None else f'. Next pose to add: {advised.words}'}"
+    )
+
+
+def is_determined(covariance: np.ndarray) -> bool:
+    """Whether shift and turn of a mount with a covariance (6, 6) are known in all directions."""
+    shift, turn = (np.sqrt(np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1]) for k in (0, 3))
+    return bool(shift <= _OPEN_MM and turn <= OPEN_RAD)
+
+
+def weaknesses(covariance: np.ndarray, rotations: Rotation, *, table: bool) -> list[str]:
+    """Directions of a mount that are known badly, and rotations of the platform that are missing, in words."""
+    lines = []
+    limits = (
+        (_OPEN_MM, _LEAST_MM, "shift along", "mm", 1.0, ""),
+        (
+            OPEN_RAD,
+            _LEAST_RAD,
+            "turn about",
+            "deg",
+            np.degrees(1.0),
+            ": the artefact stays at nearly the same place before the sensor",
+        ),
+    )
+    for first, (limit, least, what, unit, size, why) in zip((0, 3), limits, strict=True):
+        variances, axes = np.linalg.eigh(covariance[first : first + 3, first : first + 3])
+        stds = np.sqrt(np.maximum(variances, 0.0))
+        for std, axis in zip(stds, axes.T, strict=True):
+            if std > min(_WEAK * stds[int(table)], limit) and std > least:
+                known = f"known to {std * size:.2g} {unit} only" if std < limit else "open"
+                lines.append(f"the {what} {axis_words(axis)} is {known}{why}")
+    return lines if table else lines + missing_turns(rotations)
 
 
 def axis_words(direction: np.ndarray) -> str:

@@ -9,8 +9,7 @@ from tests.uwlts.joint_views import MEDIUM
 from tests.uwlts.sensor_profiles import half_way, joint_estimate, largest_parts
 from tests.virtual_sensors import scene_of
 from twin import render
-from uwlts.calibration.mount_board import _Problem
-from uwlts.calibration.mount_board_images import BoardImage, posed_board
+from uwlts.calibration.mount.board import BoardEvidence, BoardImage, agreeing_images, posed_board
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import KnownMedium
 from uwlts.model.mount import BoardFound
@@ -75,10 +74,9 @@ def test_the_covariance_is_that_of_the_errors():
     rng = np.random.default_rng(5)
     inside, ratios = [], []
     for _ in range(20):
-        problem = _Problem(simulated(rng), CAMERA, MIDDLE)
-        used, state, scatter = problem.robust()
-        std = np.sqrt(np.diag(np.linalg.inv(used.information(state, scatter)))[:6])
-        error = errors_of(state[0])
+        estimate, _ = agreeing_images(BoardEvidence(simulated(rng), CAMERA, MIDDLE))
+        std = np.sqrt(np.diag(estimate.covariance)[:6])
+        error = errors_of(estimate.state[0])
         inside.append(np.abs(error) < 2.0 * std)
         ratios.append(error / std)
     # 120 of them, correlated within a run: six standard deviations of the share are 10 %.
@@ -105,15 +103,17 @@ def table_images(rng, angles, *, position_mm=0.01, turn_rad=5e-5):
 def test_the_axis_of_a_rotary_table_is_found():
     """Direction and place have two coordinates each; their chi-square with four degrees is below 36 but once in 3e6."""
     images, table = table_images(np.random.default_rng(2), np.radians(np.linspace(-40, 40, 12)))
-    used, state, scatter = _Problem(images, CAMERA, MIDDLE, table=True).robust()
-    assert len(used.images) == 12 and used.size == 10
+    problem = BoardEvidence(images, CAMERA, MIDDLE, table=True)
+    estimate, kept = agreeing_images(problem)
+    state = estimate.state
+    assert kept.all() and problem.size == 10
     # Of the true axis in the table's frame as found, at the height of the sensor: what is free is zero there.
     there = state[0] @ table
     at = there[:3, 3] - there[:3, 2] * there[2, 3] / there[2, 2]
     height = state[0][2, 3]
     at += (height / there[2, 2]) * there[:3, 2]
     off = np.array([*at[:2], -there[1, 2], there[0, 2]])
-    covariance = (used.free @ np.linalg.inv(used.information(state, scatter)) @ used.free.T)[:6, :6]
+    covariance = (problem.free @ estimate.covariance @ problem.free.T)[:6, :6]
     assert not covariance[[2, 5]].any()
     kept = covariance[np.ix_([0, 1, 3, 4], [0, 1, 3, 4])]
     assert off @ np.linalg.solve(kept, off) < 36
@@ -121,10 +121,9 @@ def test_the_axis_of_a_rotary_table_is_found():
 
 
 def test_wrong_poses_are_left_out():
-    problem = _Problem(simulated(np.random.default_rng(1), wrong=(3, 7)), CAMERA, MIDDLE)
-    used, state, _ = problem.robust()
-    assert {image.name for image in problem.images} - {image.name for image in used.images} == {"image 3", "image 7"}
-    assert np.linalg.norm(errors_of(state[0])[:3]) < 0.3
+    estimate, kept = agreeing_images(BoardEvidence(simulated(np.random.default_rng(1), wrong=(3, 7)), CAMERA, MIDDLE))
+    assert np.flatnonzero(~kept).tolist() == [3, 7]
+    assert np.linalg.norm(errors_of(estimate.state[0])[:3]) < 0.3
 
 
 @pytest.fixture(scope="module")

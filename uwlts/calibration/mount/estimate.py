@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, Self, TypeVar
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
@@ -11,6 +11,10 @@ from scipy.stats import chi2, t
 
 from uwlts.errors import CalibrationError
 
+FALSE_ALARM = 1e-3
+"""Probability that any pose of a campaign without wrong ones is left out."""
+LARGEST_ROUGH = 6.0
+"""Times the median misfit of a pose: of 45 normal poses one in millions lies farther out."""
 _SETTLED = 0.01
 """Last step in standard uncertainties, and last change of the likelihood, which no stated figure shows."""
 _SHRINKING = 0.7
@@ -36,6 +40,15 @@ class Evidence(Protocol[State]):
     @property
     def size(self) -> int:
         """Number of parameters."""
+        ...
+
+    @property
+    def groups(self) -> int:
+        """Number of groups."""
+        ...
+
+    def selected(self, kept: np.ndarray) -> Self:
+        """Evidence of some of the groups (a mask)."""
         ...
 
     def bounds(self) -> np.ndarray:
@@ -181,6 +194,35 @@ def settle(evidence: Evidence[State], starts: Sequence[tuple[State, np.ndarray]]
         assert failed is not None
         raise failed
     return min(found, key=lambda each: each.criterion)
+
+
+def settle_agreeing(
+    evidence: Evidence[State],
+    starts: Sequence[tuple[State, np.ndarray]],
+    *,
+    false_alarm: float,
+    require: Callable[[np.ndarray], None],
+) -> tuple[Estimate[State], np.ndarray]:
+    """Estimate from the groups that agree, and their mask (G,).
+
+    While a group contradicts what the others predict, the worst one is left out.
+
+    Parameters
+    ----------
+    false_alarm
+        Probability that any group is left out where none is wrong.
+    require
+        Raises an error where a mask (G,) leaves too few groups.
+    """
+    kept = np.ones(evidence.groups, dtype=bool)
+    while True:
+        require(kept)
+        found = settle(evidence.selected(kept), starts)
+        excess = found.excess(probability=false_alarm / len(kept))
+        if excess.max() <= 1:
+            return found, kept
+        kept[np.flatnonzero(kept)[np.argmax(excess)]] = False
+        starts = [(found.state, found.scatter)]
 
 
 class NotSettled(CalibrationError):

@@ -7,15 +7,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount_artefacts import SHAPES
-from uwlts.calibration.mount_board import mount_by_board
-from uwlts.calibration.mount_estimate import Estimate, settle
-from uwlts.calibration.mount_model import Motion, MountState, Problem, Scatter
-from uwlts.calibration.mount_next_pose import axis_words, missing_turns, next_pose
-from uwlts.calibration.mount_prediction import misfits
-from uwlts.calibration.mount_profiles import LEAST_POINTS
-from uwlts.calibration.mount_sensor import CapturedProfiles, profiles_of, with_sensor
-from uwlts.calibration.mount_start import NoFit, require_surfaces, start
+from uwlts.calibration.mount.artefacts import SHAPES
+from uwlts.calibration.mount.board import mount_by_board
+from uwlts.calibration.mount.estimate import FALSE_ALARM, LARGEST_ROUGH, Estimate, settle, settle_agreeing
+from uwlts.calibration.mount.next_pose import is_determined, next_pose, require_determined, weaknesses
+from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter
+from uwlts.calibration.mount.profiles import LEAST_POINTS
+from uwlts.calibration.mount.sensor import CapturedProfiles, mount_covariance, profiles_of
+from uwlts.calibration.mount.start import NoFit, require_surfaces, start
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount, MountPose
@@ -27,19 +26,11 @@ from uwlts.storage.pose_files import PoseFormat, Unit, read_poses
 
 _MOST_POINTS = 100_000
 """Points of all profiles together; more take time and hardly lower the uncertainty, as poses err too."""
-_LARGEST_ROUGH = 6.0
-"""Times the median misfit of a pose: of 45 normal poses one in millions lies farther out."""
-_FALSE_ALARM = 1e-3
-"""Probability that any pose of a campaign without wrong ones is left out."""
 _NO_FIT = 0.1
 """Share of a sphere's radius by which platforms do not err; a wrong format of the poses gives more."""
 _OTHER_SIZE, _SURE = 0.03, 5.0
 """Share of the given size by which profiles show another one for sure, as profilers' scales err by less, and standard
 uncertainties, beyond which lies one normal error in a million."""
-_OPEN_MM, _OPEN_RAD = 5.0, np.radians(1.0)
-"""Standard uncertainties from which a mount counts as not determined; a ruler and a protractor do better."""
-_WEAK = 5.0
-"""Times the best determined direction: so much worse is worth a further pose."""
 
 
 def calibrate_mount(
@@ -82,7 +73,7 @@ def calibrate_mount(
         to it). The radius of the sphere or of the ring's wall, or the height of the step, where it is known.
     calibration
         Of the sensor that took the capture, held fixed; what a joint estimate leaves open becomes part of the mount's
-        covariance. A target's images go to `uwlts.calibration.mount_board`.
+        covariance. A target's images go to `uwlts.calibration.mount.board`.
     pose_format, profile_unit, pose_unit
         How files are to be read; see `uwlts.storage.pose_files.read_poses`.
     axis
@@ -212,9 +203,9 @@ class _Calibration:
         seen = [shape for shape in shapes if shape is not None]
         towards = None if self.evidence.axis is None else SENSOR_AXES[self.evidence.axis]
         state, problem = start(problem, whole.selected(kept), seen, self.sheet, towards, self.rng)
-        misfit = misfits(problem, state)
+        misfit = problem.rms_mm(state)
         noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
-        good = misfit < max(_LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
+        good = misfit < max(LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
         typical = max(float(np.median(misfit)), noise, 1e-6)
         scatter = Scatter(max(noise, 1e-6), typical, typical, typical, 1e-3)
         # What the first search got wrong in single profiles is searched again near the artefact that the others show.
@@ -229,24 +220,22 @@ class _Calibration:
             problem = whole.of_seen(shapes)
             good = np.ones(len(problem.points), dtype=bool)
             self._require_enough(np.flatnonzero(kept))
-        while True:
-            used = problem.selected(good)
-            require_surfaces(used)
-            # The likelier of the estimates from here and from the least squares of all distances alike.
-            found = settle(used, [(start, np.array(scatter)) for start in (state, used.plain(state))])
-            state, scatter = found.state, Scatter(*found.scatter)
-            excess = found.excess(probability=_FALSE_ALARM / len(kept))
-            if excess.max() <= 1:
-                break
-            good[np.flatnonzero(good)[np.argmax(excess)]] = False
+
+        def require(good: np.ndarray) -> None:
             self._require_enough(np.flatnonzero(kept)[good])
+            require_surfaces(problem.selected(good))
+
+        # The likelier of the estimates from here and from the least squares of all distances alike.
+        starts = [(each, np.array(scatter)) for each in (state, problem.plain(state))]
+        found, good = settle_agreeing(problem, starts, false_alarm=FALSE_ALARM, require=require)
+        used, state = problem.selected(good), found.state
         numbers = np.flatnonzero(kept)
         names = self.evidence.names
         for number in range(len(names)):
             if number in numbers[good]:
                 self.reasons.pop(number, None)
             elif number in numbers:
-                off = misfits(problem, state)[np.flatnonzero(numbers == number)[0]]
+                off = problem.rms_mm(state)[np.flatnonzero(numbers == number)[0]]
                 self.reasons[number] = f"contradicts the other poses: {off:.3g} mm off"
             else:
                 self.reasons.setdefault(number, f"no {self.evidence.artefact} found where the other poses show it")
@@ -278,7 +267,7 @@ class _Calibration:
             return
         free = replace(used, shape=SHAPES[self.evidence.artefact]())
         other = Estimate(free, state, estimate.scatter)
-        at = 5 + free.shape.count
+        at = free.size - free.scale - free.time - 1
         step, std = float(other.by(other.residuals[:, :, None])[at, 0]), float(np.sqrt(other.covariance[at, at]))
         if abs(step) > max(_OTHER_SIZE * self.shape.size_mm, _SURE * std):
             raise NoFit(
@@ -289,15 +278,23 @@ class _Calibration:
 
     def _summary(self, used: Problem, estimate: Estimate[MountState], members: list[np.ndarray]) -> Mount:
         state, scatter = estimate.state, Scatter(*estimate.scatter)
-        own = used.of_all(estimate.covariance)
-        covariance, share = own, None
-        if self.captured is not None and self.captured.known is not None:
-            by_sensor = self._by_sensor(used, estimate, members)
-            covariance, share = with_sensor(own, by_sensor, state.rotation, self.captured.known)
-        self._require_determined(used, state, scatter, covariance)
+        known = None if self.captured is None else self.captured.known
+        covariance, share, factor = mount_covariance(
+            estimate, used.free, state.rotation, known, lambda: self._moved(used, state, members)
+        )
+        turns = Rotation.from_matrix(used.motion(state.offset_s)[0])
+        weak = weaknesses(covariance[:6, :6], turns, table=used.table)
+        names = [name for number, name in enumerate(self.evidence.names) if number not in self.reasons]
+        advised = next_pose(used, state, scatter, self.sheet, names)
+        if not is_determined(covariance):
+            # A wrong radius or format also makes the scatter large.
+            wrong = np.hypot(scatter.pose_mm, scatter.smooth_mm)
+            if not self.shape.flat and wrong > 0.2 * _NO_FIT * state.artefact[3]:
+                raise NoFit(f"no mount makes the profiles fit: the poses would be wrong by {wrong:.3g} mm (rms)")
+            require_determined(covariance, weak, advised)
         moved = [used.stepped(state, step) for step, _ in estimate.without_each]
-        held = np.array([misfits(used, each)[place] for place, each in enumerate(moved)])
-        rms, numbers = misfits(used, state), [n for n in range(len(members)) if n not in self.reasons]
+        held = np.array([used.rms_mm(each)[place] for place, each in enumerate(moved)])
+        rms, numbers = used.rms_mm(state), [n for n in range(len(members)) if n not in self.reasons]
         order = {number: place for place, number in enumerate(numbers)}
         poses = []
         for number, name in enumerate(self.evidence.names):
@@ -317,13 +314,10 @@ class _Calibration:
         transform = np.eye(4)
         transform[:3, :3], transform[:3, 3] = Rotation.from_matrix(state.rotation).as_matrix(), state.translation
         weights = used.counts / used.counts.sum()
-        own_values = np.flatnonzero(np.diag(own)[:6] > 0)
         return Mount(
             T_platform_sensor=tuple(tuple(row) for row in transform.tolist()),
             covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
-            coverage_factor=estimate.coverage_factor(
-                (np.diag(own) / np.diag(covariance))[own_values], used.free[own_values]
-            ),
+            coverage_factor=factor,
             artefact=found,
             robot_scale=state.scale if used.scale else None,
             robot_scale_std=float(std[at]) if used.scale else None,
@@ -334,37 +328,19 @@ class _Calibration:
             rms_mm=float(np.sqrt(weights @ rms**2)),
             held_out_rms_mm=float(np.sqrt(weights @ held**2)),
             poses=tuple(poses),
-            weaknesses=tuple(_weaknesses(used, state, covariance)),
+            weaknesses=tuple(weak),
             table=used.table,
             sensor=share,
-            next_pose=next_pose(used, state, scatter, self.sheet, [self.evidence.names[n] for n in numbers]),
+            next_pose=advised,
             inputs=self.evidence.digests,
         )
 
-    def _by_sensor(self, used: Problem, estimate: Estimate[MountState], members: list[np.ndarray]) -> np.ndarray:
-        """Derivatives (K, Q) of all values by the parameters of the sensor's calibration, which move the profiles."""
+    def _moved(self, used: Problem, state: MountState, members: list[np.ndarray]) -> np.ndarray:
+        """Derivatives (P, K, Q) of the residuals by the parameters of the sensor's calibration."""
         assert self.captured is not None
-        normals, moved = used.normals(estimate.state), []
         numbers = [n for n in range(len(members)) if n not in self.reasons]
-        for number, own in zip(numbers, np.split(normals, np.cumsum(used.counts)[:-1]), strict=True):
-            by = self.captured.moved(number, self.rows[number][members[number]])
-            moved.append(np.einsum("ni,niq->nq", own, by))
-        return used.free @ estimate.by(used.means(used.on_lines(np.vstack(moved))))
-
-    def _require_determined(self, used: Problem, state: MountState, scatter: Scatter, covariance: np.ndarray) -> None:
-        shift = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-        turn = float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))
-        if shift <= _OPEN_MM and turn <= _OPEN_RAD:
-            return
-        # A wrong radius or format also makes the scatter large.
-        if not self.shape.flat and np.hypot(scatter.pose_mm, scatter.smooth_mm) > 0.2 * _NO_FIT * state.artefact[3]:
-            raise NoFit(f"no mount makes the profiles fit: the poses would be wrong by {scatter.pose_mm:.3g} mm (rms)")
-        numbers = [name for n, name in enumerate(self.evidence.names) if n not in self.reasons]
-        advised = next_pose(used, state, scatter, self.sheet, numbers)
-        raise CalibrationError(
-            f"the poses do not determine the mount: {'; '.join(_weaknesses(used, state, covariance))}"
-            f"{'' if advised is None else f'. Next pose to add: {advised.words}'}"
-        )
+        by = np.vstack([self.captured.moved(number, self.rows[number][members[number]]) for number in numbers])
+        return used.means(used.on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
 
 
 def _in_space(points: np.ndarray) -> np.ndarray:
@@ -409,28 +385,3 @@ def _motion(evidence: MountEvidence) -> Motion:
         return poses[:, :3, :3], poses[:, :3, 3]
 
     return motion
-
-
-def _weaknesses(problem: Problem, state: MountState, covariance: np.ndarray) -> list[str]:
-    """Directions that are known badly, and motions that are missing, in words."""
-    lines = []
-    variances, axes = np.linalg.eigh(covariance[:3, :3])
-    stds = np.sqrt(np.maximum(variances, 0.0))
-    for std, axis in zip(stds, axes.T, strict=True):
-        if std > min(_WEAK * stds[int(problem.table)], _OPEN_MM) and std > 0.01:
-            lines.append(f"the shift along {axis_words(axis)} is {_known(std, _OPEN_MM, 'mm')}")
-    variances, axes = np.linalg.eigh(covariance[3:6, 3:6])
-    turns = np.sqrt(np.maximum(variances, 0.0))
-    for std, axis in zip(turns, axes.T, strict=True):
-        if std > min(_WEAK * turns[int(problem.table)], _OPEN_RAD) and std > np.radians(0.005):
-            lines.append(
-                f"the turn about {axis_words(axis)} is {_known(np.degrees(std), np.degrees(_OPEN_RAD), 'deg')}: the "
-                "artefact stays at nearly the same place of the profile"
-            )
-    if problem.table:
-        return lines
-    return lines + missing_turns(Rotation.from_matrix(problem.motion(state.offset_s)[0]))
-
-
-def _known(std: float, limit: float, unit: str) -> str:
-    return f"known to {std:.2g} {unit} only" if std < limit else "open"

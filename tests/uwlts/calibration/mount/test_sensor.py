@@ -9,12 +9,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import uwlts
-from tests.uwlts.calibration.test_mount_board import CAMERA, MIDDLE, simulated
+from tests.uwlts.calibration.mount.test_board import CAMERA, MIDDLE, simulated
 from tests.uwlts.joint_views import MEDIUM
 from tests.uwlts.mount_views import errors_of
 from tests.uwlts.sensor_profiles import RADIUS_MM, captured_by, half_way, joint_estimate, largest_parts
 from uwlts.calibration.joint.stored_estimate import covariance_root
-from uwlts.calibration.mount_board import _Problem
+from uwlts.calibration.mount.board import BoardEvidence
+from uwlts.calibration.mount.estimate import Estimate, solved_step
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.reconstruction.moving import Ride, with_platform
 from uwlts.reconstruction.point_uncertainty import point_uncertainty
@@ -117,8 +118,16 @@ def test_a_mount_by_a_target_follows_its_images():
     rng = np.random.default_rng(3)
     by = [np.diag([0.1, 0.1, 0.1, 1e-3, 1e-3, 1e-3]) @ rng.standard_normal((6, 1)) for _ in range(12)]
     images = [replace(each, by_sensor=own) for each, own in zip(simulated(rng), by, strict=True)]
-    problem, scatter = _Problem(images, CAMERA, MIDDLE), np.array([0.05, 3e-4, 1.0])
-    state = problem.solved(problem.start(), scatter)
+    problem, scatter = BoardEvidence(images, CAMERA, MIDDLE), np.array([1.0, 0.05, 3e-4])
+
+    def solved(evidence, state):
+        for _ in range(3):
+            state = evidence.stepped(
+                state, solved_step(evidence, state, evidence.covariance(state)(np.log(scatter))[0])
+            )
+        return state
+
+    state = solved(problem, problem.start())
     ends = []
     for size in (0.1, -0.1):
         moved = []
@@ -128,7 +137,7 @@ def test_a_mount_by_a_target_follows_its_images():
             seen[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ seen[:3, :3]
             seen[:3, 3] = place - seen[:3, :3] @ MIDDLE
             moved.append(replace(image, camera_from_target=seen))
-        ends.append(_Problem(moved, CAMERA, MIDDLE).solved(state, scatter)[0])
-    expected, found = half_way(*ends) / 0.1, problem.by_sensor(state, scatter)[:6, 0]
+        ends.append(solved(BoardEvidence(moved, CAMERA, MIDDLE), state)[0])
+    expected, found = half_way(*ends) / 0.1, Estimate(problem, state, scatter).by(problem.moved(state))[:6, 0]
     size = np.repeat([np.linalg.norm(expected[:3]), np.linalg.norm(expected[3:])], 3)
     np.testing.assert_allclose(found / size, expected / size, atol=0.02)

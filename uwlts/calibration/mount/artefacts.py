@@ -1,6 +1,6 @@
 """The artefacts that a profiler on a platform may look at: where they are in a profile, and distances from them.
 
-Each kind is one class: with its start (`mount_start`) and what is stored of it (`uwlts.model.mount`) it is complete.
+Each kind is one class: with its start (`start`) and what is stored of it (`uwlts.model.mount`) it is complete.
 Values of an artefact are an array; its parameters are steps from them.
 """
 
@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from uwlts.calibration.mount_profiles import (
+from uwlts.calibration.mount.profiles import (
     ProfileArc,
     ProfileLine,
     find_arc,

@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount_artefacts import PlaneShape, RingShape, Seen, SphereShape, StepShape, square_to
-from uwlts.calibration.mount_estimate import Estimate
-from uwlts.calibration.mount_model import MountState, Problem, Scatter, cross_matrix
-from uwlts.calibration.mount_prediction import misfits
-from uwlts.calibration.mount_profiles import ProfileArc, ProfileLine, circles_through
+from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, Seen, SphereShape, StepShape, square_to
+from uwlts.calibration.mount.estimate import Estimate
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, cross_matrix
+from uwlts.calibration.mount.profiles import ProfileArc, ProfileLine, circles_through
 from uwlts.errors import CalibrationError
 
 _SUBSETS, _SUBSET = 40, 8
@@ -240,7 +239,7 @@ def _start_of_ring(
     """
     shape, plane = problem.shape, replace(problem, shape=PlaneShape())
     state = _start_of_plane(plane, lines, sheet, rng)
-    off = misfits(plane, state)
+    off = plane.rms_mm(state)
     noise = float(np.median([line.std_mm for line in lines]))
     scatter = Scatter(max(noise, 1e-6), noise, 1.0, max(float(np.median(off)), noise), 1e-3)
     used = plane.selected(off < _FAR * np.median(off) + 5 * noise)
@@ -320,4 +319,4 @@ def _best(rough: Problem, states: list[MountState]) -> MountState:
     """The state of smallest median distance after a robust refinement from each, scale and time left as they are."""
     fixed = replace(rough, scale=False, time=False)
     refined = [fixed.rough(state, _ROUGH) for state in states]
-    return min(refined, key=lambda state: float(np.median(misfits(fixed, state))))
+    return min(refined, key=lambda state: float(np.median(fixed.rms_mm(state))))

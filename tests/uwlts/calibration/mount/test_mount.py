@@ -193,9 +193,7 @@ def test_wrong_poses_of_a_ring_are_left_out(rng):
 
 
 def test_a_ring_of_another_radius_or_without_wall_is_refused(rng):
-    with pytest.raises(
-        CalibrationError, match=r"show a wall of radius 30 mm .* the ring has another radius, (24\.9|25\.0)"
-    ):
+    with pytest.raises(CalibrationError, match=r"radius 30 mm.* the ring has another radius, (24\.9|25\.0)"):
         mount_of(ring_campaign(rng), artefact="ring", radius_mm=30.0)
     with pytest.raises(CalibrationError, match="of 24 profiles show a wall square to the ring's face"):
         mount_of(sphere_campaign(rng, poses=24, plane_only=True), artefact="ring")

@@ -3,14 +3,14 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount_artefacts import Seen, Shape
-from uwlts.calibration.mount_estimate import solved_step
-from uwlts.calibration.mount_profiles import LEAST_POINTS
+from uwlts.calibration.mount.artefacts import Seen, Shape
+from uwlts.calibration.mount.estimate import solved_step
+from uwlts.calibration.mount.profiles import LEAST_POINTS
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 """Rotations (P, 3, 3) and positions (P, 3) of the platform in the base frame for a time offset, s."""
@@ -91,6 +91,15 @@ class Problem:
         """Number of parameters."""
         return self.free.shape[1]
 
+    @property
+    def groups(self) -> int:
+        """Number of poses."""
+        return len(self.points)
+
+    def rms_mm(self, state: MountState) -> np.ndarray:
+        """Root mean square distance (P,) of the points of each pose."""
+        return np.sqrt(np.bincount(self.poses, self.distances(state) ** 2) / self.counts)
+
     @cached_property
     def free(self) -> np.ndarray:
         """Steps (K, size) of all K values by the parameters."""
@@ -101,18 +110,9 @@ class Problem:
     def _parts(self) -> np.ndarray:
         return np.concatenate(self.part)
 
-    def of_all(self, covariance: np.ndarray) -> np.ndarray:
-        """Covariance (K, K) of all values from that of the parameters: 0 for what is none."""
-        return self.free @ covariance @ self.free.T
-
-    @cached_property
-    def numbers(self) -> int:
-        """How many numbers all profiles determine together: three for a circle, two for a line."""
-        return sum(self.shape.numbers(part) for part in self.part)
-
     def selected(
         self, kept: np.ndarray, points: Sequence[np.ndarray] | None = None, part: Sequence[np.ndarray] | None = None
-    ) -> "Problem":
+    ) -> Self:
         """The problem of some of the poses (a mask), perhaps with other points of all poses."""
         motion, numbers = self.motion, np.flatnonzero(kept)
         given, parts = points or self.points, part or self.part

@@ -1,0 +1,480 @@
+"""Mount of a calibrated sensor from images of a target from several poses of its platform (hand-eye calibration).
+
+Or the axis of a rotary table that turns the target.
+"""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Self
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, stored_estimate
+from uwlts.calibration.mount.estimate import FALSE_ALARM, LARGEST_ROUGH, Estimate, settle_agreeing, solved_step
+from uwlts.calibration.mount.next_pose import OPEN_RAD, missing_turns, require_determined, weaknesses
+from uwlts.calibration.mount.sensor import mount_covariance
+from uwlts.errors import CalibrationError, DescriptionError, TargetError
+from uwlts.files.writing import sha256_of
+from uwlts.model.any_calibration import check_fits
+from uwlts.model.calibration import Calibration, WindowModel
+from uwlts.model.mount import BoardFound, Mount, MountPose
+from uwlts.optics.camera import directions, project_through_window
+from uwlts.optics.window import trace_window
+from uwlts.storage.capture import Capture
+from uwlts.storage.mount_files import SENSOR_AXES, SensorAxis, require_table
+from uwlts.targets import CircleTarget, Target, parse_target
+from uwlts.targets.detection.ellipse_bias import circle_centre_bias
+
+FEWEST_IMAGES = 4
+"""Three poses with turns about two axes determine the mount; one more shows whether they agree."""
+_LEAST_PX = 1e-3
+"""No corner or circle is found closer."""
+POSE_STEPS = np.array([1e-3] * 3 + [1e-6] * 3)
+"""Of shift (mm) and turn (rad) for differences."""
+_NO_FIT = 0.1
+"""Share of the target's extent by which platforms do not err; a wrong format of the poses gives more."""
+_TRIPLES = 100
+"""With a third of the images wrong, three right ones are missed by all of them once in 10^15 times."""
+_BOUNDS = np.array([(1.0, 100.0), (1e-4, 1e3), (1e-7, 1.0)])
+"""Of the scatter: factor of the images' errors, which are at least those of their points, mm, and rad."""
+_LEAST = ((0, 1e-3), (3, 1e-6))
+"""First component of shift and turn, and the least scatter that counts, mm and rad."""
+
+
+def mount_by_board(
+    captures: Sequence[Capture],
+    calibration: Calibration,
+    poses: np.ndarray | None = None,
+    *,
+    axis: SensorAxis | None = None,
+) -> Mount:
+    """``T_platform_sensor`` from images of a target at an unknown fixed place, the sensor's calibration held fixed.
+
+    What a joint estimate of the calibration leaves open becomes part of the covariance.
+
+    Each image gives the target's pose before the camera, through window and medium. A closed form (Park and Martin,
+    IEEE Trans. Robotics and Automation 10, 1994) starts a least-squares estimate of mount and target's place, weighted
+    by the covariance of each image and the scatter of the platform in position and rotation. Restricted maximum
+    likelihood gives both, and by which factor images err more than their points' scatter says, as those of a bent
+    target do. Images that contradict the others are left out.
+
+    Parameters
+    ----------
+    captures
+        Images with the laser off show the target that the captures describe.
+    calibration
+        Of the sensor.
+    poses
+        ``T_base_platform`` (P, 4, 4) of the images with the laser off, in their order, in place of the captures' own.
+    axis
+        The platform is a rotary table that turns the target, as for `uwlts.calibrate_mount`.
+
+    Raises
+    ------
+    DescriptionError
+        A capture does not describe its target, or images have no pose.
+    CalibrationError
+        Too few images show the target, or the poses do not determine the mount or contradict the images.
+    """
+    header = captures[0].header
+    known = None if calibration.joint is None else stored_estimate(calibration, header.sensor, header.medium)
+    target, images, reasons = board_images(captures, calibration, known, poses)
+    middle = target.points_mm.mean(axis=0)
+    rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in images])
+    if axis is not None:
+        require_table(np.array([image.base_from_platform for image in images]), axis=axis)
+    elif missing := missing_turns(rotations, least_rad=OPEN_RAD):
+        raise CalibrationError(f"the poses do not determine the mount: {'; '.join(missing)}")
+    problem = BoardEvidence(images, calibration.object_transform(), middle, axis is not None)
+    estimate, kept = agreeing_images(problem)
+    used, state = problem.selected(kept), estimate.state
+    _, position_mm, _ = estimate.scatter
+    extent = float(np.linalg.norm(np.ptp(target.points_mm, axis=0)))
+    left_out = [image for image in images if image not in used.images]
+    if position_mm > _NO_FIT * extent or 2 * len(used.images) < len(images):
+        raise CalibrationError(
+            f"no mount makes the images fit: the poses would be wrong by {position_mm:.3g} mm (rms), with "
+            f"{len(left_out)} of {len(images)} left out. Are the poses T_base_platform, is their format right, are "
+            "their units right, and do they come in the order of the images?"
+        )
+    if axis is not None and state[0][2, :3] @ SENSOR_AXES[axis] <= 0:
+        raise CalibrationError(
+            f"the images turn about an axis that points away from {axis} of the sensor's frame, to "
+            f"({', '.join(f'{each:.2f}' for each in state[0][2, :3])}): are the angles counted the other way round?"
+        )
+    covariance, share, factor = mount_covariance(
+        estimate, used.free, state[0][:3, :3], known, lambda: used.moved(state)
+    )
+    turns = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in used.images])
+    weak = weaknesses(covariance[:6, :6], turns, table=used.table)
+    require_determined(covariance, weak)
+    found = {image.name: used.offsets_mm(state)[k] for k, image in enumerate(used.images)}
+    others = [used.stepped(state, step) for step, _ in estimate.without_each]
+    held = {image.name: used.offsets_mm(others[k])[k] for k, image in enumerate(used.images)}
+    rows = [
+        MountPose(
+            name=image.name,
+            points=image.points,
+            points_left_out=0,
+            rms_mm=found.get(image.name),
+            held_out_mm=held.get(image.name),
+            reason=None if image.name in found else "contradicts the other images",
+        )
+        for image in images
+    ] + [MountPose(name=name, points=0, points_left_out=0, reason=reason) for name, reason in reasons.items()]
+    distance = float(np.median([image.camera_from_target[2, 3] for image in used.images]))
+    rms_px = float(np.sqrt(np.mean([image.rms_px**2 for image in used.images])))
+    return Mount(
+        T_platform_sensor=_rows(state[0]),
+        covariance=tuple(tuple(row) for row in covariance[:6, :6].tolist()),
+        coverage_factor=factor,
+        artefact=BoardFound(T_base_target=_rows(state[1])),
+        point_std_mm=rms_px * distance / calibration.camera.fx_px,
+        pose_std_mm=float(position_mm),
+        rms_mm=float(np.sqrt(np.mean(np.square(list(found.values()))))),
+        held_out_rms_mm=float(np.sqrt(np.mean(np.square(list(held.values()))))),
+        table=axis is not None,
+        sensor=share,
+        poses=tuple(rows),
+        weaknesses=tuple(weak),
+        inputs={capture.path.name: sha256_of(capture.path) for capture in captures},
+    )
+
+
+def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
+    return tuple(tuple(row) for row in matrix.tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class BoardImage:
+    """An image of the target: its pose as the camera sees it, and that of the platform.
+
+    ``camera_from_target`` (4, 4) in mm; ``covariance`` (6, 6) is of a shift of the target's middle (mm) and a turn
+    about it (rad), in the camera's axes; ``points`` found, whose pixels miss by ``rms_px``; ``base_from_platform``
+    (4, 4). ``by_sensor`` (6, Q) are derivatives of shift and turn by the parameters of the sensor's joint estimate,
+    where it has one.
+    """
+
+    name: str
+    camera_from_target: np.ndarray
+    covariance: np.ndarray
+    points: int
+    rms_px: float
+    base_from_platform: np.ndarray
+    by_sensor: np.ndarray | None = None
+
+
+def board_images(
+    captures: Sequence[Capture], calibration: Calibration, known: StoredEstimate | None, poses: np.ndarray | None
+) -> tuple[Target, list[BoardImage], dict[str, str]]:
+    """The target, its pose in every image that shows it, and why others do not."""
+    images: list[BoardImage] = []
+    reasons: dict[str, str] = {}
+    targets, taken = [], 0
+    for capture in captures:
+        check_fits(capture.header, calibration, source=capture.path.name)
+        if capture.header.target is None:
+            raise DescriptionError(f"{capture.path.name} does not describe its target")
+        targets.append(parse_target(capture.header.target))
+        if targets[-1] != targets[0]:
+            raise DescriptionError("the captures show different targets: calibrate with one target, at one place")
+        index = calibration.index_of(capture.header.medium)
+        window = calibration.window if capture.header.sensor.camera.window.mounted else None
+        for frame, image in capture.frames(laser_on=False):
+            name = f"{capture.path.stem}, frame {frame}"
+            pose = capture.pose[frame] if poses is None else poses[taken] if taken < len(poses) else None
+            taken += 1
+            if pose is None:
+                continue
+            if not np.isfinite(pose).all():
+                raise DescriptionError(f"{name} has no pose of the platform: give a table of poses, or import them")
+            try:
+                images.append(posed_board(name, image, targets[0], calibration, known, window, index, pose))
+            except (TargetError, CalibrationError) as error:
+                reasons[name] = f"no target: {error}"
+    if poses is not None and taken != len(poses):
+        raise DescriptionError(f"there are {len(poses)} poses for {taken} images with the laser off: expected one each")
+    if len(images) < FEWEST_IMAGES:
+        why = next(iter(reasons.values()), "there are no images with the laser off")
+        raise CalibrationError(
+            f"{len(images)} of {taken} images show the target; at least {FEWEST_IMAGES} are needed ({why})"
+        )
+    return targets[0], images, reasons
+
+
+def posed_board(
+    name: str,
+    image: np.ndarray,
+    target: Target,
+    calibration: Calibration,
+    known: StoredEstimate | None,
+    window: WindowModel | None,
+    index: float,
+    base_from_platform: np.ndarray,
+) -> BoardImage:
+    """The target's pose in one image by least squares of its points' pixels."""
+    camera, view = calibration.camera, target.detect(image)
+    if len(view.points_mm) < 6:
+        raise CalibrationError(f"{len(view.points_mm)} points found; at least 6 are needed")
+    rays = trace_window(directions(camera, view.pixels), window, medium_index=index)
+    slopes = rays.directions[:, :2] / rays.directions[:, 2:]
+    good, turn, shift = cv2.solvePnP(view.points_mm, slopes, np.eye(3), None)
+    if not good or not np.isfinite(shift).all():
+        raise CalibrationError("its points fit no pose")
+    middle = target.points_mm.mean(axis=0)
+    start = rigid_transform(cv2.Rodrigues(turn)[0], shift.ravel())
+
+    def moved(step: np.ndarray) -> np.ndarray:
+        return moved_about(start, middle, step)
+
+    def projected(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+        seen = points @ pose[:3, :3].T + pose[:3, 3]
+        return project_through_window(camera, window, seen, medium_index=index)
+
+    pixels = view.pixels
+    if isinstance(target, CircleTarget):
+        bias = circle_centre_bias(
+            lambda points: projected(start, points),
+            view.points_mm,
+            diameter_mm=target.diameter_mm,
+            axis_u=(1.0, 0.0, 0.0),
+            axis_v=(0.0, 1.0, 0.0),
+        )
+        pixels = pixels - bias
+    if not np.isfinite(projected(start, view.points_mm)).all():
+        raise CalibrationError("it would lie before the window")
+    fit = least_squares(
+        lambda step: (projected(moved(step), view.points_mm) - pixels).ravel(),
+        np.zeros(6),
+        x_scale=[1.0, 1.0, 1.0, 1e-2, 1e-2, 1e-2],
+        loss="soft_l1",
+        f_scale=0.5,
+    )
+    spread = max(float(np.sqrt(np.mean(fit.fun**2) * fit.fun.size / (fit.fun.size - 6))), _LEAST_PX)
+    covariance = spread**2 * np.linalg.inv(fit.jac.T @ fit.jac)
+    by_sensor = None
+    if known is not None:
+        # The pose goes where the pixels stay as they are.
+        found, where = moved(fit.x), np.zeros(6)
+        by_pose = differences(
+            lambda step: projected(moved_about(found, middle, step), view.points_mm), where, POSE_STEPS
+        )
+        placed = view.points_mm @ found[:3, :3].T + found[:3, 3]
+        std = np.sqrt(np.diag(known.covariance))
+        by_values = differences(
+            lambda values: known.parameters.project(values, known.view, placed), known.values, 1e-2 * std
+        )
+        by_sensor = -np.linalg.lstsq(by_pose, by_values, rcond=None)[0]
+    return BoardImage(name, moved(fit.x), covariance, len(pixels), spread, base_from_platform, by_sensor)
+
+
+def differences(values: Callable[[np.ndarray], np.ndarray], at: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Derivatives (N, K) of values, flattened, by central differences with steps (K,); 0 where a step is 0."""
+    columns = []
+    for number, size in enumerate(steps):
+        step = np.zeros(len(steps))
+        step[number] = size
+        columns.append((values(at + step) - values(at - step)).ravel() / (2 * size or 1.0))
+    return np.stack(columns, axis=1)
+
+
+def rigid_transform(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = rotation, shift
+    return result
+
+
+def moved_about(pose: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """A pose (4, 4) after a shift (3,) of the place of a point ``middle`` and a turn (3,) about it."""
+    rotation = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
+    place = pose[:3, :3] @ middle + pose[:3, 3] + step[:3]
+    return rigid_transform(rotation, place - rotation @ middle)
+
+
+_State = tuple[np.ndarray, np.ndarray]
+"""``T_platform_sensor`` and ``T_base_target``, (4, 4) each."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoardEvidence:
+    """Images of a target, ``T_camera_sensor`` and the target's middle (3,) in its own frame.
+
+    The parameters are steps of mount and target; on a rotary table (``table``) shift of the mount along its z axis and
+    turn about it change nothing, and are none.
+    """
+
+    images: Sequence[BoardImage]
+    camera_from_sensor: np.ndarray
+    middle: np.ndarray
+    table: bool = False
+
+    @cached_property
+    def free(self) -> np.ndarray:
+        """Steps (12, size) of mount and target by the parameters."""
+        return np.delete(np.eye(12), (2, 5), axis=1) if self.table else np.eye(12)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self.free.shape[1]
+
+    @cached_property
+    def _platforms(self) -> np.ndarray:
+        return np.array([image.base_from_platform for image in self.images])
+
+    @cached_property
+    def _sensor_from_target(self) -> np.ndarray:
+        return np.linalg.inv(self.camera_from_sensor) @ np.array([image.camera_from_target for image in self.images])
+
+    @cached_property
+    def _covariances(self) -> np.ndarray:
+        return np.array([image.covariance for image in self.images])
+
+    @property
+    def groups(self) -> int:
+        """Number of images."""
+        return len(self.images)
+
+    def selected(self, kept: np.ndarray) -> Self:
+        """Evidence of some of the images: a mask, or their numbers."""
+        return replace(self, images=[self.images[k] for k in np.arange(len(self.images))[kept]])
+
+    def bounds(self) -> np.ndarray:
+        """Bounds (3, 2) of the scatter: factor of the images' errors, position (mm) and turn (rad) of the platform."""
+        return _BOUNDS
+
+    def start(self) -> _State:
+        """Mount and target by Park and Martin from the relative motions of all pairs of images."""
+        seen, held = self._sensor_from_target, self._platforms
+        first, second = np.triu_indices(len(held), 1)
+        tools = np.linalg.inv(held[first]) @ held[second]
+        boards = seen[first] @ np.linalg.inv(seen[second])
+        by_tool, by_board = (Rotation.from_matrix(each[:, :3, :3]).as_rotvec() for each in (tools, boards))
+        if self.table:
+            # Turns about z alone: the sensor's x axis, made square to the axis, shall be the table's.
+            axis = by_board.T @ by_tool[:, 2]
+            by_tool, by_board = np.eye(3)[[2, 0]], np.array([axis, np.eye(3)[np.argmin(np.abs(axis))]])
+        with warnings.catch_warnings():
+            # Turns about one axis only: the covariance tells.
+            warnings.simplefilter("ignore", UserWarning)
+            weights = [np.inf, 1.0] if self.table else None
+            rotation = Rotation.align_vectors(by_tool, by_board, weights)[0].as_matrix()
+        known = boards[:, :3, 3] @ rotation.T - tools[:, :3, 3]
+        unknown = (tools[:, :3, :3] - np.eye(3)).reshape(-1, 3)
+        mount = rigid_transform(rotation, np.linalg.lstsq(unknown, known.ravel(), rcond=None)[0])
+        places = held @ mount @ seen
+        turns = Rotation.from_matrix(places[:, :3, :3]).mean().as_matrix()
+        middles = places[:, :3, :3] @ self.middle + places[:, :3, 3]
+        return mount, rigid_transform(turns, np.median(middles, axis=0) - turns @ self.middle)
+
+    def residuals(self, state: _State, step: np.ndarray | None = None) -> np.ndarray:
+        """Per image (K, 6): where its target lies beside the common one, shift of the middle in mm and turn in rad."""
+        mount, common = state if step is None else self.stepped(state, step)
+        own = self._platforms @ mount @ self._sensor_from_target
+        shift = (own - common)[:, :3] @ np.append(self.middle, 1.0)
+        return np.hstack([shift, Rotation.from_matrix(own[:, :3, :3] @ common[:3, :3].T).as_rotvec()])
+
+    def covariance(self, state: _State) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+        """Function that returns covariances (K, 6, 6) of the residuals and their derivatives by logs of the scatter."""
+        both, middle = self._by_images(state[0]), state[1][:3] @ np.append(self.middle, 1.0)
+        # A turn of the platform moves what is far from its origin.
+        lever = np.tile(np.eye(6, 3, -3), (len(both), 1, 1))
+        for axis, unit in enumerate(np.eye(3)):
+            lever[:, :3, axis] = np.cross(unit, middle - self._platforms[:, :3, 3])
+        images = both @ np.array([image.covariance for image in self.images]) @ both.swapaxes(1, 2)
+        units = np.array(
+            [images, np.broadcast_to(np.diag([1.0] * 3 + [0.0] * 3), images.shape), lever @ lever.swapaxes(1, 2)]
+        )
+
+        def covariances(logs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            parts = np.exp(2 * logs)[:, None, None, None] * units
+            return parts.sum(axis=0), 2 * parts
+
+        return covariances
+
+    def repeated(self, state: _State) -> tuple[int, float]:
+        """None: the scatter of an image's points is part of its covariance."""
+        return 0, 0.0
+
+    def pose_directions(self, state: _State) -> list[np.ndarray]:
+        """All six directions of each image."""
+        return [np.eye(6)] * len(self.images)
+
+    def _by_images(self, mount: np.ndarray) -> np.ndarray:
+        """Derivatives (K, 6, 6) of the residuals by the errors of the images: these turned into the base frame."""
+        turn = (self._platforms @ mount @ np.linalg.inv(self.camera_from_sensor))[:, :3, :3]
+        both = np.zeros((len(turn), 6, 6))
+        both[:, :3, :3] = both[:, 3:, 3:] = turn
+        return both
+
+    def moved(self, state: _State) -> np.ndarray:
+        """Derivatives (K, 6, Q) of the residuals by the parameters of the sensor's calibration."""
+        return self._by_images(state[0]) @ np.array([image.by_sensor for image in self.images])
+
+    def jacobian(self, state: _State, step: np.ndarray | None = None) -> np.ndarray:
+        """Derivatives (K, 6, size) by the parameters."""
+        at = np.zeros(12) if step is None else self.free @ step
+
+        def residuals(every: np.ndarray) -> np.ndarray:
+            return self.residuals(self._moved(state, every))
+
+        return differences(residuals, at, np.tile(POSE_STEPS, 2)).reshape(-1, 6, 12) @ self.free
+
+    def stepped(self, state: _State, step: np.ndarray) -> _State:
+        """The state after a step (size,) of the parameters."""
+        return self._moved(state, self.free @ step)
+
+    def _moved(self, state: _State, step: np.ndarray) -> _State:
+        """The state after a shift and a turn of the mount about the platform's axes, and of the target's middle."""
+        mount, common = state
+        turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ mount[:3, :3]
+        return rigid_transform(turned, mount[:3, 3] + step[:3]), moved_about(common, self.middle, step[6:])
+
+    def typical_miss(self, state: _State) -> float:
+        """Median distance by which images miss, of the target's middle and of what lies its distance aside, mm."""
+        left = self.residuals(state)
+        away = np.linalg.norm(self._sensor_from_target[:, :3, 3], axis=1) + 1.0
+        return float(np.median(np.linalg.norm(left[:, :3], axis=1) + away * np.linalg.norm(left[:, 3:], axis=1)))
+
+    def offsets_mm(self, state: _State) -> np.ndarray:
+        """Distances (K,) of the target's middle in each image from the common place."""
+        return np.linalg.norm(self.residuals(state)[:, :3], axis=1)
+
+
+def agreeing_images(evidence: BoardEvidence) -> tuple[Estimate[_State], np.ndarray]:
+    """Estimate from the images that agree, and their mask.
+
+    Raises
+    ------
+    CalibrationError
+        Too few images agree.
+    """
+    rng, count = np.random.default_rng(0), len(evidence.images)
+    # A wrong image spoils the closed form, so that it starts from three images at a time too.
+    triples = [evidence.selected(rng.choice(count, 3, replace=False)).start() for _ in range(_TRIPLES)]
+    state = min([evidence.start(), *triples], key=evidence.typical_miss)
+    left = evidence.residuals(state)
+    spread = [max(float(np.median(np.linalg.norm(left[:, k : k + 3], axis=1))), least) for k, least in _LEAST]
+    rough = np.tile(np.diag(np.repeat(spread, 3) ** 2), (count, 1, 1))
+    state = evidence.stepped(state, solved_step(evidence, state, rough, loss="cauchy"))
+    sizes = (np.abs(evidence.residuals(state)) / np.repeat(spread, 3)).max(axis=1)
+    near = np.flatnonzero(sizes < LARGEST_ROUGH * max(float(np.median(sizes)), 1.0))
+
+    def require(kept: np.ndarray) -> None:
+        if np.count_nonzero(kept) < FEWEST_IMAGES:
+            raise CalibrationError(
+                f"{np.count_nonzero(kept)} of {count} images of the target agree with the poses; at least "
+                f"{FEWEST_IMAGES} are needed. Are the poses T_base_platform, is their format right, do they come in "
+                "the images' order?"
+            )
+
+    starts = [(each, np.array([1.0, *spread])) for each in (state, evidence.selected(near).start())]
+    found, among = settle_agreeing(evidence.selected(near), starts, false_alarm=FALSE_ALARM, require=require)
+    kept = np.zeros(count, dtype=bool)
+    kept[near[among]] = True
+    return found, kept
