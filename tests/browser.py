@@ -98,4 +98,4 @@ def open_chromium(path: Path) -> Iterator[Browser]:
 
 
 if __name__ == "__main__":
-    sys.exit(run_as_command("Chromium", install_chromium))
+    sys.exit(run_as_command("Chromium", install_chromium, sys.argv[1:]))

@@ -14,6 +14,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cyclopts import App
+
 import uwlts
 from tests.browser import find_chromium, open_chromium
 from tests.system.drawn_hardware import RESOLUTION_MM, STAGE, DrawnCamera, write_plan
@@ -44,7 +46,7 @@ def heap_mib(page: "Page") -> float:
     return used
 
 
-def main(images: int) -> int:
+def main(images: int = 100_000) -> int:
     """Run the soak; the exit status."""
     with tempfile.TemporaryDirectory() as place:
         return _soak(Path(place), images)
@@ -110,4 +112,4 @@ def _done(page: "Page") -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(int(sys.argv[1]) if len(sys.argv) > 1 else 100_000))
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from cyclopts import App
 
 import twin
 import uwlts
@@ -49,4 +50,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -6,8 +6,7 @@ and 15 urad across, and a dent of 0.5 mm. Prints how far distances and standard 
 """
 
 import numpy as np
-from py4dgeo import Epoch
-from py4dgeo.m3c2ep import M3C2EP
+from cyclopts import App
 
 import uwlts
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
@@ -44,6 +43,11 @@ def scanned(rng: np.random.Generator, *, dent: float) -> PointCloud:
 
 
 def main() -> None:
+    """Compare and print."""
+    # The help does not need it.
+    from py4dgeo import Epoch
+    from py4dgeo.m3c2ep import M3C2EP
+
     rng = np.random.default_rng(1)
     before, after = scanned(rng, dent=0.0), scanned(rng, dent=0.5)
     own = uwlts.compare_clouds(after, before, disc_mm=DISC_MM, deep_mm=DEEP_MM)
@@ -88,4 +92,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -4,9 +4,8 @@ Clouds are drawn with the errors that they state: noise of single points, the po
 tilt that all points share. Prints the rows of the table in docs/how-to/compare-scans.md; numbers choose some of them.
 """
 
-import sys
-
 import numpy as np
+from cyclopts import App
 
 import uwlts
 from uwlts.storage.cloud import PointCloud, PointUncertainty
@@ -45,7 +44,8 @@ def scanned(rng: np.random.Generator, surface, *, common: bool, calibration: np.
     return PointCloud(np.column_stack([x, y, z]), np.ones(count), image, np.zeros(count, int), uncertainty=known)
 
 
-def main() -> None:
+def main(*rows_drawn: int) -> None:
+    """Print the rows of the table, those of these numbers or all."""
     rows = (
         ("two scans, noise and images only", wavy, False, False, None, False),
         ("two scans of one calibration", wavy, True, True, None, False),
@@ -54,7 +54,7 @@ def main() -> None:
         ("plane, fitted", flat, True, False, "plane", False),
         ("cylinder of 300 mm, fitted", pipe, True, False, "cylinder", False),
     )
-    for number in map(int, sys.argv[1:] or range(len(rows))):
+    for number in rows_drawn or range(len(rows)):
         name, surface, common, one, reference, register = rows[number]
         rng = np.random.default_rng([11, number])
         shares, ratios, levels = [], [], []
@@ -75,4 +75,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    App(help=__doc__, help_format="plaintext", default_command=main)()

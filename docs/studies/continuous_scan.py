@@ -13,8 +13,10 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from cyclopts import App, Parameter
 
 import uwlts
 from uwlts.hardware import continuous as recorder
@@ -45,13 +47,13 @@ def spheres(cloud, stops: np.ndarray | None = None) -> tuple[str, np.ndarray]:
     return f"{text}, {len(cloud)} points", centres
 
 
-def main() -> None:
-    """Scan and print a line for each."""
+def main(*options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> None:
+    """Scan with options of `twin serve`, and print a line for each."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "fast.toml").write_text(SENSOR)
         command = [sys.executable, "-m", "twin.cli", "serve", "spheres", "--sensor", str(folder / "fast.toml")]
-        command += ["--water", "clear", *sys.argv[1:]]
+        command += ["--water", "clear", *options]
         served = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
         try:
             said = ""
@@ -60,6 +62,9 @@ def main() -> None:
                 said += line
                 if line.startswith("serving"):
                     break
+            else:
+                # It has said what is wrong.
+                sys.exit(served.wait())
             port = re.search(r"stage: +(\S+)", said)[1]
             camera = re.search(r"camera: +(\S+)", said)[1]
             start, end = map(float, re.search(r"positions, (\S+) to (\S+) mm", said).groups())
@@ -97,8 +102,8 @@ def main() -> None:
                     print(f"    {spheres(uwlts.reconstruct(folder / 'moving.h5', calibration), stops)[0]}", flush=True)
         finally:
             served.terminate()
-            served.wait()
+            served.communicate()
 
 
 if __name__ == "__main__":
-    main()
+    App(help=__doc__, help_format="plaintext", default_command=main)()

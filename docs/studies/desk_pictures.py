@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import tomli_w
+from cyclopts import App
 from playwright.sync_api import Page, sync_playwright
 
 import uwlts
@@ -106,4 +107,4 @@ def drive(page: Page, tank: Path, pictures: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:4]))
+    App(help=__doc__, help_format="plaintext", default_command=main)()

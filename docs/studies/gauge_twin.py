@@ -7,10 +7,10 @@ Who sets up the sensor at another distance is another operator; noise, speckle a
 each scan. Writes the table of docs/how-to/gauge-study.md and prints the study.
 """
 
-import sys
 from pathlib import Path
 
 import tomli_w
+from cyclopts import App
 
 import twin
 import uwlts
@@ -51,4 +51,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    App(help=__doc__, help_format="plaintext", default_command=main)()

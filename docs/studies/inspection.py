@@ -11,12 +11,12 @@ the logarithm of the depth, with the bound of its likelihood ratio: MIL-HDBK-182
 all values against the closed form, and what is claimed to have changed where nothing has.
 """
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from cyclopts import App
 from inspection_scenes import AXIS_Z_MM, DIAMETER_MM, OVALITY, SIDES_DEG, WATERS, Pits, large_pits, small_pits
 from scipy import optimize
 from scipy.spatial.transform import Rotation
@@ -265,7 +265,15 @@ def draw_again(folder: Path, draw: int) -> None:
     print(table(HEAD, rows))
 
 
-def main(folder: Path, pictures: Path) -> None:
+def main(folder: Path, pictures: str) -> None:
+    """Print all tables and draw the pictures into a folder; or, of the number of another draw, print its tables."""
+    if pictures.isdecimal():
+        draw_again(folder, int(pictures))
+    else:
+        print_and_draw(folder, Path(pictures))
+
+
+def print_and_draw(folder: Path, pictures: Path) -> None:
     """Print all tables and draw the pictures."""
     seen, figures, curves = [], [], {}
     for water in WATERS:
@@ -353,7 +361,4 @@ def draw_map(folder: Path, path: Path) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[2].isdecimal():
-        draw_again(Path(sys.argv[1]), int(sys.argv[2]))
-    else:
-        main(Path(sys.argv[1]), Path(sys.argv[2]))
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -11,7 +11,6 @@ with large pits; and one seen from six sides; welds; a thin plate from both side
 (`radius_mm`). A number after the folder draws other pits and welds, for `twin record --seed` of the same number.
 """
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from typing import Any
 import numpy as np
 import tomli_w
 import trimesh
+from cyclopts import App
 
 DIAMETER_MM, OVALITY, AXIS_Z_MM = 300.0, 0.005, 150.0
 OVAL_AT = np.radians(20.0)
@@ -177,4 +177,4 @@ def main(folder: Path, draw: int = 0) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), *map(int, sys.argv[2:]))
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -10,10 +10,10 @@ The mount for a pipe is that of the robot's capture of the same seed by the same
 as well as that robot's.
 """
 
-import sys
 from pathlib import Path
 
 import numpy as np
+from cyclopts import App
 from robot_campaigns import FOR_THE_MOUNT, RADIUS_MM
 from scipy.optimize import least_squares
 
@@ -169,4 +169,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -4,16 +4,21 @@ Runs where `pip install open3d` is, apart from the project's environment; normal
 turned to the side from which each point was seen; the depth of its octree gives cells of about half a millimetre.
 """
 
-import sys
+import argparse
 from pathlib import Path
 
 import numpy as np
-import open3d
 
 CELL_MM = 0.5
 
 
-def main(folder: Path) -> None:
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="folder with the saved points")
+    folder = parser.parse_args().folder
+    # After the arguments: the help does not need it.
+    import open3d
+
     for path in sorted(folder.glob("mesh-*.npz")):
         if path.stem.endswith(".poisson"):
             continue
@@ -32,4 +37,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main()

@@ -7,10 +7,10 @@
 Errors are of the vertices, along the normal, against the closed form of a corroded pipe and of a flange's face.
 """
 
-import sys
 from pathlib import Path
 
 import numpy as np
+from cyclopts import App
 from inspection import cloud_of
 from inspection_scenes import AXIS_Z_MM, WATERS, large_pits, radius_mm
 from scipy.spatial import KDTree
@@ -98,4 +98,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from cyclopts import App
 from scipy.spatial.transform import Rotation
 from stripe_tables import table
 
@@ -90,4 +91,4 @@ def profiles_of_poses(captured: CapturedProfiles, poses: np.ndarray) -> Captured
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -6,6 +6,7 @@
 from collections.abc import Iterator
 
 import numpy as np
+from cyclopts import App
 
 from twin.options import Options, use_variant
 from twin.scene.description import Scene
@@ -75,7 +76,12 @@ def rows() -> Iterator[str]:
             yield f"| {name} | {surface} | {shown} | {100 * len(near) / len(error):.1f} | {bias:+.3f} | {spread:.3f} |"
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Print the rows."""
     use_variant()
     for row in rows():
         print(row, flush=True)
+
+
+if __name__ == "__main__":
+    App(help=__doc__, help_format="plaintext", default_command=main)()

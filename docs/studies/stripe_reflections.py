@@ -14,6 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from cyclopts import App
 from scipy.spatial import cKDTree
 
 from twin.options import ALL, Options, use_variant
@@ -268,7 +269,12 @@ def draw(of: Rendered) -> None:
     figure.savefig(PICTURE, dpi=110)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Print the rows."""
     use_variant()
     for row in rows():
         print(row, flush=True)
+
+
+if __name__ == "__main__":
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -6,6 +6,7 @@ Run from the project's folder: ``python docs/studies/study_agreement.py`` (about
 from typing import Any
 
 import numpy as np
+from cyclopts import App
 
 from twin.design.designs import EvaluatedDesign, Marked
 from twin.design.parameters import followed, parameters_of
@@ -71,4 +72,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -10,7 +10,6 @@ A round plate with a hole stands square to the laser; turned by 180 deg about th
 The turn is known, as of a rotary table.
 """
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tomli_w
 import trimesh
+from cyclopts import App
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from stripe_tables import table
@@ -125,7 +125,15 @@ def draw(path: Path, meshes: dict[str, trimesh.Trimesh], points: np.ndarray) -> 
     figure.savefig(path)
 
 
-def main(folder: Path, pictures: Path) -> None:
+def main(folder: Path, pictures: Path | None = None) -> None:
+    """Write the scenes; or, with a folder for pictures, judge what was rendered."""
+    if pictures is None:
+        write_scenes(folder)
+    else:
+        judge(folder, pictures)
+
+
+def judge(folder: Path, pictures: Path) -> None:
     """Mesh both sides, print the table and draw the cut."""
     clouds = [side_cloud(folder, side) for side in SIDES]
     made = uwlts.mesh(*clouds, towards=[[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]])
@@ -151,7 +159,4 @@ def main(folder: Path, pictures: Path) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) == 2:
-        write_scenes(Path(sys.argv[1]))
-    else:
-        main(Path(sys.argv[1]), Path(sys.argv[2]))
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from cyclopts import App
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -51,7 +52,12 @@ def error_ms(seed: int) -> tuple[float, float]:
     return 1e3 * (mount.time_offset_s - offset_s), 1e3 * mount.time_offset_std_s
 
 
-if __name__ == "__main__":
-    found = np.array([error_ms(seed) for seed in range(int(sys.argv[1]) if len(sys.argv) > 1 else 16)])
+def main(campaigns: int = 16) -> None:
+    """Print the errors."""
+    found = np.array([error_ms(seed) for seed in range(campaigns)])
     rms, largest, stated = np.sqrt(np.mean(found[:, 0] ** 2)), np.abs(found[:, 0]).max(), found[:, 1].mean()
     print(f"{len(found)} campaigns: {rms:.3f} ms rms, {largest:.3f} ms at most; {stated:.3f} ms stated")
+
+
+if __name__ == "__main__":
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -5,10 +5,10 @@
 The sensor is as drawn, and images are 2.5 mm apart.
 """
 
-import sys
 from pathlib import Path
 
 import numpy as np
+from cyclopts import App
 from moving_scenes import truth_of
 from vehicle_pass import crossings_of, length_error
 
@@ -101,4 +101,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -17,6 +17,8 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from cyclopts import App
+
 # As the commands do (`uwlts.runtime.console.run`), before NumPy is imported: what is measured on one core must not wait
 # for a thread of the matrix library on another one, which took half of the time where that had other work.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -288,9 +290,9 @@ _ALL = (demo, reproduction, rendering, light, campaign, pipeline, studies, datas
 SECTIONS = {section.__name__: section for section in _ALL}
 
 
-def main() -> int:
+def main(*sections: str) -> int:
     """Measure, print a table after every section, write the result; exit code 1 if a limit is broken, 2 if misused."""
-    chosen = sys.argv[1:] or list(SECTIONS)
+    chosen = sections or tuple(SECTIONS)
     if unknown := set(chosen) - set(SECTIONS):
         print(f"error: unknown section {', '.join(sorted(unknown))}; there are {', '.join(SECTIONS)}", file=sys.stderr)
         return 2
@@ -318,4 +320,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -5,15 +5,15 @@ standard is scanned and measured with each calibration. With ``--varied``, campa
 thesis's, sensors whose uncertainty is stated wrongly, and errors that the calibration does not model.
 """
 
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from cyclopts import App, Parameter
 from rich.console import Console
 from rich.table import Table
 
@@ -266,7 +266,7 @@ def attempt(campaign: Campaign, send: Any = None) -> Outcome | None:
         return None
 
 
-def varied(count: int) -> int:
+def varied_campaigns(count: int) -> int:
     """Run so many campaigns of each variation and print, for each, how often the truth is where it is said to be."""
     table = Table(
         "campaigns in water",
@@ -303,13 +303,11 @@ def varied(count: int) -> int:
     return 0
 
 
-def main() -> int:
+def main(campaigns: int = CAMPAIGNS, *, varied: Annotated[bool, Parameter(negative="")] = False) -> int:
     """Run all campaigns and print how often the truth is where it is said to be."""
-    words = [word for word in sys.argv[1:] if word != "--varied"]
-    count = int(words[0]) if words else CAMPAIGNS
-    if "--varied" in sys.argv:
-        return varied(count)
-    jobs = [Campaign(seed, wet) for seed in range(count) for wet in (True, False)]
+    if varied:
+        return varied_campaigns(campaigns)
+    jobs = [Campaign(seed, wet) for seed in range(campaigns) for wet in (True, False)]
     outcomes = work_through(run_campaign, jobs)
     table = Table("scan", "quantity", "number", "within 95 %", "rms error / std", "mean |error|", "mean std")
     for (scan, quantity), measured in judged(outcomes).items():
@@ -332,4 +330,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    App(help=__doc__, help_format="plaintext", default_command=main)()

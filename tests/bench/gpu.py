@@ -6,12 +6,12 @@ run there with ``TWIN_TEST_VARIANT=cuda_ad_mono make test-full``.
 """
 
 import statistics
-import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 import numpy as np
+from cyclopts import App
 
 from twin.options import GPU, use_variant
 from uwlts.errors import SetupError
@@ -82,4 +82,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    App(help=__doc__, help_format="plaintext", default_command=main)()

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from cyclopts import App
 
 import uwlts
 from tests.uwlts.calibration_views import built_sensor
@@ -189,4 +190,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    App(help=__doc__, help_format="plaintext", default_command=main)()

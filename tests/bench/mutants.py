@@ -23,10 +23,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from queue import SimpleQueue
 
-from cosmic_ray.ast import ast_nodes, get_ast
-from cosmic_ray.mutating import mutate_code
-from cosmic_ray.plugins import get_operator, operator_names
-from coverage import CoverageData
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -59,6 +55,10 @@ class Mutant:
 
     def code(self, source: str) -> str:
         """The file's text with the change."""
+        # Late, here and below: the help does not need the libraries.
+        from cosmic_ray.mutating import mutate_code
+        from cosmic_ray.plugins import get_operator
+
         return mutate_code(source, get_operator(f"core/{self.operator}")(), self.occurrence)
 
 
@@ -84,6 +84,9 @@ def annotated_lines(source: str) -> set[tuple[int, int]]:
 
 def drawn(package: str, number: int, rng: random.Random) -> list[Mutant]:
     """So many mutants of a package, from any place in it at most one."""
+    from cosmic_ray.ast import ast_nodes, get_ast
+    from cosmic_ray.plugins import get_operator, operator_names
+
     places: dict[tuple[str, int, int], list[Mutant]] = {}
     for path in sorted((ROOT / package).rglob("*.py")):
         source, file = path.read_text(), str(path.relative_to(ROOT))
@@ -131,6 +134,8 @@ class Tests:
     @classmethod
     def observed(cls, folder: Path, package: str, *, slow: bool) -> "Tests":
         """Run a package's tests once."""
+        from coverage import CoverageData
+
         report = folder / "report.xml"
         options = [f"--cov={package}", "--cov-context=test", "--cov-report=", f"--junitxml={report}"]
         options += [] if slow else ["-m", "not slow"]

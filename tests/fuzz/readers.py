@@ -39,7 +39,6 @@ from uwlts.report.inventory import describe
 from uwlts.storage.calibration_file import load_calibration, read_calibration, write_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud, write_cloud
-from uwlts.storage.export_ import export_cloud
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import read_intrinsics, with_intrinsics
 from uwlts.storage.import_.folder_description import capture_header, described_sensor, read_description, read_header
@@ -135,7 +134,7 @@ def _text_cloud(path: Path) -> None:
 
 
 def _foreign(path: Path) -> None:
-    export_cloud(some_cloud(), path)
+    write_cloud(path, some_cloud())
 
 
 def _las(path: Path) -> None:
@@ -153,7 +152,7 @@ def _exported(path: Path) -> None:
     """Read a cloud and write it in the formats of others."""
     cloud = read_cloud(path)
     for suffix in (".xyz", ".laz", ".e57"):
-        export_cloud(cloud, path.with_name(f"exported{suffix}"), overwrite=True)
+        write_cloud(path.with_name(f"exported{suffix}"), cloud, overwrite=True)
 
 
 def _all_of_capture(path: Path) -> None:

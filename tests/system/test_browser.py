@@ -142,7 +142,7 @@ def test_the_command_says_what_is_missing(
 ):
     monkeypatch.delenv(browser.VARIABLE, raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert packages.run_as_command("Chromium", browser.install_chromium) == 2
+    assert packages.run_as_command("Chromium", browser.install_chromium, []) == 2
     message = capsys.readouterr().err
     expected = ("there is no Chromium", "Found: none", "apt-get install", browser.VARIABLE)
     assert [part for part in expected if part not in message] == []

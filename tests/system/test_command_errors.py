@@ -16,16 +16,18 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import trimesh
 
 from twin import cli as twin_cli
 from uwlts import cli as uwlts_cli
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
+from uwlts.report.plot import DEVIATIONS, colour_limit_mm
 from uwlts.storage.calibration_file import read_calibration, write_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import read_cloud, write_cloud
+from uwlts.storage.cloud_files import CLOUD_FORMATS, read_cloud, write_cloud
 
 ROOT = Path(__file__).resolve().parents[2]
 WIDTH, HEIGHT = 160, 128
@@ -632,31 +634,63 @@ def test_theses_that_cannot_be(fails, tmp_path: Path):
 
 # --- outputs
 
+BEGINNINGS = {
+    ".ply": b"ply\nformat binary_little_endian",
+    ".h5": b"\x89HDF",
+    ".xyz": b"//X Y Z",
+    ".laz": b"LASF",
+    ".las": b"LASF",
+    ".e57": b"ASTM-E57",
+    ".mcap": b"\x89MCAP",
+}
+"""First bytes of the formats, by their specifications."""
+
 OUTPUTS = {
-    "calibrate": "uwlts calibrate --air air.h5 --out {}",
-    "polynomials": "uwlts polynomials --target air.h5 --out {}",
-    "reconstruct": "uwlts reconstruct scan.h5 --calibration calibration.json --out {}",
-    "nominal": "uwlts nominal sensor.toml --medium water --out {}",
-    "evaluate": "uwlts evaluate scan.ply --out {}",
-    "simulate": "twin simulate scene.toml --sensor sensor.toml --spp 1 --out {}",
+    "calibrate": "uwlts calibrate --air air.h5 --out {}.json",
+    "polynomials": "uwlts polynomials --target air.h5 --out {}.json",
+    "reconstruct": "uwlts reconstruct scan.h5 --calibration calibration.json --out {}.ply",
+    "nominal": "uwlts nominal sensor.toml --medium water --out {}.json",
+    "evaluate": "uwlts evaluate scan.ply --out {}.json",
+    "simulate": "twin simulate scene.toml --sensor sensor.toml --spp 1 --out {}.h5",
 }
 
 
 @pytest.mark.parametrize("name", OUTPUTS)
 def test_outputs_that_cannot_be_written(fails, folder: Path, tmp_path: Path, monkeypatch, name: str):
     monkeypatch.chdir(folder)
-    existing = tmp_path / "existing"
+    ending = Path(OUTPUTS[name]).suffix
+    existing, folder_there = tmp_path / f"existing{ending}", tmp_path / f"there{ending}"
     existing.write_bytes(b"precious")
+    folder_there.mkdir()
     for place, says in (
-        (existing, "existing exists already"),
+        (tmp_path / "existing", f"existing{ending} exists already"),
         (tmp_path / "missing" / "x", "missing does not exist"),
-        (tmp_path, "not a regular file"),
-        (existing / "x", "existing does not exist"),
+        (tmp_path / "there", "not a regular file"),
+        (existing / "x", f"existing{ending} does not exist"),
         (tmp_path / ("x" * 300), "File name too long"),
     ):
         fails(*OUTPUTS[name].format(place).split(), says=says)
     assert existing.read_bytes() == b"precious"
-    assert list(tmp_path.iterdir()) == [existing]
+    assert set(tmp_path.iterdir()) == {existing, folder_there}
+
+
+@pytest.mark.parametrize("ending", CLOUD_FORMATS)
+def test_the_ending_of_a_cloud_decides_its_format(command, folder: Path, tmp_path: Path, ending: str):
+    out, calibration = tmp_path / f"q{ending}", folder / "calibration.json"
+    ended = command("uwlts", "reconstruct", folder / "scan.h5", "--calibration", calibration, "--out", out)
+    assert ended.code == 0, ended.err
+    assert out.read_bytes()[: len(BEGINNINGS[ending])] == BEGINNINGS[ending]
+
+
+def test_a_coloured_cloud_has_the_colours_of_its_picture(command, folder: Path, tmp_path: Path):
+    arguments = ["--out", tmp_path / "x.json", "--coloured", tmp_path / "c.ply"]
+    assert command("uwlts", "evaluate", folder / "scan.ply", *arguments).code == 0
+    seen, deviation = trimesh.load(tmp_path / "c.ply"), read_cloud(tmp_path / "c.ply").deviation_mm
+    assert deviation is not None
+    wanted = DEVIATIONS(np.clip(deviation / colour_limit_mm(deviation) / 2 + 0.5, 0, 1))
+    # A value between two of the 256 colours may be rounded to either.
+    assert np.abs(seen.colors[:, :3] - 255 * wanted[:, :3]).max() <= 4
+    assert len(np.unique(seen.colors, axis=0)) > 10
 
 
 def test_coloured_cloud_that_exists(fails, folder: Path, tmp_path: Path):

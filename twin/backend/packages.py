@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from argparse import ArgumentParser
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TypeVar
@@ -50,8 +51,9 @@ def obtain(find: Callable[[], Found], packages: Sequence[str], report: Report = 
     return find()
 
 
-def run_as_command(what: str, install: Callable[[Report], object]) -> int:
-    """Run an installation from a command line; return the exit status: 0, or 2 after printing the reason."""
+def run_as_command(what: str, install: Callable[[Report], object], words: Sequence[str]) -> int:
+    """Run an installation from a command line without options; return the exit status: 0, or 2 with the reason."""
+    ArgumentParser(description=f"Print which {what} is used, and install one first if there is none.").parse_args(words)
     try:
         print(f"{what}: {install(partial(print, flush=True))}")
     except SetupError as error:

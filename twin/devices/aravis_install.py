@@ -16,4 +16,4 @@ def install_aravis(report: Report) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(run_as_command("Aravis", install_aravis))
+    sys.exit(run_as_command("Aravis", install_aravis, sys.argv[1:]))

@@ -15,9 +15,11 @@ from twin.options import CPU, Options, Variant, use_variant
 from twin.scene.description import Scene, load_scene
 from uwlts.errors import DescriptionError
 from uwlts.files.command_files import keeps_inputs
+from uwlts.files.writing import require_ending
 from uwlts.model.library import load_sensor, validated
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.runtime.console import progress_bar
+from uwlts.storage.capture import CAPTURES
 from uwlts.storage.truth import Truth
 
 AnyScene = str | Path | Scene
@@ -197,6 +199,7 @@ def simulate(
         A file exists already, or cannot be written.
     """
     out = Path(out)
+    require_ending(out, CAPTURES)
     places = (placement,) if isinstance(placement, str) else tuple(placement) or (None,)
     if len(places) > 1 and "{placement}" not in out.name:
         raise DescriptionError(f"several placements would all be written to {out}: put {{placement}} into its name")

@@ -7,6 +7,8 @@ from typing import Literal
 
 import uwlts
 from uwlts.cli.options import (
+    AUTO,
+    JSON,
     CalibrationOut,
     Coefficients,
     Files,
@@ -18,6 +20,7 @@ from uwlts.cli.options import (
     Workers,
     any_stage,
     app,
+    chosen_distortion,
     say,
     show,
     stripe_settings,
@@ -43,7 +46,7 @@ def calibrate(
     out: CalibrationOut,
     refractions: Literal[1, 2] = 2,
     poses: Literal["stage-normal", "stage", "free"] = "stage-normal",
-    distortion: Coefficients | Literal["auto"] = "auto",
+    distortion: Coefficients = AUTO,
     pixels: Literal["auto", "square", "free"] = "auto",
     index: Index = None,
     method: Method = None,
@@ -99,7 +102,8 @@ def calibrate(
     from uwlts.optics.window import require_index
     from uwlts.report.inventory import calibration_lines
 
-    refuse_unsuitable(out, overwrite=overwrite)
+    estimated = chosen_distortion(distortion)
+    refuse_unsuitable(out, overwrite=overwrite, endings=JSON)
     if live is not None:
         if air or water or step or scan:
             raise DescriptionError("--live records its own captures: give either it, or --air, --water and --step")
@@ -112,7 +116,7 @@ def calibrate(
             stage=stage,
             port=port,
             refractions=refractions,
-            distortion=("k1", "k2") if distortion == "auto" else distortion,
+            distortion=("k1", "k2") if estimated == "auto" else estimated,
             resume=resume,
             overwrite=overwrite,
             report=say,
@@ -131,7 +135,7 @@ def calibrate(
             strict=strict,
             refractions=refractions,
             poses=poses,
-            distortion=distortion,
+            distortion=estimated,
             pixels=pixels,
             index=index,
             stripe=stripe_settings(stripe, method),
@@ -155,7 +159,7 @@ def camera(
     target: Path | None = None,
     out: Path,
     channel: str | None = None,
-    distortion: Coefficients | Literal["auto"] = "auto",
+    distortion: Coefficients = AUTO,
     pixels: Literal["auto", "square", "free"] = "auto",
     overwrite: Overwrite = False,
 ) -> None:
@@ -175,12 +179,13 @@ def camera(
     """
     from uwlts.report.camera_page import camera_lines
 
+    estimated = chosen_distortion(distortion)
     page = out.with_suffix(".html")
-    for path in (out, page):
-        refuse_unsuitable(path, overwrite=overwrite)
+    refuse_unsuitable(out, overwrite=overwrite, endings=(".yaml", ".yml"))
+    refuse_unsuitable(page, overwrite=overwrite)
     with progress_bar("calibrating") as progress:
         found = uwlts.calibrate_camera(
-            folder, target=target, channel=channel, distortion=distortion, pixels=pixels, progress=any_stage(progress)
+            folder, target=target, channel=channel, distortion=estimated, pixels=pixels, progress=any_stage(progress)
         )
     uwlts.write_camera(out, found, overwrite=overwrite)
     uwlts.write_camera_page(page, found, overwrite=overwrite)
@@ -237,7 +242,7 @@ def mount(
     """
     from uwlts.report.mount_lines import mount_lines
 
-    refuse_unsuitable(out, overwrite=overwrite)
+    refuse_unsuitable(out, overwrite=overwrite, endings=JSON)
     found = uwlts.calibrate_mount(
         profiles,
         poses,
@@ -289,7 +294,7 @@ def refresh(
     from uwlts.calibration.joint.next_shot import advice_lines
 
     path = out or calibration.with_name(f"{calibration.stem}.refreshed.json")
-    refuse_unsuitable(path, overwrite=overwrite)
+    refuse_unsuitable(path, overwrite=overwrite, endings=JSON)
     with progress_bar("refreshing") as progress:
         result = uwlts.refresh(
             calibration,
@@ -325,7 +330,7 @@ def polynomials(
     """
     from uwlts.report.inventory import polynomial_lines
 
-    refuse_unsuitable(out, overwrite=overwrite)
+    refuse_unsuitable(out, overwrite=overwrite, endings=JSON)
     with progress_bar("calibrating") as progress:
         result = uwlts.calibrate_polynomials(
             target, degree=degree, stripe=stripe_settings(stripe, method), progress=any_stage(progress)
@@ -367,7 +372,7 @@ def models(
     from uwlts.report.model_comparison import content_of, lines_of
 
     if out is not None:
-        refuse_unsuitable_page(out, example="models.html", overwrite=overwrite)
+        refuse_unsuitable_page(out, overwrite=overwrite)
     with progress_bar("comparing models") as progress:
         comparison = uwlts.compare_models(
             air=air,

@@ -4,7 +4,8 @@ from pathlib import Path
 from typing import Literal
 
 import uwlts
-from uwlts.cli.options import CalibrationOut, Flag, Overwrite, app, show, warn
+from uwlts.cli.options import JSON, CalibrationOut, Flag, Overwrite, app, show, warn
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.console import progress_bar
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -35,6 +36,7 @@ def nominal(sensor: str, *, medium: str, out: CalibrationOut, overwrite: Overwri
         sensor: Name or path of a sensor description.
         medium: One of the sensor's media; the laser's window may turn the sheet in it.
     """
+    refuse_unsuitable(out, overwrite=overwrite, endings=JSON)
     uwlts.write_calibration(out, uwlts.nominal(sensor, medium=medium), overwrite=overwrite)
     print(f"wrote {out}")
 
@@ -86,7 +88,7 @@ def export(
     Args:
         file: Capture (.h5) or cloud (.ply, .h5, .copc.laz; of other programs .xyz, .las, .e57).
         out: New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
-            .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers, written a part at a time).
+            .las, .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers, written a part at a time).
         images: Format of a capture's images; both keep all bits.
         region_mm: Only the points in a box: x y z of one corner, x y z of the other.
         at_most: Only an even sample of about so many points.

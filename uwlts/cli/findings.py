@@ -1,13 +1,18 @@
 """Commands that judge measured objects: what changed, features, the gauge, and reports."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 import uwlts
-from uwlts.cli.options import Files, Flag, Overwrite, Workers, app, show
+from uwlts.cli.options import JSON, Files, Flag, Overwrite, Workers, app, show
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.console import progress_bar
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import refuse_unsuitable_cloud
 
 
 @app.command
@@ -29,19 +34,30 @@ def evaluate(
         out: Evaluation to write (JSON).
         artefact: TOML file with the artefact's kind and calibrated values, in place of those in the capture.
         truth: Ground truth of the capture, if it was rendered.
-        coloured: Also write the cloud with the deviation of every point to this file.
+        coloured: Also write the cloud coloured by the deviation of every point, with these in mm, to this PLY, LAZ,
+            LAS, E57 or HDF5 file.
     """
     from uwlts.report.inventory import evaluation_lines
+    from uwlts.report.plot import colour_limit_mm
 
-    for path in (out, coloured):
-        if path:
-            refuse_unsuitable(path, overwrite=overwrite)
+    refuse_unsuitable(out, overwrite=overwrite, endings=JSON)
+    if coloured:
+        refuse_unsuitable_cloud(coloured, overwrite=overwrite, coloured=True)
     evaluation = uwlts.evaluate(cloud, artefact, truth)
     uwlts.write_evaluation(out, evaluation, overwrite=overwrite)
     if coloured:
-        uwlts.write_cloud(coloured, evaluation.cloud, overwrite=overwrite)
+        _write_coloured(coloured, evaluation.cloud, colour_limit_mm, overwrite=overwrite)
     show(evaluation_lines(evaluation.record()))
     print(f"wrote {out}")
+
+
+def _write_coloured(path: Path, cloud: PointCloud, limit_mm: Callable[[np.ndarray], float], *, overwrite: bool) -> None:
+    """Write a cloud with its deviations in the colours of the pages, which end at a limit."""
+    from uwlts.report.plot import deviation_colours
+
+    deviation = np.full(len(cloud), np.nan) if cloud.deviation_mm is None else cloud.deviation_mm
+    limit = limit_mm(deviation) if np.isfinite(deviation).any() else 1.0
+    uwlts.write_cloud(path, cloud, overwrite=overwrite, colours=deviation_colours(deviation, limit))
 
 
 @app.command
@@ -68,7 +84,8 @@ def compare(
         reference: Earlier cloud; a mesh (.stl, .obj, .off, or .ply with faces); or an ideal shape: plane, sphere or
             cylinder to fit one, or a TOML file with its kind and what is known of it (docs/how-to/compare-scans.md).
         out: Page to write, with the figures as JSON beside it.
-        coloured: Also write the places with distance, level of detection and significance to this PLY or LAZ file.
+        coloured: Also write the places in the colours of the map, with distance, level of detection and significance,
+            to this PLY, LAZ or LAS file.
         register: Move the cloud onto the reference first; else both have one frame.
         datums: TOML file with spheres that hold what has not changed; only points in them count for the registration.
         disc_mm: Diameter over which points are averaged; about 30 points unless given.
@@ -77,10 +94,11 @@ def compare(
         unit: Unit of the reference.
     """
     from uwlts.pages.toolkit import refuse_unsuitable_page
+    from uwlts.report.change_page import PLACES_FORMATS
 
-    refuse_unsuitable_page(out, example="change.html", overwrite=overwrite)
+    refuse_unsuitable_page(out, overwrite=overwrite)
     if coloured:
-        refuse_unsuitable(coloured, overwrite=overwrite)
+        refuse_unsuitable(coloured, overwrite=overwrite, endings=PLACES_FORMATS)
     change = uwlts.compare_clouds(
         cloud,
         reference,
@@ -119,7 +137,8 @@ def inspect(
         cloud: Cloud of the object (.ply, .h5, .copc.laz; of other programs .las, .e57, and text in mm).
         kind: What the cloud shows.
         out: Findings to write (JSON), each value with its definition and its source.
-        coloured: Also write the cloud with each point's distance from the undamaged surface to this file.
+        coloured: Also write the cloud coloured by each point's distance from the undamaged surface, with these in
+            mm, to this PLY, LAZ, LAS, E57 or HDF5 file.
         section_mm: Length of a section along a pipe (up to twelve unless given) or a weld.
         wall_mm: Thickness of a pipe's undamaged wall, for the wall that remains.
         false_alarm: Probability that anything is found on the whole of a pipe's surface where nothing is.
@@ -127,10 +146,12 @@ def inspect(
         datum: Cloud of another face in the same frame, to which a flange's face is to be parallel.
     """
     from uwlts.files.json_files import write_record
+    from uwlts.report.findings_page import surface_limit_mm
 
-    for path in (out, coloured):
-        if path:
-            refuse_unsuitable(path, overwrite=overwrite)
+    if out:
+        refuse_unsuitable(out, overwrite=overwrite, endings=JSON)
+    if coloured:
+        refuse_unsuitable_cloud(coloured, overwrite=overwrite, coloured=True)
     measured = uwlts.read_cloud(cloud)
     found = uwlts.inspect(
         measured,
@@ -143,7 +164,8 @@ def inspect(
     )
     show(found.lines())
     if coloured:
-        uwlts.write_cloud(coloured, replace(measured, deviation_mm=found.deviation_mm), overwrite=overwrite)
+        shown = replace(measured, deviation_mm=found.deviation_mm)
+        _write_coloured(coloured, shown, surface_limit_mm, overwrite=overwrite)
         print(f"wrote {coloured}")
     if out:
         write_record(out, found.record(), overwrite=overwrite)
@@ -172,7 +194,7 @@ def gauge(
     from uwlts.files.json_files import write_record
 
     if out:
-        refuse_unsuitable(out, overwrite=overwrite)
+        refuse_unsuitable(out, overwrite=overwrite, endings=JSON)
     study = uwlts.gauge_study(table, tolerance=tolerance, reference=reference)
     show(study.lines())
     if out:
@@ -206,7 +228,7 @@ def findings_report(
     Args:
         cloud: Cloud of the object.
         kind: What the cloud shows.
-        out: Page to write, with the findings as JSON beside it.
+        out: Page to write, with the findings as JSON beside it: of pipe.html, pipe.findings.json.
         pdf: Also print the page to a PDF beside it, with the Chromium or Chrome that is installed.
         title: Title of the report.
         captures: Captures that the cloud was reconstructed from, for the traceability.
@@ -219,6 +241,9 @@ def findings_report(
         largest_ovality: Ovality over the diameter that a pipe may have where less than half of it was seen.
         datum: Cloud of another face in the same frame, to which a flange's face is to be parallel.
     """
+    from uwlts.pages.toolkit import json_beside
+    from uwlts.report.findings_page import FINDINGS
+
     found = uwlts.write_findings(
         cloud,
         kind,
@@ -237,8 +262,8 @@ def findings_report(
         overwrite=overwrite,
     )
     show(found.lines())
-    beside = [out.with_suffix(suffix).name for suffix in ((".json", ".pdf") if pdf else (".json",))]
-    print(f"wrote {out}, {', '.join(beside)}")
+    beside = [json_beside(out, FINDINGS), *([out.with_suffix(".pdf")] if pdf else [])]
+    print(f"wrote {out}, {', '.join(each.name for each in beside)}")
 
 
 @app.command

@@ -7,10 +7,11 @@ from cyclopts import Parameter
 
 import uwlts
 from uwlts.cli.options import Flag, Index, Method, Overwrite, Stripe, app, show, stripe_settings, warn
-from uwlts.errors import OutputError
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.console import progress_bar
+from uwlts.storage.cloud_files import refuse_unsuitable_cloud
 
+CSV = (".csv",)
 Direction = tuple[float, float, float]
 
 
@@ -41,8 +42,8 @@ def reconstruct(
     Args:
         capture: Capture of a scan.
         calibration: Calibration of the sensor, or one by polynomials.
-        out: Cloud to write, PLY or by its ending HDF5 (.h5), with intensity, frame and line of every point, and from a
-            joint calibration its uncertainty.
+        out: Cloud to write, by its ending PLY, HDF5 (.h5) or another format of uwlts export, with intensity, frame and
+            line of every point, and from a joint calibration its uncertainty.
         mount: Where the sensor is on its platform (uwlts mount), in place of what the capture states. Poses are the
             platform's then, and points are given in the frame of the poses.
         trajectory: CSV file or ROS bag with times and poses of the platform (of the sensor without a mount), which
@@ -61,7 +62,7 @@ def reconstruct(
         with_uncertainty: Calculate and write the uncertainty of the points, by default from a joint calibration, with
             which files are more than ten times as large.
     """
-    refuse_unsuitable(out, overwrite=overwrite)
+    refuse_unsuitable_cloud(out, overwrite=overwrite)
     known = uwlts.load_calibration(calibration)
     path = None if trajectory is None else uwlts.read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
     with uwlts.open_capture(capture) as opened, progress_bar(f"reconstructing {capture.name}") as progress:
@@ -114,8 +115,9 @@ def register(
 
     Args:
         clouds: Two or more clouds (.ply or .h5), in any order.
-        out: Merged cloud to write (.ply or .h5).
-        page: Page to write, with all figures, poses and their covariance as JSON beside it.
+        out: Merged cloud to write, in the format that its ending names, as for uwlts export.
+        page: Page to write, with all figures, poses and their covariance as JSON beside it: of pipe.html,
+            pipe.registration.json.
         poses_out: Poses of the scans to write (CSV, matrix, mm).
         poses: CSV file with the pose of every scan at the start, in the order of the clouds; the scans' frames are
             taken as one unless given.
@@ -128,12 +130,13 @@ def register(
         reach_mm: How far overlapping surfaces lie apart at the start, at most; a 20th of a scan's size unless given.
     """
     from uwlts.pages.toolkit import refuse_unsuitable_page
+    from uwlts.report.registration_page import REGISTRATION
 
-    for path in (out, poses_out):
-        if path:
-            refuse_unsuitable(path, overwrite=overwrite)
+    refuse_unsuitable_cloud(out, overwrite=overwrite)
+    if poses_out:
+        refuse_unsuitable(poses_out, overwrite=overwrite, endings=CSV)
     if page:
-        refuse_unsuitable_page(page, example="registration.html", overwrite=overwrite)
+        refuse_unsuitable_page(page, kind=REGISTRATION, overwrite=overwrite)
     start = None if poses is None else uwlts.read_poses(poses, pose_format=pose_format, unit=pose_unit)[0]
     with progress_bar(f"registering {len(clouds)} scans") as progress:
         found = uwlts.register(
@@ -193,9 +196,10 @@ def align(
     from uwlts.files.json_files import write_record
 
     beside = out.with_suffix(".json")
-    for path in (out, beside, aligned):
-        if path:
-            refuse_unsuitable(path, overwrite=overwrite)
+    refuse_unsuitable(out, overwrite=overwrite, endings=CSV)
+    refuse_unsuitable(beside, overwrite=overwrite)
+    if aligned:
+        refuse_unsuitable_cloud(aligned, overwrite=overwrite)
     path = uwlts.read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
     with progress_bar(f"aligning {cloud.name}") as progress:
         found = uwlts.align_trajectory(
@@ -239,9 +243,7 @@ def mesh(
     """
     from uwlts.storage.mesh_file import MESH_FORMATS
 
-    if out.suffix.lower() not in MESH_FORMATS:
-        raise OutputError(f"{out} ends with none of {', '.join(MESH_FORMATS)}, which name the format of a mesh")
-    refuse_unsuitable(out, overwrite=overwrite)
+    refuse_unsuitable(out, overwrite=overwrite, endings=MESH_FORMATS)
     with progress_bar("meshing") as progress:
         surface = uwlts.mesh(*clouds, cube_mm=cube_mm, radius_mm=radius_mm, towards=towards, progress=progress)
     show(surface.lines())

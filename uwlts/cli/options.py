@@ -19,9 +19,14 @@ app = App(
 
 Flag = Annotated[bool, Parameter(negative="")]
 Files = Annotated[tuple[Path, ...], Parameter(consume_multiple=True, negative="")]
+# Not a union of "auto" and tuples: cyclopts takes one value, or refuses the type, where kinds differ in their number.
 Coefficients = Annotated[
-    tuple[Literal["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"], ...], Parameter(consume_multiple=True, negative="")
+    tuple[Literal["auto", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"], ...],
+    Parameter(consume_multiple=True, negative="", show_default=" ".join),
 ]
+JSON = (".json",)
+"""Ending of calibrations, mounts, evaluations, findings and studies."""
+AUTO: Coefficients = ("auto",)
 if TYPE_CHECKING:
     MethodName = str
 else:
@@ -71,6 +76,17 @@ def stripe_settings(stripe: Stripe, method: Method, peak: str | None = None) -> 
             settings[name] = value
     given: dict[str, object] = {"method": method, "peak": peak}
     return settings | {name: value for name, value in given.items() if value is not None}
+
+
+def chosen_distortion(given: Coefficients) -> tuple[str, ...] | Literal["auto"]:
+    """Coefficients to estimate that were given on the command line."""
+    from uwlts.errors import DescriptionError
+
+    if given == AUTO:
+        return "auto"
+    if "auto" in given or len(set(given)) < len(given):
+        raise DescriptionError(f"--distortion {' '.join(given)}: expected auto alone, or each coefficient once")
+    return given
 
 
 def any_stage(progress: Callable[[int, int], None]) -> Callable[[str, int, int], None]:

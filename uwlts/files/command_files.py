@@ -19,7 +19,7 @@ from typing import ParamSpec, TypeVar
 
 from uwlts.errors import OutputError
 
-OUTPUTS = frozenset({"out", "coloured", "pictures"})
+OUTPUTS = frozenset({"out", "coloured", "pictures", "aligned", "page", "poses_out"})
 """Names of the parameters of commands and functions that say where to write."""
 
 _Identity = tuple[int, int]

@@ -4,7 +4,7 @@ import errno
 import hashlib
 import os
 import secrets
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -59,13 +59,24 @@ def _aside(target: Path, *, overwrite: bool) -> Iterator[Path]:
             raise OutputError(_cannot_write(target, error)) from error
 
 
-def refuse_unsuitable(target: Path, *, overwrite: bool) -> None:
+def refuse_unsuitable(target: Path, *, overwrite: bool, endings: Sequence[str] = ()) -> None:
     """Raise OutputError where nothing may be written; commands ask before the work and not only after it.
 
-    From here until the running command ends, other processes are refused the same output.
+    With ``endings``, the name has to end with one of them. From here until the running command ends, other processes
+    are refused the same output.
     """
     _require_suitable(target, overwrite=overwrite)
+    require_ending(target, endings)
     hold_until_end(Path(os.path.realpath(target)), one_writer)
+
+
+def require_ending(target: Path, endings: Sequence[str]) -> None:
+    """Raise OutputError where a name ends with none of the endings of formats, if there are any."""
+    if endings and not target.name.lower().endswith(tuple(endings)):
+        raise OutputError(
+            f"{target} ends with none of {', '.join(endings)}, which name the format of this file; give a name like "
+            f"{target.stem}{endings[0]}"
+        )
 
 
 def _require_suitable(target: Path, *, overwrite: bool) -> None:

@@ -27,7 +27,7 @@ from uwlts.hardware.scan_plan import Light, ScanPlan, load_plan
 from uwlts.hardware.scan_watch import LOOKS, LaserWatch, LitPlace, Place, SlipWatch, centres_of, shows_laser, spread
 from uwlts.model.sensor import Sensor
 from uwlts.storage.calibration_file import load_calibration
-from uwlts.storage.capture import Capture, Frame, part_path
+from uwlts.storage.capture import CAPTURES, Capture, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.import_.images import without_background
 from uwlts.stripe import Stripe, StripeStatus
@@ -133,12 +133,12 @@ def scan(
     OutputError
         The file exists, or cannot be written.
     """
+    refuse_unsuitable(Path(out), overwrite=overwrite, endings=CAPTURES)
     plan, out = plan if isinstance(plan, ScanPlan) else load_plan(Path(plan)), Path(out)
     address, serial_port = camera or plan.camera, stage or plan.stage.port
     if address is None or serial_port is None:
         what = "camera" if address is None else "stage"
         raise DescriptionError(f"neither the plan nor the command line gives the {what}: give --{what}")
-    refuse_unsuitable(out, overwrite=overwrite)
     if calibration:
         if not watch:
             raise DescriptionError("--calibration is for the cloud on the page: give --watch too")

@@ -31,7 +31,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
-from uwlts.errors import OutputError
 from uwlts.files.writing import refuse_unsuitable, written_aside
 
 if TYPE_CHECKING:
@@ -104,31 +103,38 @@ def render_page(package: str, template: str, /, *, interactive: FigureCollector 
     )
 
 
-def write_page(path: str | Path, text: str, *, beside: str | None = None, overwrite: bool = False) -> None:
-    """Write a page, and a JSON text beside it if one is given, each whole or not at all.
+HTML = (".html", ".htm")
+"""Endings of pages."""
+
+
+def write_page(
+    path: str | Path, text: str, *, beside: str | None = None, kind: str = "", overwrite: bool = False
+) -> None:
+    """Write a page, and a JSON text beside it (`json_beside`) if one is given, each whole or not at all.
 
     Raises OutputError: a file exists and ``overwrite`` is not given, or cannot be written.
     """
     with ExitStack() as stack:
         if beside is not None:
-            aside = stack.enter_context(written_aside(json_beside(Path(path)), overwrite=overwrite))
+            aside = stack.enter_context(written_aside(json_beside(Path(path), kind), overwrite=overwrite))
             aside.write_text(beside, encoding="utf-8")
         aside = stack.enter_context(written_aside(path, overwrite=overwrite))
         # A file name on the page may hold bytes that are no text.
         aside.write_text(text, encoding="utf-8", errors="replace")
 
 
-def json_beside(page: Path) -> Path:
-    """Path of the JSON of a page."""
-    return page.with_suffix(".json")
+def json_beside(page: Path, kind: str = "") -> Path:
+    """Path of the JSON of a page: PAGE.json, or with a kind PAGE.KIND.json unless the page is named by its kind.
+
+    Pages of findings and registrations are named after the object, as are its other JSON files.
+    """
+    return page.with_suffix(".json" if page.stem.rpartition(".")[2] == kind or not kind else f".{kind}.json")
 
 
-def refuse_unsuitable_page(page: Path, *, example: str, overwrite: bool) -> None:
-    """Raise OutputError if a page, or the JSON beside it, cannot be written; ``example`` is a suitable name."""
-    if page.suffix == ".json":
-        raise OutputError(f"{page} is the page, which is HTML, and its JSON goes beside it; give a name like {example}")
-    for path in (page, json_beside(page)):
-        refuse_unsuitable(path, overwrite=overwrite)
+def refuse_unsuitable_page(page: Path, *, kind: str = "", overwrite: bool) -> None:
+    """Raise OutputError if a page, or the JSON beside it (`json_beside`), cannot be written."""
+    refuse_unsuitable(page, overwrite=overwrite, endings=HTML)
+    refuse_unsuitable(json_beside(page, kind), overwrite=overwrite)
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,10 @@ from uwlts._version import __version__
 from uwlts.errors import OutputError, RangeError
 from uwlts.evaluation.evaluate import TruthComparisons
 from uwlts.files.command_files import keeps_inputs
-from uwlts.files.writing import refuse_unsuitable
+from uwlts.files.writing import refuse_unsuitable, require_ending
 from uwlts.pages.numbers import fixed, is_number, small_length, unit_of, words_of
 from uwlts.pages.toolkit import (
+    HTML,
     MISSING,
     ComparisonTable,
     FigureCollector,
@@ -102,6 +103,8 @@ def write_report(
     """
     if workers < 1:
         raise RangeError(f"workers is {workers}; it must be at least 1")
+    if out:
+        require_ending(Path(out), HTML)
     campaign = gather_campaign(folder)
     published = load_reference(reference) if reference else None
     page = Path(out or campaign.folder / "report.html")

@@ -76,7 +76,7 @@ def write_certificate(
     """
     source = Path(calibration)
     page = Path(out or source.with_name(f"{source.stem}.certificate.html"))
-    refuse_unsuitable_page(page, example="cert.html", overwrite=overwrite)
+    refuse_unsuitable_page(page, overwrite=overwrite)
     known = read_calibration(source)
     content = certificate_of(known, source, issued=datetime.now(UTC).isoformat(timespec="seconds"))
     earlier = None if before is None else (Path(before).name, read_calibration(before))

@@ -4,16 +4,21 @@ from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
-from plyfile import PlyData, PlyElement
+from matplotlib import colormaps
+from matplotlib.colors import to_rgb
 
 from uwlts._version import __version__
 from uwlts.comparison.change import SurfaceChange
-from uwlts.errors import OutputError
 from uwlts.files.json_files import json_text
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import require_ending, written_aside
 from uwlts.pages.toolkit import BLUE, INK, RED, new_figure, png_data_uri, render_page, svg_of, write_page
-from uwlts.storage.export_ import laz_content
+from uwlts.report.plot import UNKNOWN
+from uwlts.storage.cloud_files import PLY_COLOURS, write_ply_points
+from uwlts.storage.las_file import las_content
 
+PLACES_FORMATS = (".ply", ".laz", ".las")
+"""Endings of the files of places."""
+_COLOURS = colormaps["RdBu"]
 _NOT_SIGNIFICANT = "#cccccc"
 _INK = 60_000
 """Area of all dots together, square points: they nearly touch."""
@@ -41,10 +46,10 @@ def write_change(
     coloured: str | Path | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write the page of a change, its figures as JSON beside it, and its places as a PLY or LAZ cloud (``coloured``).
+    """Write the page of a change, its figures as JSON beside it, and its places as a cloud (``coloured``).
 
-    The cloud's points have x, y, z (mm in PLY, m in LAZ), nx, ny, nz, distance, level (mm; NaN where not compared) and
-    significant (0, 1).
+    The cloud is PLY, LAZ or LAS by its ending. Its points have x, y, z (mm in PLY, else m), the colours of the map,
+    nx, ny, nz, distance, level (mm; NaN where not compared) and significant (0, 1).
     OutputError if a file exists and ``overwrite`` is not given, or cannot be written.
     """
     text = render_page(
@@ -65,23 +70,34 @@ def write_change(
 
 
 def _write_places(path: Path, change: SurfaceChange, *, overwrite: bool) -> None:
+    require_ending(path, PLACES_FORMATS)
     fields = dict(zip(("nx", "ny", "nz"), change.normals.T.astype(np.float32), strict=True))
     fields |= {"distance": change.distance_mm.astype(np.float32), "level": change.level_mm.astype(np.float32)}
     fields["significant"] = change.significant.astype(np.uint8)
-    match path.suffix.lower():
-        case ".laz":
-            content = laz_content(change.points_mm, np.zeros(len(change.points_mm), np.float32), fields)
-            with written_aside(path, overwrite=overwrite) as aside:
-                aside.write_bytes(content)
-        case ".ply":
-            columns = dict(zip(("x", "y", "z"), change.points_mm.T, strict=True)) | fields
-            vertices = np.empty(len(change.points_mm), [(name, values.dtype) for name, values in columns.items()])
-            for name, values in columns.items():
-                vertices[name] = values
-            with written_aside(path, overwrite=overwrite) as aside:
-                PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(aside))
-        case _:
-            raise OutputError(f"{path}: the places are written as PLY or LAZ; give a name like change.ply")
+    colours = _colours(change)
+    if path.suffix.lower() == ".ply":
+        places = dict(zip("xyz", change.points_mm.T, strict=True)) | dict(zip(PLY_COLOURS, colours.T, strict=True))
+        write_ply_points(path, places | fields, overwrite=overwrite)
+        return
+    none = np.zeros(len(change.points_mm), np.float32)
+    compressed = path.suffix.lower() == ".laz"
+    content = las_content(change.points_mm, none, fields, colours=colours, compressed=compressed)
+    with written_aside(path, overwrite=overwrite) as aside:
+        aside.write_bytes(content)
+
+
+def _limit_mm(change: SurfaceChange) -> float:
+    """Distance at which the colours end."""
+    return float(np.quantile(np.abs(change.distance_mm[change.compared]), _CLIPPED)) or 1.0
+
+
+def _colours(change: SurfaceChange) -> np.ndarray:
+    """Red, green and blue (P, 3) uint8 of the places, as on the map; `UNKNOWN` where not compared."""
+    limit = _limit_mm(change) if change.compared.any() else 1.0
+    colours = _COLOURS((np.nan_to_num(change.distance_mm) / limit + 1) / 2, bytes=True)[:, :3]
+    for where, colour in ((~change.significant, _NOT_SIGNIFICANT), (~change.compared, UNKNOWN)):
+        colours[where] = np.rint(255 * np.array(to_rgb(colour)))
+    return colours
 
 
 def _rows(change: SurfaceChange) -> list[tuple[str, ...]]:
@@ -104,7 +120,7 @@ def _map(change: SurfaceChange) -> str:
     """The places from above, across the two longest of their extents, coloured where the change is significant."""
     first, second = np.sort(np.argsort(np.ptp(change.points_mm, axis=0), kind="stable")[1:])
     shown, changed = change.compared, change.significant
-    limit = float(np.quantile(np.abs(change.distance_mm[shown]), _CLIPPED))
+    limit = _limit_mm(change)
     figure, (axes,) = new_figure(9.0, 6.0)
     u, v = change.points_mm[:, first], change.points_mm[:, second]
     size = float(np.clip(_INK / len(u), 2, 60))
@@ -114,7 +130,7 @@ def _map(change: SurfaceChange) -> str:
         v[changed],
         s=size,
         c=change.distance_mm[changed],
-        cmap="RdBu",
+        cmap=_COLOURS,
         vmin=-limit,
         vmax=limit,
         linewidths=0,
@@ -129,7 +145,7 @@ def _map(change: SurfaceChange) -> str:
 
 def _histogram(change: SurfaceChange) -> Markup:
     distance, level = change.distance_mm[change.compared], change.level_mm[change.compared]
-    limit = float(np.quantile(np.abs(distance), _CLIPPED)) or 1.0
+    limit = _limit_mm(change)
     figure, (axes,) = new_figure(9.0, 3.2)
     axes.hist(np.clip(distance, -limit, limit), bins=81, color=BLUE)
     for side in (-1, 1):

@@ -57,6 +57,10 @@ _SMALLEST = 1e-6
 _SMALLEST_MM = 0.002
 """Figures without uncertainty are written to a tenth of it."""
 _MOST_PICTURES = 40
+FINDINGS = "findings"
+"""Kind of the page, in the name of the JSON beside it."""
+_CLIPPED = 0.995
+"""Share of the points within the colours' range: the findings are drawn larger below."""
 _MOST_DRAWN = 60_000
 _AROUND = 1.2
 """Times a finding's size: how much is drawn around it."""
@@ -116,7 +120,7 @@ def write_findings(
     cloud, kind, section_mm, wall_mm, false_alarm, largest_ovality, datum
         As for `uwlts.inspect`.
     out
-        Page to write; the JSON goes beside it.
+        Page to write; the JSON goes beside it, for pipe.html to pipe.findings.json.
     pdf
         Also print the page to a PDF beside it, with the Chromium or Chrome that is installed.
     title
@@ -145,7 +149,7 @@ def write_findings(
         A PDF is asked for and there is no browser.
     """
     page, path = Path(out), Path(cloud)
-    refuse_unsuitable_page(page, example="findings.html", overwrite=overwrite)
+    refuse_unsuitable_page(page, kind=FINDINGS, overwrite=overwrite)
     if pdf:
         refuse_unsuitable_pdf(page.with_suffix(".pdf"))
         refuse_unsuitable(page.with_suffix(".pdf"), overwrite=overwrite)
@@ -178,7 +182,7 @@ def write_findings(
     }
     if pdf:
         print_pdf(text, page.with_suffix(".pdf"), overwrite=overwrite)
-    write_page(page, text, beside=json_text(record, indent=1), overwrite=overwrite)
+    write_page(page, text, beside=json_text(record, indent=1), kind=FINDINGS, overwrite=overwrite)
     return found
 
 
@@ -333,6 +337,12 @@ def _tiles(whole: list[Feature], parts: list[Feature]) -> list[Tile]:
     return tiles
 
 
+def surface_limit_mm(deviation_mm: np.ndarray) -> float:
+    """Deviation at which the colours of an inspected surface end, so that all but its largest findings differ."""
+    seen = deviation_mm[np.isfinite(deviation_mm)]
+    return (float(np.quantile(np.abs(seen), _CLIPPED)) if len(seen) else 0.0) or 1e-3
+
+
 def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:
     """All points by their deviation: of a pipe unrolled along its axis, else across the two longest extents."""
     seen = np.flatnonzero(np.isfinite(found.deviation_mm))
@@ -344,8 +354,7 @@ def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:
     # As wide as the surface asks for at a height of 5 inches, with the bar of colours beside it.
     width = 1.8 + 4.5 * float(np.ptp(u)) / max(float(np.ptp(v)), 1e-9)
     figure, (axes,) = new_figure(float(np.clip(width, 4.0, 9.0)), 5.0)
-    # A robust range: the findings are drawn larger below.
-    limit = float(np.quantile(np.abs(found.deviation_mm[seen]), 0.995)) or 1e-3
+    limit = surface_limit_mm(found.deviation_mm)
     style: dict[str, Any] = {"cmap": DEVIATIONS, "vmin": -limit, "vmax": limit, "linewidths": 0, "s": 3}
     colours = axes.scatter(u, v, c=found.deviation_mm[seen], rasterized=True, **style)
     figure.colorbar(colours, ax=axes, label="above the undamaged surface / mm")

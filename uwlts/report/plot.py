@@ -156,6 +156,13 @@ def _coloured_by(cloud: PointCloud, colour: Colour) -> tuple[np.ndarray | None, 
             assert_never(colour)
 
 
+def deviation_colours(deviation_mm: np.ndarray, limit_mm: float) -> np.ndarray:
+    """Red, green and blue (N, 3) uint8 of deviations (N,) as pictures show them: those of `DEVIATIONS` up to the limit,
+    `UNKNOWN` where one is NaN."""
+    shown = DEVIATIONS.with_extremes(bad=UNKNOWN)
+    return shown(np.ma.masked_invalid((deviation_mm / limit_mm + 1) / 2), bytes=True)[:, :3]
+
+
 def view_direction() -> np.ndarray:
     """Unit vector (3,) in the OCS along which clouds are looked at."""
     azimuth, elevation = np.radians((AZIMUTH_DEG, ELEVATION_DEG))

@@ -19,6 +19,10 @@ _CLIPPED = 0.99
 _VIEWS = ((0, 1), (0, 2), (1, 2))
 
 
+REGISTRATION = "registration"
+"""Kind of the page, in the name of the JSON beside it."""
+
+
 def write_registration(
     path: str | Path, registered: RegisteredScans, *, title: str = "Registration of scans", overwrite: bool = False
 ) -> None:
@@ -38,7 +42,7 @@ def write_registration(
         overlaps=_overlaps(registered),
         histograms=_histograms(registered),
     )
-    write_page(path, text, beside=json_text(registered.record()), overwrite=overwrite)
+    write_page(path, text, beside=json_text(registered.record()), kind=REGISTRATION, overwrite=overwrite)
 
 
 def _scans(registered: RegisteredScans) -> str:

@@ -20,10 +20,14 @@ USER_ERROR, INTERRUPTED = 2, 130
 @contextmanager
 def progress_bar(title: str, *, shown: bool = True) -> Iterator[Callable[[int, int], None]]:
     """A bar on standard error, moved by calling ``progress(done, total)``; silent unless shown on a terminal."""
+    console = Console(stderr=True)
+    if not (shown and console.is_terminal):
+        # A disabled bar of rich before 14.3 prints an empty line.
+        yield lambda done, total: None
+        return
     times = TimeElapsedColumn(), TimeRemainingColumn()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *times
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not (shown and console.is_terminal)) as bar:
+    with Progress(*columns, console=console) as bar:
         task = bar.add_task(title, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
 

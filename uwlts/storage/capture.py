@@ -138,6 +138,10 @@ def sensor_poses(capture: "Capture | FrameTable") -> np.ndarray:
     return capture.pose if mount is None else capture.pose @ np.array(mount)
 
 
+CAPTURES = (".h5",)
+"""Endings of captures."""
+
+
 def part_path(path: Path) -> Path:
     """Name of an unfinished recording of ``path``."""
     return path.with_name(path.name + ".part")

@@ -3,7 +3,7 @@ programs."""
 
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -13,13 +13,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from uwlts.errors import CaptureError
+from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import opened, parsed_json, require_regular_file, shortened
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import refuse_unsuitable, require_ending, written_aside
 from uwlts.model.sensor import Description, Table
 from uwlts.storage.cloud import KINDS, NO_INDEX, PAIRS, PER_POINT, PointCloud, PointUncertainty, joined, metadata_json
 from uwlts.storage.copc_file import is_copc, read_copc
-from uwlts.storage.foreign_clouds import FOREIGN_FORMATS, read_foreign
+from uwlts.storage.foreign_clouds import (
+    FOREIGN_FORMATS,
+    WRITTEN_FORMATS,
+    read_foreign,
+    require_libraries,
+    write_foreign,
+)
 from uwlts.storage.hdf5_file import find_dataset, format_of, read_array, read_label, write_label
 
 FORMAT = "uwlts-cloud"
@@ -30,6 +36,11 @@ POINTS_OF_PART = 1_000_000
 
 CLOUD_ENDINGS = (".ply", ".h5", ".copc.laz", *FOREIGN_FORMATS)
 """Endings of the clouds that can be read."""
+CLOUD_FORMATS = (".ply", ".h5", *WRITTEN_FORMATS)
+"""Endings of the clouds that can be written; ``.copc.laz`` and ``.foxglove.mcap`` are among them."""
+COLOURED_FORMATS = (".ply", ".h5", ".laz", ".las", ".e57")
+"""Endings of those that can be written with a colour of each point."""
+PLY_COLOURS = ("red", "green", "blue")
 _CLOUDS_ALONE = (".ply", ".xyz", ".las", ".e57")
 """Endings of clouds and of nothing else that is measured."""
 _UNCERTAINTY = ["random_mm2", "position_mm", "patterns_mm", "poses_mm"]
@@ -46,36 +57,86 @@ _TYPE_BYTES |= {f"{kind}{bits}": bits // 8 for kind in ("int", "uint", "float") 
 _Rows = Callable[[int], slice]
 
 
-def write_cloud(path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool = False) -> None:
-    """Write a cloud as HDF5 where the path ends with ``.h5``, else as binary little-endian PLY; whole or not at all.
+def write_cloud(
+    path: str | os.PathLike[str], cloud: PointCloud, *, overwrite: bool = False, colours: np.ndarray | None = None
+) -> None:
+    """Write a cloud in the format that the path's ending names, whole or not at all.
 
-    In HDF5 the datasets are those of `PointCloud` and `PointUncertainty`, by their names, with systematic_mm2 (N, 6)
-    besides. In PLY the vertex properties are x, y, z (double), intensity, deviation (float), frame, line (int), and
-    perhaps time (double, s). Where the uncertainty is known there are its covariances in mm2, random_xx to random_zz
-    and systematic_xx to systematic_zz, and in mm position_x to position_z, pattern0_x, pattern0_y and so on, and
-    perhaps pose0_x to pose5_z (`PointUncertainty`). The metadata is JSON in numbered comments,
-    short enough for every reader.
+    - ``.ply``, ``.h5``: mm, everything kept. In HDF5 the datasets are those of `PointCloud` and `PointUncertainty`, by
+      their names, with systematic_mm2 (N, 6) besides. In PLY, binary and little-endian, the vertex properties are x, y,
+      z (double), intensity, deviation (float), frame, line (int), and perhaps time (double, s). Where the uncertainty
+      is known there are its covariances in mm2, random_xx to random_zz and systematic_xx to systematic_zz, and in mm
+      position_x to position_z, pattern0_x, pattern0_y and so on, and perhaps pose0_x to pose5_z (`PointUncertainty`).
+      The metadata is JSON in numbered comments, short enough for every reader.
+    - ``.xyz``: text, a line of names, then X Y Z in mm and the intensity (nan where unknown) of every point, with all
+      the digits that they have.
+    - ``.laz``, ``.las``: LAS 1.4, point format 6, or 7 with colours, metres in steps of 1e-7 m. The standard intensity
+      is rounded to whole numbers (0 where unknown); ``amplitude`` holds it as it is, the standard ``gps_time`` the time
+      in s where it is known, ``frame``, ``line``, ``deviation_mm`` and the covariance ``cov_xx_mm2`` to ``cov_zz_mm2``
+      the rest.
+    - ``.copc.laz``: the same without times and covariances as COPC, in an octree with levels of detail.
+    - ``.e57``: metres and intensity as 32-bit floating point numbers, that is to 6e-8 of the coordinate; the
+      image as column, the line as row where both are known and below 65536; ``timeStamp`` in 64 bits since
+      ``acquisitionStart`` where times are known; the covariance as extension, ``uwlts:cov_xx_mm2`` to
+      ``uwlts:cov_zz_mm2``.
+    - ``.mcap``: messages sensor_msgs/msg/PointCloud2 of ROS 2, and where the name ends with ``.foxglove.mcap``
+      foxglove.PointCloud; one for each image where the points' times are known (`uwlts.storage.mcap_clouds`).
+
+    Other programs show the points in ``colours`` (N, 3) uint8, red, green and blue, if these are given: with
+    PLY, LAS, LAZ and E57 (`COLOURED_FORMATS`; in HDF5 the deviation stands for them).
 
     Raises
     ------
     OutputError
-        The file exists and `overwrite` is not set, the folder is missing, the disk is full.
+        The ending is another one, the file exists and `overwrite` is not set, the folder is missing, the disk is full,
+        the format does not hold such a cloud or colours.
+    SetupError
+        The format's library is not installed.
     """
+    path = Path(path)
+    _require_format(path, coloured=colours is not None)
+    if path.suffix.lower() in WRITTEN_FORMATS:
+        write_foreign(path, cloud, overwrite=overwrite, colours=colours)
+        return
     if _in_hdf5(path):
         _write_hdf5(path, cloud, overwrite=overwrite)
         return
     deviation = np.full(len(cloud), np.nan, np.float32) if cloud.deviation_mm is None else cloud.deviation_mm
-    columns = dict(zip("xyz", cloud.points_mm.T, strict=True)) | {"intensity": cloud.intensity, "deviation": deviation}
+    columns = dict(zip("xyz", cloud.points_mm.T, strict=True))
+    if colours is not None:
+        columns |= dict(zip(PLY_COLOURS, colours.T, strict=True))
+    columns |= {"intensity": cloud.intensity, "deviation": deviation}
     if cloud.time_s is not None:
         columns["time"] = cloud.time_s
     columns |= {"frame": cloud.frame, "line": cloud.line} | _uncertainty_columns(cloud.uncertainty)
-    vertices = np.empty(len(cloud), [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
+    write_ply_points(path, columns, comments=_comments(_with_shared(cloud)), overwrite=overwrite)
+
+
+def write_ply_points(
+    path: Path, columns: Mapping[str, np.ndarray], *, comments: Sequence[str] = (), overwrite: bool
+) -> None:
+    """Write columns (N,) as properties of vertices, binary and little-endian, whole or not at all."""
+    count = len(next(iter(columns.values())))
+    vertices = np.empty(count, [(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
     for name, values in columns.items():
         vertices[name] = values
-    comments = _comments(_with_shared(cloud))
-    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=comments)
+    ply = PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<", comments=list(comments))
     with written_aside(path, overwrite=overwrite) as aside:
         ply.write(str(aside))
+
+
+def refuse_unsuitable_cloud(path: str | os.PathLike[str], *, overwrite: bool, coloured: bool = False) -> None:
+    """Raise OutputError or SetupError where a cloud, perhaps with colours, cannot be written (`refuse_unsuitable`)."""
+    path = Path(path)
+    refuse_unsuitable(path, overwrite=overwrite)
+    _require_format(path, coloured=coloured)
+    require_libraries(path)
+
+
+def _require_format(path: Path, *, coloured: bool) -> None:
+    require_ending(path, COLOURED_FORMATS if coloured else CLOUD_FORMATS)
+    if coloured and is_copc(path):
+        raise OutputError(f"{path}: COPC is written without colours; give a name that ends with .laz alone")
 
 
 def read_cloud(path: str | os.PathLike[str]) -> PointCloud:

@@ -15,6 +15,8 @@ from uwlts.storage.las_file import brief, library
 PREFIX, EXTENSION = "uwlts", "urn:uwlts:point-fields"
 """Of the fields that the standard does not have: an extension is a prefix of their names, and its own name as a URI."""
 
+COLOURS = "colorRed", "colorGreen", "colorBlue"
+"""Columns of the standard for 8 bits of each colour."""
 _LIMITS: tuple[tuple[str, Callable[[np.ndarray], Any]], ...] = (("Minimum", np.min), ("Maximum", np.max))
 _PLACES = ("cartesianInvalidState", "sphericalInvalidState")
 """Fields of points that have no place."""
@@ -76,6 +78,11 @@ def write_e57(
             scan.set("cartesianBounds", structure(_limits(named, float)))
             if "intensity" in fields:
                 scan.set("intensityLimits", structure(_limits([("intensity", fields["intensity"])], float)))
+            if COLOURS[0] in fields:
+                limits = {
+                    f"{label}{end}": full for label in COLOURS for end, full in (("Minimum", 0), ("Maximum", 255))
+                }
+                scan.set("colorLimits", structure(limits))
             if "rowIndex" in fields:
                 named = [(each, fields[f"{each}Index"]) for each in ("row", "column")]
                 scan.set("indexBounds", structure(_limits(named, int)))

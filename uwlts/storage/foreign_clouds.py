@@ -1,23 +1,28 @@
-"""Clouds of other programs and scanners: text, LAS, E57.
+"""Clouds for and of other programs and scanners: text, LAS, E57; LAZ, COPC and MCAP are written only here.
 
 LAZ is read as COPC only: the decompressor ends the process on some damaged files.
 """
 
 import struct
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from uwlts.errors import CaptureError, DescriptionError
+from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.files.reading import opened
-from uwlts.storage.e57_file import read_e57
-from uwlts.storage.las_file import brief, library
+from uwlts.files.writing import written_aside
+from uwlts.storage.cloud import PointCloud
+from uwlts.storage.copc_file import is_copc, write_copc
+from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
+from uwlts.storage.las_file import brief, las_content, library
+from uwlts.storage.mcap_clouds import covariance_columns, mcap_of
 from uwlts.storage.pose_files import read_columns
 
 TEXT_FORMATS = (".xyz", ".txt", ".csv", ".asc")
 """Columns x, y, z by name, or the first three, in mm; and perhaps intensity."""
 FOREIGN_FORMATS = (*TEXT_FORMATS, ".las", ".e57")
+WRITTEN_FORMATS = (".xyz", ".laz", ".e57", ".las", ".mcap")
 
 _LAS_START, _LAS_RECORD = 104, 54
 """Bytes of a LAS header up to its number of variable length records, and fewest bytes of such a record."""
@@ -106,3 +111,73 @@ def _read_las(path: Path, start: bytes) -> ForeignPoints:
         # Programs leave it 0 where they know no times.
         None if times is None or not times.any() else times,
     )
+
+
+def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: np.ndarray | None = None) -> None:
+    """Write a cloud in the format that the suffix names, one of `WRITTEN_FORMATS`, whole or not at all.
+
+    OutputError where the file exists, the cloud is empty, too wide for LAS, or lacks intensities that E57 cannot leave
+    out, or storage fails; SetupError where the format's library is not installed.
+    """
+    if len(cloud) == 0:
+        raise OutputError(f"the cloud has no points, and {path.suffix} cannot hold none: write PLY or HDF5")
+    if is_copc(path):
+        write_copc(path, lambda: [cloud], overwrite=overwrite)
+        return
+    with written_aside(path, overwrite=overwrite) as aside:
+        match path.suffix.lower():
+            case ".xyz":
+                rows = zip(*cloud.points_mm.T.tolist(), cloud.intensity, strict=True)
+                with open(aside, "w", encoding="utf-8") as file:
+                    # CloudCompare takes the names from a first line that begins so.
+                    file.write("//X Y Z Intensity\n")
+                    file.writelines(f"{x!r} {y!r} {z!r} {intensity!s}\n" for x, y, z, intensity in rows)
+            case ".laz" | ".las" as suffix:
+                fields = {"amplitude": cloud.intensity, "frame": cloud.frame, "line": cloud.line}
+                if cloud.deviation_mm is not None:
+                    fields["deviation_mm"] = cloud.deviation_mm
+                fields |= covariance_columns(cloud)
+                content = las_content(
+                    cloud.points_mm,
+                    cloud.intensity,
+                    fields,
+                    time_s=cloud.time_s,
+                    colours=colours,
+                    compressed=suffix == ".laz",
+                )
+                aside.write_bytes(content)
+            case ".mcap":
+                aside.write_bytes(mcap_of(cloud, foxglove=path.name.lower().endswith(".foxglove.mcap")))
+            case _:
+                _write_e57(cloud, aside, path, colours)
+
+
+_LIBRARIES: dict[str, tuple[Literal["laspy", "lazrs", "copclib", "pye57"], ...]] = {
+    ".copc.laz": ("copclib",),
+    ".laz": ("laspy", "lazrs"),
+    ".las": ("laspy",),
+    ".e57": ("pye57",),
+}
+
+
+def require_libraries(path: Path) -> None:
+    """Raise SetupError where a library is not installed that writing a file of this ending needs."""
+    ending = next((each for each in _LIBRARIES if path.name.lower().endswith(each)), "")
+    for name in _LIBRARIES.get(ending, ()):
+        library(name, ending.strip(".").upper())
+
+
+def _write_e57(cloud: PointCloud, aside: Path, path: Path, colours: np.ndarray | None) -> None:
+    unknown = np.isnan(cloud.intensity)
+    if unknown.any() and not unknown.all():
+        raise OutputError(
+            f"{np.count_nonzero(unknown)} of {len(cloud)} points have no intensity, which E57 as written here cannot "
+            "mark: write PLY, XYZ or LAZ"
+        )
+    columns = {} if unknown.any() else {"intensity": cloud.intensity}
+    if colours is not None:
+        columns |= dict(zip(COLOURS, colours.T, strict=True))
+    if all(numbers.min() >= 0 and numbers.max() < 2**16 for numbers in (cloud.frame, cloud.line)):
+        columns |= {"columnIndex": cloud.frame.astype(np.uint16), "rowIndex": cloud.line.astype(np.uint16)}
+    further = covariance_columns(cloud)
+    write_e57(aside, cloud.points_mm, columns, to=path, time_s=cloud.time_s, further=further)

@@ -1,4 +1,4 @@
-"""LAZ as other programs read it: points in m, in steps of 0.1 um, with fields of any name."""
+"""LAS and LAZ as other programs read them: points in m, in steps of 0.1 um, with fields of any name."""
 
 from importlib import import_module
 from io import BytesIO
@@ -16,15 +16,23 @@ _REACH_M = LAZ_STEP_M * (2**31 - 1)
 INTENSITY_LIMITS = 0, 2**16 - 1
 
 
-def laz_content(
-    points_mm: np.ndarray, intensity: np.ndarray, fields: dict[str, np.ndarray], *, time_s: np.ndarray | None = None
+def las_content(
+    points_mm: np.ndarray,
+    intensity: np.ndarray,
+    fields: dict[str, np.ndarray],
+    *,
+    time_s: np.ndarray | None = None,
+    colours: np.ndarray | None = None,
+    compressed: bool,
 ) -> bytes:
-    """Content of a LAZ file of points (N, 3), their intensity (N,), fields (N,) by name, and times (N,)."""
-    laspy = library("laspy", "LAZ")
-    library("lazrs", "LAZ")
+    """Content of a LAS or LAZ file of points (N, 3), their intensity (N,), fields (N,) by name, times (N,), and
+    red, green and blue (N, 3) uint8."""
+    laspy = library("laspy", "LAZ" if compressed else "LAS")
+    if compressed:
+        library("lazrs", "LAZ")
     points = 1e-3 * points_mm
     middle = las_middle(points.min(axis=0), points.max(axis=0))
-    header = laspy.LasHeader(version="1.4", point_format=6)
+    header = laspy.LasHeader(version="1.4", point_format=6 if colours is None else 7)
     header.offsets, header.scales = middle, np.full(3, LAZ_STEP_M)
     header.add_extra_dims([laspy.ExtraBytesParams(name=name, type=values.dtype) for name, values in fields.items()])
     table = laspy.LasData(header)
@@ -32,11 +40,14 @@ def laz_content(
     table.intensity = np.rint(np.nan_to_num(intensity)).clip(*INTENSITY_LIMITS).astype(np.uint16)
     if time_s is not None:
         table.gps_time = time_s
+    if colours is not None:
+        # 16 bits for each colour, all of them used, as the standard wants.
+        table.red, table.green, table.blue = 257 * colours.T.astype(np.uint16)
     for name, values in fields.items():
         table[name] = values
     # In memory: the compressor has errors of its own where storage fails.
     content = BytesIO()
-    table.write(content, do_compress=True)
+    table.write(content, do_compress=compressed)
     return content.getvalue()
 
 

@@ -319,9 +319,16 @@ def test_the_command_writes_page_figures_and_cloud(ball, tmp_path, monkeypatch):
     assert record["largest_rise_mm"] == pytest.approx(0.3, abs=0.05) and record["registration"] is None
     places = PlyData.read(tmp_path / "change.ply")["vertex"].data
     assert set(places.dtype.names) >= {"x", "y", "z", "distance", "level", "significant"}
+    # Grey where nothing changed, else red below and blue above, as on the map.
+    seen = np.asarray(trimesh.load(tmp_path / "change.ply").colors, int)[:, :3]
+    compared, changed = np.isfinite(places["distance"]), places["significant"] == 1
+    assert changed.sum() > 20
+    assert (seen[compared & ~changed] == 0xCC).all()
+    assert np.array_equal((seen[changed, 2] > seen[changed, 0]), places["distance"][changed] > 0)
     assert places["significant"].mean() == pytest.approx(record["significant_share"], abs=0.2)
     table = laspy.read(tmp_path / "change.laz")
     np.testing.assert_allclose(1e3 * np.column_stack([table.x, table.y, table.z])[:, 0], places["x"], atol=1e-3)
+    np.testing.assert_array_equal(np.column_stack([table.red, table.green, table.blue]), 257 * seen)
     np.testing.assert_array_equal(table["significant"], places["significant"])
     page = (tmp_path / "change.html").read_text()
     assert "level of detection" in page and "ball.ply against ball.stl" in page

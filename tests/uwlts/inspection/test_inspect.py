@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.stats import norm
 
 import uwlts
@@ -444,6 +445,10 @@ def test_clouds_without_covariance_say_so(tmp_path, monkeypatch, capsys):
     assert pit["values"]["depth"]["source"].startswith("ASME B31G")
     assert "pit 1" in capsys.readouterr().out
     deviation = uwlts.read_cloud("c.ply").deviation_mm
+    # As on the page: blue in the pit, red where the surface stands out, and most of it pale.
+    red, _, blue, _ = np.asarray(trimesh.load("c.ply").colors, int).T
+    assert (blue > red)[deviation < -0.1].all() and (blue <= red)[deviation > 0.01].all()
+    assert len(np.unique(red)) > 50
     assert np.nanmin(deviation) == pytest.approx(-0.6, abs=0.15)
 
 

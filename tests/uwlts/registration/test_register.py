@@ -223,7 +223,7 @@ def test_the_command_writes_cloud_poses_and_page(tmp_path, monkeypatch):
     uwlts.write_poses("start.csv", wrong[:2])
     words = ["register", "view-0.ply", "view-1.ply", "--poses", "start.csv", "--out", "pipe.h5"]
     app([*words, "--page", "pipe.html", "--poses-out", "found.csv"], result_action="return_value")
-    merged, record = uwlts.read_cloud("pipe.h5"), json.loads((tmp_path / "pipe.json").read_text())
+    merged, record = uwlts.read_cloud("pipe.h5"), json.loads((tmp_path / "pipe.registration.json").read_text())
     assert len(merged) == len(scans[0]) + len(scans[1]) and merged.uncertainty is not None
     assert [each["name"] for each in merged.metadata["scans"]] == ["view-0", "view-1"]
     poses, _ = uwlts.read_poses("found.csv")

@@ -56,7 +56,7 @@ def test_page_json_and_pdf_say_the_same(folder, chromium, monkeypatch):
     words = ["findings-report", "pipe.ply", "--wall-mm", "8", "--captures", "pipe.ply", "--out", "report.html", "--pdf"]
     words += ["--verification", "ball.evaluation.json"]
     app(words, result_action="return_value")
-    record = json.loads((folder / "report.json").read_text())
+    record = json.loads((folder / "report.findings.json").read_text())
     pits = [each for each in record["inspection"]["features"] if each["kind"] == "pit"]
     assert len(pits) == 1
     wall = pits[0]["values"]["remaining wall"]
@@ -91,7 +91,7 @@ def test_foreign_calibrations_and_missing_browsers_are_refused(folder, tmp_path,
     uwlts.write_evaluation(tmp_path / "foreign.json", foreign)
     with pytest.raises(EvaluationError, match="by another calibration"):
         uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", verification=[tmp_path / "foreign.json"])
-    with pytest.raises(OutputError, match="which is HTML"):
+    with pytest.raises(OutputError, match="give a name like a.html"):
         uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.json")
     monkeypatch.delenv("CHROMIUM", raising=False)
     monkeypatch.setattr(pdf, "shutil", SimpleNamespace(which=lambda name: None))

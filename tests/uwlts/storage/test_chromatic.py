@@ -50,24 +50,41 @@ def test_colours_that_lie_together_and_one_colour_for_both_give_no_warning(tmp_p
     assert chromatic_warnings([PHOTOGRAPHS / "frame0001.jpg"], BOARD, lamp_channel="green", wavelength_nm=450.0) == []
 
 
-def test_an_import_tells_it(tmp_path):
-    folder = tmp_path / "images"
-    folder.mkdir()
-    coloured(folder, magnified=1.001)
+def described(folder: Path, *, channel: str, lamp_channel: str) -> Path:
+    """The folder with a description of its photographs, each a laser image and a lamp image."""
     (folder / "import.toml").write_text(
-        """
+        f"""
 medium = "air"
 laser = "lamp*.png"
 lamp = "lamp*.png"
-channel = "red"
-lamp_channel = "green"
-stage = {free = true}
-sensor = {base = "thesis", camera = {stripe_along = "height", window = {mounted = false}}}
-target = {kind = "chessboard", columns = 7, rows = 6, square_mm = 10.0}
+channel = "{channel}"
+lamp_channel = "{lamp_channel}"
+stage = {{free = true}}
+sensor = {{base = "thesis", camera = {{stripe_along = "height", window = {{mounted = false}}}}}}
+target = {{kind = "chessboard", columns = 7, rows = 6, square_mm = 10.0}}
 """
     )
+    return folder
+
+
+def test_an_import_tells_it(tmp_path):
+    coloured(tmp_path, magnified=1.001)
+    folder = described(tmp_path, channel="red", lamp_channel="green")
     warnings = import_images(folder, tmp_path / "a.h5").warnings
     assert any("red is magnified by 1.001" in each for each in warnings)
+
+
+@pytest.mark.parametrize("lamp_channel", ["green", "red - max(green, blue)", "2 * green - red"])
+def test_an_import_succeeds_where_a_colour_does_not_show_the_target(tmp_path, lamp_channel):
+    # The board is in green and blue alone: the first looks for it in red too, the others do not find or do see it.
+    for path in coloured(tmp_path):
+        image = cv2.imread(str(path))
+        image[..., 2] = 40
+        image[:, 300:303, 2] = 200
+        cv2.imwrite(str(path), image)
+    imported = import_images(described(tmp_path, channel="red", lamp_channel=lamp_channel), tmp_path / "a.h5")
+    assert (imported.laser, imported.lamp) == (2, 2)
+    assert not any("magnified" in each for each in imported.warnings)
 
 
 def test_colours_of_lasers():

@@ -9,6 +9,7 @@ import laspy
 import numpy as np
 import pye57
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from tests.uwlts.storage.test_capture import a_header, record, small_sensor
@@ -18,8 +19,9 @@ from uwlts.runtime.console import run
 from uwlts.storage.capture import Capture, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import read_cloud, write_cloud
-from uwlts.storage.export_ import CLOUD_FORMATS, export_capture, export_cloud
+from uwlts.storage.cloud_files import CLOUD_FORMATS, COLOURED_FORMATS, read_cloud, write_cloud
+from uwlts.storage.export_ import export, export_capture
+from uwlts.storage.foreign_clouds import WRITTEN_FORMATS
 from uwlts.storage.import_ import import_images
 from uwlts.storage.las_file import LAZ_STEP_M
 
@@ -110,7 +112,7 @@ def test_an_interruption_leaves_nothing(tmp_path: Path):
 
 def test_ply_keeps_everything(tmp_path: Path):
     cloud = a_cloud(deviation_mm=np.linspace(-1, 1, 500))
-    export_cloud(cloud, tmp_path / "a.ply")
+    write_cloud(tmp_path / "a.ply", cloud)
     back = read_cloud(tmp_path / "a.ply")
     assert np.array_equal(back.points_mm, cloud.points_mm) and np.array_equal(back.intensity, cloud.intensity)
     assert np.array_equal(back.deviation_mm, cloud.deviation_mm) and back.metadata == cloud.metadata
@@ -118,7 +120,7 @@ def test_ply_keeps_everything(tmp_path: Path):
 
 def test_xyz_keeps_every_digit(tmp_path: Path):
     cloud = a_cloud(intensity=np.r_[np.nan, np.random.default_rng(1).uniform(0, 255, 499)])
-    export_cloud(cloud, tmp_path / "a.xyz")
+    write_cloud(tmp_path / "a.xyz", cloud)
     assert (tmp_path / "a.xyz").read_text().startswith("//X Y Z Intensity\n")
     back = np.loadtxt(tmp_path / "a.xyz", comments="//")
     assert np.array_equal(back[:, :3], cloud.points_mm)
@@ -127,7 +129,7 @@ def test_xyz_keeps_every_digit(tmp_path: Path):
 
 def test_laz_keeps_a_tenth_of_a_micrometre(tmp_path: Path):
     cloud = a_cloud(deviation_mm=np.linspace(-1, 1, 500), intensity=np.r_[np.nan, np.linspace(0, 300, 499)])
-    export_cloud(cloud, tmp_path / "a.laz")
+    write_cloud(tmp_path / "a.laz", cloud)
     content = laspy.read(tmp_path / "a.laz")
     assert (tmp_path / "a.laz").read_bytes()[:4] == b"LASF" and content.header.are_points_compressed
     # Rounded to half a step, and the sum with the offset to double precision.
@@ -141,13 +143,13 @@ def test_laz_keeps_a_tenth_of_a_micrometre(tmp_path: Path):
 def test_laz_refuses_what_its_steps_do_not_reach(tmp_path: Path):
     wide = a_cloud(2, points_mm=np.array([[0.0, 0, 0], [500e3, 0, 0]]))
     with pytest.raises(OutputError, match="reaches 250 m from its middle"):
-        export_cloud(wide, tmp_path / "a.laz")
+        write_cloud(tmp_path / "a.laz", wide)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_e57_keeps_single_precision(tmp_path: Path):
     cloud = a_cloud()
-    export_cloud(cloud, tmp_path / "a.e57")
+    write_cloud(tmp_path / "a.e57", cloud)
     file = pye57.E57(str(tmp_path / "a.e57"))
     back = file.read_scan_raw(0)
     file.close()
@@ -158,18 +160,18 @@ def test_e57_keeps_single_precision(tmp_path: Path):
 
 
 def test_e57_of_unknown_intensity(tmp_path: Path):
-    export_cloud(a_cloud(intensity=np.full(500, np.nan)), tmp_path / "a.e57")
+    write_cloud(tmp_path / "a.e57", a_cloud(intensity=np.full(500, np.nan)))
     file = pye57.E57(str(tmp_path / "a.e57"))
     assert "intensity" not in file.read_scan_raw(0)
     file.close()
     with pytest.raises(OutputError, match="1 of 500 points have no intensity"):
-        export_cloud(a_cloud(intensity=np.r_[np.nan, np.ones(499)]), tmp_path / "b.e57")
+        write_cloud(tmp_path / "b.e57", a_cloud(intensity=np.r_[np.nan, np.ones(499)]))
 
 
 @pytest.mark.parametrize("suffix", CLOUD_FORMATS)
 def test_one_point_and_a_flat_cloud(tmp_path: Path, suffix: str):
-    export_cloud(a_cloud(1), tmp_path / f"one{suffix}")
-    export_cloud(a_cloud(points_mm=a_cloud().points_mm * [1, 1, 0]), tmp_path / f"flat{suffix}")
+    write_cloud(tmp_path / f"one{suffix}", a_cloud(1))
+    write_cloud(tmp_path / f"flat{suffix}", a_cloud(points_mm=a_cloud().points_mm * [1, 1, 0]))
 
 
 @pytest.mark.parametrize("suffix", CLOUD_FORMATS)
@@ -177,26 +179,69 @@ def test_what_exists_stays_and_nothing_is_made_of_nothing(tmp_path: Path, suffix
     path = tmp_path / f"a{suffix}"
     path.write_bytes(b"precious")
     with pytest.raises(OutputError, match="exists already"):
-        export_cloud(a_cloud(), path)
+        write_cloud(path, a_cloud())
     assert path.read_bytes() == b"precious"
-    export_cloud(a_cloud(), path, overwrite=True)
+    write_cloud(path, a_cloud(), overwrite=True)
     assert path.stat().st_size > 1000
     empty = a_cloud(0, points_mm=np.empty((0, 3)), intensity=np.empty(0), frame=np.empty(0), line=np.empty(0))
+    write_cloud(tmp_path / "empty.ply", empty)
     with pytest.raises(OutputError, match="has no points"):
-        export_cloud(empty, tmp_path / f"b{suffix}")
-    assert [left.name for left in tmp_path.iterdir()] == [path.name]
+        export(tmp_path / "empty.ply", tmp_path / f"b{suffix}")
+    assert {left.name for left in tmp_path.iterdir()} == {path.name, "empty.ply"}
+
+
+@pytest.mark.parametrize("suffix", WRITTEN_FORMATS)
+def test_formats_that_hold_no_empty_cloud_say_so(tmp_path: Path, suffix: str):
+    empty = a_cloud(0, points_mm=np.empty((0, 3)), intensity=np.empty(0), frame=np.empty(0), line=np.empty(0))
+    with pytest.raises(OutputError, match="has no points"):
+        write_cloud(tmp_path / f"a{suffix}", empty)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_las_is_laz_that_is_not_compressed(tmp_path: Path):
+    cloud = a_cloud()
+    for suffix in (".las", ".laz"):
+        write_cloud(tmp_path / f"a{suffix}", cloud)
+    plain, packed = (laspy.read(tmp_path / f"a{suffix}") for suffix in (".las", ".laz"))
+    assert not plain.header.are_points_compressed
+    assert np.array_equal(plain.points.array, packed.points.array)
+    # To half a step.
+    assert np.abs(read_cloud(tmp_path / "a.las").points_mm - cloud.points_mm).max() <= 0.5001e3 * LAZ_STEP_M
+
+
+def test_colours_are_those_that_other_programs_read(tmp_path: Path):
+    cloud, colours = a_cloud(), np.random.default_rng(5).integers(0, 256, (500, 3)).astype(np.uint8)
+    for suffix in COLOURED_FORMATS:
+        write_cloud(tmp_path / f"a{suffix}", cloud, colours=colours)
+    seen = trimesh.load(tmp_path / "a.ply")
+    assert np.array_equal(seen.colors[:, :3], colours) and (seen.colors[:, 3] == 255).all()
+    for suffix in (".las", ".laz"):
+        table = laspy.read(tmp_path / f"a{suffix}")
+        assert np.array_equal(np.column_stack([table.red, table.green, table.blue]), 257 * colours.astype(int))
+    file = pye57.E57(str(tmp_path / "a.e57"))
+    found = file.read_scan(0, colors=True, ignore_missing_fields=True)
+    file.close()
+    assert np.array_equal(np.column_stack([found[f"color{each}"] for each in ("Red", "Green", "Blue")]), colours)
+    assert np.array_equal(read_cloud(tmp_path / "a.ply").points_mm, cloud.points_mm)
+
+
+@pytest.mark.parametrize("name", ["a.xyz", "a.mcap", "a.copc.laz"])
+def test_formats_without_colours_are_refused(tmp_path: Path, name: str):
+    with pytest.raises(OutputError, match=r"ends with none of .ply|give a name that ends with .laz alone"):
+        write_cloud(tmp_path / name, a_cloud(), colours=np.zeros((500, 3), np.uint8))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_unknown_endings_are_refused(tmp_path: Path):
     with pytest.raises(OutputError, match=r"ends with none of .ply, .h5, .xyz, .laz, .e57"):
-        export_cloud(a_cloud(), tmp_path / "a.obj")
+        write_cloud(tmp_path / "a.obj", a_cloud())
 
 
 @pytest.mark.parametrize(("library", "suffix"), [("laspy", ".laz"), ("lazrs", ".laz"), ("pye57", ".e57")])
 def test_a_library_that_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, library: str, suffix: str):
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(SetupError, match=rf"needs the library {library}.*uwlts\[clouds\]"):
-        export_cloud(a_cloud(), tmp_path / f"a{suffix}")
+        write_cloud(tmp_path / f"a{suffix}", a_cloud())
     assert list(tmp_path.iterdir()) == []
 
 

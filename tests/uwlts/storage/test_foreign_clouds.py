@@ -9,15 +9,14 @@ import pytest
 
 from tests.uwlts.storage.test_cloud import some_cloud
 from uwlts.errors import CaptureError
-from uwlts.storage.cloud_files import cloud_parts, is_cloud, read_cloud, read_thinned_cloud
-from uwlts.storage.export_ import export_cloud
+from uwlts.storage.cloud_files import cloud_parts, is_cloud, read_cloud, read_thinned_cloud, write_cloud
 
 
 # All digits; half a unit in the last of 24 binary digits of coordinates below 2 m.
 @pytest.mark.parametrize(("suffix", "apart_mm"), [(".xyz", 0.0), (".e57", 1e3 * 2.0**-24)])
 def test_exported_clouds_come_back(tmp_path: Path, suffix: str, apart_mm: float):
     path, cloud = tmp_path / f"a{suffix}", some_cloud(300, time_s=5 + np.arange(300.0))
-    export_cloud(cloud, path)
+    write_cloud(path, cloud)
     back = read_cloud(path)
     assert is_cloud(path) and np.abs(back.points_mm - cloud.points_mm).max() <= apart_mm
     assert np.array_equal(back.intensity, cloud.intensity)

@@ -13,8 +13,8 @@ from rosbags.typesys import Stores, get_typestore
 
 import uwlts
 from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.cloud_files import write_cloud
 from uwlts.storage.e57_file import write_e57
-from uwlts.storage.export_ import export_cloud
 
 FIELDS = ("x", "y", "z", "intensity", "frame", "line", "time")
 NUMBERS = {5: "<i4", 7: "<f4", 8: "<f8"}
@@ -57,7 +57,7 @@ def assert_same(cloud: PointCloud, table: dict[str, np.ndarray]) -> None:
 
 def test_point_cloud2_of_ros_2(cloud, tmp_path):
     path = tmp_path / "a.mcap"
-    export_cloud(cloud, path)
+    write_cloud(path, cloud)
     parts, stamps = [], []
     with path.open("rb") as file:
         for schema, channel, message, decoded in make_reader(
@@ -87,7 +87,7 @@ def test_point_cloud_of_foxglove(cloud, tmp_path):
     from foxglove.messages import PointCloud as Message
 
     path = tmp_path / "a.foxglove.mcap"
-    export_cloud(cloud, path)
+    write_cloud(path, cloud)
     parts = []
     with path.open("rb") as file:
         for schema, _, message in make_reader(file).iter_messages():
@@ -103,14 +103,14 @@ def test_point_cloud_of_foxglove(cloud, tmp_path):
 
 def test_a_cloud_without_times_is_one_message(cloud, tmp_path):
     plain = PointCloud(cloud.points_mm, cloud.intensity, cloud.frame, cloud.line)
-    export_cloud(plain, tmp_path / "a.mcap")
+    write_cloud(tmp_path / "a.mcap", plain)
     with (tmp_path / "a.mcap").open("rb") as file:
         (found,) = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
     assert found[3].width == len(plain) and [field.name for field in found[3].fields] == list(FIELDS[:-1])
 
 
 def test_laz_has_time_image_and_covariance(cloud, tmp_path):
-    export_cloud(cloud, tmp_path / "a.laz")
+    write_cloud(tmp_path / "a.laz", cloud)
     found = laspy.read(tmp_path / "a.laz")
     table = {axis: np.asarray(getattr(found, axis)) for axis in "xyz"}
     table |= {"time": np.asarray(found.gps_time), "intensity": np.asarray(found["amplitude"])}
@@ -123,7 +123,7 @@ def test_laz_has_time_image_and_covariance(cloud, tmp_path):
 
 
 def test_e57_has_time_image_and_covariance(cloud, tmp_path):
-    export_cloud(cloud, tmp_path / "a.e57")
+    write_cloud(tmp_path / "a.e57", cloud)
     names = {"x": "cartesianX", "y": "cartesianY", "z": "cartesianZ", "intensity": "intensity"}
     names |= {"frame": "columnIndex", "line": "rowIndex", "time": "timeStamp"}
     names |= {name: f"uwlts:{name}" for name in (f"cov_{'xyz'[i]}{'xyz'[j]}_mm2" for i, j in PAIRS)}
@@ -142,7 +142,7 @@ def test_e57_has_time_image_and_covariance(cloud, tmp_path):
 def test_e57_gives_its_times_back(cloud, tmp_path):
     for number, times in enumerate((cloud.time_s, cloud.time_s - 1.7e9 - 0.3, None)):
         path = tmp_path / f"{number}.e57"
-        export_cloud(replace(cloud, time_s=times), path)
+        write_cloud(path, replace(cloud, time_s=times))
         again = uwlts.read_cloud(path)
         np.testing.assert_allclose(again.points_mm, cloud.points_mm, atol=2e-5)
         assert (again.time_s is None) == (times is None)
@@ -172,5 +172,5 @@ def test_ply_has_time_image_and_covariance(cloud, tmp_path):
 def test_times_before_zero_are_refused(cloud, tmp_path):
     early = PointCloud(cloud.points_mm, cloud.intensity, cloud.frame, cloud.line, time_s=cloud.time_s - 2e9)
     with pytest.raises(uwlts.Error, match="no time before 0"):
-        export_cloud(early, tmp_path / "a.mcap")
+        write_cloud(tmp_path / "a.mcap", early)
     assert not list(tmp_path.iterdir())

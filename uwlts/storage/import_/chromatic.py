@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from uwlts.errors import ImageError
+from uwlts.errors import Error
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_.channels import one_channel
 from uwlts.targets import Target
@@ -39,8 +39,8 @@ def chromatic_warnings(
         raw = read_image(path)
         if raw.ndim == 2:
             return []
-        in_lamp = _seen(target, one_channel(raw, lamp_channel, name=path.name))
-        in_laser = _seen(target, one_channel(raw, colour, name=path.name)) if in_lamp else {}
+        in_lamp = _seen(target, raw, lamp_channel)
+        in_laser = _seen(target, raw, colour) if in_lamp else {}
         both = sorted(in_lamp.keys() & in_laser.keys())
         lamp, laser = (np.array([points[place] for place in both]).reshape(-1, 2) for points in (in_lamp, in_laser))
         if len(both) >= _FEWEST_POINTS and np.median(np.abs(laser - lamp)) < _OTHER_NUMBERS_PX:
@@ -63,11 +63,13 @@ def chromatic_warnings(
     ]
 
 
-def _seen(target: Target, image: np.ndarray) -> dict[tuple[int, ...], np.ndarray]:
-    """Pixels (2,) of a target's points by their places in it; none where the image does not show it."""
+def _seen(target: Target, raw: np.ndarray, channel: str) -> dict[tuple[int, ...], np.ndarray]:
+    """Pixels (2,) of a target's points by their places in it; none where the channel does not show it."""
+    # What a formula gives may be negative.
+    grey = np.clip(one_channel(raw, channel, name="the image"), 0, None).astype(raw.dtype)
     try:
-        view = target.detect(image)
-    except ImageError:
+        view = target.detect(grey)
+    except Error:
         return {}
     return dict(zip(map(tuple, view.indices.tolist()), view.pixels, strict=True))
 

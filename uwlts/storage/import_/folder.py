@@ -13,7 +13,7 @@ from uwlts.errors import DescriptionError, ImageError
 from uwlts.files.command_files import keeps_inputs
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.sensor import Sensor, Table
-from uwlts.storage.capture import Frame, part_path
+from uwlts.storage.capture import CAPTURES, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import ImageHeader
@@ -158,7 +158,7 @@ def import_images(
         The capture cannot be written.
     """
     folder, out = Path(folder), Path(out)
-    refuse_unsuitable(out, overwrite=overwrite)
+    refuse_unsuitable(out, overwrite=overwrite, endings=CAPTURES)
     if not folder.is_dir():
         raise ImageError(f"no folder at {folder}")
     path = folder / NAME if description is None else Path(description)

@@ -1,0 +1,52 @@
+"""Scripts of benches, tests and studies: each explains itself, and refuses a wrong option before it does anything."""
+
+import ast
+import runpy
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def _is_script(path: Path) -> bool:
+    """Whether a module does something when it is run."""
+    return any(
+        isinstance(each, ast.If) and ast.unparse(each.test) == "__name__ == '__main__'"
+        for each in ast.parse(path.read_text(encoding="utf-8")).body
+    )
+
+
+PROCESSES = {"tests/fuzz/running.py", "tests/uwlts/stripe/test_unchanged.py"}
+"""Not for the command line of a user: a child process, and a test that writes its data again."""
+SCRIPTS = [
+    path
+    for folder in ("docs/studies", "tests")
+    for path in sorted((ROOT / folder).rglob("*.py"))
+    if str(path.relative_to(ROOT)) not in PROCESSES and _is_script(path)
+]
+
+
+def test_scripts_are_found():
+    assert {"coverage.py", "soak.py", "inspection.py"} <= {path.name for path in SCRIPTS}
+
+
+@pytest.mark.filterwarnings("ignore:Cyclopts application invoked without tokens")
+@pytest.mark.parametrize("path", SCRIPTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_help_and_a_wrong_option(path, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(path.parent), *sys.path])
+    # A broad terminal, so that nothing is broken within words.
+    monkeypatch.setenv("COLUMNS", "1000")
+    codes, texts = [], []
+    for option in ("--help", "--no-such-option"):
+        monkeypatch.setattr(sys, "argv", [str(path), option])
+        with pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(path), run_name="__main__")
+        codes.append(ended.value.code)
+        texts.append(capfd.readouterr())
+    assert codes[0] in (0, None) and codes[1] not in (0, None)
+    assert texts[0].out.lower().startswith("usage: ")
+    assert "error" in texts[1].err.lower() and "Traceback" not in texts[1].err
+    assert list(tmp_path.iterdir()) == []
