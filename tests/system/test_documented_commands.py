@@ -171,6 +171,7 @@ PAGES_RUN = {
         given={name: name for name in ("target-air.h5", "target-water.h5", "step-near.h5", "step-far.h5", "spheres.h5")}
         | {"pipe.h5": "pipe.h5", "plane.h5": "plane.h5", "target.h5": "target-water.h5", "today.h5": "today.h5"}
         | {"step-today.h5": "step-today.h5", "last-year.json": "calibration.json"},
+        instead={"--limit 0.05": "--limit 0.5"},
         again=("uwlts calibrate --air", "uwlts calibrate --joint", "uwlts calibrate --water target.h5")
         + ("uwlts certificate calibration.json --before",),
     ),
@@ -218,7 +219,7 @@ PAGES_RUN = {
         """,
     ),
     "docs/how-to/large-clouds.md": Page(
-        given={"scan.ply": "pipe.ply"}, instead={"1000 -50 300 1100 50 600": "-10 -50 300 10 50 600"}
+        given={"scan.ply": "pipe.ply"}, instead={"1000 -50 300 1100 50 600": "-10 -50 0 10 50 30"}
     ),
     "docs/how-to/make-a-data-set.md": Page(
         tables={"mine.toml": 0}, instead={"--scenes 200": "--scenes 1", "scenes = 40 ": "scenes = 2 "}

@@ -207,8 +207,10 @@ def _weights(light: np.ndarray, features: np.ndarray, exposure: np.ndarray) -> n
     # Blocks of cells tell the weights as well, as all features are blurred.
     counts, seen = _in_blocks(light), _in_blocks(features * exposure)
     norm = seen.sum(axis=1)
-    per_norm = np.divide(1, norm, out=np.zeros_like(norm), where=norm > 0)
-    weights = counts.sum(axis=1)[:, None] * per_norm / np.count_nonzero(norm)
+    # The inverse of a smaller number is not finite.
+    bright = norm >= np.finfo(norm.dtype).tiny
+    per_norm = np.divide(1, norm, out=np.zeros_like(norm), where=bright)
+    weights = counts.sum(axis=1)[:, None] * per_norm / np.count_nonzero(bright)
     seen = np.ascontiguousarray(seen.T)
     scratch = np.empty_like(per_norm), np.empty(len(seen), np.int64)
     for each, found in zip(weights, counts, strict=True):

@@ -411,16 +411,21 @@ def _widened(name: str, value: float, top: Largest, fixed: float, shared: float 
     )
 
 
+def _on_bead(bead: _Bead, profiles: np.ndarray) -> np.ndarray:
+    """Heights (S, G) of the profiles between the toes; -inf elsewhere."""
+    inside = np.isfinite(profiles) & (np.abs(bead.profiles.across_mm) < bead.half_mm)
+    return np.where(inside, profiles, -np.inf)
+
+
 def _tops(bead: _Bead, profiles: np.ndarray) -> np.ndarray:
     """Greatest height (S,) of each profile between the toes; -inf where there is none."""
-    inside = np.isfinite(profiles) & (np.abs(bead.profiles.across_mm) < bead.half_mm)
-    return np.max(np.where(inside, profiles, -np.inf), axis=1)
+    return np.max(_on_bead(bead, profiles), axis=1)
 
 
 def _toes_and_slopes(bead: _Bead, profiles: np.ndarray, whole: np.ndarray) -> np.ndarray:
     """Toes left and right, and the flanks' slopes there (W, 4), of some sections."""
-    tops = _tops(bead, profiles)
-    return np.array([_flanks(bead.profiles.across_mm, profiles[k], float(tops[k])) for k in whole])
+    peaks = np.argmax(_on_bead(bead, profiles), axis=1)
+    return np.array([_flanks(bead.profiles.across_mm, profiles[k], int(peaks[k])) for k in whole])
 
 
 def _figures(
@@ -456,10 +461,9 @@ def _undercuts(bead: _Bead, profiles: np.ndarray, toes: np.ndarray, side: int) -
     return np.where(seen, -np.min(np.where(groove, profiles, np.inf), axis=1), np.nan)
 
 
-def _flanks(grid: np.ndarray, profile: np.ndarray, top: float) -> tuple[float, float, float, float]:
+def _flanks(grid: np.ndarray, profile: np.ndarray, peak: int) -> tuple[float, float, float, float]:
     """Toes left and right, and slopes of the flanks there, from the lines through their lower halves."""
-    peak = int(np.nanargmax(profile))
-    low, high = _FLANK[0] * top, _FLANK[1] * top
+    low, high = (share * profile[peak] for share in _FLANK)
     result = []
     for step in (-1, 1):
         k = peak

@@ -89,7 +89,9 @@ def test_no_walks_and_dark_features_are_no_light():
     assert (nothing.cells == 0).all()
     findings = FoundLight(*SHAPE)
     findings.add(np.array([70]), np.array([1.0], np.float32))
-    dark = np.stack([np.zeros(SHAPE, np.float32), np.ones(SHAPE, np.float32)])
+    # The inverse of the second one's sum is more than single precision holds.
+    none, hardly = np.zeros(SHAPE, np.float32), np.full(SHAPE, 1e-43, np.float32)
+    dark = np.stack([none, hardly, np.ones(SHAPE, np.float32)])
     spread = estimated(findings, np.ones(SHAPE), dark, tolerance=1e-3, noise_share=0.05).cells
     assert spread.sum(dtype=float) == pytest.approx(1.0, rel=1e-4)
     assert spread.max() < 0.01

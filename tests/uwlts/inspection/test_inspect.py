@@ -8,6 +8,7 @@ import json
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from uwlts.inspection.blemish_search import UnrolledSurface, search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
 from uwlts.inspection.flat import _circle
 from uwlts.inspection.pipe_form import fit_pipe, pipe_features
+from uwlts.inspection.weld import _toes_and_slopes
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty
 
 NOISE_MM, IMAGE_MM = 0.02, 0.004
@@ -426,6 +428,19 @@ def test_holes_that_are_not_measured_are_named():
     gap = uwlts.inspect(flat_scan(np.random.default_rng(19), lambda x, y: 0 * x, gapped), "gap")
     within(gap.features[0], {"width": 3.0})
     assert sum("profiles cross it, fewer than the gap" in note for note in gap.notes) == 1
+
+
+def test_what_stands_at_the_rim_of_a_section_is_not_its_top():
+    """Few sections: in one of them something higher than the bead stands where the grid of the sections ends."""
+    grid = np.linspace(-12.0, 12.0, 97)
+    profile = weld_height(0.0, grid, undercut=0.0, offset=0.0)
+    profile[-3:] = 5.0
+    profiles = SimpleNamespace(across_mm=grid)
+    left, right, *slopes = _toes_and_slopes(
+        SimpleNamespace(profiles=profiles, half_mm=6.0), profile[None], np.array([0])
+    )[0]
+    assert right == pytest.approx(-left, abs=1e-9) and 4.0 < right < 6.0
+    assert slopes[0] == pytest.approx(slopes[1])
 
 
 def test_clouds_without_covariance_say_so(tmp_path, monkeypatch, capsys):
