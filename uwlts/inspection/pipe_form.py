@@ -141,7 +141,8 @@ def _fitted(cloud: PointCloud, fitted: np.ndarray, frame: PipeFrame, radius: flo
         raise EvaluationError(f"only {len(fitted)} of {len(cloud)} points are left for a pipe")
     points = cloud.points_mm[fitted]
     scale = max(0.5 * float(np.ptp(frame.places(points)[0])), 1e-9)
-    arc, moved, terms, coefficients, weight, design = 0.0, np.inf, (), np.zeros(0), np.zeros(0), np.zeros((0, 0))
+    arc, moved, off, terms = 0.0, np.inf, np.zeros(0), ()
+    coefficients, weight, design = np.zeros(0), np.zeros(0), np.zeros((0, 0))
     for number in range(_ROUNDS):
         along, angle, away = frame.places(points)
         off = away - radius
