@@ -135,20 +135,23 @@ def _contents(folder: Path) -> dict[Path, bytes]:
 @pytest.mark.parametrize("named", ["laser1.png", "sensor.toml", "base.toml", "import.toml"])
 def test_what_a_folder_or_a_description_leads_to_is_an_input(tmp_path, named):
     folder = _photographs(tmp_path / "photographs")
-    before = _contents(folder)
-    ended = run_program(APPS["uwlts"], "uwlts", "import", folder, "--out", folder / named, "--overwrite")
+    # By another name: one that ends otherwise is refused as that.
+    os.link(folder / named, tmp_path / "out.h5")
+    before = _contents(tmp_path)
+    ended = run_program(APPS["uwlts"], "uwlts", "import", folder, "--out", tmp_path / "out.h5", "--overwrite")
     assert ended.returncode == 2, ended
     assert "is an input of this command" in ended.stderr, ended.stderr
-    assert _contents(folder) == before
+    assert _contents(tmp_path) == before
 
 
 def test_a_photograph_is_not_replaced_by_the_camera(tmp_path):
     folder = _photographs(tmp_path / "photographs")
-    before = _contents(folder)
-    ended = run_program(APPS["uwlts"], "uwlts", "camera", folder, "--out", folder / "laser0.png", "--overwrite")
+    os.link(folder / "laser0.png", tmp_path / "out.yaml")
+    before = _contents(tmp_path)
+    ended = run_program(APPS["uwlts"], "uwlts", "camera", folder, "--out", tmp_path / "out.yaml", "--overwrite")
     assert ended.returncode == 2, ended
     assert "is an input of this command" in ended.stderr, ended.stderr
-    assert _contents(folder) == before
+    assert _contents(tmp_path) == before
 
 
 @pytest.fixture(scope="module")
@@ -198,10 +201,12 @@ def test_a_file_that_has_the_inode_of_one_replaced_may_be_read(tmp_path):
 def test_a_file_in_a_reported_folder_is_not_replaced_by_the_report(tmp_path, nominal):
     calibration = tmp_path / "calibration.json"
     calibration.write_bytes(nominal.read_bytes())
-    ended = run_program(APPS["uwlts"], "uwlts", "report", tmp_path, "--out", calibration, "--overwrite")
+    os.link(calibration, tmp_path / "out.html")
+    ended = run_program(APPS["uwlts"], "uwlts", "report", tmp_path, "--out", tmp_path / "out.html", "--overwrite")
     assert ended.returncode == 2, ended
     assert "is an input" in ended.stderr
     assert calibration.read_bytes() == nominal.read_bytes()
+    (tmp_path / "out.html").unlink()
     for _ in range(2):
         ended = run_program(APPS["uwlts"], "uwlts", "report", tmp_path, "--overwrite")
         assert ended.returncode == 0, ended
