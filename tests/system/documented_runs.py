@@ -118,7 +118,9 @@ class Runner:
             done = subprocess.run(
                 _called(words), cwd=self.folder, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=600
             )
-        assert done.returncode == 0, (
+        # The doctor judges the machine, of which no test knows.
+        expected = (0, 1) if words[:2] == ["uwlts", "doctor"] else (0,)
+        assert done.returncode in expected, (
             f"{shlex.join(words)}: {done.returncode}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
         )
         return done.stdout
