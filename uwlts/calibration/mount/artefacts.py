@@ -93,10 +93,6 @@ class Shape(ABC):
 
     surfaces: ClassVar[int] = 1
 
-    def numbers(self, part: np.ndarray) -> int:
-        """How many numbers a profile determines, of whose points the surfaces are given: of a line two."""
-        return 2
-
     def missing(self, parts: Sequence[np.ndarray]) -> str | None:
         """What too few profiles show, in words, or None; given the surfaces of the points of each."""
         return None
@@ -131,9 +127,6 @@ class SphereShape(Shape):
     def derivatives(self, values: np.ndarray, points: np.ndarray, part: np.ndarray) -> np.ndarray:
         by_radius = np.full((len(points), int(self.size_unknown)), -1.0)
         return np.hstack([-self.normals(values, points, part), by_radius])
-
-    def numbers(self, part: np.ndarray) -> int:
-        return 3
 
     def found(self, values: np.ndarray, size_std_mm: float | None) -> SphereFound:
         x, y, z, radius = values.tolist()
@@ -239,9 +232,6 @@ class RingShape(Shape):
         arms = np.where((part == 0)[:, None], radial, -height[:, None] * normals)
         by_radius = -(part > 0).astype(np.float64)[:, None][:, : int(self.size_unknown)]
         return np.hstack([arms @ square_to(values[:3]).T, -normals, by_radius])
-
-    def numbers(self, part: np.ndarray) -> int:
-        return 2 + 2 * bool(part.any())
 
     def missing(self, parts: Sequence[np.ndarray]) -> str | None:
         walls = sum(bool(part.any()) for part in parts)

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import SHAPES
 from uwlts.calibration.mount.board import mount_by_board
-from uwlts.calibration.mount.estimate import FALSE_ALARM, LARGEST_ROUGH, Estimate, settle, settle_agreeing
-from uwlts.calibration.mount.next_pose import is_determined, next_pose, require_determined, weaknesses
+from uwlts.calibration.mount.estimate import FALSE_ALARM, LARGEST_ROUGH, Estimate, NotSettled, settle, settle_agreeing
+from uwlts.calibration.mount.next_pose import next_pose, require_determined, weaknesses
 from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter
 from uwlts.calibration.mount.profiles import LEAST_POINTS
 from uwlts.calibration.mount.sensor import CapturedProfiles, mount_covariance, profiles_of
@@ -137,7 +137,7 @@ def calibrate_mount(
     )
     try:
         return _Calibration(evidence, captured).result()
-    except NoFit as error:
+    except (NoFit, NotSettled) as error:
         raise CalibrationError(f"{error}. {_advice(evidence)}") from error
 
 
@@ -286,12 +286,14 @@ class _Calibration:
         weak = weaknesses(covariance[:6, :6], turns, table=used.table)
         names = [name for number, name in enumerate(self.evidence.names) if number not in self.reasons]
         advised = next_pose(used, state, scatter, self.sheet, names)
-        if not is_determined(covariance):
-            # A wrong radius or format also makes the scatter large.
-            wrong = np.hypot(scatter.pose_mm, scatter.smooth_mm)
-            if not self.shape.flat and wrong > 0.2 * _NO_FIT * state.artefact[3]:
-                raise NoFit(f"no mount makes the profiles fit: the poses would be wrong by {wrong:.3g} mm (rms)")
+        try:
             require_determined(covariance, weak, advised)
+        except CalibrationError as error:
+            # A wrong radius or format also makes the scatter large.
+            wrong = float(np.hypot(scatter.pose_mm, scatter.smooth_mm))
+            if self.shape.flat or wrong < 0.2 * _NO_FIT * state.artefact[3]:
+                raise
+            raise NoFit(f"no mount makes the profiles fit: the poses would be wrong by {wrong:.3g} mm (rms)") from error
         moved = [used.stepped(state, step) for step, _ in estimate.without_each]
         held = np.array([used.rms_mm(each)[place] for place, each in enumerate(moved)])
         rms, numbers = used.rms_mm(state), [n for n in range(len(members)) if n not in self.reasons]

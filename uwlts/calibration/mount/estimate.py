@@ -18,7 +18,7 @@ LARGEST_ROUGH = 6.0
 _SETTLED = 0.01
 """Last step in standard uncertainties, and last change of the likelihood, which no stated figure shows."""
 _SHRINKING = 0.7
-"""Ratio of successive steps from which they count as oscillating: steps that shrink faster settle within the rounds."""
+"""Ratio of successive steps of opposite directions from which they are damped: faster ones settle within the rounds."""
 _MOST_ROUNDS = 60
 """Rounds after which an estimate counts as not settled: four halvings of the steps, and ten rounds for each."""
 _LEAST_FRACTION = 1 / 16
@@ -231,16 +231,18 @@ class NotSettled(CalibrationError):
 
 def _settled(evidence: Evidence[State], state: State, scatter: np.ndarray) -> Estimate[State]:
     """Weighted least squares and likeliest components by turns; steps that oscillate are damped."""
-    fraction, before, size = 1.0, np.inf, 0.0
+    fraction, before, size = 1.0, np.zeros(evidence.size), 0.0
     for _ in range(_MOST_ROUNDS):
         covariances, _ = evidence.covariance(state)(np.log(scatter))
         step = solved_step(evidence, state, covariances)
         by = evidence.jacobian(state)
         information = np.einsum("gkp,gkq->pq", by, np.linalg.solve(covariances, by))
-        size = float(np.sqrt(step @ information @ step / evidence.size))
-        if size > _SHRINKING * before:
+        size, last = (float(np.sqrt(each @ information @ each / evidence.size)) for each in (step, before))
+        if step @ information @ before >= 0:
+            fraction = min(2 * fraction, 1.0)
+        elif size > _SHRINKING * last:
             fraction = max(fraction / 2, _LEAST_FRACTION)
-        before = size
+        before = step
         state = evidence.stepped(state, fraction * step)
         scatter, criterion, gain = _likeliest(evidence, state, scatter)
         if size < _SETTLED and gain < _SETTLED:

@@ -141,18 +141,12 @@ def _on_plane(
 
 def require_determined(covariance: np.ndarray, weak: Sequence[str], advised: NextPose | None = None) -> None:
     """CalibrationError where the covariance (6, 6) of a mount leaves a direction open; ``weak`` says which."""
-    if is_determined(covariance):
-        return
-    raise CalibrationError(
-        f"the poses do not determine the mount: {'; '.join(weak)}"
-        f"{'' if advised is None else f'. Next pose to add: {advised.words}'}"
-    )
-
-
-def is_determined(covariance: np.ndarray) -> bool:
-    """Whether shift and turn of a mount with a covariance (6, 6) are known in all directions."""
     shift, turn = (np.sqrt(np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1]) for k in (0, 3))
-    return bool(shift <= _OPEN_MM and turn <= OPEN_RAD)
+    if shift > _OPEN_MM or turn > OPEN_RAD:
+        raise CalibrationError(
+            f"the poses do not determine the mount: {'; '.join(weak)}"
+            f"{'' if advised is None else f'. Next pose to add: {advised.words}'}"
+        )
 
 
 def weaknesses(covariance: np.ndarray, rotations: Rotation, *, table: bool) -> list[str]:

@@ -21,7 +21,7 @@ _POINT_MM, _TURN_RAD = (1e-5, 1e2), (1e-8, 1.0)
 _ROUNDING = 1e-12
 """Of the largest variance: more than rounding errors change, which make covariances singular."""
 _BINS = 32
-"""Of a profile: an arc of 60 deg then bends by less than a thousandth of its radius in each."""
+"""Of a profile, whose points count together in each: a smooth error that changes within one acts like noise."""
 _LEAST_SPAN = 1e-6
 """Of the largest thing that a pose's errors do to its profile: less counts as nothing."""
 _LEAST_SHARE = 1e-3
@@ -276,11 +276,11 @@ class Problem:
                 first += len(run)
         return np.concatenate(order), np.concatenate(starts), np.concatenate(poses), np.concatenate(places)
 
-    def means(self, values: np.ndarray, fill: float = 0.0) -> np.ndarray:
-        """Means (P, K, ...) of values (N, ...) of the points in bins along the profiles; ``fill`` beyond the bins."""
+    def means(self, values: np.ndarray) -> np.ndarray:
+        """Means (P, K, ...) of values (N, ...) of the points in bins along the profiles; 0 beyond the bins."""
         order, starts, poses, places = self._bins
         counts = np.diff(starts, append=len(order)).reshape(-1, *[1] * (values.ndim - 1))
-        result = np.full((len(self.points), int(places.max()) + 1, *values.shape[1:]), fill)
+        result = np.zeros((len(self.points), int(places.max()) + 1, *values.shape[1:]))
         result[poses, places] = np.add.reduceat(values[order], starts, axis=0) / counts
         return result
 

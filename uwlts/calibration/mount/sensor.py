@@ -86,7 +86,28 @@ def profiles_of(
     return CapturedProfiles(profiles, where, times, at, pose_times_s, known)
 
 
-def with_sensor(
+def mount_covariance(
+    estimate: Estimate[Any],
+    free: np.ndarray,
+    rotation: np.ndarray,
+    known: StoredEstimate | None,
+    moved: Callable[[], np.ndarray],
+) -> tuple[np.ndarray, SensorShare | None, float]:
+    """Covariance (K, K) of all values of an estimate of a mount, the sensor's share, and the factor for 95 %.
+
+    ``free`` (K, size) are steps of all values by the parameters, ``rotation`` (3, 3) the mount's; ``moved`` returns the
+    derivatives (G, K, Q) of the residuals by the parameters of the sensor's joint estimate, where that is ``known``.
+    """
+    own = free @ estimate.covariance @ free.T
+    covariance, share = own, None
+    if known is not None:
+        covariance, share = _with_sensor(own, free @ estimate.by(moved()), rotation, known)
+    estimated = np.flatnonzero(np.diag(own)[:6] > 0)
+    shares = (np.diag(own) / np.where(np.diag(covariance) > 0, np.diag(covariance), 1.0))[estimated]
+    return (covariance + covariance.T) / 2, share, estimate.coverage_factor(shares, free[estimated])
+
+
+def _with_sensor(
     own: np.ndarray, by_parameters: np.ndarray, rotation: np.ndarray, known: StoredEstimate
 ) -> tuple[np.ndarray, SensorShare]:
     """Covariance (K, K) of a mount and what was estimated with it, with what the sensor's calibration does to them.
@@ -111,24 +132,3 @@ def with_sensor(
         covariance_apart=tuple(tuple(row) for row in ((apart + apart.T) / 2)[:6, :6].tolist()),
     )
     return (total + total.T) / 2, share
-
-
-def mount_covariance(
-    estimate: Estimate[Any],
-    free: np.ndarray,
-    rotation: np.ndarray,
-    known: StoredEstimate | None,
-    moved: Callable[[], np.ndarray],
-) -> tuple[np.ndarray, SensorShare | None, float]:
-    """Covariance (K, K) of all values of an estimate of a mount, the sensor's share, and the factor for 95 %.
-
-    ``free`` (K, size) are steps of all values by the parameters, ``rotation`` (3, 3) the mount's; ``moved`` returns the
-    derivatives (G, K, Q) of the residuals by the parameters of the sensor's joint estimate, where that is ``known``.
-    """
-    own = free @ estimate.covariance @ free.T
-    covariance, share = own, None
-    if known is not None:
-        covariance, share = with_sensor(own, free @ estimate.by(moved()), rotation, known)
-    estimated = np.flatnonzero(np.diag(own)[:6] > 0)
-    shares = (np.diag(own) / np.where(np.diag(covariance) > 0, np.diag(covariance), 1.0))[estimated]
-    return (covariance + covariance.T) / 2, share, estimate.coverage_factor(shares, free[estimated])

@@ -134,6 +134,12 @@ def test_a_plane_gives_the_mount(rng):
     assert abs(mount.artefact.distance_mm) == pytest.approx(SPHERE_MM[2] - 1.1 * RADIUS_MM, abs=0.2)
 
 
+def test_a_plane_and_a_robot_that_scatters_give_the_mount():
+    """Steps whose first ones reverse, as the scatter changes, and that are not to be damped ever after."""
+    campaign = sphere_campaign(np.random.default_rng([1, 3]), poses=24, plane_only=True, robot_mm=0.03)
+    within(mount_of(campaign, artefact="plane"))
+
+
 @pytest.mark.parametrize("height", [12.0, None])
 def test_a_step_gives_the_mount(rng, height):
     """Two faces 12 mm apart; errors as of `within`, and the height as well known as it says."""
