@@ -44,7 +44,7 @@ Install what is missing:
   Debian, Ubuntu:  apt-get install libllvm19 libatomic1   (as root; any of libllvm17 and newer)
   Fedora:          dnf install llvm-libs libatomic   (as root)
   Arch:            pacman -S llvm-libs gcc-libs   (as root)
-  x86-64 Linux:    pip install 'karellen-llvm-core>=19.1,<20'   (without root; libatomic comes from the system)"""
+  x86-64 Linux:    pip install 'karellen-llvm-core>=19.1.7,<20'   (without root; libatomic comes from the system)"""
 _EXAMINE = """
 import json, sys
 sys.path.insert(0, sys.argv[1])
