@@ -81,6 +81,7 @@ SERVING = {
     "test_scan_exposure.py",
     "test_scan_ended.py",
     "test_scan_faults.py",
+    "test_light.py",
     "test_live_view.py",
     "test_cameras.py",
     "test_doctor.py",
