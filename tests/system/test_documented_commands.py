@@ -229,7 +229,7 @@ PAGES_RUN = {
     "docs/how-to/register-scans.md": Page(
         given=THREE_VIEWS,
         texts={"start.csv": NO_MOVEMENT},
-        before=ROBOT + "twin simulate vehicle-pass --out pass.h5",
+        before=ROBOT + "twin simulate vehicle-pass --out pass.h5\ncp pass.trajectory.csv corrected.csv",
         not_run={"uwlts align pass.ply": ALIGNED_ELSEWHERE},
     ),
     "docs/how-to/scan-from-a-moving-platform.md": Page(
