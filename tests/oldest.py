@@ -4,7 +4,7 @@ The arguments name the extras whose dependencies count besides the project's own
 Versions that are pinned have no oldest one, and are left out.
 """
 
-import sys
+import argparse
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -37,4 +37,6 @@ def _requirements(project: dict[str, Any], extras: tuple[str, ...]) -> Iterator[
 
 
 if __name__ == "__main__":
-    print("\n".join(oldest(*sys.argv[1:])))
+    parser = argparse.ArgumentParser(description="Print the oldest allowed version of each dependency.")
+    parser.add_argument("extras", nargs="*", help="extras whose dependencies count too")
+    print("\n".join(oldest(*parser.parse_args().extras)))

@@ -53,7 +53,7 @@ class StageState:
 
 
 @dataclass(frozen=True)
-class Light:
+class LitTime:
     """A period in which the laser was lit, in s of the monotonic clock; ``off_s`` is None while it still is."""
 
     on_s: float
@@ -88,7 +88,7 @@ class GrblController:
         self._lock, self._ending = threading.RLock(), threading.Event()
         self._resets_when_opened, self._gated, self._port_open = resets_when_opened, gated, False
         self._powered, self._muted, self._cut, self._laser_broken = True, False, False, False
-        self._lights: list[Light] = []
+        self._lights: list[LitTime] = []
         all_settings = {**BENCH_SETTINGS, **(settings or {})}
         self._firmware = GrblFirmware(
             all_settings, position_mm=position_mm, clock=self._now, say=self._say, speed_up=speed_up, **build
@@ -122,7 +122,7 @@ class GrblController:
             return StageState(time_s, position, speed * self._speed_up, power > 0, power, self._port_open)
 
     @property
-    def lights(self) -> tuple[Light, ...]:
+    def lights(self) -> tuple[LitTime, ...]:
         """Periods of light so far, as the controller saw them, to some ms."""
         with self._lock:
             return tuple(self._lights)
@@ -130,9 +130,9 @@ class GrblController:
     def _log_light(self) -> None:
         state, lit = self.state(), bool(self._lights) and self._lights[-1].off_s is None
         if state.laser_on and not lit:
-            self._lights.append(Light(state.time_s))
+            self._lights.append(LitTime(state.time_s))
         elif lit and not state.laser_on:
-            self._lights[-1] = Light(self._lights[-1].on_s, state.time_s)
+            self._lights[-1] = LitTime(self._lights[-1].on_s, state.time_s)
 
     def steps(self, state: StageState | None = None) -> int:
         """Count of an encoder on the axis, a step each, in a state; now unless given."""

@@ -3,16 +3,17 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
-
-import numpy as np
+from typing import TYPE_CHECKING, Literal
 
 import uwlts
-from uwlts.cli.options import JSON, Files, Flag, Overwrite, Workers, app, show
+from uwlts.cli.options import JSON, Files, Flag, Overwrite, Workers, app, refuse_unsuitable_cloud, show
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.console import progress_bar
-from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import refuse_unsuitable_cloud
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from uwlts.storage.cloud import PointCloud
 
 
 @app.command
@@ -51,8 +52,12 @@ def evaluate(
     print(f"wrote {out}")
 
 
-def _write_coloured(path: Path, cloud: PointCloud, limit_mm: Callable[[np.ndarray], float], *, overwrite: bool) -> None:
+def _write_coloured(
+    path: Path, cloud: "PointCloud", limit_mm: "Callable[[np.ndarray], float]", *, overwrite: bool
+) -> None:
     """Write a cloud with its deviations in the colours of the pages, which end at a limit."""
+    import numpy as np
+
     from uwlts.report.plot import deviation_colours
 
     deviation = np.full(len(cloud), np.nan) if cloud.deviation_mm is None else cloud.deviation_mm

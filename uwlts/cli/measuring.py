@@ -6,10 +6,20 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 import uwlts
-from uwlts.cli.options import Flag, Index, Method, Overwrite, Stripe, app, show, stripe_settings, warn
+from uwlts.cli.options import (
+    Flag,
+    Index,
+    Method,
+    Overwrite,
+    Stripe,
+    app,
+    refuse_unsuitable_cloud,
+    show,
+    stripe_settings,
+    warn,
+)
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.console import progress_bar
-from uwlts.storage.cloud_files import refuse_unsuitable_cloud
 
 CSV = (".csv",)
 Direction = tuple[float, float, float]

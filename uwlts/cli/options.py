@@ -108,3 +108,10 @@ def warn(*texts: str) -> None:
     """Print warnings on standard error."""
     for text in texts:
         print(f"warning: {text}", file=sys.stderr, flush=True)
+
+
+def refuse_unsuitable_cloud(path: Path, *, overwrite: bool, coloured: bool = False) -> None:
+    """Refuse a cloud that cannot be written; imported when it is needed, as the commands' help needs no NumPy."""
+    from uwlts.storage import cloud_files
+
+    cloud_files.refuse_unsuitable_cloud(path, overwrite=overwrite, coloured=coloured)

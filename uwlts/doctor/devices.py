@@ -16,6 +16,12 @@ from pathlib import Path
 from uwlts.doctor.machine import Finding
 from uwlts.errors import Error, HardwareError, SetupError
 
+try:
+    import grp
+    import pwd
+except ImportError:
+    grp = pwd = None  # Windows, where ports have no owners
+
 PRODUCERS = "GENICAM_GENTL64_PATH"
 # Aravis waits a second for answers; drivers of broken USB devices may take for ever.
 _DISCOVERY_S = 2.5
@@ -108,9 +114,7 @@ def _examine_port(port: str, description: str) -> Finding:
     if os.access(port, os.R_OK | os.W_OK):
         return Finding("serial port", "ok", named)
     owned = os.stat(port)
-    import grp  # only on POSIX systems
-    import pwd
-
+    assert grp is not None and pwd is not None
     user, group, members = f"user {os.geteuid()}", str(owned.st_gid), []
     with suppress(KeyError):
         user = pwd.getpwuid(os.geteuid()).pw_name

@@ -137,6 +137,8 @@ def _modules(name: str) -> list[str]:
     usual = name.lower().replace("-", "_")
     files = [file.parts for file in metadata.files(name) or ()]
     packages = {parts[0] for parts in files if len(parts) == 2 and parts[1] == "__init__.py"}
+    if files and not any(parts[-1].endswith((".py", ".so", ".pyd")) and ".." not in parts for parts in files):
+        return []  # a shared library, which nothing imports
     if usual in packages or not packages:
         return [usual]
     return sorted(package for package in packages if not package.startswith("_"))

@@ -19,8 +19,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from uwlts.runtime.workers import processors
-
 Status = Literal["ok", "warning", "missing"]
 
 _STYLES = {"ok": "green", "warning": "yellow", "missing": "bold red"}
@@ -115,6 +113,8 @@ def examine_buffer(limit: Path = _RMEM_MAX) -> Finding:
 
 def examine_computer() -> Finding:
     """Processors this program may use, and the memory."""
+    from uwlts.runtime.workers import processors
+
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     load = os.getloadavg()[0]
     found = f"{processors()} processors, {load:.1f} of them busy in the last minute, {memory / 1e9:.0f} GB of memory"

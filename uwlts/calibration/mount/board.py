@@ -15,7 +15,13 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, stored_estimate
-from uwlts.calibration.mount.estimate import FALSE_ALARM, LARGEST_ROUGH, Estimate, settle_agreeing, solved_step
+from uwlts.calibration.mount.estimate import (
+    FALSE_ALARM,
+    LARGEST_ROUGH,
+    RestrictedEstimate,
+    settle_agreeing,
+    solved_step,
+)
 from uwlts.calibration.mount.next_pose import OPEN_RAD, missing_turns, require_determined, weaknesses
 from uwlts.calibration.mount.sensor import mount_covariance
 from uwlts.errors import CalibrationError, DescriptionError, TargetError
@@ -446,7 +452,7 @@ class BoardEvidence:
         return np.linalg.norm(self.residuals(state)[:, :3], axis=1)
 
 
-def agreeing_images(evidence: BoardEvidence) -> tuple[Estimate[_State], np.ndarray]:
+def agreeing_images(evidence: BoardEvidence) -> tuple[RestrictedEstimate[_State], np.ndarray]:
     """Estimate from the images that agree, and their mask.
 
     Raises

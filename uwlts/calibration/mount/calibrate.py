@@ -9,7 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import SHAPES
 from uwlts.calibration.mount.board import mount_by_board
-from uwlts.calibration.mount.estimate import FALSE_ALARM, LARGEST_ROUGH, Estimate, NotSettled, settle, settle_agreeing
+from uwlts.calibration.mount.estimate import (
+    FALSE_ALARM,
+    LARGEST_ROUGH,
+    NotSettled,
+    RestrictedEstimate,
+    settle,
+    settle_agreeing,
+)
 from uwlts.calibration.mount.next_pose import next_pose, require_determined, weaknesses
 from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter
 from uwlts.calibration.mount.profiles import LEAST_POINTS
@@ -253,7 +260,7 @@ class _Calibration:
                 "needed. Record more poses, or check artefact, size and units"
             )
 
-    def _require_fit(self, used: Problem, estimate: Estimate[MountState]) -> None:
+    def _require_fit(self, used: Problem, estimate: RestrictedEstimate[MountState]) -> None:
         state, scatter = estimate.state, Scatter(*estimate.scatter)
         extent = float(np.median([np.linalg.norm(np.ptp(each, axis=0)) for each in self.flat if len(each)]))
         limit = _NO_FIT * (0.1 * extent if self.shape.flat else state.artefact[3])
@@ -266,7 +273,7 @@ class _Calibration:
         if self.shape.size_mm is None:
             return
         free = replace(used, shape=SHAPES[self.evidence.artefact]())
-        other = Estimate(free, state, estimate.scatter)
+        other = RestrictedEstimate(free, state, estimate.scatter)
         at = free.size - free.scale - free.time - 1
         step, std = float(other.by(other.residuals[:, :, None])[at, 0]), float(np.sqrt(other.covariance[at, at]))
         if abs(step) > max(_OTHER_SIZE * self.shape.size_mm, _SURE * std):
@@ -276,7 +283,7 @@ class _Calibration:
                 f"{std:.2g} mm)"
             )
 
-    def _summary(self, used: Problem, estimate: Estimate[MountState], members: list[np.ndarray]) -> Mount:
+    def _summary(self, used: Problem, estimate: RestrictedEstimate[MountState], members: list[np.ndarray]) -> Mount:
         state, scatter = estimate.state, Scatter(*estimate.scatter)
         known = None if self.captured is None else self.captured.known
         covariance, share, factor = mount_covariance(

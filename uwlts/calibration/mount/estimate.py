@@ -30,7 +30,7 @@ _LEAST_EIGENVALUE = 1e-13
 State = TypeVar("State")
 
 
-class Evidence(Protocol[State]):
+class GroupedEvidence(Protocol[State]):
     """Groups of residuals (one group for each pose), their derivatives, and the variances of their errors.
 
     Groups have K residuals; shorter ones are filled up with zeros, of unit variance. ``logs`` (Q,) are logarithms of
@@ -81,10 +81,10 @@ class Evidence(Protocol[State]):
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate(Generic[State]):
+class RestrictedEstimate(Generic[State]):
     """Parameters and variance components; ``criterion`` is minus twice the log likelihood where they settled."""
 
-    evidence: Evidence[State]
+    evidence: GroupedEvidence[State]
     state: State
     scatter: np.ndarray
     criterion: float = np.inf
@@ -176,7 +176,7 @@ class Estimate(Generic[State]):
         return float(t.ppf(0.975, max(float(np.median(freedom)), 1.0)))
 
 
-def settle(evidence: Evidence[State], starts: Sequence[tuple[State, np.ndarray]]) -> Estimate[State]:
+def settle(evidence: GroupedEvidence[State], starts: Sequence[tuple[State, np.ndarray]]) -> RestrictedEstimate[State]:
     """The likeliest of the estimates to which the iterations from several states and components settle.
 
     Raises
@@ -197,12 +197,12 @@ def settle(evidence: Evidence[State], starts: Sequence[tuple[State, np.ndarray]]
 
 
 def settle_agreeing(
-    evidence: Evidence[State],
+    evidence: GroupedEvidence[State],
     starts: Sequence[tuple[State, np.ndarray]],
     *,
     false_alarm: float,
     require: Callable[[np.ndarray], None],
-) -> tuple[Estimate[State], np.ndarray]:
+) -> tuple[RestrictedEstimate[State], np.ndarray]:
     """Estimate from the groups that agree, and their mask (G,).
 
     While a group contradicts what the others predict, the worst one is left out.
@@ -229,7 +229,7 @@ class NotSettled(CalibrationError):
     """An iteration that still changes its result after all rounds."""
 
 
-def _settled(evidence: Evidence[State], state: State, scatter: np.ndarray) -> Estimate[State]:
+def _settled(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray) -> RestrictedEstimate[State]:
     """Weighted least squares and likeliest components by turns; steps that oscillate are damped."""
     fraction, before, size = 1.0, np.zeros(evidence.size), 0.0
     for _ in range(_MOST_ROUNDS):
@@ -246,7 +246,7 @@ def _settled(evidence: Evidence[State], state: State, scatter: np.ndarray) -> Es
         state = evidence.stepped(state, fraction * step)
         scatter, criterion, gain = _likeliest(evidence, state, scatter)
         if size < _SETTLED and gain < _SETTLED:
-            return Estimate(evidence, state, scatter, criterion)
+            return RestrictedEstimate(evidence, state, scatter, criterion)
     raise NotSettled(
         f"the estimate of the mount does not settle: after {_MOST_ROUNDS} rounds it still moves by {size:.2g} standard "
         "uncertainties. Record more poses, with turns about two axes and the artefact in all parts of the profile"
@@ -254,7 +254,7 @@ def _settled(evidence: Evidence[State], state: State, scatter: np.ndarray) -> Es
 
 
 def solved_step(
-    evidence: Evidence[State], state: State, covariances: np.ndarray, *, loss: str = "linear"
+    evidence: GroupedEvidence[State], state: State, covariances: np.ndarray, *, loss: str = "linear"
 ) -> np.ndarray:
     """The step (size,) from a state to the least weighted squares of the residuals, the covariances held fixed."""
     whitener = np.linalg.inv(np.linalg.cholesky(covariances))
@@ -275,7 +275,7 @@ def solved_step(
     ).x
 
 
-def _likeliest(evidence: Evidence[State], state: State, start: np.ndarray) -> tuple[np.ndarray, float, float]:
+def _likeliest(evidence: GroupedEvidence[State], state: State, start: np.ndarray) -> tuple[np.ndarray, float, float]:
     """Variance components of the greatest restricted likelihood at a state, the criterion, and the gain in it.
 
     Patterson and Thompson 1971: minus twice the log likelihood of what is left of the residuals after the parameters.

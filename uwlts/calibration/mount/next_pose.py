@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import SphereShape
-from uwlts.calibration.mount.estimate import Estimate
+from uwlts.calibration.mount.estimate import RestrictedEstimate
 from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, cross_matrix
 from uwlts.errors import CalibrationError
 from uwlts.model.mount import NextPose
@@ -43,7 +43,7 @@ def next_pose(
     middle = np.vstack(problem.points).mean(axis=0)
     prior = np.zeros(problem.size)
     prior[:3], prior[3:6] = _UNKNOWN_MM**-2.0, _UNKNOWN_RAD**-2.0
-    known = Estimate(problem, state, np.array(scatter)).information.sum(axis=0) + np.diag(prior)
+    known = RestrictedEstimate(problem, state, np.array(scatter)).information.sum(axis=0) + np.diag(prior)
     to_point = np.hstack([np.eye(3), -cross_matrix(state.rotation @ middle)])
 
     def point_std(information: np.ndarray) -> float:
@@ -66,7 +66,9 @@ def next_pose(
                 points = _on_plane(points, seen, turned @ state.rotation, normal, sheet)
             if points is None:
                 continue
-            added = Estimate(_one_pose(problem, points, turned, position), state, np.array(scatter)).information[0]
+            added = RestrictedEstimate(
+                _one_pose(problem, points, turned, position), state, np.array(scatter)
+            ).information[0]
             after = point_std(known + added)
             if best is None or after < best[0]:
                 words = (

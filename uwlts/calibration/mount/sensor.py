@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, stored_estimate
-from uwlts.calibration.mount.estimate import Estimate
+from uwlts.calibration.mount.estimate import RestrictedEstimate
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.any_calibration import calibration_digest, check_fits
 from uwlts.model.calibration import Calibration
@@ -87,7 +87,7 @@ def profiles_of(
 
 
 def mount_covariance(
-    estimate: Estimate[Any],
+    estimate: RestrictedEstimate[Any],
     free: np.ndarray,
     rotation: np.ndarray,
     known: StoredEstimate | None,

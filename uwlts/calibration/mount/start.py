@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, Seen, SphereShape, StepShape, square_to
-from uwlts.calibration.mount.estimate import Estimate
+from uwlts.calibration.mount.estimate import RestrictedEstimate
 from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, cross_matrix
 from uwlts.calibration.mount.profiles import ProfileArc, ProfileLine, circles_through
 from uwlts.errors import CalibrationError
@@ -244,7 +244,7 @@ def _start_of_ring(
     scatter = Scatter(max(noise, 1e-6), noise, 1.0, max(float(np.median(off)), noise), 1e-3)
     used = plane.selected(off < _FAR * np.median(off) + 5 * noise)
     state = used.rough(state, scatter)
-    covariance = Estimate(used, state, np.array(scatter)).covariance[:6, :6]
+    covariance = RestrictedEstimate(used, state, np.array(scatter)).covariance[:6, :6]
     middle = state.rotation @ np.vstack(used.points).mean(axis=0)
     to_point = np.hstack([np.eye(3), -cross_matrix(middle)])
     known = float(np.sqrt(np.linalg.eigvalsh(to_point @ covariance @ to_point.T)[-1]))
