@@ -170,8 +170,7 @@ def _covariances(columns: dict[str, np.ndarray], path: Path, mm_per_unit: float)
 
 def write_trajectory(path: str | Path, trajectory: Trajectory, *, overwrite: bool = False) -> None:
     """Write a trajectory as CSV for `read_trajectory` in the format quaternion-xyzw, mm; OutputError if that fails."""
-    # Older SciPy takes no array that cannot be written to.
-    turns = Rotation.from_matrix(trajectory.poses[:, :3, :3].copy()).as_quat()
+    turns = Rotation.from_matrix(trajectory.poses[:, :3, :3]).as_quat()
     table = np.column_stack([trajectory.times_s, trajectory.poses[:, :3, 3], turns])
     names = ["time_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"]
     if trajectory.covariance is not None:
