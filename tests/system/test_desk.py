@@ -356,6 +356,8 @@ def test_laser_off_works_in_every_state_of_the_page(desk, sized, served):
     assert page.get_by_role("dialog").is_visible()
     page.evaluate("scrollTo(0, document.body.scrollHeight)")
     off.works("about-scrolled")
+    # The listener repeats Ctrl-X until the server has answered the last press: light that stays shows that it has.
+    light(served.controller)
     os.kill(desk.process.pid, signal.SIGSTOP)
     try:
         off.works("server-stands-still")
