@@ -30,6 +30,13 @@ def is_rigid(matrices: np.ndarray, *, within: float) -> bool:
     return square and last and bool((np.linalg.det(rotation) > 0).all())
 
 
+def rigid_transform(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Matrix (4, 4) of a rotation (3, 3) and a shift (3,)."""
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = rotation, shift
+    return result
+
+
 def _rigid(matrix: _Rows) -> _Rows:
     """A matrix (4, 4) that is a rotation, not a reflection, and a shift, to 1e-6, as text may be rounded."""
     if len(matrix) == 4 and is_rigid(np.array(matrix), within=1e-6):

@@ -12,7 +12,7 @@ from uwlts.calibration.camera.target_images import Placement, TargetImage, obser
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
 from uwlts.calibration.sequential.sheet_fit import fit_sheet, points_on_target
 from uwlts.errors import CalibrationError, RangeError
-from uwlts.model.calibration import CameraModel
+from uwlts.model.calibration import CameraModel, rigid_transform
 from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Medium, Sensor
@@ -64,9 +64,7 @@ def pose_of(view: TargetView, camera: CameraModel) -> np.ndarray:
     found, rotation, translation = cv2.solvePnP(view.points_mm, view.pixels, camera.matrix(), camera.coefficients())
     if not found or not np.isfinite(translation).all():
         raise CalibrationError("no pose of the target explains its image: is it the described target?")
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
-    return pose
+    return rigid_transform(cv2.Rodrigues(rotation)[0], translation[:, 0])
 
 
 def judge_residual(before: CameraSolution | None, after: CameraSolution) -> tuple[str, ...]:
@@ -214,10 +212,9 @@ def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) 
     for depth, x, y, tilt in product(_DEPTHS, _PLACES, _PLACES, tilts):
         distance = nearest + depth * (farthest - nearest)
         ray = directions(camera, np.array([[x * camera.width_px, y * camera.height_px]]))[0]
-        pose = np.eye(4)
-        pose[:3, :3] = cv2.Rodrigues(tilt)[0] @ spin
-        pose[:3, 3] = ray / ray[2] * distance - pose[:3, :3] @ middle
-        rotation = cv2.Rodrigues(pose[:3, :3])[0]
+        turn = cv2.Rodrigues(tilt)[0] @ spin
+        pose = rigid_transform(turn, ray / ray[2] * distance - turn @ middle)
+        rotation = cv2.Rodrigues(turn)[0]
         pixels = cv2.projectPoints(points, rotation, pose[:3, 3], camera.matrix(), camera.coefficients())[0][:, 0]
         ahead = points @ pose[2, :3] + pose[2, 3] > 0
         inside = ahead & np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)

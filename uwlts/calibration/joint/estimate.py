@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwlts.calibration.joint.earlier_estimate import Parameters
 from uwlts.calibration.joint.noise import Noise, judged, outliers, with_common_error, with_misfit
+from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.residuals import STEP, STRIPE, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SCANNED, SurfaceScanEvidence
 from uwlts.errors import CalibrationError

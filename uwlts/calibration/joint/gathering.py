@@ -16,8 +16,7 @@ from uwlts.calibration.capture_evidence import (
     no_stripe_in,
     step_evidence,
 )
-from uwlts.calibration.joint.derivatives import SHEET
-from uwlts.calibration.joint.earlier_estimate import Prior, ViewMedium, window_values
+from uwlts.calibration.joint.parameters import SHEET, Prior, ViewMedium, window_values
 from uwlts.calibration.joint.residuals import BENDS, SHIFT, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, common_sensor, sources_of

@@ -8,12 +8,10 @@ import cv2
 import numpy as np
 
 from uwlts.calibration.camera.camera_parameters import DISTORTION, Intrinsics
-from uwlts.calibration.camera.image_turns import refuse_turned_travel
 from uwlts.calibration.camera.target_images import Placement
-from uwlts.calibration.camera.target_poses import placement_pose, solve_camera, stage_direction
-from uwlts.calibration.joint.derivatives import DescribedSheet
-from uwlts.calibration.joint.earlier_estimate import Parameters, Prior, ViewMedium
+from uwlts.calibration.camera.target_poses import placement_pose, refuse_turned_travel, solve_camera, stage_direction
 from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series, added_tangential
+from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.residuals import StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import (
     LEAST_SHARE,

@@ -7,7 +7,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.camera.target_images import Placement, pose_values
-from uwlts.calibration.joint.earlier_estimate import Prior, ViewMedium
 from uwlts.calibration.joint.estimate import Evidence
 from uwlts.calibration.joint.noise import Noise, with_common_error
 from uwlts.calibration.joint.observability import (
@@ -18,10 +17,11 @@ from uwlts.calibration.joint.observability import (
     regions,
     weaknesses,
 )
+from uwlts.calibration.joint.parameters import Prior, ViewMedium
 from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Spheres, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, with_independent
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.sheet import sheet_surface
@@ -149,11 +149,9 @@ def _targets(
 
 def _pose(calibration: Calibration, target: Target, depth_mm: float, turns: tuple[float, float]) -> np.ndarray:
     """``T_camera_target`` (4, 4) with the target's middle on the OCS's axis, turned from being square to that axis."""
-    frame, pose = calibration.object_transform(), np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("XY", _TILT_DEG * np.array(turns), degrees=True).as_matrix() @ frame[:3, :3]
-    middle = np.append(target.extent_mm.mean(axis=0), 0.0)
-    pose[:3, 3] = frame[:3, 3] + depth_mm * frame[:3, 2] - pose[:3, :3] @ middle
-    return pose
+    frame, middle = calibration.object_transform(), np.append(target.extent_mm.mean(axis=0), 0.0)
+    turn = Rotation.from_euler("XY", _TILT_DEG * np.array(turns), degrees=True).as_matrix() @ frame[:3, :3]
+    return rigid_transform(turn, frame[:3, 3] + depth_mm * frame[:3, 2] - turn @ middle)
 
 
 def _target_shot(known: StoredEstimate, target: Target, pose: np.ndarray) -> _Shot | None:

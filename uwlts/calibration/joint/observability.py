@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwlts.calibration.joint.earlier_estimate import ViewMedium
+from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, found_estimate, require_joint
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration

@@ -11,9 +11,9 @@ from scipy.stats import chi2
 from uwlts.calibration.camera.camera_parameters import Intrinsics
 from uwlts.calibration.camera.target_images import pose_values
 from uwlts.calibration.joint.consistency import much_left_out
-from uwlts.calibration.joint.earlier_estimate import Parameters, ViewMedium
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.noise import outlier_limit
+from uwlts.calibration.joint.parameters import Parameters, ViewMedium
 from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.joint.residuals import STEP, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence

@@ -26,10 +26,10 @@ from uwlts.calibration.mount.next_pose import OPEN_RAD, missing_turns, require_d
 from uwlts.calibration.mount.sensor import mount_covariance
 from uwlts.errors import CalibrationError, DescriptionError, TargetError
 from uwlts.files.writing import sha256_of
-from uwlts.model.any_calibration import check_fits
-from uwlts.model.calibration import Calibration, WindowModel
+from uwlts.model.calibration import Calibration, WindowModel, rigid_transform
 from uwlts.model.mount import BoardFound, Mount, MountPose
 from uwlts.optics.camera import directions, project_through_window
+from uwlts.optics.fitness import check_fits
 from uwlts.optics.window import trace_window
 from uwlts.storage.capture import Capture
 from uwlts.storage.mount_files import SENSOR_AXES, SensorAxis, require_table
@@ -287,12 +287,6 @@ def differences(values: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step
         step[number] = size
         columns.append((values(at + step) - values(at - step)).ravel() / (2 * size or 1.0))
     return np.stack(columns, axis=1)
-
-
-def rigid_transform(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, shift
-    return result
 
 
 def moved_about(pose: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Calibration of the mount of a laser profiler on a moving platform, from its profiles of an unknown fixed artefact."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from uwlts.calibration.mount.profiles import LEAST_POINTS
 from uwlts.calibration.mount.sensor import CapturedProfiles, mount_covariance, profiles_of
 from uwlts.calibration.mount.start import NoFit, require_surfaces, start
 from uwlts.errors import CalibrationError, DescriptionError
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.mount import Mount, MountPose
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.calibration_file import loaded_calibration
@@ -149,27 +150,19 @@ def calibrate_mount(
 
 
 def _advice(evidence: MountEvidence) -> str:
-    """What makes the profiles fit, of the usual mistakes, in words."""
-    inverse = "the poses are T_platform_base: give their inverses"
-    mistakes = [(replace(evidence, poses=np.linalg.inv(evidence.poses)), inverse)]
+    """Name the usual mistakes; of them another size of the artefact is tried."""
     if evidence.size_mm is not None:
-        mistakes.append((replace(evidence, size_mm=None), f"the {evidence.artefact} has another {evidence.size}"))
-    for name, poses in evidence.other_readings():
-        mistakes.append((replace(evidence, poses=poses), f"the poses are {name}, not {evidence.pose_format}"))
-    for changed, words in mistakes:
-        try:
-            found = _Calibration(changed).result()
-        except CalibrationError:
-            continue
-        used = sum(pose.reason is None for pose in found.poses)
-        if 2 * used > len(found.poses):
-            where = ""
-            if changed.size_mm is None and evidence.size_mm is not None:
-                where = f", {found.size_mm():.3f} mm"
-            return f"They do fit, with {found.rms_mm:.3g} mm rms, if {words}{where}"
+        with suppress(CalibrationError):
+            found = _Calibration(replace(evidence, size_mm=None)).result()
+            if 2 * sum(pose.reason is None for pose in found.poses) > len(found.poses):
+                return (
+                    f"They do fit, with {found.rms_mm:.3g} mm rms, if the {evidence.artefact} has another "
+                    f"{evidence.size}, {found.size_mm():.3f} mm"
+                )
     return (
-        "Are the poses T_base_platform, is their format right, are the units right, and do profiles and poses come in "
-        "the same order?"
+        "Are the poses T_base_platform rather than their inverses T_platform_base? Is their format right (Euler angles "
+        "about moved axes, such as ZYX, or fixed ones, such as xyz; the place of w in a quaternion)? Are the units "
+        "right, and do profiles and poses come in the same order?"
     )
 
 
@@ -320,8 +313,7 @@ class _Calibration:
             )
         std, at = np.sqrt(np.diag(covariance)), 6 + self.shape.count
         found = self.shape.found(state.artefact, float(std[at - 1]) if self.shape.size_unknown else None)
-        transform = np.eye(4)
-        transform[:3, :3], transform[:3, 3] = Rotation.from_matrix(state.rotation).as_matrix(), state.translation
+        transform = rigid_transform(Rotation.from_matrix(state.rotation).as_matrix(), state.translation)
         weights = used.counts / used.counts.sum()
         return Mount(
             T_platform_sensor=tuple(tuple(row) for row in transform.tolist()),
@@ -366,9 +358,8 @@ def _thinned(points: np.ndarray, most: int) -> np.ndarray:
 def _sheet_frame(profiles: list[np.ndarray]) -> np.ndarray:
     """Frame (4, 4) of the plane of all points, with x and z in it; the sensor's where that is its y = 0."""
     points = np.vstack(profiles)
-    frame = np.eye(4)
     if not points[:, 1].any():
-        return frame
+        return np.eye(4)
     middle = points.mean(axis=0)
     extents, axes = np.linalg.svd(_thinned(points - middle, 20_000), full_matrices=False)[1:]
     if extents[2] > 0.02 * extents[1]:
@@ -376,9 +367,7 @@ def _sheet_frame(profiles: list[np.ndarray]) -> np.ndarray:
             "the profiles do not lie in one plane of the sensor's frame: expected the points of a laser sheet, in the "
             "sensor's frame and without the motion of the platform"
         )
-    frame[:3, :3] = np.column_stack([axes[0], np.cross(axes[1], axes[0]), axes[1]])
-    frame[:3, 3] = middle
-    return frame
+    return rigid_transform(np.column_stack([axes[0], np.cross(axes[1], axes[0]), axes[1]]), middle)
 
 
 def _motion(evidence: MountEvidence) -> Motion:

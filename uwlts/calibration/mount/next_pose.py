@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import SphereShape
 from uwlts.calibration.mount.estimate import RestrictedEstimate
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, cross_matrix
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, point_by_mount
 from uwlts.errors import CalibrationError
+from uwlts.model.calibration import rigid_transform
 from uwlts.model.mount import NextPose
 
 _TURN_RAD = np.radians(30)
@@ -44,7 +45,7 @@ def next_pose(
     prior = np.zeros(problem.size)
     prior[:3], prior[3:6] = _UNKNOWN_MM**-2.0, _UNKNOWN_RAD**-2.0
     known = RestrictedEstimate(problem, state, np.array(scatter)).information.sum(axis=0) + np.diag(prior)
-    to_point = np.hstack([np.eye(3), -cross_matrix(state.rotation @ middle)])
+    to_point = point_by_mount(state.rotation @ middle)
 
     def point_std(information: np.ndarray) -> float:
         size = 1 / np.sqrt(np.diag(information))
@@ -75,9 +76,7 @@ def next_pose(
                     f"turn the platform by {np.degrees(side * _TURN_RAD):+.0f} deg about its {'xyz'[axis]} axis from "
                     f"pose {names[nearest]}, with the {problem.shape.kind} {where}"
                 )
-                pose = np.eye(4)
-                pose[:3, :3], pose[:3, 3] = turned, position
-                best = after, words, pose
+                best = after, words, rigid_transform(turned, position)
     if best is None:
         return None
     after, words, pose = best

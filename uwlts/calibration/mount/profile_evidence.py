@@ -8,9 +8,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefacts import Seen, Shape
+from uwlts.calibration.mount.artefacts import Shape
 from uwlts.calibration.mount.estimate import solved_step
-from uwlts.calibration.mount.profiles import LEAST_POINTS
+from uwlts.calibration.mount.profiles import LEAST_POINTS, Seen
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 """Rotations (P, 3, 3) and positions (P, 3) of the platform in the base frame for a time offset, s."""
@@ -367,15 +367,14 @@ class Problem:
         return self.stepped(state, solved_step(self, state, covariances, loss=loss))
 
 
-def cross_matrix(vector: np.ndarray) -> np.ndarray:
-    """Matrix (3, 3) of the cross product with a vector (3,)."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def point_by_mount(point: np.ndarray) -> np.ndarray:
+    """Derivatives (3, 6) of a point (3,) along the platform's axes by shift and turn of the mount."""
+    return np.hstack([np.eye(3), np.cross(point, np.eye(3))])
 
 
 def _left_jacobian(vector: np.ndarray) -> np.ndarray:
     """Derivative of exp(v + dv) exp(-v) by dv as a rotation vector (J. Sola and others 2018, arXiv:1812.01537, 145)."""
-    angle, cross = float(np.linalg.norm(vector)), cross_matrix(vector)
+    angle, cross = float(np.linalg.norm(vector)), np.cross(np.eye(3), vector)
     if angle < 1e-6:
         return np.eye(3) + cross / 2
     return np.eye(3) + (1 - np.cos(angle)) / angle**2 * cross + (angle - np.sin(angle)) / angle**3 * cross @ cross

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, Seen, SphereShape, StepShape, square_to
+from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, SphereShape, StepShape, square_to
 from uwlts.calibration.mount.estimate import RestrictedEstimate
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, cross_matrix
-from uwlts.calibration.mount.profiles import ProfileArc, ProfileLine, circles_through
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, point_by_mount
+from uwlts.calibration.mount.profiles import ProfileArc, ProfileLine, Seen, circles_through
 from uwlts.errors import CalibrationError
 
 _SUBSETS, _SUBSET = 40, 8
@@ -109,12 +109,7 @@ def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray,
     angles = -Rotation.from_matrix(rotations[0].T @ rotations).as_rotvec()[:, 2]
     centres, radii = np.array([arc.centre_mm for arc in arcs]), np.array([arc.radius_mm for arc in arcs])
     design = np.column_stack([np.ones(len(arcs)), np.cos(angles), np.sin(angles)])
-    weights, flat = np.ones(len(arcs)), np.zeros((3, 2))
-    for _ in range(_REWEIGHTED):
-        flat = np.linalg.lstsq(design * weights[:, None], centres * weights[:, None], rcond=None)[0]
-        off = np.linalg.norm(centres - design @ flat, axis=1)
-        # Cauchy's weights.
-        weights = 1 / np.sqrt(1 + (off / max(2 * float(np.median(off)), 1e-6)) ** 2)
+    flat = _robust(design, centres)
     largest, states = float(np.quantile(radii, 0.9)), []
     root = np.sqrt(complex(flat[2] @ flat[2] - flat[1] @ flat[1], -2 * flat[1] @ flat[2]))
     for radius in [problem.shape.size_mm] if problem.shape.size_mm else [share * largest for share in _RADII]:
@@ -212,7 +207,7 @@ def _start_of_plane(
         for turn in (turns[number], turns[number] * np.array([-1.0, 1.0, -1.0])):
             places = np.einsum("pij,jk,pk->pi", rotations, turn, middles) + positions
             design = np.column_stack([np.einsum("pji,j->pi", rotations, normal), -np.ones(len(lines))])
-            solution = _robust(design, -places @ normal)
+            solution = _robust(design, -(places @ normal)[:, None])[:, 0]
             states.append(MountState(turn, solution[:3], np.append(normal, solution[3])))
     return _best(problem.thinned(_THINNED), [_in_sensor_frame(state, sheet) for state in states])
 
@@ -246,7 +241,7 @@ def _start_of_ring(
     state = used.rough(state, scatter)
     covariance = RestrictedEstimate(used, state, np.array(scatter)).covariance[:6, :6]
     middle = state.rotation @ np.vstack(used.points).mean(axis=0)
-    to_point = np.hstack([np.eye(3), -cross_matrix(middle)])
+    to_point = point_by_mount(middle)
     known = float(np.sqrt(np.linalg.eigvalsh(to_point @ covariance @ to_point.T)[-1]))
     reach = _FAR * float(np.hypot(known, scatter.pose_mm))
     base = whole.base(state)
@@ -301,11 +296,14 @@ def _circle_of_most(
 
 
 def _robust(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Solution of linear equations of which some are wrong, by Cauchy's weights."""
-    weights, solution = np.ones(len(design)), np.zeros(design.shape[1])
+    """Solution (k, m) of linear equations, ``design`` (N, k) and ``wanted`` (N, m), of which some are wrong.
+
+    By Cauchy's weights.
+    """
+    weights, solution = np.ones(len(design)), np.zeros((design.shape[1], wanted.shape[1]))
     for _ in range(_REWEIGHTED):
-        solution = np.linalg.lstsq(design * weights[:, None], wanted * weights, rcond=1e-10)[0]
-        off = np.abs(design @ solution - wanted)
+        solution = np.linalg.lstsq(design * weights[:, None], wanted * weights[:, None], rcond=1e-10)[0]
+        off = np.linalg.norm(design @ solution - wanted, axis=1)
         weights = 1 / np.sqrt(1 + (off / max(2 * float(np.median(off)), 1e-6)) ** 2)
     return solution
 

@@ -13,9 +13,8 @@ from pydantic import JsonValue
 
 from uwlts._version import __version__
 from uwlts.calibration.camera.camera_parameters import CameraOptions
-from uwlts.calibration.camera.image_turns import refuse_turned_travel
 from uwlts.calibration.camera.lens import LensCalibration, LensChoice, calibrate_lens, half_doubt, jackknife
-from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
+from uwlts.calibration.camera.target_poses import CameraSolution, Poses, refuse_turned_travel, solve_camera
 from uwlts.calibration.capture_evidence import (
     AirEvidence,
     Progress,

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from uwlts.calibration.camera.image_turns import turned_like
+from uwlts.calibration.camera.target_poses import turned_like
 from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.fitting.least_squares import fit_robustly
 from uwlts.fitting.shapes import fit_plane
-from uwlts.model.calibration import CameraModel, SheetModel
+from uwlts.model.calibration import CameraModel, SheetModel, rigid_transform
 from uwlts.optics.camera import directions
 
 # Spread of the points along the shorter direction of the sheet over their scatter across it, and over their spread
@@ -179,7 +179,4 @@ def object_frame(sheet: SheetModel, *, laser_axis: np.ndarray) -> np.ndarray:
     z = z / np.linalg.norm(z)
     if not (abs(x[2]) > 1e-9 and sheet.offset_mm / x[2] > 0):
         raise CalibrationError("the camera's axis does not meet the calibrated sheet in front of the camera")
-    transform = np.eye(4)
-    transform[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    transform[2, 3] = sheet.offset_mm / x[2]
-    return transform
+    return rigid_transform(np.stack([x, np.cross(z, x), z], axis=1), np.array([0.0, 0.0, sheet.offset_mm / x[2]]))
