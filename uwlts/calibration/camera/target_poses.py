@@ -8,6 +8,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from pydantic import JsonValue
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
 from uwlts.calibration.camera.target_images import Placement, TargetImage, observe, placements, pose_values
@@ -180,6 +181,26 @@ class CameraSolution:
     def largest_bias_px(self) -> float | None:
         """Longest offset taken out, over all circles."""
         return None if self.bias_px is None else float(np.max(np.linalg.norm(np.vstack(self.bias_px), axis=1)))
+
+    def figures(self) -> dict[str, JsonValue]:
+        """Residuals, standard deviations and covariance as files hold them; None for what is missing."""
+        direction, tilt, tilt_std = self.stage_direction, self.stage_tilt_rad, self.stage_tilt_std_rad
+        return {
+            "images": len(self.residuals_px),
+            "points": sum(map(len, self.residuals_px)),
+            "rms_px": self.rms_px(),
+            "sigma_px": self.sigma_px,
+            "image_rms_px": self.image_rms_px().tolist(),
+            "std": {**self.std()},
+            "parameters": list(self.parameters),
+            "covariance": self.covariance.tolist(),
+            "stage_direction": None if direction is None else direction.tolist(),
+            "stage_tilt_deg": None if tilt is None else float(np.degrees(tilt)),
+            "stage_tilt_std_deg": None if tilt_std is None else float(np.degrees(tilt_std)),
+            "largest_circle_bias_px": self.largest_bias_px(),
+            "rounds": self.rounds,
+            "stopped": self.stopped,
+        }
 
 
 def solve_camera(

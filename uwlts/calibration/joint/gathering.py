@@ -36,7 +36,8 @@ from uwlts.optics.brightness import sharp_lines, slopes_of_brightness
 from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeSettings, find_stripes
 
-_FEWEST_KEPT, _MOST_LEFT_OUT = 3, 0.3  # images; where more contradict the rest, it is not clear which are right
+_FEWEST_KEPT = 3  # images that are left where some contradict the others
+_MOST_LEFT_OUT = 0.3  # share of the images: where more contradict the rest, it is not clear which are right
 Scanned = SphereStandard | PlaneStandard | PipeStandard
 
 

@@ -9,8 +9,7 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics
-from uwlts.calibration.joint.estimate import Estimate, Evidence
-from uwlts.calibration.joint.noise import outliers
+from uwlts.calibration.joint.estimate import Estimate, Evidence, outliers
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium, window_values
 from uwlts.calibration.joint.residuals import TARGET, SeenSheet
 from uwlts.calibration.sequential.sheet_fit import object_frame

@@ -10,14 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import SHAPES
 from uwlts.calibration.mount.board import mount_by_board
-from uwlts.calibration.mount.estimate import (
-    FALSE_ALARM,
-    LARGEST_ROUGH,
-    NotSettled,
-    RestrictedEstimate,
-    settle,
-    settle_agreeing,
-)
+from uwlts.calibration.mount.estimate import LARGEST_ROUGH, NotSettled, RestrictedEstimate, settle, settle_agreeing
 from uwlts.calibration.mount.next_pose import next_pose, require_determined, weaknesses
 from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter
 from uwlts.calibration.mount.profiles import LEAST_POINTS
@@ -36,9 +29,10 @@ _MOST_POINTS = 100_000
 """Points of all profiles together; more take time and hardly lower the uncertainty, as poses err too."""
 _NO_FIT = 0.1
 """Share of a sphere's radius by which platforms do not err; a wrong format of the poses gives more."""
-_OTHER_SIZE, _SURE = 0.03, 5.0
-"""Share of the given size by which profiles show another one for sure, as profilers' scales err by less, and standard
-uncertainties, beyond which lies one normal error in a million."""
+_OTHER_SIZE = 0.03
+"""Share of the given size by which profiles show another one for sure, as profilers' scales err by less."""
+_SURE = 5.0
+"""Standard uncertainties of the same, beyond which lies one normal error in a million; the larger of both counts."""
 
 
 def calibrate_mount(
@@ -122,7 +116,7 @@ def calibrate_mount(
             if capture.header.target is not None and not capture.laser_on.all():
                 if radius_mm is not None or height_mm is not None or scale or time:
                     raise DescriptionError("the capture shows a target: give no radius, height, scale or time")
-                return mount_by_board([capture], known, table, axis=axis)
+                return mount_by_board(capture, known, table, axis=axis)
             profiles = profiles_of(capture, known, table, times)
     captured = None
     if isinstance(profiles, CapturedProfiles):
@@ -227,7 +221,7 @@ class _Calibration:
 
         # The likelier of the estimates from here and from the least squares of all distances alike.
         starts = [(each, np.array(scatter)) for each in (state, problem.plain(state))]
-        found, good = settle_agreeing(problem, starts, false_alarm=FALSE_ALARM, require=require)
+        found, good = settle_agreeing(problem, starts, require=require)
         used, state = problem.selected(good), found.state
         numbers = np.flatnonzero(kept)
         names = self.evidence.names

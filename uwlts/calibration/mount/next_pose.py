@@ -18,13 +18,17 @@ _TURN_RAD = np.radians(30)
 """A robot turns so far easily with the artefact in view."""
 _LEAST_TURN_RAD = np.radians(5.0)
 """Root mean square of turns about an axis below which a note says that there are too few."""
-_OPEN_MM, OPEN_RAD = 5.0, np.radians(1.0)
-"""Standard uncertainties from which a mount counts as not determined; a ruler and a protractor do better."""
-_WEAK, _LEAST_MM, _LEAST_RAD = 5.0, 0.01, np.radians(0.005)
-"""Times the best determined direction, and standard uncertainty, mm and rad: so much worse is worth a further pose."""
+_OPEN_MM = 5.0  # standard uncertainty from which the shift of a mount counts as not determined: a ruler does better
+OPEN_RAD = np.radians(1.0)
+"""The same of its turn: a protractor does better."""
+_WEAK = 5.0  # times the uncertainty of the best determined direction from which another is worth a further pose
+_LEAST_MM = 0.01  # standard uncertainty of a shift below which no direction is worth a further pose
+_LEAST_RAD = np.radians(0.005)  # the same of a turn: 0.02 mm at 220 mm
 _POINTS = 100
-_UNKNOWN_MM, _UNKNOWN_RAD = 100.0, 0.5
-"""Standard uncertainty of a mount of which nothing is known, so that open directions can be compared."""
+"""Points of a profile that a pose would add: more repeat what these say."""
+_UNKNOWN_MM = 100.0
+"""Standard uncertainty of the shift of a mount of which nothing is known, so that open directions can be compared."""
+_UNKNOWN_RAD = 0.5  # the same of its turn
 
 
 def next_pose(

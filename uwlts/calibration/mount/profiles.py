@@ -16,9 +16,9 @@ _TRIALS = 400
 """Curves proposed for a profile: with a tenth of it on the artefact, and neighbours as proposals, some 40 are right."""
 _REJECTED_BEYOND = 4.0
 """Robust standard deviations; of normal noise six points in a hundred thousand lie farther out."""
-_DOUBLINGS, _FEW_MORE = 3, 1.1
-"""Doublings of the distance at which points count as near, up to 30 times the noise: profilers err smoothly by less.
-Where one brings fewer than a tenth more points, those near the curve have been found."""
+_DOUBLINGS = 3
+"""Doublings of the distance at which points count as near, up to 30 times the noise: profilers err smoothly by less."""
+_FEW_MORE = 1.1  # ratio of the numbers of points near a curve, below which a wider distance finds no more of its own
 _LEAST_ARC = np.radians(30)
 """Smaller arcs are like straight lines, and their centres move by more than the noise along the sagitta."""
 LEAST_WALL = 6
@@ -30,8 +30,8 @@ _LINES = 4
 """Lines sought in a profile of a step or ring: its faces, and what lies beside them."""
 _PARALLEL = 2e-3
 """By how much faces of a step may seem to be turned against each other besides noise, rad: bow of the profiler."""
-_LEAST_SEEN, _LEAST_SEEN_COSINE = 0.95, 0.5
-"""A step shows its height at least, but for the profiler's scale, and twice that where the sheet leans by 60 deg."""
+_LEAST_SEEN = 0.95  # share of its height that a step shows at least: profilers' scales err by less
+_LEAST_SEEN_COSINE = 0.5  # cosine of the angle by which the sheet may lean against a step: 60 deg
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -12,12 +12,13 @@ from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatte
 from uwlts.calibration.mount.profiles import ProfileArc, ProfileLine, Seen, circles_through
 from uwlts.errors import CalibrationError
 
-_SUBSETS, _SUBSET = 40, 8
-"""Random choices of poses: with a fifth of the poses wrong one of six choices of eight has none of these."""
-_TRIED = 4
+_SUBSET = 8  # poses of a random choice: 24 linear equations for 12 unknowns
+_SUBSETS = 40  # random choices: with a fifth of the poses wrong one of six has none of these
+_TRIED = 4  # of the linear solutions for a sphere, the best ones that are refined
 _THINNED = 9
-_TURNS, _TURNS_TRIED = 5000, 10
-"""Rotations tried for a plane, some 12 deg apart, and how many of the best are refined."""
+"""Points of each profile by which a refined start is judged."""
+_TURNS = 5000  # rotations tried for a plane, some 12 deg apart
+_TURNS_TRIED = 10  # of these the best that are refined
 _RADII = (1.02, 1.15, 1.5)
 """Radius of an unknown sphere over that of its largest section."""
 _REWEIGHTED = 10
@@ -25,8 +26,8 @@ _FAR = 4.0
 """Standard uncertainties within which points of a ring's wall are sought; poses with as many misfits are left out."""
 _CLEAR = 6.0
 """Least radius over the width within which a circle's points are sought: a smaller one cannot be distinguished."""
-_CIRCLES, _JUDGED = 3000, 1500
-"""Circles tried, and points by which each is judged: where a fifth of the points are on the wall, 24 circles are."""
+_CIRCLES = 3000  # circles tried: where a fifth of the points are on the wall, 24 of them are
+_JUDGED = 1500  # points by which each is judged
 _ROUGH = Scatter(point_mm=0.1, smooth_mm=1e-4, length_mm=1.0, pose_mm=0.3, turn_rad=3e-3)
 """Scatter for the weights of the search, whose robust loss begins beyond it."""
 
