@@ -311,11 +311,6 @@ class State:
         information = information_of(view.points_mm, view.pixels, pose, self.camera, self.setting)
         return self.with_image(pose, view.pixels, information)
 
-    @property
-    def enough(self) -> bool:
-        """Whether everything wanted is reached."""
-        return not missing(self)
-
 
 @dataclass(frozen=True, eq=False)
 class PoseAdvice:

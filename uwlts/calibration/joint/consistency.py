@@ -169,7 +169,7 @@ def findings(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) 
         for residuals in parts
         if len(residuals.values) >= _FEWEST_VALUES
     ]
-    known = [*_of_priors(result), *_of_stage(result, evidence, sensor)]
+    known = [*((each.wrong(), each.words()) for each in deviations(result)), *_of_stage(result, evidence, sensor)]
     lens = [*_of_lens(result, sensor)]
     earlier = [] if any(wrong for wrong, _ in known + lens) else [*_of_earlier(result)]
     unfit, noisy = _of_images(images)
@@ -324,11 +324,6 @@ def wrong_sizes(deviations: Sequence[SizeDeviation], *, least: float = _WRONG) -
     if len(known) > 1 and np.all(np.abs(share - common) < _ALIKE * std):
         words.append(f"all known sizes are off by the same {100 * common:+.2f} %: check the target's spacings as well")
     return words
-
-
-def _of_priors(result: Estimate) -> _Found:
-    for each in deviations(result):
-        yield each.wrong(), each.words()
 
 
 def _of_earlier(result: Estimate) -> _Found:

@@ -315,10 +315,6 @@ class BoardEvidence(GroupedEvidence[_State]):
     def _sensor_from_target(self) -> np.ndarray:
         return np.linalg.inv(self.camera_from_sensor) @ np.array([image.camera_from_target for image in self.images])
 
-    @cached_property
-    def _covariances(self) -> np.ndarray:
-        return np.array([image.covariance for image in self.images])
-
     @property
     def groups(self) -> int:
         return len(self.images)

@@ -12,7 +12,7 @@ from uwlts.calibration.mount.artefacts import SHAPES
 from uwlts.calibration.mount.board import mount_by_board
 from uwlts.calibration.mount.estimate import LARGEST_ROUGH, NotSettled, RestrictedEstimate, settle, settle_agreeing
 from uwlts.calibration.mount.next_pose import next_pose, require_determined, weaknesses
-from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter
+from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, in_sheet, in_space
 from uwlts.calibration.mount.profiles import LEAST_POINTS
 from uwlts.calibration.mount.sensor import CapturedProfiles, mount_covariance, profiles_of
 from uwlts.calibration.mount.start import NoFit, require_surfaces, start
@@ -170,9 +170,10 @@ class _Calibration:
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
         self.rows = [_thinned(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
-        self.profiles = [_in_space(each[rows]) for each, rows in zip(evidence.profiles, self.rows, strict=True)]
+        chosen = [each[rows] for each, rows in zip(evidence.profiles, self.rows, strict=True)]
+        self.profiles = [each if each.shape[1] == 3 else in_space(each) for each in chosen]
         self.sheet = _sheet_frame(self.profiles)
-        self.flat = [((each - self.sheet[:3, 3]) @ self.sheet[:3, :3])[:, [0, 2]] for each in self.profiles]
+        self.flat = in_sheet(self.profiles, self.sheet)
         self.reasons: dict[int, str] = {}
 
     def result(self) -> Mount:
@@ -289,20 +290,20 @@ class _Calibration:
                 raise
             raise NoFit(f"no mount makes the profiles fit: the poses would be wrong by {wrong:.3g} mm (rms)") from error
         moved = [used.stepped(state, step) for step, _ in estimate.without_each]
-        held = np.array([used.rms_mm(each)[place] for place, each in enumerate(moved)])
-        rms, numbers = used.rms_mm(state), [n for n in range(len(members)) if n not in self.reasons]
-        order = {number: place for place, number in enumerate(numbers)}
+        rms, held = used.rms_mm(state), np.array([used.rms_mm(each)[place] for place, each in enumerate(moved)])
+        off = zip(used.counts.tolist(), rms.tolist(), held.tolist(), strict=True)
         poses = []
-        for number, name in enumerate(self.evidence.names):
-            seen, place = int(members[number].sum()), order.get(number)
+        for number, (name, profile) in enumerate(zip(self.evidence.names, self.profiles, strict=True)):
+            reason = self.reasons.get(number)
+            count, own, without = (0, None, None) if reason else next(off)
             poses.append(
                 MountPose(
                     name=name,
-                    points=seen if place is not None else 0,
-                    points_left_out=len(self.profiles[number]) - (seen if place is not None else 0),
-                    rms_mm=None if place is None else float(rms[place]),
-                    held_out_mm=None if place is None else float(held[place]),
-                    reason=self.reasons.get(number),
+                    points=count,
+                    points_left_out=len(profile) - count,
+                    rms_mm=own,
+                    held_out_mm=without,
+                    reason=reason,
                 )
             )
         std, at = np.sqrt(np.diag(covariance)), 6 + self.shape.count
@@ -336,11 +337,6 @@ class _Calibration:
         numbers = [n for n in range(len(members)) if n not in self.reasons]
         by = np.vstack([self.captured.moved(number, self.rows[number][members[number]]) for number in numbers])
         return used.means(used.on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
-
-
-def _in_space(points: np.ndarray) -> np.ndarray:
-    """Points (N, 3) of a profile (N, 2) or (N, 3)."""
-    return points if points.shape[1] == 3 else np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]])
 
 
 def _thinned(points: np.ndarray, most: int) -> np.ndarray:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import SphereShape
 from uwlts.calibration.mount.estimate import RestrictedEstimate
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, point_by_mount
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, in_sheet, point_by_mount
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import rigid_transform
 from uwlts.model.mount import NextPose
@@ -100,7 +100,7 @@ def _one_pose(problem: Problem, points: np.ndarray, rotation: np.ndarray, positi
 
 def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
     """Points (n, 3) of the artefact in the sensor's frame, its place (3,) there, and that in words, for each view."""
-    flat = [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in problem.points]
+    flat = in_sheet(problem.points, sheet)
     low, high = np.quantile(np.vstack(flat), (0.1, 0.9), axis=0)
     views = []
     if isinstance(problem.shape, SphereShape):

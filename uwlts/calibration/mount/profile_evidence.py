@@ -355,6 +355,16 @@ class Problem(GroupedEvidence[MountState]):
         return self.stepped(state, solved_step(self, state, covariances, loss=loss))
 
 
+def in_sheet(points: Sequence[np.ndarray], sheet: np.ndarray) -> list[np.ndarray]:
+    """x and z (n, 2) in the sheet of points (n, 3) of each profile; ``sheet`` (4, 4) maps its frame to the sensor's."""
+    return [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in points]
+
+
+def in_space(flat: np.ndarray) -> np.ndarray:
+    """Points or directions (n, 3) in the frame of the sheet from their x and z (n, 2)."""
+    return np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
+
+
 def point_by_mount(point: np.ndarray) -> np.ndarray:
     """Derivatives (3, 6) of a point (3,) along the platform's axes by shift and turn of the mount."""
     return np.hstack([np.eye(3), np.cross(point, np.eye(3))])

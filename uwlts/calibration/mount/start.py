@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, SphereShape, StepShape, square_to
 from uwlts.calibration.mount.estimate import RestrictedEstimate
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, point_by_mount
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, in_sheet, in_space, point_by_mount
 from uwlts.calibration.mount.profiles import ProfileArc, ProfileLine, Seen, circles_through
 from uwlts.errors import CalibrationError
 
@@ -93,8 +93,7 @@ def _start_of_sphere(
             for state in _linear_solutions(rotations, positions, centres, depth, subset, radius):
                 found.append((_misfit(rotations, positions, centres, depth, state), state))
     found.sort(key=lambda each: each[0])
-    rough = problem.thinned(_THINNED)
-    return _best(rough, [_in_sensor_frame(state, sheet) for _, state in found[:_TRIED]])
+    return _best(problem, [state for _, state in found[:_TRIED]], sheet)
 
 
 def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, towards: np.ndarray) -> MountState:
@@ -129,7 +128,7 @@ def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray,
             translation = np.array([0.0, 0.0, height]) - rotation @ q
             place = rotations[0] @ np.array([reach, 0.0, height]) + positions[0]
             states.append(MountState(rotation, translation, np.append(place, radius)))
-    return _best(problem.thinned(_THINNED), [_in_sensor_frame(state, sheet) for state in states])
+    return _best(problem, states, sheet)
 
 
 def _linear_solutions(
@@ -196,8 +195,8 @@ def _start_of_plane(
     distance are linear then.
     """
     rotations, positions = problem.motion(0.0)
-    middles = _in_space(np.array([line.middle_mm for line in lines]))
-    directions = _in_space(np.array([line.direction for line in lines]))
+    middles = in_space(np.array([line.middle_mm for line in lines]))
+    directions = in_space(np.array([line.direction for line in lines]))
     turns = Rotation.random(_TURNS, rng=rng).as_matrix()
     seen = np.einsum("pij,tjk,pk->tpi", rotations, turns, directions)
     values, vectors = np.linalg.eigh(np.einsum("tpi,tpj->tij", seen, seen))
@@ -210,7 +209,7 @@ def _start_of_plane(
             design = np.column_stack([np.einsum("pji,j->pi", rotations, normal), -np.ones(len(lines))])
             solution = _robust(design, -(places @ normal)[:, None])[:, 0]
             states.append(MountState(turn, solution[:3], np.append(normal, solution[3])))
-    return _best(problem.thinned(_THINNED), [_in_sensor_frame(state, sheet) for state in states])
+    return _best(problem, states, sheet)
 
 
 def _start_of_step(
@@ -261,7 +260,7 @@ def _start_of_ring(
     state = replace(
         state, artefact=np.concatenate([normal, circle[:2] @ axes + distance * normal, [shape.size_mm or circle[2]]])
     )
-    flat = [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in whole.points]
+    flat = in_sheet(whole.points, sheet)
     for narrower in (1.0, 3.0, 9.0):
         problem = whole.of_seen(whole.seen_again(state, flat, max(reach / narrower, 5 * noise), rng))
         require_surfaces(problem)
@@ -309,13 +308,11 @@ def _robust(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return solution
 
 
-def _in_space(flat: np.ndarray) -> np.ndarray:
-    """Points or directions (P, 2) of the sheet in its frame (P, 3)."""
-    return np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
+def _best(problem: Problem, states: list[MountState], sheet: np.ndarray) -> MountState:
+    """The state, as one of the sensor's frame, of smallest median distance after a robust refinement from each.
 
-
-def _best(rough: Problem, states: list[MountState]) -> MountState:
-    """The state of smallest median distance after a robust refinement from each, scale and time left as they are."""
-    fixed = replace(rough, scale=False, time=False)
-    refined = [fixed.rough(state, _ROUGH) for state in states]
+    Scale and time are left as they are.
+    """
+    fixed = replace(problem.thinned(_THINNED), scale=False, time=False)
+    refined = [fixed.rough(_in_sensor_frame(state, sheet), _ROUGH) for state in states]
     return min(refined, key=lambda state: float(np.median(fixed.rms_mm(state))))
