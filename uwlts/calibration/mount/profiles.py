@@ -36,8 +36,7 @@ _LEAST_SEEN_COSINE = 0.5  # cosine of the angle by which the sheet may lean agai
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Seen:
-    """Points of a profile on the artefact: their mask (N,), the surface (N,) of each, 0 for the first, and their
-    scatter, mm."""
+    """Points of a profile on the artefact: their mask (N,), the surface (N,) of each (0 the first), scatter in mm."""
 
     members: np.ndarray
     part: np.ndarray
@@ -72,25 +71,6 @@ class ProfileLine(Seen):
     def with_parts(self, others: np.ndarray) -> "ProfileLine":
         """The line with points of other surfaces, whose numbers (N,) are not 0."""
         return replace(self, members=self.members | (others > 0), part=np.where(others > 0, others, self.part))
-
-
-def _settled(
-    members: np.ndarray, tolerance: float, off: Callable[[np.ndarray], np.ndarray]
-) -> tuple[np.ndarray, float] | None:
-    """Points (N,) on a curve, found anew until they stay the same, and their scatter; None where they are too few.
-
-    ``off`` returns the distances (N,) of all points from the curve through some (N,).
-    """
-    std = 0.0
-    for _ in range(_LARGEST_ROUNDS):
-        if np.count_nonzero(members) < LEAST_POINTS:
-            return None
-        away = np.abs(off(members))
-        std = MAD_TO_STD * float(np.median(away[members]))
-        before, members = members, away < min(max(_REJECTED_BEYOND * std, 1e-4), 2 * tolerance)
-        if np.array_equal(before, members):
-            break
-    return (members, std) if np.count_nonzero(members) >= LEAST_POINTS else None
 
 
 def noise_of(points: np.ndarray) -> float:
@@ -153,6 +133,25 @@ def circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         bb, cc = np.sum(b**2, axis=1), np.sum(c**2, axis=1)
         away = np.stack([c[:, 1] * bb - b[:, 1] * cc, b[:, 0] * cc - c[:, 0] * bb], axis=1) / double[:, None]
     return triples[:, 0] + away, np.linalg.norm(away, axis=1)
+
+
+def _settled(
+    members: np.ndarray, tolerance: float, off: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, float] | None:
+    """Points (N,) on a curve, found anew until they stay the same, and their scatter; None where they are too few.
+
+    ``off`` returns the distances (N,) of all points from the curve through some (N,).
+    """
+    std = 0.0
+    for _ in range(_LARGEST_ROUNDS):
+        if np.count_nonzero(members) < LEAST_POINTS:
+            return None
+        away = np.abs(off(members))
+        std = MAD_TO_STD * float(np.median(away[members]))
+        before, members = members, away < min(max(_REJECTED_BEYOND * std, 1e-4), 2 * tolerance)
+        if np.array_equal(before, members):
+            break
+    return (members, std) if np.count_nonzero(members) >= LEAST_POINTS else None
 
 
 def _refined_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> ProfileArc | None:
