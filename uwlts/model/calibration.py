@@ -1,5 +1,6 @@
 """The calibrated sensor: everything reconstruction needs, stored as readable JSON with residuals and provenance."""
 
+from dataclasses import dataclass
 from itertools import product
 from typing import Annotated, Literal
 
@@ -28,6 +29,13 @@ def is_rigid(matrices: np.ndarray, *, within: float) -> bool:
     square = np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=within)
     last = np.allclose(matrices[..., 3, :], (0, 0, 0, 1), atol=within)
     return square and last and bool((np.linalg.det(rotation) > 0).all())
+
+
+def rigid_transform(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Matrix (4, 4) of a rotation (3, 3) and a shift (3,)."""
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = rotation, shift
+    return result
 
 
 def _rigid(matrix: _Rows) -> _Rows:
@@ -157,6 +165,19 @@ class KnownStage(Description):
     direction: Vector
 
 
+@dataclass(frozen=True)
+class StandardUncertainties:
+    """Standard uncertainties that the steps of a calibration found; None, or no entry, for what none of them did.
+
+    ``camera`` holds those of the camera's parameters by their names: f, fx, fy, cx and cy in px, and the distortion's.
+    ``sheet_normal_deg`` is that of the direction of the sheet's normal, ``window_distance_mm`` that of the window.
+    """
+
+    camera: dict[str, float]
+    sheet_normal_deg: float | None
+    window_distance_mm: float | None
+
+
 class Calibration(Description):
     """A calibrated sensor.
 
@@ -213,6 +234,17 @@ class Calibration(Description):
     def figures(self, step: str) -> Table:
         """Figures of a step among the residuals; none where there are none of it."""
         return self.residuals.get(step, {})
+
+    def std(self) -> StandardUncertainties:
+        """Standard uncertainties by the figures of its steps; those of a joint estimate are all in `joint`."""
+
+        def numbers(table: object) -> dict[str, float]:
+            known = table if isinstance(table, dict) else {}
+            return {name: value for name, value in known.items() if isinstance(value, int | float)}
+
+        sheet, window = (numbers(self.figures(step)) for step in ("sheet", "window"))
+        camera = numbers(self.figures("camera").get("std"))
+        return StandardUncertainties(camera, sheet.get("normal_std_deg"), window.get("std_mm"))
 
     def origin(self) -> Origin:
         """Evidence that the calibration was made from, by its provenance."""

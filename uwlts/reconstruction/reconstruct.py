@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.errors import CalibrationError, DescriptionError
-from uwlts.model.any_calibration import AnyCalibration, calibration_digest, check_fits
+from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory
 from uwlts.optics.brightness import LitSheet, footprint_std, sharp_lines, slopes_of_brightness
+from uwlts.optics.fitness import check_fits
 from uwlts.optics.triangulation import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile, stage_travel
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.reconstruction.moving import carried, platform_ride, with_platform

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from uwlts.model.calibration import Calibration
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.pages.numbers import as_fine_as, entries_of, fixed, is_number, numbers_in, plain, unit_of, words_of
+from uwlts.pages.numbers import as_fine_as, entries_of, fixed, is_number, plain, unit_of, words_of
 from uwlts.pages.toolkit import MISSING, ComparisonTable
 from uwlts.report.gather import CALIBRATION, GatheredCalibration, GatheredCampaign, GatheredMeasurement, Reference
 from uwlts.report.plot import SHORT_LIST
@@ -149,7 +149,7 @@ def _side_by_side(columns: list[tuple[str, dict[tuple[str, str], str]]]) -> Comp
 
 def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
     camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
-    std = numbers_in(calibration.figures("camera").get("std"))
+    std = calibration.std().camera
     table = {}
     for words, value, names in (
         ("focal length, x", camera.fx_px, ("fx", "f")),
@@ -166,8 +166,7 @@ def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
     table["sheet's distance from the camera", "mm"] = fixed(sheet.offset_mm)
     if window is not None:
         table["refractions", ""] = str(window.refractions)
-        known = numbers_in(calibration.figures("window")).get("std_mm")
-        table["window distance d", "mm"] = _with_std(window.distance_mm, known, 3)
+        table["window distance d", "mm"] = _with_std(window.distance_mm, calibration.std().window_distance_mm, 3)
         cosine = float(window.normal[2] / np.linalg.norm(window.normal))
         table["window tilt", "°"] = fixed(math.degrees(math.acos(min(1, cosine))), 3)
         if window.refractions == 2:

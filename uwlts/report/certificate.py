@@ -240,7 +240,8 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
         rows = zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True)
         return tuple(_row(*row) for row in rows)
     camera, window = calibration.camera, calibration.window
-    std = numbers_in(calibration.figures("camera").get("std"))
+    known = calibration.std()
+    std = known.camera
     values = (
         {"f": camera.fx_px} if "f" in std or camera.fx_px == camera.fy_px else {"fx": camera.fx_px, "fy": camera.fy_px}
     )
@@ -248,8 +249,7 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
     values |= {name: value for name, value in camera.distortion.model_dump().items() if value}
     rows = [_row(parameter_of(name), value, std.get(name)) for name, value in values.items()]
     if window is not None:
-        distance_std = numbers_in(calibration.figures("window")).get("std_mm")
-        rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, distance_std))
+        rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, known.window_distance_mm))
         if window.refractions == 2:
             rows.append(_row(WindowParameter.THICKNESS, window.thickness_mm))
             rows.append(_row(WindowParameter.GLASS_INDEX, window.glass_index))

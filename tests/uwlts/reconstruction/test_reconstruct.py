@@ -15,9 +15,9 @@ from uwlts.calibration.sequential.sequential_calibration import (
     solve,
 )
 from uwlts.errors import CalibrationError, CaptureError, RangeError
-from uwlts.model.any_calibration import check_fits
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Medium
+from uwlts.optics.fitness import check_fits
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_profile
 from uwlts.reconstruction.reconstruct import reconstruct, reconstruct_stripes

@@ -32,13 +32,15 @@ _RATIONAL = tuple((*_USUAL, *names) for names in RATIONAL_BESIDES)
 _FOLDS = 5
 _WORSE = 1.0  # standard errors of the mean difference of squares; below, a model counts as good as the best
 _LEAST_GAIN = 0.01  # of the mean square; less is of no use, however certain
-_SOFT, _OUTLIER = 2.0, 5.0  # robust standard deviations from where a point counts less, and not at all
+_SOFT = 2.0  # robust standard deviations from where a point counts less
+_OUTLIER = 5.0  # robust standard deviations from where a point does not count
 _LARGEST_REJECTED = 0.3  # of an image's points; more are another board, or another pose
 _LEAST_SCATTER_PX = 1e-6  # of points; drawn ones may have none
 _MOVED = 3.0  # standard uncertainties by which one image may move a parameter
 HALVES_APART = 4.0
 """Standard uncertainties that a parameter from one half of the images may differ from that by the other."""
-_FEWEST_IMAGES, _LARGEST_LEFT_OUT = 5, 0.2
+_FEWEST_IMAGES = 5  # that are left: of fewer the influence of one says little
+_LARGEST_LEFT_OUT = 0.2  # share of the images: where more move a parameter, it is not clear which are right
 
 Distortion = Literal["auto"] | tuple[str, ...]
 Pixels = Literal["auto", "square", "free"]

@@ -16,8 +16,7 @@ from uwlts.calibration.capture_evidence import (
     no_stripe_in,
     step_evidence,
 )
-from uwlts.calibration.joint.derivatives import SHEET
-from uwlts.calibration.joint.earlier_estimate import Prior, ViewMedium, window_values
+from uwlts.calibration.joint.parameters import SHEET, Prior, ViewMedium, window_values
 from uwlts.calibration.joint.residuals import BENDS, SHIFT, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, common_sensor, sources_of
@@ -37,7 +36,8 @@ from uwlts.optics.brightness import sharp_lines, slopes_of_brightness
 from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeSettings, find_stripes
 
-_FEWEST_KEPT, _MOST_LEFT_OUT = 3, 0.3  # images; where more contradict the rest, it is not clear which are right
+_FEWEST_KEPT = 3  # images that are left where some contradict the others
+_MOST_LEFT_OUT = 0.3  # share of the images: where more contradict the rest, it is not clear which are right
 Scanned = SphereStandard | PlaneStandard | PipeStandard
 
 

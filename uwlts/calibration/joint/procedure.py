@@ -18,10 +18,10 @@ from uwlts.calibration.joint.consistency import (
     understated,
     wrong_sizes,
 )
-from uwlts.calibration.joint.earlier_estimate import Parameters
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
 from uwlts.calibration.joint.initial import line_start, series_start, step_profiles, surface_scans
+from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.residuals import BENDS, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import Plane, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import calibration_of

@@ -9,12 +9,11 @@ import numpy as np
 from pydantic import JsonValue
 
 from uwlts.calibration.capture_evidence import Progress
-from uwlts.calibration.joint.derivatives import SHEET
-from uwlts.calibration.joint.earlier_estimate import EarlierEstimate, ViewMedium
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
 from uwlts.calibration.joint.initial import line_start, step_profiles
 from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
+from uwlts.calibration.joint.parameters import SHEET, EarlierEstimate, ViewMedium
 from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.joint.stored_estimate import (
     StoredEstimate,
@@ -26,11 +25,12 @@ from uwlts.calibration.joint.stored_estimate import (
 )
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, sources_of
 from uwlts.errors import CalibrationError, RangeError
-from uwlts.model.any_calibration import calibration_digest, check_fits
+from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration, KnownStage
 from uwlts.model.joint_estimate import CoveredRegion, JointEstimate, Origin
 from uwlts.model.parameter_keys import MediumIndex
 from uwlts.model.sensor import Medium
+from uwlts.optics.fitness import check_fits
 from uwlts.optics.window import require_index
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, opened_captures

@@ -9,10 +9,8 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics
-from uwlts.calibration.joint.derivatives import DescribedSheet
-from uwlts.calibration.joint.earlier_estimate import Parameters, Prior, ViewMedium, window_values
-from uwlts.calibration.joint.estimate import Estimate, Evidence
-from uwlts.calibration.joint.noise import outliers
+from uwlts.calibration.joint.estimate import Estimate, Evidence, outliers
+from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium, window_values
 from uwlts.calibration.joint.residuals import TARGET, SeenSheet
 from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.errors import CalibrationError

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from uwlts.calibration.capture_evidence import Progress as Searched
+from uwlts.calibration.joint.estimate import outlier_limit
 from uwlts.calibration.joint.gathering import Gathered, Series, gather_jointly
-from uwlts.calibration.joint.noise import outlier_limit
 from uwlts.calibration.joint.procedure import JointProblem, joint_problem
 from uwlts.calibration.joint.residuals import STRIPE, TARGET, TargetEvidence
 from uwlts.calibration.model_comparison.held_out import (

@@ -10,7 +10,6 @@ from pydantic import JsonValue
 
 from uwlts.calibration.capture_evidence import AirEvidence, Progress, air_evidence
 from uwlts.calibration.polynomial.polynomial_evidence import (
-    PlateMap,
     PlateStripes,
     common_header,
     object_coordinates,
@@ -27,8 +26,8 @@ MOST_SMOOTH = 8
 _LINES_PER_DEGREE = 10  # a degree over the lines needs several lines of its own
 _DETERMINED = 1e-6  # smallest singular value over the largest: a full view has 0.1, one cut to a triangle thousandths
 _OUTLIER = 5.0  # standard deviations; of a million normal values one is farther
-# Outliers may return for so many rounds, then they stay out, so that the rounds end.
-_ROUNDS, _RETURNING_ROUNDS = 20, 10
+_ROUNDS = 20  # of leaving out outliers; a few settle
+_RETURNING_ROUNDS = 10  # in which outliers may return; then they stay out, so that the rounds end
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,14 +133,12 @@ class PolynomialResult:
 
     Attributes
     ----------
-    maps : from pixels to the plate, of each image
     depth, along : the fits of Z(position) and of Y(Z), with the residuals of the stripe points: of all for Z, of those
         that Z used for Y
     """
 
     calibration: PolynomialCalibration
     stripes: PlateStripes
-    maps: list[PlateMap]
     depth: LinePolynomials
     along: LinePolynomials
     warnings: list[str]
@@ -259,7 +256,7 @@ def fit_polynomials(
         )
     provenance = {"source": "polynomials from captures", "captures": list(sources), "warnings": warnings}
     calibration = calibration.model_copy(update={"residuals": figures, "provenance": provenance})
-    return PolynomialResult(calibration, stripes, maps, depth, along, warnings)
+    return PolynomialResult(calibration, stripes, depth, along, warnings)
 
 
 def _line_excess(fit: LinePolynomials, lines: np.ndarray) -> float:

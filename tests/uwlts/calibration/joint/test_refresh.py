@@ -13,9 +13,9 @@ from tests.uwlts import drawn_stripes
 from tests.uwlts.calibration_views import STEP_MM, built_sensor
 from tests.uwlts.joint_views import Noise, gathered, lit_points, seen, target_series
 from uwlts.calibration.capture_evidence import StepEvidence
-from uwlts.calibration.joint.earlier_estimate import EarlierEstimate, Prior, ViewMedium
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
+from uwlts.calibration.joint.parameters import EarlierEstimate, Prior, ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.refresh import refresh, solve_refreshed
 from uwlts.calibration.joint.residuals import StepProfileEvidence
@@ -220,7 +220,7 @@ def test_what_was_held_is_as_the_calibration_says(earlier):
         }
     )
     known, pixels = found_estimate(calibration, WARM), np.array([[150.0, 480.0], [640.0, 520.0], [1100.0, 450.0]])
-    found = known.parameters.on_sheet(known.values, known.view, pixels).points
+    found = known.parameters.stripe_points(known.values, known.view, pixels, across=0).points
     index, along = calibration.index_of(WARM), np.eye(3)[0]
     frame = calibration.object_transform()
 

@@ -161,6 +161,9 @@ def test_the_file_keeps_the_figures(result, tmp_path):
     assert kept == result.calibration.model_validate(json.loads(result.calibration.model_dump_json()))
     assert kept.residuals["camera"]["rms_px"] == result.camera.rms_px()
     assert kept.residuals["window"]["distance_mm"] == kept.window.distance_mm
+    std = kept.std()
+    assert std.camera == result.camera.std() and std.window_distance_mm == result.window.uncertainty_mm
+    assert std.sheet_normal_deg == np.degrees(result.sheet.normal_std_rad)
     assert len(kept.residuals["window"]["curve_mm"]) == len(result.window.curve_mm)
     assert kept.provenance["warnings"] == result.warnings
     assert kept.provenance["step_captures"][0]["medium"] == "water"
