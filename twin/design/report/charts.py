@@ -30,8 +30,10 @@ Static = tuple[Figure, str]
 Interactive = tuple[go.Figure, str]
 """A figure for a page, and its caption."""
 
-_FRONT, _PALE = COLOURS[2], "#c3cad2"
-"""Colours of the Pareto front, and of bars of designs that miss a constraint."""
+_FRONT = COLOURS[2]
+"""Colour of the Pareto front."""
+_PALE = "#c3cad2"
+"""Colour of bars of designs that miss a constraint."""
 _LIMITS = ("#d9480f", "#862e9c", "#0b7285", "#e67700", "#364fc7")
 """Colours of the lines on which constraints are just met."""
 _SYMBOLS = (("diamond", "D"), ("circle", "o"), ("star", "*"), ("square", "s"), ("cross", "P"))

@@ -256,17 +256,17 @@ def _border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
 
 # --- the drawing ------------------------------------------------------------------------------------------------------
 
-_GLASS, _BEHIND, _THIN, _HOUSING, _VOLUME, _VOLUME_END = (
-    "#12a3a8",
-    "#98a3af",
-    "#b9c2cc",
-    "#aab4c0",
-    "#f1ecd9",
-    "#bda96b",
-)
+_GLASS = "#12a3a8"
+_BEHIND = "#98a3af"
+_THIN = "#b9c2cc"
+_HOUSING = "#aab4c0"
+_VOLUME = "#f1ecd9"
+_VOLUME_END = "#bda96b"
 _INCHES = (11.5, 7.0)
 _MARGIN = 0.1
 """Room for dimensions around a view, as a share of its larger side."""
+_LABELS = 0.35
+"""Room for labels at the right, as a share of the width."""
 _ARC = 0.4
 """Radius of the arc at the triangulation angle, as a share of the way from the window to the sheet's crossing."""
 
@@ -289,11 +289,18 @@ def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | N
 
 
 def _box(view: SideView | FrontView) -> np.ndarray:
-    """Least and largest coordinates (2, 2) of a view with a margin."""
+    """Least and largest coordinates (2, 2) of a view with a margin, and with room for labels at the right."""
     points = np.concatenate(view.outlines())
     points = points[np.isfinite(points).all(axis=1)]
     margin = _MARGIN * np.ptp(points, axis=0).max()
-    return np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
+    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+    return np.stack([low, high + (_LABELS * (high - low)[0], 0.0)])
+
+
+def _labels_at(axes: Axes) -> float:
+    """Where the room for labels begins."""
+    left, right = axes.get_xlim()
+    return left + (right - left) / (1 + _LABELS)
 
 
 def _fill(axes: Axes, points: np.ndarray, colour: str, alpha: float, edge: str = "none") -> None:
@@ -319,11 +326,11 @@ def _dimension(axes: Axes, start: tuple[float, float], end: tuple[float, float],
 
 def _draw_side(axes: Axes, view: SideView) -> None:
     cross, outer, (near, far) = float(view.crossing[1]), view.outer_mm, view.volume[:, 1].tolist()
-    (left, right), top = axes.get_xlim(), axes.get_ylim()[1]
+    left, top = axes.get_xlim()[0], axes.get_ylim()[1]
     axes.axhspan(near, far, color=_VOLUME, zorder=0)
     for depth, name in ((near, "near"), (far, "far")):
         axes.axhline(depth, color=_VOLUME_END, linewidth=0.8, zorder=0)
-        axes.text(right, depth, f" {name} {number_text(depth - outer)}", va="center")
+        axes.text(_labels_at(axes), depth, f"{name} {number_text(depth - outer)} mm", va="bottom")
     _fill(axes, np.concatenate([view.edges[0], view.edges[1][::-1]]), BLUE, 0.1)
     _draw_module(axes, view.camera, "camera")
     _draw_module(axes, view.laser, "laser")
@@ -355,7 +362,7 @@ def _draw_side(axes: Axes, view: SideView) -> None:
 
 
 def _draw_front(axes: Axes, view: FrontView) -> None:
-    right, end = axes.get_xlim()[1], max(edge[-1, 1] for edge in view.fan)
+    right, end = _labels_at(axes), max(edge[-1, 1] for edge in view.fan)
     _fill(axes, np.concatenate([view.fan[0], view.fan[1][::-1]]), RED, 0.06)
     _fill(axes, view.region, RED, 0.18)
     _draw_module(axes, view.laser, "laser")
