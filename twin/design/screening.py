@@ -184,7 +184,7 @@ def screen(study: Study, folder: Path, workers: Workers, *, progress: Progress =
     """
     made_folder(folder)
     # Hidden files are being written by another machine that has just begun, or were by one that is gone.
-    keep_to_plan(folder, _plan(study), set(), recorded="[!.]*", called="a study", overwrite=False)
+    keep_to_plan(folder, _plan(study), set(), recorded="[!.]*", called="files", overwrite=False)
     place = made_folder(folder / PARTS)
     if study.sampling.kind == "optimise":
         _optimise(study, folder, place, workers, progress)
