@@ -206,8 +206,8 @@ def new_figure(
 
     figure = figure_of(width, height)
     with matplotlib.rc_context(_STYLE):
-        ratios = {"height_ratios": height_ratios, "width_ratios": width_ratios}
-        return figure, list(figure.subplots(rows, columns, squeeze=False, **ratios).flat)
+        axes = figure.subplots(rows, columns, squeeze=False, height_ratios=height_ratios, width_ratios=width_ratios)
+        return figure, list(axes.flat)
 
 
 def legend_below(figure: Figure, *, columns: int = 4) -> None:

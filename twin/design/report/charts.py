@@ -218,9 +218,9 @@ def mesh_between(judged: Judged, places: np.ndarray, x: str, y: str) -> Triangul
     shares = np.column_stack([share_of(judged.study.variables[name], judged.columns[name][places]) for name in (x, y)])
     if np.linalg.matrix_rank(shares - shares.mean(axis=0), tol=_FLAT) < 2:
         return None
-    triangles = Triangulation(*shares.T).triangles
-    at = (np.asarray(judged.columns[name][places], dtype=float) for name in (x, y))
-    return Triangulation(*at, triangles, mask=~judged.works[places][triangles].all(axis=1))
+    triangles = Triangulation(shares[:, 0], shares[:, 1]).triangles
+    at_x, at_y = (np.asarray(judged.columns[name][places], dtype=float) for name in (x, y))
+    return Triangulation(at_x, at_y, triangles, mask=~judged.works[places][triangles].all(axis=1))
 
 
 @_plain_text
@@ -408,11 +408,11 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
         plot_bgcolor="white",
     )
     for number, one in enumerate(marked):
-        at, colour = [one.design.number_of(name) for name in (x, y)], RED if one is marked[-1] else INK
-        if all(map(math.isfinite, at)):
+        place, colour = [one.design.number_of(name) for name in (x, y)], RED if one is marked[-1] else INK
+        if all(map(math.isfinite, place)):
             figure.add_scatter(
-                x=tables.rounded(at[:1]),
-                y=tables.rounded(at[1:]),
+                x=tables.rounded(place[:1]),
+                y=tables.rounded(place[1:]),
                 mode="markers+text",
                 showlegend=False,
                 cliponaxis=False,
