@@ -29,22 +29,6 @@ from uwlts.storage.truth import Truth, TruthHeader, truth_path, write_truth
 Progress = Callable[[int, int], None]
 
 
-def _threads_for(shot: Shot, threads: int) -> int:
-    """How many of Dr.Jit's threads render a shot while another thread exposes and writes the one before.
-
-    Between the many small kernels of a laser image they would keep that one from its processor; a lamp image has few
-    large kernels.
-    """
-    return threads if shot.light == "lamp" else min(threads, max(1, (os.cpu_count() or 1) - 1))
-
-
-def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], shots: Sequence[Shot]) -> Truth:
-    """The truths of a recording's frames as one, with the depth map of the first of its ``shots``."""
-    stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
-    poses = np.stack([studio.pose(shot) for shot in shots])
-    return Truth(**stacked, depth_mm=depth_map(studio.renderer, poses[0]), pose=poses)
-
-
 def record_scene(
     scene: Scene,
     sensor: Sensor,
@@ -137,3 +121,19 @@ def record_scene(
         described = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))
         truth = truth_of_recording(studio, truths, shots)
         write_truth(truth_path(path), described, truth, overwrite=overwrite or resume)
+
+
+def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], shots: Sequence[Shot]) -> Truth:
+    """The truths of a recording's frames as one, with the depth map of the first of its ``shots``."""
+    stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
+    poses = np.stack([studio.pose(shot) for shot in shots])
+    return Truth(**stacked, depth_mm=depth_map(studio.renderer, poses[0]), pose=poses)
+
+
+def _threads_for(shot: Shot, threads: int) -> int:
+    """How many of Dr.Jit's threads render a shot while another thread exposes and writes the one before.
+
+    Between the many small kernels of a laser image they would keep that one from its processor; a lamp image has few
+    large kernels.
+    """
+    return threads if shot.light == "lamp" else min(threads, max(1, (os.cpu_count() or 1) - 1))
