@@ -31,6 +31,7 @@ from .model.mount import Mount as Mount
 from .model.polynomial_calibration import PolynomialCalibration as PolynomialCalibration
 from .model.sensor import Sensor as Sensor
 from .model.trajectory import Trajectory as Trajectory
+from .optics.design_table import design as design
 from .optics.nominal import nominal as nominal
 from .reconstruction.reconstruct import ScanCloud as ScanCloud, reconstruct as reconstruct
 from .reconstruction.verify import Verification as Verification, verify as verify
@@ -42,7 +43,7 @@ from .report.certificate import check_certificate as check_certificate
 from .report.certificate_page import write_certificate as write_certificate
 from .report.change_page import write_change as write_change
 from .report.findings_page import write_findings as write_findings
-from .report.inventory import describe as describe, design as design
+from .report.inventory import describe as describe
 from .report.model_comparison import write_models as write_models
 from .report.registration_page import write_registration as write_registration
 from .storage.calibration_file import load_calibration as load_calibration, write_calibration as write_calibration

@@ -16,7 +16,7 @@ import numpy as np
 import twin
 import uwlts
 from twin.options import CPU, Options, use_variant
-from twin.recording.studio import record_scene
+from twin.recording.record_scene import record_scene
 from twin.scene.campaign import load_campaign, takes
 from twin.scene.description import load_scene
 

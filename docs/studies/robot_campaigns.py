@@ -18,7 +18,7 @@ from stripe_tables import table
 
 import uwlts
 from twin.scene.description import Scene
-from twin.scene.platforms import Robot
+from twin.scene.robot import Robot
 from uwlts.calibration.mount.sensor import CapturedProfiles, profiles_of
 from uwlts.fitting.shapes import fit_sphere
 from uwlts.model.calibration import Calibration

@@ -22,7 +22,7 @@ from robot_campaigns import FOR_THE_MOUNT, RADIUS_MM
 from stripe_tables import table
 
 import uwlts
-from twin.scene.platforms import Vehicle
+from twin.scene.vehicle import Vehicle
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.pose_files import trajectory_path
 from uwlts.storage.truth import Truth

@@ -7,7 +7,7 @@ import pytest
 
 import uwlts
 from twin.options import Flaws, Options
-from twin.recording.studio import record_scene
+from twin.recording.record_scene import record_scene
 from twin.scene.description import altered, load_scene
 from uwlts.model.library import load_sensor
 from uwlts.storage.capture import Capture

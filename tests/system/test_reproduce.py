@@ -20,7 +20,7 @@ import pytest
 from twin import cli
 from twin.options import Options
 from twin.recording.campaigns import record as record_one, record_campaigns
-from twin.recording.studio import record_scene
+from twin.recording.record_scene import record_scene
 from twin.scene.campaign import load_campaign, takes
 from uwlts.errors import DescriptionError
 from uwlts.storage.capture import Capture, part_path

@@ -16,7 +16,7 @@ from tests.system.small_board import small_sensor, turned_board
 from tests.waiting import within
 from twin.devices.serve import ServedTwin, serve
 from twin.options import Options
-from twin.recording.studio import record_scene
+from twin.recording.record_scene import record_scene
 from twin.scene.description import Scene
 from uwlts.errors import CaptureError
 from uwlts.model.sensor import Sensor

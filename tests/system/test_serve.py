@@ -15,7 +15,7 @@ import pytest
 from tests.system.small_board import small_sensor, turned_board
 from twin.devices.serve import NAMES, Fault, ServedTwin, Track, parse_fault, serve
 from twin.options import Options
-from twin.recording.studio import record_scene
+from twin.recording.record_scene import record_scene
 from twin.scene.description import Scene, load_scene
 from uwlts.errors import DescriptionError, DesignError, HardwareError, ImageError
 from uwlts.hardware.camera_addresses import open_camera

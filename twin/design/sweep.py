@@ -19,10 +19,11 @@ from pydantic import TypeAdapter
 from twin.design.choice import choose
 from twin.design.designs import Columns, Marked
 from twin.design.report.study_page import page_text
-from twin.design.screening import JOURNAL, PARTS, PLAN, read_parts, screen, write_csv
+from twin.design.screening import JOURNAL, PARTS, read_parts, screen, write_csv
 from twin.design.study import Study, load_study
 from twin.design.verification import Agreement, render
 from twin.options import CPU
+from twin.recording.campaigns import PLAN
 from uwlts.errors import DescriptionError
 from uwlts.files.writing import written_aside
 from uwlts.pages.toolkit import write_page
@@ -30,7 +31,10 @@ from uwlts.runtime.console import progress_bar
 from uwlts.runtime.workers import open_workers
 
 RENDERED = "verified"
-PAGE, TABLE, WINNER, SUMMARY = "report.html", "designs.csv", "winner.toml", "summary.json"
+PAGE = "report.html"
+TABLE = "designs.csv"
+WINNER = "winner.toml"
+SUMMARY = "summary.json"
 
 
 @dataclass(frozen=True)

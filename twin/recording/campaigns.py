@@ -220,7 +220,7 @@ def _record(job: _Job, report: Callable[[None], None]) -> None:
     use_variant(job.variant)
     import drjit as dr
 
-    from twin.recording.studio import record_scene
+    from twin.recording.record_scene import record_scene
 
     dr.set_thread_count(1)
     take = job.take

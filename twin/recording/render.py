@@ -101,7 +101,8 @@ def render(
             raise DescriptionError(f"frames is {list(frames)}; give numbers from 0 to {len(shots) - 1}")
         shots = [shots[number] for number in frames]
     use_variant(variant)
-    from twin.recording.studio import Studio, truth_of_recording
+    from twin.recording.record_scene import truth_of_recording
+    from twin.recording.studio import Studio
 
     studio = Studio(built, described, options)
     taken = [studio.frame(shot, number) for number, shot in shots]
@@ -207,7 +208,7 @@ def simulate(
     nominal, built = choose_sensors(sensor, as_built)
     options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
     use_variant(variant)
-    from twin.recording.studio import record_scene
+    from twin.recording.record_scene import record_scene
 
     files, paths = {"overwrite": overwrite, "resume": resume}, []
     for each in described:

@@ -240,7 +240,7 @@ def mount(
         scale: Estimate the robot's scale too.
         time: Estimate the offset to add to the profiles' times (columns time_s; the poses are a trajectory).
     """
-    from uwlts.report.mount_lines import mount_lines
+    from uwlts.report.inventory import mount_lines
 
     refuse_unsuitable(out, overwrite=overwrite, endings=JSON)
     found = uwlts.calibrate_mount(

@@ -21,7 +21,7 @@ def design(sensor: str, *, medium: str) -> None:
         sensor: Name or path of a sensor description.
         medium: One of the sensor's media.
     """
-    from uwlts.report.inventory import table_lines
+    from uwlts.optics.design_table import table_lines
 
     show(table_lines(uwlts.design(sensor, medium=medium)))
 

@@ -151,7 +151,7 @@ def inspect(
         datum: Cloud of another face in the same frame, to which a flange's face is to be parallel.
     """
     from uwlts.files.json_files import write_record
-    from uwlts.report.findings_page import surface_limit_mm
+    from uwlts.report.plot import surface_limit_mm
 
     if out:
         refuse_unsuitable(out, overwrite=overwrite, endings=JSON)

@@ -21,7 +21,8 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit
 from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parameter_of
 from uwlts.model.sensor import Medium
-from uwlts.pages.numbers import numbers_in
+from uwlts.pages.numbers import as_fine_as, numbers_in
+from uwlts.pages.toolkit import MISSING
 from uwlts.report.certificate_volume import InUse, LengthUncertainty, in_use, index_key, length_uncertainties
 
 FORMAT = "uwlts-certificate"
@@ -106,6 +107,12 @@ class ParameterRow(_Stored):
     value: float
     std: float | None
     std_before: float | None
+
+    def texts(self) -> tuple[str, str]:
+        """The value with as many decimals as two digits of its standard uncertainty have, and that."""
+        if self.std is None or not self.std > 0:
+            return f"{self.value:.6g}", MISSING
+        return as_fine_as(self.value, self.std, digits=2), as_fine_as(self.std, self.std, digits=2)
 
 
 class CalibratedMedium(_Stored):

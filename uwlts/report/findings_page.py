@@ -44,7 +44,7 @@ from uwlts.pages.toolkit import (
     write_page,
 )
 from uwlts.report.certificate import check_certificate
-from uwlts.report.plot import DEVIATIONS
+from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_cloud
@@ -59,8 +59,6 @@ _SMALLEST_MM = 0.002
 _MOST_PICTURES = 40
 FINDINGS = "findings"
 """Kind of the page, in the name of the JSON beside it."""
-_CLIPPED = 0.995
-"""Share of the points within the colours' range: the findings are drawn larger below."""
 _MOST_DRAWN = 60_000
 _AROUND = 1.2
 """Times a finding's size: how much is drawn around it."""
@@ -84,14 +82,6 @@ class _CheckedFigure:
     calibrated_mm: float | None
     value_mm: float
     expanded_mm: float | None
-
-
-@dataclass(frozen=True)
-class _ArtefactCheck:
-    """An artefact in words, and its figures."""
-
-    artefact: str
-    figures: tuple[_CheckedFigure, ...]
 
 
 @keeps_inputs
@@ -176,7 +166,7 @@ def write_findings(
         "software": f"uwlts {__version__}",
         "sources": [vars(source) for source in sources],
         "verification": [
-            {"artefact": check.artefact, "figures": [vars(figure) for figure in check.figures]} for check in checks
+            {"artefact": artefact, "figures": [vars(each) for each in figures]} for artefact, figures in checks
         ],
         "inspection": found.record(),
     }
@@ -217,8 +207,8 @@ def _sources(
     return sources
 
 
-def _artefact_check(path: str | Path, cloud: PointCloud) -> _ArtefactCheck:
-    """Figures of an artefact that was measured by the calibration that the cloud names."""
+def _artefact_check(path: str | Path, cloud: PointCloud) -> tuple[str, list[_CheckedFigure]]:
+    """Name and figures of an artefact that was measured by the calibration that the cloud names."""
     record, named = read_evaluation(path), cloud.metadata.get("calibration")
     if record.artefact is None or record.evaluation is None:
         raise EvaluationError(f"{path} is the evaluation of no artefact: give those of spheres, a step or a plane")
@@ -233,12 +223,12 @@ def _artefact_check(path: str | Path, cloud: PointCloud) -> _ArtefactCheck:
         known, key = record.uncertainty.get(name), keys.get(name)
         calibrated = None if key is None or key.calibrated is None else key.calibrated.value_mm
         rows.append(_CheckedFigure(name, calibrated, measured, None if known is None else known.expanded_mm))
-    return _ArtefactCheck(f"{record.evaluation.kind}, {record.cloud}", tuple(rows))
+    return f"{record.evaluation.kind}, {record.cloud}", rows
 
 
-def _check_rows(check: _ArtefactCheck) -> list[tuple[str, ...]]:
+def _check_rows(figures: Sequence[_CheckedFigure]) -> list[tuple[str, ...]]:
     rows = []
-    for each in check.figures:
+    for each in figures:
         fine = each.expanded_mm or _SMALLEST_MM
         calibrated = MISSING if each.calibrated_mm is None else f"{each.calibrated_mm:g}"
         stated = MISSING if each.expanded_mm is None else as_fine_as(each.expanded_mm, fine, digits=2)
@@ -247,7 +237,13 @@ def _check_rows(check: _ArtefactCheck) -> list[tuple[str, ...]]:
 
 
 def _page(
-    found: Inspection, cloud: PointCloud, sources: list[Source], checks: list[_ArtefactCheck], *, title: str, made: str
+    found: Inspection,
+    cloud: PointCloud,
+    sources: list[Source],
+    checks: list[tuple[str, list[_CheckedFigure]]],
+    *,
+    title: str,
+    made: str,
 ) -> str:
     parts = [each for each in found.features if each.kind in _BLEMISHES]
     whole = [each for each in found.features if each.kind not in (*_BLEMISHES, FeatureKind.SECTION, FeatureKind.HOLE)]
@@ -269,7 +265,7 @@ def _page(
         left_out=len(parts) - len(drawn),
         notes=found.notes,
         sources=[(each.role, each.name, each.note, each.sha256) for each in sources],
-        checks=[(check.artefact, _check_rows(check)) for check in checks],
+        checks=[(artefact, _check_rows(figures)) for artefact, figures in checks],
         stated=cloud.uncertainty is not None,
         searched=found.kind == "pipe",
         coverage=f"{100 * COVERAGE:.0f} %",
@@ -335,12 +331,6 @@ def _tiles(whole: list[Feature], parts: list[Feature]) -> list[Tile]:
             if not value.name.startswith("axis"):
                 tiles.append(Tile(f"{each.name}: {value.name}", f"{_with_interval(value)} {value.unit}"))
     return tiles
-
-
-def surface_limit_mm(deviation_mm: np.ndarray) -> float:
-    """Deviation at which the colours of an inspected surface end, so that all but its largest findings differ."""
-    seen = deviation_mm[np.isfinite(deviation_mm)]
-    return (float(np.quantile(np.abs(seen), _CLIPPED)) if len(seen) else 0.0) or 1e-3
 
 
 def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:

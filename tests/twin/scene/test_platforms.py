@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twin.scene.navigation import Navigation, Sea, drift_of, waves_of
+from twin.scene.guide_and_table import LinearGuide, RotaryTable
 from twin.scene.placed import Pose
-from twin.scene.platforms import IdealPath, LinearGuide, Robot, RotaryTable, Vehicle
+from twin.scene.platforms import IdealPath
+from twin.scene.robot import Robot
+from twin.scene.vehicle import Navigation, Sea, Vehicle, drift_of, waves_of
 from uwlts.errors import DescriptionError
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.pose_files import read_trajectory, write_trajectory

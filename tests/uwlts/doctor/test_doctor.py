@@ -160,7 +160,7 @@ def test_a_libllvm_that_is_none_is_a_warning_with_the_command_that_gets_one(tmp_
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "libLLVM.so"))
     (finding,) = examine_renderer()
     assert finding.status == "warning" and str(tmp_path) in finding.found
-    assert finding.advice.endswith("-m twin.backend.llvm --install")
+    assert finding.advice.endswith("-m twin.backend.llvm")
 
 
 # The machine

@@ -19,7 +19,6 @@ from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import ImageHeader
 from uwlts.storage.import_.centre_lines import profile_rows
 from uwlts.storage.import_.channels import is_formula, one_channel
-from uwlts.storage.import_.chromatic import chromatic_warnings
 from uwlts.storage.import_.folder_description import (
     NAME,
     ImportDescription,
@@ -31,7 +30,6 @@ from uwlts.storage.import_.images import bits_of, grey_values, without_backgroun
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
 from uwlts.stripe import Stripe
 from uwlts.stripe.capture_stripes import BLACK, FEWEST_LINES, WHITE, is_black, shown_stripe, white_share
-from uwlts.targets import parse_target
 
 _SIZE_ADVICE = {
     (True, True): "the images are turned by a quarter turn: turn them back, or exchange width_px and height_px of the "
@@ -224,11 +222,6 @@ def import_images(
         part_path(out).unlink(missing_ok=True)
         raise
     warnings = content.warnings()
-    if given.target is not None:
-        lamps = [folder / row.file for row in frames if row.light == "lamp"]
-        channel, wavelength = given.lamp_channel or given.channel, header.sensor.laser.wavelength_nm
-        target = parse_target(given.target)
-        warnings += chromatic_warnings(lamps, target, lamp_channel=channel, wavelength_nm=wavelength)
     if not in_time:
         warnings.append("the images are not in the order of their times, which are left out: the table's lines give it")
     if unmatched := matched.unmatched:
