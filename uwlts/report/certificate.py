@@ -55,7 +55,14 @@ def read_certificate(path: str | Path) -> dict[str, JsonValue]:
 
 
 def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
-    """Objections to a certificate and to its belonging to a calibration's file; none if both are as issued.
+    """Return objections to a certificate and to its belonging to a calibration's file; none if both are as issued.
+
+    Parameters
+    ----------
+    path : str or Path
+        Certificate (JSON) to verify.
+    calibration : str or Path
+        The calibration file that it is about.
 
     Raises
     ------

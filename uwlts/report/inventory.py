@@ -43,9 +43,16 @@ class DesignRow(NamedTuple):
 
 
 def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
-    """Resolution, line length, depth range and speckle limit of a sensor in one of its media by the design formulas.
+    """Calculate what a sensor can do by the design formulas: resolution, line length, depth range, speckle limit.
 
     Depths and ranges run along the camera's axis unless named otherwise.
+
+    Parameters
+    ----------
+    sensor : str, Path or Sensor
+        Name or path of a sensor description, or the description itself.
+    medium : str
+        One of the sensor's media.
 
     Raises
     ------
@@ -114,7 +121,12 @@ def table_lines(rows: list[DesignRow]) -> list[str]:
 
 
 def describe(path: str | Path) -> str:
-    """Text about a file, or about a sensor that ships with the package.
+    """Describe a file: a capture, cloud, calibration, mount, evaluation, or a sensor description (by name or path).
+
+    Parameters
+    ----------
+    path : str or Path
+        File, or name of a shipped sensor such as thesis.
 
     Raises
     ------

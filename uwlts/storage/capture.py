@@ -381,20 +381,6 @@ class Capture(AbstractContextManager["Capture"]):
         self.close()
 
 
-def open_capture(path: str | Path) -> Capture:
-    """Open a capture file (HDF5) for reading; CaptureError as from `Capture`.
-
-    Per-frame values are read at once, images when they are asked for: ``capture[12]`` is a `Frame`. A recording that is
-    still being written can be opened by its name ``NAME.part``; it has the frames that were complete then.
-
-    Examples
-    --------
-    >>> with uwlts.open_capture("spheres.h5") as capture:
-    ...     images = [frame.image for frame in capture if frame.laser_on]
-    """
-    return Capture(path)
-
-
 @contextmanager
 def opened_captures(captures: Iterable[Capture | str | Path]) -> Iterator[list[Capture]]:
     """A context with several captures, each as from `opened_capture`."""

@@ -27,7 +27,7 @@ NOBODY = 65534
 
 
 def doctor(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "uwlts.cli", "doctor", *arguments]
+    command = [sys.executable, "-m", "uwlts", "doctor", *arguments]
     return subprocess.run(command, cwd=folder, env=os.environ | environment, capture_output=True, text=True, timeout=60)
 
 

@@ -12,7 +12,7 @@ from uwlts.errors import CaptureError, Error, OutputError
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.storage.calibration_file import read_calibration, write_calibration
+from uwlts.storage.calibration_file import read_calibration
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def calibration() -> Calibration:
 
 @pytest.fixture
 def path(tmp_path: Path, calibration: Calibration) -> Path:
-    write_calibration(tmp_path / "calibration.json", calibration)
+    calibration.save(tmp_path / "calibration.json")
     return tmp_path / "calibration.json"
 
 
@@ -57,7 +57,7 @@ def test_everything_comes_back_exactly(path: Path, calibration: Calibration):
 
 def test_calibration_for_air_only(tmp_path: Path, calibration: Calibration):
     dry = calibration.model_copy(update={"window": None})
-    write_calibration(tmp_path / "dry.json", dry)
+    dry.save(tmp_path / "dry.json")
     assert read_calibration(tmp_path / "dry.json") == dry
 
 
@@ -65,16 +65,16 @@ def test_existing_file_is_only_replaced_on_demand(path: Path, calibration: Calib
     before = path.read_bytes()
     other = calibration.model_copy(update={"sensor_name": "other"})
     with pytest.raises(OutputError, match="exists already"):
-        write_calibration(path, other)
+        other.save(path)
     assert path.read_bytes() == before
-    write_calibration(path, other, overwrite=True)
+    other.save(path, overwrite=True)
     assert read_calibration(path).sensor_name == "other"
     assert list(path.parent.iterdir()) == [path]
 
 
 def test_folder_must_exist(tmp_path: Path, calibration: Calibration):
     with pytest.raises(OutputError, match="missing does not exist"):
-        write_calibration(tmp_path / "missing" / "a.json", calibration)
+        calibration.save(tmp_path / "missing" / "a.json")
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ def test_missing_keys_are_named(path: Path):
 @given(data=st.data())
 def test_random_damage_gives_only_known_errors(tmp_path: Path, calibration: Calibration, data):
     path = tmp_path / "a.json"
-    write_calibration(path, calibration, overwrite=True)
+    calibration.save(path, overwrite=True)
     content = bytearray(path.read_bytes())
     place = data.draw(st.integers(0, len(content) - 1))
     new = data.draw(st.binary(min_size=1, max_size=6) | st.sampled_from([b"NaN", b"null", b"[]", b"-", b"1e999", b"{"]))

@@ -16,14 +16,7 @@ from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.image_turns import refuse_turned_travel
 from uwlts.calibration.camera.lens import LensCalibration, LensChoice, calibrate_lens, half_doubt, jackknife
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
-from uwlts.calibration.capture_evidence import (
-    AirEvidence,
-    Progress,
-    StepEvidence,
-    air_evidence,
-    no_stripe_in,
-    step_evidence,
-)
+from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence, air_evidence, no_stripe_in, step_evidence
 from uwlts.calibration.sequential.sheet_fit import (
     SheetSolution,
     StripePoints,
@@ -38,6 +31,7 @@ from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor, Window
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture, source_of
 from uwlts.stripe import StripeSettings
 
@@ -129,7 +123,7 @@ def calibrate_sequentially(
     steps: Sequence[Capture] = (),
     *,
     options: CalibrationOptions | None = None,
-    progress: Progress | None = None,
+    progress: ProgressListener = unheard,
 ) -> CalibrationResult:
     """Calibrate a sensor from its captures; without step captures for use in the medium of the target's images only.
 
@@ -153,7 +147,11 @@ def calibrate_sequentially(
 
 
 def gather(
-    air: Sequence[Capture], steps: Sequence[Capture], *, options: CalibrationOptions, progress: Progress | None = None
+    air: Sequence[Capture],
+    steps: Sequence[Capture],
+    *,
+    options: CalibrationOptions,
+    progress: ProgressListener = unheard,
 ) -> Evidence:
     """Find the target, the stripes on it and on the step standard in all images; errors as `calibrate_sequentially`.
 
