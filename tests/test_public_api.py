@@ -113,8 +113,8 @@ def test_commands_run_with_their_defaults(line: str, monkeypatch: pytest.MonkeyP
 def test_messages_name_options():
     from uwlts.runtime.console import as_options
 
-    command = uwlts.cli.app["calibrate"].default_command
-    assert as_options("give `new_water` with `scan`, not `this`", command) == "give --new-water with --scan, not `this`"
+    names = inspect.signature(uwlts.cli.app["calibrate"].default_command).parameters
+    assert as_options("give `new_water` with ``scan``, not `this`", names) == "give --new-water with --scan, not `this`"
 
 
 @pytest.mark.parametrize("program", APPS)

@@ -47,7 +47,7 @@ def inspect_pipe(
     cloud
         Cloud of the object, or its file (.ply, .h5, .copc.laz; of other programs .las, .e57, and text in mm).
     section_mm
-        Length of a section along the pipe; up to twelve sections unless given.
+        Length of a section along the pipe (or a weld); up to twelve sections unless given.
     wall_mm
         Thickness of the pipe's undamaged wall, for the wall that remains.
     false_alarm

@@ -8,7 +8,7 @@ import ast
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cache, cached_property, reduce
@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from cyclopts import App, Parameter
 
-from uwlts.runtime.console import progress_bar
+from uwlts.runtime.console import as_options, progress_bar
 
 _LISTENERS = ("progress", "report", "warn")
 """Parameters by which functions show what they do; a command prints it."""
@@ -113,7 +113,7 @@ class Derived:
         self._package, self._function, self._also, self._shortcuts = package, function, also, shortcuts
         self._body = body
         self.__name__ = body.__name__
-        prose = summary or _sections(docstring(package, function))[0].replace("`", "")
+        prose = summary or _as_help(_sections(docstring(package, function))[0], descriptions(package, function))
         self.__doc__ = f"{prose.rstrip()}\n\n{inspect.getdoc(body)}"
 
     @property
@@ -193,7 +193,7 @@ def _options_of(package: ModuleType, function: str) -> dict[str, inspect.Paramet
         kind = None if name in _LISTENERS or one.kind is one.VAR_KEYWORD else typed(hints[name])
         if kind is None:
             continue
-        text, default = described[name].replace("`", ""), one.default
+        text, default = _as_help(described[name], described), one.default
         parameter = Parameter(help=text, negative="") if kind is bool else Parameter(help=text)
         if get_origin(kind) is tuple and get_args(kind)[-1] is ...:
             if default is not one.empty:
@@ -277,6 +277,11 @@ def descriptions(package: ModuleType, function: str) -> dict[str, str]:
         names = listed.split(" : ")[0].split(", ")
         found |= {name.lstrip("*"): elsewhere.get(name, " ".join(block.split())) for name in names}
     return found
+
+
+def _as_help(text: str, names: Collection[str]) -> str:
+    """Text of a docstring as a command's help: options in place of parameters, and no backticks."""
+    return as_options(text, names).replace("`", "")
 
 
 def _sections(text: str) -> list[str]:

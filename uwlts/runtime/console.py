@@ -5,7 +5,7 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
 from cyclopts import App, CycloptsError
@@ -66,7 +66,8 @@ def run(app: App) -> int:
     except CycloptsError:
         return USER_ERROR
     except Error as error:
-        print(f"error: {as_options(str(error), command)}", file=sys.stderr)
+        names = inspect.signature(command).parameters if callable(command) else ()
+        print(f"error: {as_options(str(error), names)}", file=sys.stderr)
         return USER_ERROR
     except KeyboardInterrupt:
         print("interrupted; what is complete is kept: run it again, recordings with --resume", file=sys.stderr)
@@ -80,9 +81,8 @@ def run(app: App) -> int:
     return 0
 
 
-def as_options(message: str, command: object) -> str:
-    """A function's message with the command's options in place of its parameters, which stand in backticks."""
-    options = inspect.signature(command).parameters if callable(command) else {}
+def as_options(text: str, names: Collection[str]) -> str:
+    """A function's text with the command's options in place of parameters with these names, which are in backticks."""
     return re.sub(
-        r"`(\w+)`", lambda found: f"--{found[1].replace('_', '-')}" if found[1] in options else found[0], message
+        r"(`+)(\w+)\1", lambda found: f"--{found[2].replace('_', '-')}" if found[2] in names else found[0], text
     )

@@ -310,6 +310,10 @@ class Capture(AbstractContextManager["Capture"]):
             )
         return dataset
 
+    def __repr__(self) -> str:
+        """Name of the file, and numbers of images."""
+        return f"Capture: {self.path.name}, {len(self)} images, {int(self.laser_on.sum())} with the laser on"
+
     def __len__(self) -> int:
         return self._count
 

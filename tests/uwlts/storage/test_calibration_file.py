@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
+import uwlts
 from uwlts.errors import CaptureError, Error, OutputError
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
@@ -187,3 +188,16 @@ def test_random_damage_gives_only_known_errors(tmp_path: Path, calibration: Cali
     else:
         assert np.isfinite(found.object_transform()).all()
         assert np.isfinite(found.camera.matrix()).all()
+
+
+def test_uncertainties_of_a_sequential_calibration_have_names():
+    residuals = {
+        "camera": {"std": {"f": 1.5, "cx": 0.25, "k1": 0.001}},
+        "sheet": {"normal_std_deg": 0.02},
+        "window": {"std_mm": 0.125},
+    }
+    known = uwlts.nominal("thesis", medium="water").model_copy(update={"residuals": residuals}).std()
+    assert (known.fx_px, known.fy_px, known.cx_px, known.cy_px) == (1.5, 1.5, 0.25, None)
+    assert known.distortion == {"k1": 0.001}
+    assert (known.sheet_normal_deg, known.window_distance_mm) == (0.02, 0.125)
+    assert uwlts.nominal("thesis", medium="water").std().fx_px is None
