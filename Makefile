@@ -29,7 +29,7 @@ help:
 	@echo "make clean   remove .venv, $(OLDEST), caches and build results"
 
 demo: setup
-	@$(PYTHON) -m twin.cli demo
+	@$(PYTHON) -m twin demo
 
 test: PYTEST_OPTIONS := -m "not slow"
 # Threads of two test processes on two cores would wait for each other in every small product of matrices.

@@ -54,7 +54,7 @@ def main() -> None:
                 water=[folder / "target-water.h5"],
                 step=sorted(path for path in folder.glob("step-*.h5") if ".truth." not in path.name),
             )
-            uwlts.write_calibration(folder / "calibration.json", calibration)
+            calibration.save(folder / "calibration.json")
         take = takes(load_campaign(plan), seed=number)[0]
         for name in given.scenes:
             for seed in given.seeds:

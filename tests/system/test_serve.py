@@ -299,7 +299,7 @@ def test_a_camera_that_is_gone_says_so_and_what_keeps_it_from_frames_ends_the_se
 def test_the_command_serves_until_it_is_interrupted(folder: Path, served):
     served.camera.disconnect()
     arguments = ["serve", folder / "board.toml", "--sensor", folder / "sensor.toml", "--ideal", "--spp", 1]
-    program = [sys.executable, "-m", "twin.cli", *map(str, arguments), "--stage-start", "50", "--speed-up", "50"]
+    program = [sys.executable, "-m", "twin", *map(str, arguments), "--stage-start", "50", "--speed-up", "50"]
     command = subprocess.Popen(
         program, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import math
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +30,7 @@ from twin.recording.campaigns import keep_to_plan
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import require_regular_file
 from uwlts.files.writing import written_aside
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import Lost, Workers
 
 _MOST_PART_BYTES = 2**28
@@ -151,7 +152,6 @@ def _report(search: optuna.Study, study: Study, columns: Columns) -> None:
             search.tell(number, state=TrialState.FAIL)
 
 
-Progress = Callable[[int, int], None]  # called with the number of designs that are done, and of how many
 PARTS = "screen"
 _FREE_TO_CHANGE = ("verify", "verify_tolerance", "refine", "title")
 """Settings that may differ when a sweep is resumed, besides the number of random, Sobol or optimised designs."""
@@ -176,7 +176,7 @@ def judged_part(batch: Batch) -> bytes:
     return as_part(judged(batch.study, batch.all()))
 
 
-def screen(study: Study, folder: Path, workers: Workers, *, progress: Progress = lambda done, total: None) -> None:
+def screen(study: Study, folder: Path, workers: Workers, *, progress: ProgressListener = unheard) -> None:
     """Judge all designs of a study that are not judged yet, into parts below ``folder``.
 
     DescriptionError where the folder holds another study, OutputError where a part cannot be written, SetupError where
@@ -211,7 +211,7 @@ def screen(study: Study, folder: Path, workers: Workers, *, progress: Progress =
         progress(done, total)
 
 
-def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progress: Progress) -> None:
+def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progress: ProgressListener) -> None:
     """Judge what the optimiser proposes, a generation at a time, shared among the workers."""
     search, free = _open_search(study, folder), study.free()
     space: dict[str, BaseDistribution] = {

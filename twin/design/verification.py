@@ -34,6 +34,7 @@ from uwlts import errors
 from uwlts.errors import Error
 from uwlts.files.writing import written_aside
 from uwlts.model.sensor import Sensor
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import Lost, Workers, work_through
 from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.cloud_files import read_cloud
@@ -151,7 +152,7 @@ def _record(
 
 def _run(command: str, *arguments: str, fails_as: type[Error]) -> None:
     """Run a command of the sensor's software; its complaint as an error of a class where it fails."""
-    line = [sys.executable, "-m", "uwlts.cli", command, *arguments, "--overwrite"]
+    line = [sys.executable, "-m", "uwlts", command, *arguments, "--overwrite"]
     done = subprocess.run(line, check=False, capture_output=True, text=True)
     if done.returncode == 0:
         return
@@ -274,7 +275,7 @@ def render(
     workers: Workers,
     *,
     variant: str,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> list[Agreement]:
     """Verify candidates, in their order; each result is kept in a file of ``folder``.
 

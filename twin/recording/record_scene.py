@@ -1,7 +1,7 @@
 """Recording of a scene into a capture, with its ground truth, and what a platform reports, in files beside it."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields
 from importlib.metadata import version
@@ -21,12 +21,11 @@ from twin.scene.platforms import Platform
 from uwlts.errors import OutputError
 from uwlts.model.sensor import Sensor, Table
 from uwlts.model.trajectory import Trajectory
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import CaptureHeader
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.pose_files import trajectory_path, write_trajectory
+from uwlts.storage.pose_files import trajectory_path
 from uwlts.storage.truth import Truth, TruthHeader, truth_path, write_truth
-
-Progress = Callable[[int, int], None]
 
 
 def record_scene(
@@ -38,7 +37,7 @@ def record_scene(
     options: Options = Options(),
     overwrite: bool = False,
     resume: bool = False,
-    progress: Progress | None = None,
+    progress: ProgressListener = unheard,
 ) -> None:
     """Render a scene into a capture at ``path`` and its ground truth into the file beside it.
 
@@ -49,11 +48,11 @@ def record_scene(
     """
     path = Path(path)
     if truth_path(path).exists() and not (overwrite or resume):
-        raise OutputError(f"{truth_path(path)} exists already; give another name, or --overwrite to replace it")
+        raise OutputError(f"{truth_path(path)} exists already; give another name, or `overwrite` to replace it")
     motion = scene.motion
     report = motion.course().report if isinstance(motion, Platform) else None
     if report is not None and trajectory_path(path).exists() and not (overwrite or resume):
-        raise OutputError(f"{trajectory_path(path)} exists already; give another name, or --overwrite to replace it")
+        raise OutputError(f"{trajectory_path(path)} exists already; give another name, or `overwrite` to replace it")
     studio = Studio(as_built or sensor, scene, options)
     # What an operator would note: nominal values only.
     header = CaptureHeader(
@@ -102,8 +101,7 @@ def record_scene(
         def end(index: int, taken: Future[None] | None) -> None:
             if taken is not None:
                 taken.result()
-            if progress is not None:
-                progress(index + 1, len(shots))
+            progress(index + 1, len(shots))
 
         # An image is exposed and written while the light of the next one is rendered.
         before: Future[None] | None = None
@@ -117,7 +115,7 @@ def record_scene(
             before = None if light is None else camera.submit(take, light, shot, index)
         end(len(shots) - 1, before)
         if report is not None:
-            write_trajectory(trajectory_path(path), Trajectory(*report), overwrite=overwrite or resume)
+            Trajectory(*report).save(trajectory_path(path), overwrite=overwrite or resume)
         described = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))
         truth = truth_of_recording(studio, truths, shots)
         write_truth(truth_path(path), described, truth, overwrite=overwrite or resume)

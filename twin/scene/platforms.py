@@ -188,7 +188,7 @@ class Route(Platform):
     """Base of platforms that follow a path of the sensor, as it is by the mount's drawing.
 
     ``waypoints`` are its places one after the other, or ``trajectory`` is a file of times and poses in
-    ``trajectory_format`` and ``trajectory_unit`` (`uwlts.read_trajectory`); a relative path starts at the scene's
+    ``trajectory_format`` and ``trajectory_unit`` (`uwlts.read`); a relative path starts at the scene's
     folder. Between them it follows Akima's curve (rotations a spline), at a speed of about ``speed_mm_per_s`` and at
     most ``turn_deg_per_s``. With a speed of 0 it stops at every waypoint.
     """

@@ -24,7 +24,7 @@ class PageBeside:
     """
 
     def __init__(self, capture: Path, *, calibration: str | Path | None, port: int, say: Callable[[str], None]):
-        command = [sys.executable, "-m", "uwlts.cli", "watch", str(capture), "--port", str(port)]
+        command = [sys.executable, "-m", "uwlts", "watch", str(capture), "--port", str(port)]
         self._command = [*command, "--calibration", str(calibration)] if calibration else command
         self._say = say
         self._process: subprocess.Popen[str] | None = None

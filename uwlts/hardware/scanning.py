@@ -26,6 +26,7 @@ from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, stripe_of,
 from uwlts.hardware.scan_plan import Light, ScanPlan, load_plan
 from uwlts.hardware.scan_watch import LOOKS, LaserWatch, LitPlace, Place, SlipWatch, centres_of, shows_laser, spread
 from uwlts.model.sensor import Sensor
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import CAPTURES, Capture, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
@@ -85,11 +86,13 @@ def scan(
     port: int = 8080,
     resume: bool = False,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
     report: Callable[[str], None] = lambda line: None,
     warn: Callable[[str], None] = lambda text: None,
 ) -> ScanProgress:
-    """Connect camera and stage and record a scan into a capture.
+    """Record a scan with a camera and a stage into a capture.
+
+    Moves, lets the stage settle, switches the laser, takes an image and stores it with the position read back.
 
     The plan is checked against travel and volume before anything moves; the laser goes off however the scan ends. An
     interrupted scan leaves its complete images in ``out.part``; ``resume`` goes on after them, at exposures that the
@@ -98,23 +101,27 @@ def scan(
     Parameters
     ----------
     plan : ScanPlan or path of a TOML file
-        Sensor, medium, positions, lights and exposures.
+        TOML file with sensor, medium, positions, lights and exposures (docs/how-to/scan.md).
     out : str or Path
         Capture to write.
     camera : str, optional
         Address of the camera, in place of the plan's: gige:NAME, genicam:PRODUCER.cti or replay:PATH.
     stage : str, optional
         Serial port of the stage, in place of the plan's.
-    home, unlock : bool
-        Find the limit switch first; or take the stage's position as it is, without homing.
+    home : bool
+        Find the limit switch first.
+    unlock : bool
+        Take the stage's position as it is, without homing.
     watch : bool
-        Show the recording in a browser meanwhile, as `watch` does.
+        Show the recording in a browser meanwhile, as uwlts watch does.
     calibration : str or Path, optional
-        Calibration of any kind for the cloud on that page.
+        Watched: calibration of the sensor, or one by polynomials, for the cloud.
     port : int
-        Port of that page; the next free one is taken if it is in use.
-    resume, overwrite : bool
-        Continue an interrupted scan; replace an existing capture.
+        Watched: port of the page; the next free one is taken if it is in use.
+    resume : bool
+        Continue an interrupted scan; refused if the plan is another than the one it began with.
+    overwrite : bool
+        Replace an existing capture.
     progress : callable, optional
         Called with the number of images done and the number in all.
     report, warn : callable, optional
@@ -141,7 +148,7 @@ def scan(
         raise DescriptionError(f"neither the plan nor the command line gives the {what}: give --{what}")
     if calibration:
         if not watch:
-            raise DescriptionError("--calibration is for the cloud on the page: give --watch too")
+            raise DescriptionError("`calibration` is for the cloud on the page: give `watch` too")
         load_calibration(calibration)
     with ExitStack() as stack:
         page = stack.enter_context(PageBeside(out, calibration=calibration, port=port, say=report)) if watch else None
@@ -174,7 +181,7 @@ def record_scan(
     stage: GrblStage,
     resume: bool = False,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
     report: Callable[[str], None] = lambda line: None,
     warn: Callable[[str], None] = lambda text: None,
     between: Callable[[], None] = lambda: None,
@@ -209,7 +216,7 @@ def record_scan(
     )
     if plan.continuous is not None:
         if resume:
-            raise DescriptionError("a continuous scan cannot be resumed: give --overwrite to scan again")
+            raise DescriptionError("a continuous scan cannot be resumed: give `overwrite` to scan again")
         ways_of(plan, plan.continuous, stage)
         rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
         seen = ScanProgress()
@@ -409,8 +416,8 @@ class _Taking:
         raise HardwareError(
             f"the stage has lost steps, or sensor or object were moved: the image back at {place.position_mm:g} mm "
             f"{seen}. All images are recorded, but from somewhere on at wrong positions: find the cause (feed, "
-            "acceleration, something in the way) and scan again with --overwrite, or take them as they are with "
-            "--resume"
+            "acceleration, something in the way) and scan again with `overwrite`, or take them as they are with "
+            "`resume`"
         )
 
     def _shorten(self, light: Light, position_mm: float) -> bool:

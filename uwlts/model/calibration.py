@@ -1,7 +1,7 @@
 """The calibrated sensor: everything reconstruction needs, stored as readable JSON with residuals and provenance."""
 
-from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -15,8 +15,12 @@ from pydantic import (
 )
 
 from uwlts.errors import problems_of
+from uwlts.files.json_files import write_model
+from uwlts.model.brief import Brief
 from uwlts.model.joint_estimate import JointEstimate, Origin
 from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, Table, UnitVector, Vector, Window
+
+FORMAT, VERSION = "uwlts-calibration", 1
 
 _Rows = tuple[tuple[float, float, float, float], ...]
 
@@ -51,6 +55,12 @@ def _with_numbers(figures: Table) -> Table:
         if not isinstance(value := figures.get(name), int | float | None):
             raise ValueError(f"{name} is {value!r}; expected a number")
     return figures
+
+
+def _numbers_in(figures: object) -> dict[str, float]:
+    """The finite numbers among figures by their names; none where there are no figures."""
+    known = figures.items() if isinstance(figures, dict) else ()
+    return {name: value for name, value in known if isinstance(value, int | float) and np.isfinite(value)}
 
 
 def _with_origin(provenance: Table) -> Table:
@@ -165,26 +175,31 @@ class KnownStage(Description):
     direction: Vector
 
 
-@dataclass(frozen=True)
-class StandardUncertainties:
-    """Standard uncertainties that the steps of a calibration found; None, or no entry, for what none of them did.
+class CalibrationStd(Description):
+    """Standard uncertainties of the parameters of a calibration; None for those that were not estimated, or not alone.
 
-    ``camera`` holds those of the camera's parameters by their names: f, fx, fy, cx and cy in px, and the distortion's.
-    ``sheet_normal_deg`` is that of the direction of the sheet's normal, ``window_distance_mm`` that of the window.
+    A single focal length for square pixels gives both ``fx_px`` and ``fy_px``. ``distortion`` is by the names of the
+    coefficients.
     """
 
-    camera: dict[str, float]
-    sheet_normal_deg: float | None
-    window_distance_mm: float | None
+    fx_px: float | None = None
+    fy_px: float | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
+    distortion: dict[str, float] = {}
+    sheet_normal_deg: float | None = None
+    window_distance_mm: float | None = None
 
 
-class Calibration(Description):
+class Calibration(Brief, Description):
     """A calibrated sensor.
 
     ``window`` is None where none stands in the light's way, or where its effect was left to focal length and
     distortion. Without a window the calibration holds in the kind of medium in which the target was seen,
-    ``medium_kind``; in water that is the approximation of a single viewpoint. ``camera_from_object`` is the 4x4 matrix
-    ``T_camera_object`` of the OCS: X normal to the sheet, Z along the laser's axis, Y along the stripe.
+    ``medium_kind``; in water that is the approximation of a single viewpoint. With a window it holds in all media, and
+    ``medium_kind`` is that of the target, or of a `uwlts.nominal` calibration that of the sheet.
+    ``camera_from_object`` is the 4x4 matrix ``T_camera_object`` of the OCS: X normal to the sheet, Z along the laser's
+    axis, Y along the stripe.
     ``stripe_along`` is as in the sensor description. ``media`` are those of the evidence: in just these the index
     found replaces the one that follows from the description. ``stages`` are those whose direction was found.
     ``residuals`` are named figures of each step, ``provenance`` what the calibration was made from. ``joint`` is the
@@ -231,20 +246,26 @@ class Calibration(Description):
         place = 1 + next((number for number, (key, _) in enumerate(figures) if key == "camera"), -1)
         return dict([*figures[:place], ("joint", self.joint.in_file()), *figures[place:]])
 
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the calibration as JSON, whole or not at all; OutputError if that fails."""
+        write_model(path, self, format=FORMAT, version=VERSION, overwrite=overwrite)
+
     def figures(self, step: str) -> Table:
         """Figures of a step among the residuals; none where there are none of it."""
         return self.residuals.get(step, {})
 
-    def std(self) -> StandardUncertainties:
-        """Standard uncertainties by the figures of its steps; those of a joint estimate are all in `joint`."""
-
-        def numbers(table: object) -> dict[str, float]:
-            known = table if isinstance(table, dict) else {}
-            return {name: value for name, value in known.items() if isinstance(value, int | float)}
-
-        sheet, window = (numbers(self.figures(step)) for step in ("sheet", "window"))
-        camera = numbers(self.figures("camera").get("std"))
-        return StandardUncertainties(camera, sheet.get("normal_std_deg"), window.get("std_mm"))
+    def std(self) -> CalibrationStd:
+        """Standard uncertainties of camera, sheet and window as far as the calibration states them."""
+        camera = _numbers_in(self.figures("camera").get("std"))
+        focal = camera.pop("f", None)
+        known: Table = {f"{name}_px": camera.pop(name, focal) for name in ("fx", "fy")}
+        known |= {f"{name}_px": camera.pop(name, None) for name in ("cx", "cy")}
+        others = {
+            "distortion": camera,
+            "sheet_normal_deg": _numbers_in(self.figures("sheet")).get("normal_std_deg"),
+            "window_distance_mm": _numbers_in(self.figures("window")).get("std_mm"),
+        }
+        return CalibrationStd.model_validate(known | others)
 
     def origin(self) -> Origin:
         """Evidence that the calibration was made from, by its provenance."""

@@ -56,7 +56,14 @@ def read_certificate(path: str | Path) -> dict[str, JsonValue]:
 
 
 def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
-    """Objections to a certificate and to its belonging to a calibration's file; none if both are as issued.
+    """Return objections to a certificate and to its belonging to a calibration's file; none if both are as issued.
+
+    Parameters
+    ----------
+    path : str or Path
+        Certificate (JSON) to verify.
+    calibration : str or Path
+        The calibration file that it is about.
 
     Raises
     ------
@@ -248,10 +255,9 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
         return tuple(_row(*row) for row in rows)
     camera, window = calibration.camera, calibration.window
     known = calibration.std()
-    std = known.camera
-    values = (
-        {"f": camera.fx_px} if "f" in std or camera.fx_px == camera.fy_px else {"fx": camera.fx_px, "fy": camera.fy_px}
-    )
+    std = {"f": known.fx_px, "fx": known.fx_px, "fy": known.fy_px, "cx": known.cx_px, "cy": known.cy_px}
+    std |= known.distortion
+    values = {"f": camera.fx_px} if camera.fx_px == camera.fy_px else {"fx": camera.fx_px, "fy": camera.fy_px}
     values |= {"cx": camera.cx_px, "cy": camera.cy_px}
     values |= {name: value for name, value in camera.distortion.model_dump().items() if value}
     rows = [_row(parameter_of(name), value, std.get(name)) for name, value in values.items()]

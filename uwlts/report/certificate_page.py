@@ -52,7 +52,7 @@ def write_certificate(
     Parameters
     ----------
     calibration : str or Path
-        Calibration file; only a joint calibration has uncertainties.
+        Calibration file; only a joint one has uncertainties.
     out : str or Path, optional
         Page to write; CALIBRATION.certificate.html unless given. The JSON goes beside it.
     before : str or Path, optional

@@ -26,8 +26,7 @@ from uwlts.inspection.features import (
     FeatureValue,
     Inspection,
 )
-from uwlts.inspection.inspect import InspectionKind, inspect
-from uwlts.inspection.pipe_form import LARGEST_OVALITY
+from uwlts.inspection.inspect import InspectionKind, inspected
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.sensor import Table
 from uwlts.pages.numbers import as_fine_as
@@ -96,19 +95,17 @@ def write_findings(
     calibration: str | Path | None = None,
     certificate: str | Path | None = None,
     verification: Sequence[str | Path] = (),
-    section_mm: float | None = None,
-    wall_mm: float | None = None,
-    false_alarm: float = 0.05,
-    largest_ovality: float = LARGEST_OVALITY,
-    datum: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
+    **options: Any,
 ) -> Inspection:
     """Inspect a cloud and write the report for the object's owner: a page, the same as JSON, and as PDF.
 
     Parameters
     ----------
-    cloud, kind, section_mm, wall_mm, false_alarm, largest_ovality, datum
-        As for `uwlts.inspect`.
+    cloud
+        File of the object's cloud.
+    kind
+        What the cloud shows.
     out
         Page to write; the JSON goes beside it, for pipe.html to pipe.findings.json.
     pdf
@@ -122,10 +119,12 @@ def write_findings(
     certificate
         Its certificate (JSON), whose seal is checked.
     verification
-        Evaluations (JSON of `uwlts.write_evaluation`) of artefacts that were measured by the same calibration; their
-        figures stand in the report.
+        Evaluations (JSON of uwlts evaluate) of artefacts that were measured by the same calibration; their figures
+        stand in the report.
     overwrite
         Replace existing files.
+    options
+        Those of the kind's inspection: `uwlts.inspect_pipe`, `uwlts.inspect_weld`, `uwlts.inspect_flange`.
 
     Raises
     ------
@@ -149,15 +148,7 @@ def write_findings(
     sources += [
         Source("verification", Path(each).name, sha256_of(each), "by the same calibration") for each in verification
     ]
-    found = inspect(
-        measured,
-        kind,
-        section_mm=section_mm,
-        wall_mm=wall_mm,
-        false_alarm=false_alarm,
-        largest_ovality=largest_ovality,
-        datum=datum,
-    )
+    found = inspected(measured, kind, **options)
     made = datetime.now(UTC).isoformat(timespec="seconds")
     text = _page(found, measured, sources, checks, title=title or f"Inspection of {path.name}", made=made)
     record: Table = {

@@ -32,7 +32,12 @@ from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth
 
 
 def describe(path: str | Path) -> str:
-    """Text about a file, or about a sensor that ships with the package.
+    """Describe a file: a capture, cloud, calibration, mount, evaluation, or a sensor description (by name or path).
+
+    Parameters
+    ----------
+    path : str or Path
+        File, or name of a shipped sensor such as thesis.
 
     Raises
     ------

@@ -8,10 +8,10 @@ from typing import Literal, get_args
 import numpy as np
 
 from uwlts.errors import DescriptionError
-from uwlts.files.json_files import read_model, write_model
+from uwlts.files.json_files import read_model
 from uwlts.files.writing import sha256_of
 from uwlts.model.library import read_table, validated
-from uwlts.model.mount import Mount
+from uwlts.model.mount import FORMAT, VERSION, Mount
 from uwlts.model.sensor import Description, Positive
 from uwlts.storage.cloud_files import is_cloud, read_cloud
 from uwlts.storage.import_.matching import natural_key
@@ -26,8 +26,6 @@ from uwlts.storage.pose_files import (
     read_columns,
     scaled,
 )
-
-FORMAT, VERSION = "uwlts-mount", 1
 
 Artefact = Literal["sphere", "plane", "step", "ring"]
 _SIZES: dict[Artefact, str] = {"sphere": "radius", "step": "height", "ring": "radius"}
@@ -254,11 +252,6 @@ def _points_of(columns: dict[str, np.ndarray], path: Path) -> np.ndarray:
             f"{path} has the columns {', '.join(columns)}; expected x and z, and y where there is one"
         )
     return np.column_stack([columns[name] for name in ("x", "y", "z") if name in columns])
-
-
-def write_mount(path: str | Path, mount: Mount, *, overwrite: bool = False) -> None:
-    """Write a mount as JSON, completely or not at all; OutputError if that fails."""
-    write_model(path, mount, format=FORMAT, version=VERSION, overwrite=overwrite)
 
 
 def read_mount(path: str | Path) -> Mount:

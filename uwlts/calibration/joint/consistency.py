@@ -55,7 +55,7 @@ def format_deviation(key: ParameterKey, value: float, known: float, std: float, 
                 "standard uncertainties off): check the target's spacing and the stage's scale"
             )
         case MediumIndex():
-            check = "the medium and the step's height in the captures, or --index"
+            check = "the medium and the step's height in the captures, or `index`"
         case StepHeight():
             check = "which standard it is"
             if value > known:
@@ -288,7 +288,7 @@ class SizeDeviation:
         return (
             f"{self.scan}: {self.quantity.words} found {found}, described as {described} ({self.off_mm:+.3f} mm or "
             f"{self.sigmas():.1f} standard uncertainties off): most likely it is described wrongly, check the artefact"
-            + (", or give --unknown-sizes" if self.known() else "; it was estimated")
+            + (", or give `unknown_sizes`" if self.known() else "; it was estimated")
         )
 
 

@@ -8,14 +8,7 @@ from pydantic import JsonValue
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.target_images import Placement, placements
-from uwlts.calibration.capture_evidence import (
-    AirEvidence,
-    Progress,
-    StepEvidence,
-    air_evidence,
-    no_stripe_in,
-    step_evidence,
-)
+from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence, air_evidence, no_stripe_in, step_evidence
 from uwlts.calibration.joint.parameters import SHEET, Prior, ViewMedium, window_values
 from uwlts.calibration.joint.residuals import BENDS, SHIFT, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
@@ -33,6 +26,7 @@ from uwlts.model.parameter_keys import (
 )
 from uwlts.model.sensor import Medium, Sensor, Uncertainty
 from uwlts.optics.brightness import sharp_lines, slopes_of_brightness
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeSettings, find_stripes
 
@@ -145,7 +139,7 @@ def gather_jointly(
     scans: Sequence[Capture] = (),
     *,
     options: CalibrationOptions,
-    progress: Progress | None = None,
+    progress: ProgressListener = unheard,
 ) -> Gathered:
     """Find the target, the stripes on it and those on steps and scanned surfaces in all images.
 

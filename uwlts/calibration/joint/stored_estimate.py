@@ -202,7 +202,7 @@ def covariance_root(covariance: np.ndarray) -> np.ndarray:
 def require_joint(calibration: Calibration) -> JointEstimate:
     """The joint estimate of a calibration; CalibrationError where it holds none."""
     if calibration.joint is None:
-        raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (--water or --joint)")
+        raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (`water` or `joint`)")
     return calibration.joint
 
 

@@ -52,7 +52,11 @@ def calibrate_mount(
     profile_times_s: np.ndarray | None = None,
     pose_times_s: np.ndarray | None = None,
 ) -> Mount:
-    """Find ``T_platform_sensor`` of any laser profiler from profiles of an artefact at an unknown fixed place.
+    """Calibrate the mount of a laser profiler on a robot or stage, from its profiles of a sphere, plane, step or ring.
+
+    Or that of a calibrated sensor, from a capture of one of them or of a target; or the axis of a rotary table. The
+    result is ``T_platform_sensor`` with its uncertainty, the poses that were left out, what the motions determine
+    badly, and the pose to add next.
 
     The platform's poses ``T_base_platform`` are known, as a robot's flange's. The artefact's place and the mount are
     estimated together by least squares of the distances of all points from the artefact, weighted by the noise of the
@@ -63,29 +67,39 @@ def calibrate_mount(
     Parameters
     ----------
     profiles
-        One array for each pose: (N, 2) with x along the profile and z, or (N, 3) with x, y, z in the sensor's frame, in
-        the order along the profile, mm, NaN where nothing was seen. Or a file or folder: a description (.toml) of
-        everything, a folder of CSV files, or one CSV file with a column ``pose``, or a cloud of `uwlts.reconstruct`
-        whose frames are the poses. Or, with a ``calibration``, a capture: of a target that its images with the laser
-        off show, else of an artefact that its laser images show.
+        Folder with one CSV file (columns x and z) for each pose, one CSV file with a column pose, a cloud whose frames
+        are the poses, or a description of everything (.toml; docs/how-to/calibrate-a-mount.md). With a calibration, a
+        capture of the artefact, or of a target that images with the laser off show. Or one array for each pose: (N, 2)
+        with x along the profile and z, or (N, 3) with x, y, z in the sensor's frame, in the order along the profile,
+        mm, NaN where nothing was seen.
     poses
-        ``T_base_platform`` (P, 4, 4), mm, or a CSV file with one pose a line; not needed for a capture that holds them.
-    artefact, radius_mm, height_mm
-        What is seen: a sphere, a plane, a step (two parallel faces), or a ring (a face, and a cylindrical wall square
-        to it). The radius of the sphere or of the ring's wall, or the height of the step, where it is known.
+        CSV file with the pose of the platform in the base frame for each profile, or image of the target; or
+        ``T_base_platform`` (P, 4, 4), mm. Those of the capture unless given.
+    artefact
+        What the profiles show: a sphere, a plane, a step (two parallel faces), or a ring (a face, and a cylindrical
+        wall square to it).
+    radius_mm
+        Radius of the sphere, or of the ring's wall; estimated unless given.
+    height_mm
+        Height of the step; estimated unless given.
     calibration
-        Of the sensor that took the capture, held fixed; what a joint estimate leaves open becomes part of the mount's
-        covariance. A target's images go to `uwlts.calibration.mount.board`.
-    pose_format, profile_unit, pose_unit
-        How files are to be read; see `uwlts.storage.pose_files.read_poses`.
+        Calibration of the sensor that took the capture, held fixed; what a joint estimate leaves open becomes part of
+        the mount's covariance.
+    pose_format
+        matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about the moved axes),
+        euler-zyx-deg (about the fixed axes) or another order, -rad for radians; angle-deg of a rotary table.
+    profile_unit
+        Unit of the profiles.
+    pose_unit
+        Unit of the positions.
     axis
-        The platform is a rotary table whose axis is not known, and which turns the sphere or target: the direction of
-        the sensor's frame that is nearest to the axis about which its angles turn counter-clockwise. The mount then
-        leads to a frame whose z axis is the table's (`uwlts.storage.pose_files.read_poses`, format ``angle-deg``).
+        The sphere or target stands on a rotary table whose axis is not known: direction in the sensor's frame nearest
+        to the axis about which angles turn it counter-clockwise. The mount then leads to a frame whose z axis is the
+        table's.
     scale
-        Estimate by which factor the robot's lengths are too short.
+        Estimate the robot's scale too.
     time
-        Estimate the offset to add to the times of the profiles; both have times then.
+        Estimate the offset to add to the profiles' times (columns time_s; the poses are a trajectory).
     profile_times_s, pose_times_s
         Times (P,) of the profiles and (M,) of the poses, which are then a trajectory of any number M of poses
         (`uwlts.Trajectory`).

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial import legendre
 from pydantic import JsonValue
 
-from uwlts.calibration.capture_evidence import AirEvidence, Progress, air_evidence
+from uwlts.calibration.capture_evidence import AirEvidence, air_evidence
 from uwlts.calibration.polynomial.polynomial_evidence import (
     PlateStripes,
     common_header,
@@ -17,7 +17,9 @@ from uwlts.calibration.polynomial.polynomial_evidence import (
 )
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.model.brief import Brief
 from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture, CaptureHeader, opened_captures
 from uwlts.stripe import StripeSettings
 
@@ -127,8 +129,8 @@ _LARGEST_MAP_SHARE = 0.004  # the map should be good to two thousandths of the c
 _LARGEST_LINE_EXCESS = 1.5  # 1 by chance, within a few percent for thousands of points
 
 
-@dataclass(frozen=True, eq=False)
-class PolynomialResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class PolynomialResult(Brief):
     """A polynomial calibration with everything a report shows of its making.
 
     Attributes
@@ -149,17 +151,21 @@ def calibrate_polynomials(
     *,
     degree: int = 6,
     stripe: StripeSettings = None,
-    progress: Progress | None = None,
+    progress: ProgressListener = unheard,
 ) -> PolynomialResult:
-    """Calibrate a sensor by polynomials, position to Z and Z to Y for each profile line.
+    """Calibrate by polynomials, position to Z and Z to Y for each profile line, completely in the medium of use.
 
     Parameters
     ----------
     target : sequence of Capture or path
-        A target in the medium of use, square to the laser's axis, that stands still in all captures while the stage
-        moves the sensor along Z. Images with the laser off show the target, those with the laser on, at the same
-        positions and in the same capture, the stripe on it.
-    degree : of all polynomials
+        Captures of a target that stands still, square to the laser's axis, while the stage moves the sensor along Z: at
+        every stage position one image under the lamp and one with the laser.
+    degree : int
+        Degree of the polynomials; there must be more stage positions.
+    stripe : StripeOptions or dict, optional
+        As for `reconstruct`.
+    progress : callable, optional
+        Called with the number of images done, the number in all, and the name of the stage.
 
     Returns
     -------

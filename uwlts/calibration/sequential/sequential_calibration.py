@@ -15,14 +15,7 @@ from uwlts._version import __version__
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import LensCalibration, LensChoice, calibrate_lens, half_doubt, jackknife
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, refuse_turned_travel, solve_camera
-from uwlts.calibration.capture_evidence import (
-    AirEvidence,
-    Progress,
-    StepEvidence,
-    air_evidence,
-    no_stripe_in,
-    step_evidence,
-)
+from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence, air_evidence, no_stripe_in, step_evidence
 from uwlts.calibration.sequential.sheet_fit import (
     SheetSolution,
     StripePoints,
@@ -36,6 +29,7 @@ from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor, Window
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture, source_of
 from uwlts.stripe import StripeSettings
 
@@ -125,7 +119,7 @@ def calibrate_sequentially(
     steps: Sequence[Capture] = (),
     *,
     options: CalibrationOptions | None = None,
-    progress: Progress | None = None,
+    progress: ProgressListener = unheard,
 ) -> CalibrationResult:
     """Calibrate a sensor from its captures; without step captures for use in the medium of the target's images only.
 
@@ -149,7 +143,11 @@ def calibrate_sequentially(
 
 
 def gather(
-    air: Sequence[Capture], steps: Sequence[Capture], *, options: CalibrationOptions, progress: Progress | None = None
+    air: Sequence[Capture],
+    steps: Sequence[Capture],
+    *,
+    options: CalibrationOptions,
+    progress: ProgressListener = unheard,
 ) -> Evidence:
     """Find the target, the stripes on it and on the step standard in all images; errors as `calibrate_sequentially`.
 

@@ -1,7 +1,6 @@
 """Import of a folder of images as a capture, with checks for black, saturated and stripe-free images."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +12,7 @@ from uwlts.errors import DescriptionError, ImageError
 from uwlts.files.command_files import keeps_inputs
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.sensor import Sensor, Table
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import CAPTURES, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.image_file import read_image
@@ -125,9 +125,9 @@ def import_images(
     *,
     description: str | Path | None = None,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> Imported:
-    """Write the images of a folder as a capture, whole or not at all.
+    """Turn a folder of images of any camera into a capture, written whole or not at all.
 
     Where laser images have a background, all images are stored with 16 bit, the laser images as the difference plus
     2^bits: the sign of the noise about zero is part of the evidence.
@@ -135,11 +135,11 @@ def import_images(
     Parameters
     ----------
     folder : str or Path
-        The images: PNG, TIFF, BMP or JPEG, in it or in folders below it.
+        Folder of PNG, TIFF, BMP or JPEG images, in it or in folders below it.
     out : str or Path
         Capture to write.
     description : str or Path, optional
-        TOML file of an `ImportDescription`; import.toml in the folder unless given.
+        TOML file with sensor, medium, positions, and which image is what; import.toml in the folder unless given.
     overwrite : bool
         Replace an existing capture.
     progress : callable

@@ -29,7 +29,7 @@ from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.report.certificate import certificate_of
-from uwlts.storage.calibration_file import read_calibration, write_calibration
+from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture
 
 BUILT = built_sensor()
@@ -245,7 +245,7 @@ def test_correlations_of_the_earlier_estimate_count(earlier, thesis):
 def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
     result = refreshed(earlier, steps(thesis), index_std=POORLY_KNOWN)
     path = tmp_path / "new.json"
-    write_calibration(path, result.calibration)
+    result.calibration.save(path)
     calibration = read_calibration(path)
     joint, before = calibration.joint, earlier.joint
     count = len(before.parameters)
@@ -310,7 +310,7 @@ def drawn(tmp_path_factory):
     sensor = drawn_stripes.SENSOR.model_copy(
         update={"laser": drawn_stripes.SENSOR.laser.model_copy(update={"window": square})}
     )
-    write_calibration(folder / "calibration.json", calibrated(sensor, sensor))
+    calibrated(sensor, sensor).save(folder / "calibration.json")
     return folder, sensor
 
 
