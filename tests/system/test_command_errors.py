@@ -169,7 +169,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "twin simulate scene.toml --sensor sensor.toml --out rendered.h5 --spp 1",
         ):
             assert exit_code(*line.split()) == 0, line
-    dry = read_calibration(folder / "calibration.json").model_copy(update={"window": None})
+    dry = read_calibration(folder / "calibration.json").model_copy(update={"window": None, "medium_kind": "air"})
     dry.save(folder / "dry.json")
     (folder / "campaigns" / "campaign-0").mkdir(parents=True)
     (folder / "campaign").mkdir()

@@ -233,7 +233,7 @@ def _record(job: _Job, report: Callable[[None], None]) -> None:
             overwrite=True,
             # What is there of an incomplete recording is a part to go on with, or lacks its truth.
             resume=part_path(job.path).exists(),
-            progress=lambda images, total: report(None),
+            progress=lambda done, total, stage="": report(None),
         )
     except Error as error:
         raise type(error)(f"{job.path}: {error}") from error

@@ -171,7 +171,7 @@ def align_trajectory(
     for turn, kind in enumerate((drift.kind or USUAL_DRIFT, _ROUGH)):
         estimate = PathEstimate(cloud, times, path, kind, stated=drift.kind)
 
-        def searched(done: int, total: int, turn: int = turn) -> None:
+        def searched(done: int, total: int, stage: str = "", turn: int = turn) -> None:
             progress(turn * total + done, (turn + 1) * total)
 
         doubtful = close_crossings(estimate, searched)

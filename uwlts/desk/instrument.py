@@ -374,7 +374,7 @@ class Instrument:
                 for number in range(0, len(earlier), -(-len(earlier) // _EARLIER) or 1):
                     view.see(earlier[number], number)
 
-        def progress(done: int, total: int) -> None:
+        def progress(done: int, total: int, stage: str = "") -> None:
             begun[:] = begun or [done - 1]
             board.count(done, total, before=begun[0])
             self._show_laser()
