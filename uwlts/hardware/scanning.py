@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.errors import DescriptionError, HardwareError
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import CameraDevice
@@ -71,7 +71,7 @@ class ScanProgress:
         return said
 
 
-@keeps_inputs
+@inputs_kept()
 def scan(
     plan: str | Path | ScanPlan,
     out: str | Path,
@@ -165,7 +165,7 @@ def scan(
         )
 
 
-@keeps_inputs
+@inputs_kept()
 def record_scan(
     plan: ScanPlan,
     out: Path,

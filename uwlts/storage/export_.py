@@ -13,7 +13,7 @@ import numpy as np
 import tomli_w
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import require_possible_name
 from uwlts.model.stripe import rows_of
 from uwlts.storage.capture import Capture
@@ -37,7 +37,7 @@ HEADER, TABLE = "header.json", "frames.csv"
 _COLUMNS = ("file", "light", "stage_mm", "exposure_ms", "time_s")
 
 
-@keeps_inputs
+@inputs_kept()
 def export(
     file: str | Path,
     out: str | Path,

@@ -10,7 +10,7 @@ import numpy as np
 
 from uwlts._version import __version__
 from uwlts.errors import DescriptionError, ImageError
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.sensor import Sensor, Table
 from uwlts.storage.capture import CAPTURES, Frame, part_path
@@ -120,7 +120,7 @@ class Imported:
     warnings: tuple[str, ...]
 
 
-@keeps_inputs
+@inputs_kept()
 def import_images(
     folder: str | Path,
     out: str | Path,
