@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from uwlts.storage.import_ import import_images
-from uwlts.storage.import_.chromatic import chromatic_warnings, laser_colour
+from uwlts.storage.import_.chromatic import chromatic_warnings
 from uwlts.targets import ChessboardTarget
 
 PHOTOGRAPHS = Path(__file__).parents[2] / "data" / "etna"
@@ -85,11 +85,3 @@ def test_an_import_succeeds_where_a_colour_does_not_show_the_target(tmp_path, la
     imported = import_images(described(tmp_path, channel="red", lamp_channel=lamp_channel), tmp_path / "a.h5")
     assert (imported.laser, imported.lamp) == (2, 2)
     assert not any("magnified" in each for each in imported.warnings)
-
-
-def test_colours_of_lasers():
-    assert [laser_colour(nm) for nm in (405.0, 450.0, 520.0, 532.0, 635.0, 660.0)] == [
-        *["blue"] * 2,
-        *["green"] * 2,
-        *["red"] * 2,
-    ]

@@ -1,4 +1,4 @@
-"""Colours that a lens magnifies differently: the target is seen in the lamp's, the stripe in the laser's."""
+"""Warning where the target is seen in another colour than the stripe, and the lens images them apart."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,30 +6,23 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.errors import Error
+from uwlts.optics.lateral_colour import colour_shift, laser_colour
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_.channels import one_channel
 from uwlts.targets import Target
 
-_MOST_IMAGES, _MOST_TRIED, _FEWEST_POINTS = 3, 6, 8
+_MOST_IMAGES = 3  # with the target in both colours; one alone covers little of the image
+_MOST_TRIED = 6  # an import is not to wait for a target that one colour does not show
+_FEWEST_POINTS = 8  # of an image: four would do for shift and magnification, without any to judge them by
 _OTHER_NUMBERS_PX = 5.0  # colours are never so far apart: points of a symmetric target were numbered in two ways
-_LEAST_PX, _SIGMAS = 0.1, 5.0  # from where two colours count as apart in the image's corners
-_BLUE_TO_GREEN_NM, _GREEN_TO_RED_NM = 490.0, 580.0
-
-
-def laser_colour(wavelength_nm: float) -> str:
-    """The channel of a colour camera that sees most of a laser's light."""
-    if wavelength_nm < _BLUE_TO_GREEN_NM:
-        return "blue"
-    return "green" if wavelength_nm < _GREEN_TO_RED_NM else "red"
 
 
 def chromatic_warnings(
     images: Sequence[Path], target: Target, *, lamp_channel: str | None, wavelength_nm: float
 ) -> list[str]:
-    """What speaks against taking the target from ``lamp_channel`` and the stripe from the laser's colour, in words.
+    """Warnings against taking the target from ``lamp_channel`` and the stripe from the laser's colour.
 
-    Of the first of the lamp images. The points of one colour are those of the other, moved and magnified
-    about the image's middle, as lateral chromatic aberration and a colour filter array do.
+    They are by the target's points in both colours, in the first of the lamp images.
     """
     colour = laser_colour(wavelength_nm)
     if lamp_channel in (None, colour):
@@ -51,15 +44,14 @@ def chromatic_warnings(
     if not pairs:
         return []
     lamp, laser = (np.vstack(points) for points in zip(*pairs, strict=True))
-    shift, magnified, certain = _magnified(lamp - size / 2, laser - size / 2)
-    corners = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]]) * size / 2
-    largest = float(np.linalg.norm(shift + (magnified - 1) * corners, axis=1).max())
-    if largest < _LEAST_PX or not certain:
+    shift = colour_shift(lamp, laser, size)
+    if not shift.significant:
         return []
     return [
         f"{colour}, the laser's colour, and {lamp_channel}, in which the target is seen, are apart in the image: "
-        f"{colour} is magnified by {magnified:.5f} and moved by {np.linalg.norm(shift):.2f} px, {largest:.2f} px in "
-        f"the corners: take the target from the laser's colour as well, lamp_channel = '{colour}'"
+        f"{colour} is magnified by {shift.magnification:.5f} and moved by {shift.shift_px:.2f} px, "
+        f"{shift.largest_px:.2f} px in the corners: take the target from the laser's colour as well, "
+        f"lamp_channel = '{colour}'"
     ]
 
 
@@ -72,13 +64,3 @@ def _seen(target: Target, raw: np.ndarray, channel: str) -> dict[tuple[int, ...]
     except Error:
         return {}
     return dict(zip(map(tuple, view.indices.tolist()), view.pixels, strict=True))
-
-
-def _magnified(places: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, float, bool]:
-    """Shift (2,) and magnification that lead from places (N, 2) to others, and whether they are certain."""
-    design = np.column_stack([np.tile(np.eye(2), (len(places), 1)), places.ravel()])
-    off = (others - places).ravel()
-    found = np.linalg.lstsq(design, off, rcond=None)[0]
-    variance = np.sum((off - design @ found) ** 2) / (off.size - 3)
-    std = np.sqrt(variance * np.diag(np.linalg.inv(design.T @ design)))
-    return found[:2], 1 + float(found[2]), bool((np.abs(found) > _SIGMAS * std).any())
