@@ -17,12 +17,12 @@ from .comparison.surface_mesh import mesh as mesh
 from .desk.guided import record_guided as record_guided
 from .desk.operator_page import serve_desk as serve_desk
 from .desk.recording_view import watch as watch
+from .desk.scan import scan as scan
 from .doctor import Finding as Finding, examine as examine
 from .errors import Error as Error
 from .evaluation.evaluate import Evaluation as Evaluation, evaluate as evaluate, write_evaluation as write_evaluation
 from .evaluation.gauge import GaugeStudy as GaugeStudy, gauge_study as gauge_study
 from .hardware.guided.record import GuidedRecording as GuidedRecording
-from .hardware.scanning import scan as scan
 from .inspection.features import Inspection as Inspection
 from .inspection.inspect import inspect as inspect
 from .model.calibration import Calibration as Calibration
