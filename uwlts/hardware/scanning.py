@@ -24,7 +24,7 @@ from uwlts.hardware.scan_watch import LOOKS, LaserWatch, LitPlace, Place, SlipWa
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.import_.images import without_background
+from uwlts.storage.import_.grey_values import without_background
 from uwlts.stripe import Stripe, StripeStatus
 
 _FAINT = 0.1

@@ -8,7 +8,7 @@ import numpy as np
 from uwlts.errors import Error
 from uwlts.optics.lateral_colour import colour_shift, laser_colour
 from uwlts.storage.image_file import read_image
-from uwlts.storage.import_.channels import one_channel
+from uwlts.storage.import_.grey_values import one_channel
 from uwlts.targets import Target
 
 _MOST_IMAGES = 3  # with the target in both colours; one alone covers little of the image
