@@ -203,6 +203,27 @@ class PointCloud(Brief):
         return None if self.uncertainty is None else self.uncertainty.covariance_mm2()
 
 
+def cloud_of(
+    points_mm: np.ndarray,
+    *,
+    intensity: np.ndarray | None = None,
+    frame: np.ndarray | None = None,
+    line: np.ndarray | None = None,
+    deviation_mm: np.ndarray | None = None,
+    time_s: np.ndarray | None = None,
+) -> PointCloud:
+    """A cloud of another program, whose intensity, frame or line may be unknown; CaptureError as from `PointCloud`."""
+    unknown = np.full(len(points_mm), NO_INDEX)
+    return PointCloud(
+        points_mm,
+        np.full(len(points_mm), np.nan) if intensity is None else intensity,
+        unknown if frame is None else frame,
+        unknown if line is None else line,
+        deviation_mm=deviation_mm,
+        time_s=time_s,
+    )
+
+
 def joined(parts: Sequence[PointCloud]) -> PointCloud:
     """One cloud of the parts of one cloud."""
     known = [part.uncertainty for part in parts if part.uncertainty is not None]
