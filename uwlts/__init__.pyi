@@ -32,7 +32,7 @@ from .model.polynomial_calibration import PolynomialCalibration as PolynomialCal
 from .model.sensor import Sensor as Sensor
 from .model.trajectory import Trajectory as Trajectory
 from .optics.nominal import nominal as nominal
-from .reconstruction.reconstruct import ScanCloud as ScanCloud, reconstruct as reconstruct
+from .reconstruction.reconstruct import reconstruct as reconstruct
 from .reconstruction.verify import Verification as Verification, verify as verify
 from .registration.register import RegisteredScans as RegisteredScans, register as register
 from .report import plot as plot
