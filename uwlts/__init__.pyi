@@ -28,7 +28,7 @@ from .model.sensor import Sensor as Sensor
 from .model.trajectory import Trajectory as Trajectory
 from .optics.design_table import design as design
 from .optics.nominal import nominal as nominal
-from .reconstruction.reconstruct import ScanCloud as ScanCloud, reconstruct as reconstruct
+from .reconstruction.reconstruct import reconstruct as reconstruct
 from .reconstruction.verify import verify as verify
 from .registration.register import register as register
 from .report import plot as plot

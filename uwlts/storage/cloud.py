@@ -133,6 +133,13 @@ class PointCloud(Brief):
         How well the points are known.
     metadata : dict
         Medium, sensor, artefact, capture, digest of the calibration; of a foreign cloud anything that JSON can hold.
+    lines_by_status : dict
+        Of the cloud of a whole capture, not kept in files: number of profile lines by the name of their `StripeStatus`,
+        and ``blurred`` by a joint calibration.
+    rays_by_status : dict
+        The same for stripe centres by the name of their `RayStatus`.
+    warnings : list of str
+        The same: what speaks against the calibration's being that of the sensor.
 
     Raises
     ------
@@ -148,6 +155,9 @@ class PointCloud(Brief):
     uncertainty: PointUncertainty | None = None
     time_s: np.ndarray | None = None
     metadata: Table = field(default_factory=dict)
+    lines_by_status: dict[str, int] = field(default_factory=dict)
+    rays_by_status: dict[str, int] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
     writer: ClassVar[Callable[..., None]]
     """How clouds are written: `uwlts.storage.cloud_files`, which knows the formats, sets it."""
 
