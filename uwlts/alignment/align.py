@@ -18,7 +18,7 @@ from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_prior import USUAL_DRIFT, DriftKind, PathSpline
 from uwlts.alignment.stated_drift import stated_drift
 from uwlts.errors import EvaluationError
-from uwlts.fitting.patches import scatter
+from uwlts.fitting.least_squares import noise_factor
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory, on_clock
 from uwlts.reconstruction.path_uncertainty import along_corrected_path
@@ -201,7 +201,7 @@ def _crossing(estimate: PathEstimate, pair: Pair) -> Crossing:
     for number, rows, sign in zip(pair, (now.target, now.source), (-1.0, 1.0), strict=True):
         shift += sign * (estimate.moved(number).places_mm - estimate.pieces[number].places_mm)[rows]
     before = now.distance_mm - np.einsum("qi,qi->q", shift, now.normals)
-    inside = np.abs(now.distance_mm) < 5 * now.std_mm * scatter(now.distance_mm / now.std_mm)
+    inside = np.abs(now.distance_mm) < 5 * now.std_mm * noise_factor(now.distance_mm / now.std_mm)
 
     def rms(values: np.ndarray, which: np.ndarray) -> float:
         return float(np.sqrt(np.mean(values[which] ** 2))) if which.any() else 0.0

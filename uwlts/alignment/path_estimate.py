@@ -15,27 +15,29 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, eigh, inv, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, inv, solve_triangular
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from uwlts.alignment.path_prior import USUAL_DRIFT, DriftKind, PathPrior, PathSpline
 from uwlts.errors import EvaluationError
+from uwlts.fitting.least_squares import biweight, noise_factor
 from uwlts.fitting.patches import (
+    LEAST_INFORMATION,
     PatchDistances,
     Patches,
     averaged_points,
     disc_radius,
     distances_between,
-    scatter,
+    information_of_slopes,
     surface_patches,
+    ways_of_moving,
 )
 from uwlts.storage.cloud import PointCloud
 
 Pair = tuple[int, int]
 """Numbers of two pieces that show the same surface, the earlier first."""
 
-_TUKEY = 4.685
 _VOXEL = 0.4
 """Of the radius of patches: points for a search by heights."""
 _WALKS = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 0.6)
@@ -78,10 +80,6 @@ _FEWEST_HELD_OUT = 10
 _PER_PARAMETER = 3.0
 """Independent distances of a crossing for each parameter of the path that it determines: a surface without features
 fits anywhere if the path may bend as much as it takes."""
-_NOISE = 5.0
-"""Times the information that the noise of normals alone would give: a movement with less is open."""
-_ROUNDING = 1e-9
-"""Of the information on the best determined movement: less is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -455,12 +453,10 @@ class PathEstimate:
                 continue
             std = found.std_mm[used]
             if seed is None:
-                std = std * scatter(found.distance_mm[used] / std)
-                u = np.clip(found.distance_mm[used] / (std * _TUKEY), -1, 1)
-            else:
-                u = np.zeros(len(std))
+                std = std * noise_factor(found.distance_mm[used] / std)
+            likely = biweight(found.distance_mm[used] / std) if seed is None else np.ones(len(std))
             # Both directions count by half.
-            ways.append((source, target, found, used, (1 - u * u) ** 2 / std**2 / (2 * patches[source].shared)))
+            ways.append((source, target, found, used, likely / std**2 / (2 * patches[source].shared)))
         if not ways:
             return np.zeros(0, int), np.zeros((0, 0)), np.zeros(0)
         middle = np.vstack([found.places_mm[used] for _, _, found, used, _ in ways]).mean(axis=0)
@@ -528,16 +524,15 @@ def _observable(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middl
     scale = np.repeat([1.0, 1 / float(np.sqrt(np.mean(np.sum(places**2, axis=1))))], 3)
     for found, used, weight in ways:
         normals, levers = found.normals[used], found.places_mm[used] - middle
-        by = np.hstack([normals, np.cross(levers, normals)]) * scale
+
+        def by_movement(directions: np.ndarray, levers: np.ndarray = levers) -> np.ndarray:
+            return np.hstack([directions, np.cross(levers, directions)]) * scale
+
+        by = by_movement(normals)
         normal += by.T @ (weight[:, None] * by)
-        across = np.cross(normals, np.eye(3)[np.argmin(np.abs(normals), axis=1)])
-        across /= np.linalg.norm(across, axis=1, keepdims=True)
-        for direction in (across, np.cross(normals, across)):
-            by = np.hstack([direction, np.cross(levers, direction)]) * scale
-            spurious += by.T @ ((weight * found.slope_variance[used])[:, None] * by)
-    metric = spurious + _ROUNDING / _NOISE * float(np.linalg.eigvalsh(normal)[-1]) * np.eye(6)
-    values, ways_of_moving = eigh(normal, metric)
-    open_ = ways_of_moving[:, values <= _NOISE]
+        spurious += information_of_slopes(normals, weight * found.slope_variance[used], by_movement)
+    values, movements, metric = ways_of_moving(normal, spurious)
+    open_ = movements[:, values <= LEAST_INFORMATION]
     return scale[:, None] * (np.eye(6) - open_ @ open_.T @ metric) / scale
 
 

@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist
 
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity, spread_mm
-from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD, RobustFit, fit_robustly
+from uwlts.fitting.least_squares import DEFAULT_K, RobustFit, fit_robustly, robust_std
 from uwlts.fitting.shapes import SphereFit, fit_sphere
 from uwlts.model.artefacts import SphereStandard
 
@@ -143,7 +143,7 @@ def _accepted(points: np.ndarray, usable: np.ndarray, centre: np.ndarray, radius
         if abs(fit.radius_mm - radius) > _RADIUS_TOLERANCE * radius:
             return None
         centre, distances, last = fit.centre_mm, fit.distances_mm(points), limit
-        spread = MAD_TO_STD * float(np.median(np.abs(fit.residuals_mm - np.median(fit.residuals_mm))))
+        spread = robust_std(fit.residuals_mm - np.median(fit.residuals_mm))
         limit = min(max(DEFAULT_K * spread, _SMALLEST_LIMIT * radius), _LARGEST_LIMIT * radius)
         if abs(limit - last) <= 0.05 * last:
             break

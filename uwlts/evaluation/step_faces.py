@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD, accepted_points, evenly_thinned, principal_axes
+from uwlts.fitting.least_squares import DEFAULT_K, accepted_points, evenly_thinned, principal_axes, robust_std
 from uwlts.fitting.shapes import fit_line, fit_plane
 from uwlts.runtime.compiled import compiled
 
@@ -186,6 +186,6 @@ def _near_level(heights: np.ndarray, level: float, height: float) -> np.ndarray:
         if not len(near):
             break
         level = float(np.median(near))
-        spread = MAD_TO_STD * float(np.median(np.abs(near - level)))
+        spread = robust_std(near - level)
         limit = float(np.clip(DEFAULT_K * spread, _LIMITS[0] * height, _LIMITS[1] * height))
     return np.abs(heights - level) <= limit

@@ -12,23 +12,24 @@ from dataclasses import dataclass, replace
 from itertools import combinations, pairwise, permutations
 
 import numpy as np
-from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.patches import PatchDistances, Patches, distances_between, scatter
+from uwlts.fitting.least_squares import biweight, noise_factor
+from uwlts.fitting.patches import (
+    LEAST_INFORMATION,
+    PatchDistances,
+    Patches,
+    distances_between,
+    information_of_slopes,
+    ways_of_moving,
+)
 from uwlts.registration.marker_spheres import MarkerSphere, common_markers
 
-_TUKEY = 4.685
-"""Of Tukey's biweight, in standard deviations: 95 % efficient for normal noise."""
 _FEWEST = 12
 """Patches of an overlap; a movement has six parameters."""
-_NOISE = 5.0
-"""Times the information that the noise of normals alone would give: a direction with less is open."""
 _OWN_PART = 1e-4
 """Variance of a pattern that no other scan has, of one: a hundredth of its errors, as temperature and load change."""
-_ROUNDING = 1e-9
-"""Of the information of the best determined direction: less is rounding."""
 _SPHERE_REACH = 0.25
 """Of the diameter: how far the centres of one sphere lie apart in two scans, at most."""
 
@@ -154,10 +155,8 @@ class JointRegistration:
         within = np.linalg.solve(beside, normal[count:, :count])
         reduced = normal[:count, :count] - normal[:count, count:] @ within
         reduced = (reduced + reduced.T) / 2
-        rounding = _ROUNDING / _NOISE * float(np.linalg.eigvalsh(reduced)[-1])
-        metric = spurious + max(rounding, 1e-300) * np.eye(count)
-        values, vectors = eigh(reduced, metric)
-        known = values > _NOISE
+        values, vectors, metric = ways_of_moving(reduced, spurious)
+        known = values > LEAST_INFORMATION
         ways, strengths = vectors[:, known], values[known]
         down = gradient[:count] - within.T @ gradient[count:]
         open_ways = np.linalg.qr(vectors[:, np.logical_not(known)])[0]
@@ -236,15 +235,14 @@ class JointRegistration:
     ) -> PairEvidence:
         unknown, count = len(self.units), self.unknown_poses
         relative = np.concatenate([each.distance_mm / each.std_mm for *_, each in ways]) if ways else np.empty(0)
-        spread = scatter(relative)
+        spread = noise_factor(relative)
         blocks, residuals, weights, deviations = [], [], [], []
         spurious = np.zeros((count, count))
         for source, target, found in ways:
             std = found.std_mm * spread
-            u = np.clip(found.distance_mm / std / _TUKEY, -1, 1)
             # Both directions count by half, and K scans of one place have K (K - 1) / 2 pairs and K - 1 differences.
             each = 1 / (others[source][found.source] * self.patches[source].alike(len(found.source)))
-            weight = (1 - u * u) ** 2 / std**2 * each
+            weight = biweight(found.distance_mm / std) / std**2 * each
             block = np.zeros((len(weight), unknown))
             for number, rows, sign in ((source, found.source, 1.0), (target, found.target, -1.0)):
                 if len(columns := self.pose_columns[number]):
@@ -288,16 +286,15 @@ class JointRegistration:
 
     def _spurious(self, source: int, target: int, found: PatchDistances, weight: np.ndarray) -> np.ndarray:
         """Information (P, P) that the noise of the normals alone would give."""
-        across = np.cross(found.normals, np.eye(3)[np.argmin(np.abs(found.normals), axis=1)])
-        across /= np.linalg.norm(across, axis=1, keepdims=True)
-        result = np.zeros((self.unknown_poses,) * 2)
-        for direction in (across, np.cross(found.normals, across)):
+
+        def by_poses(directions: np.ndarray) -> np.ndarray:
             block = np.zeros((len(weight), self.unknown_poses))
             for number, sign in ((source, 1.0), (target, -1.0)):
                 if len(columns := self.pose_columns[number]):
-                    block[:, columns] = sign * self._by_pose(number, found.places_mm, direction)
-            result += block.T @ ((weight * found.slope_variance)[:, None] * block)
-        return result
+                    block[:, columns] = sign * self._by_pose(number, found.places_mm, directions)
+            return block
+
+        return information_of_slopes(found.normals, weight * found.slope_variance, by_poses)
 
     def _from_start(self) -> np.ndarray:
         """Shifts and turns (P,) of the poses from the start."""
