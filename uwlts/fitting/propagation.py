@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty, images_along, variance_along
+from uwlts.storage.cloud import PointCloud, PointUncertainty, images_along, matrices_of, variance_along
 
 _SEED = 635
 """Of all draws: the same cloud has the same uncertainties."""
@@ -122,9 +122,7 @@ def covariance_of_groups(along: np.ndarray, group: np.ndarray) -> np.ndarray:
 
 def noise_mm(uncertainty: PointUncertainty) -> np.ndarray:
     """Return the move (N, 3) of each point for one standard deviation of its stripe centre; of either sign."""
-    covariance = np.zeros((len(uncertainty.random_mm2), 3, 3))
-    for column, (i, j) in enumerate(PAIRS):
-        covariance[:, i, j] = covariance[:, j, i] = uncertainty.random_mm2[:, column]
+    covariance = matrices_of(uncertainty.random_mm2.astype(np.float64))
     # The covariance is v v^T: its column with the largest element on the diagonal is v times that of v.
     largest = np.argmax(np.einsum("nii->ni", covariance), axis=1)
     rows = np.arange(len(covariance))

@@ -39,12 +39,16 @@ _MOST_CELLS = 4_000_000
 _ROUNDS = 10
 _FEWEST = 6
 """Points of an indication."""
-_NEIGHBOURS, _OUTLIER = 9, 6.0
-"""Nearest points with which each is compared, and robust standard deviations from their median that make an outlier."""
+_NEIGHBOURS = 9
+"""Nearest points with which each is compared."""
+_OUTLIER = 6.0
+"""Robust standard deviations from their median that make an outlier."""
 _EDGE_SHARE = 0.1
 """Of a blemish's depth, where its region ends."""
-_GROWN, _GROWTH = 3, 1.7
-"""Times that the window about a peak grows, where its region reaches the edge, and by how much."""
+_GROWN = 3
+"""Times that the window about a peak grows at most, if its region reaches the edge."""
+_GROWTH = 1.7
+"""Growth of the window's side."""
 _CORE = 0.8
 """Of the bell's radius: points that belong to the peak in any case."""
 _EDGE_STD = 3.0

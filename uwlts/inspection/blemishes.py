@@ -24,15 +24,22 @@ from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.blemish_search import BlemishSearch, Indication, UnrolledSurface
 from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR, FeatureKind, FeatureValue, plain_value
 
-_DRAWS, _TO_LEVEL, _SEED = 120, 48, 635
-"""Three are beyond either end of a 95 % interval; a standard deviation of the second number is right to 10 %."""
+_DRAWS = 120
+"""Draws of noise: three are beyond either end of a 95 % interval."""
+_TO_LEVEL = 48
+"""Draws for the noise of depths: their standard deviation is right to 10 %."""
+_SEED = 635
+"""Of the draws, so that the same cloud has the same values."""
 _EXPONENTS = 1, 2, 3
 """Of bells (1 - t^2)^p: from a paraboloid with a sharp edge to one that runs out slowly."""
-_BANDWIDTH, _POINTS = 0.35, 150
-"""Radius of the local quadratic in the blemish's, with which it lowers the depth of a bell by 0.3 %, or less where a
-smaller one holds so many points: with these the noise is a sixth of one point's."""
-_EDGE_SHARE, _EDGE_STD = 0.1, 3.0
-"""Depth of the contour: a tenth of the blemish's, as metal loss is boxed in pipe inspection, and above the noise."""
+_BANDWIDTH = 0.35
+"""Radius of the local quadratic, relative to the blemish's: it lowers the depth of a bell by 0.3 %."""
+_POINTS = 150
+"""Points in the local quadratic from which its radius is smaller: the noise is a sixth of one point's."""
+_EDGE_SHARE = 0.1
+"""Depth of the contour, relative to the blemish's, as metal loss is boxed in pipe inspection."""
+_EDGE_STD = 3.0
+"""Least depth of the contour in standard deviations of the depths."""
 _RING = 0.6
 """Width of the surroundings in the blemish's radius."""
 _FEWEST = 12

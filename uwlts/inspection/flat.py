@@ -27,8 +27,10 @@ from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, Inspec
 from uwlts.storage.cloud import PointCloud
 
 _FEWEST = 200
-_PROPOSALS, _THINNED = 600, 3000
-"""Planes through three points tried for the largest face, and points on which they are judged."""
+_PROPOSALS = 600
+"""Planes through three points that are tried for the largest face."""
+_THINNED = 3000
+"""Points on which they are judged."""
 _NEAR_SHARE = 2e-3
 """Of the cloud's size: how near to a proposed plane a point has to be; flatter faces than that are refined after."""
 _OFF_FACE = 6.0

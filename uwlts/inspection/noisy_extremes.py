@@ -17,8 +17,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from uwlts.fitting.least_squares import robust_std
 from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR
 
-_DRAWS, _SEED = 2000, 635
-"""Fifty are beyond a quantile of 97.5 %, which is right to a tenth of a standard deviation."""
+_DRAWS = 2000
+"""Draws of noise: fifty are beyond a quantile of 97.5 %, which is right to a tenth of a standard deviation."""
+_SEED = 635
+"""Of the draws, so that the same profiles have the same values."""
 _TO_NO_NOISE = 1 / (np.sqrt(2) - 1)
 """Noise once more adds this part of what the noise itself has added, where that is proportional to its deviation."""
 

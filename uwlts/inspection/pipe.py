@@ -16,10 +16,11 @@ from uwlts.inspection.features import Feature, FeatureKind, Inspection
 from uwlts.inspection.pipe_form import LARGEST_OVALITY, MOST_OFF_SHARE, PipeForm, fit_pipe, pipe_features, refit_pipe
 from uwlts.storage.cloud import PointCloud
 
-_OVERLAP, _SEARCHED = 0.6, 0.1
-"""Radians by which both sides of a pipe that is cut open overlap, unless as many without a point part them; and by
-which findings count beyond the cut. Farther beyond it points are surroundings alone: findings there have less of these
-than on the other side, where they are found, too."""
+_OVERLAP = 0.6
+"""Angle, rad, by which both sides of a pipe that is cut open overlap, unless as much without a point parts them."""
+_SEARCHED = 0.1
+"""Angle, rad, by which findings count beyond the cut. Farther beyond it points are surroundings alone: findings there
+have less of these than on the other side, where they are found, too."""
 _FEWEST = 500
 """Points from which a pipe's surface can be searched."""
 

@@ -18,7 +18,10 @@ _TO_START = 6000
 """Points for the first cylinder; more add nothing to a start."""
 _MOST_POINTS = 150_000
 """Points for the form; with more what remains is common to all of them."""
-_ROUNDS, _STILL_MM = 12, 1e-6
+_ROUNDS = 12
+"""Rounds of the axis at most; each divides its error by some ten."""
+_STILL_MM = 1e-6
+"""Move of the axis that ends the rounds."""
 _SECTORS = 72
 """Sectors of 5 deg, as of a pipe standard (`uwlts.evaluation.artefact_figures`)."""
 _LEAST_ARC = np.pi
@@ -28,8 +31,10 @@ LARGEST_OVALITY = 0.02
 specification is given. A choice: pipes bent in the yard or dented by handling are less round than new line pipe."""
 _WHOLE_ARC = np.radians(300.0)
 """Arc from which the third and fourth harmonics are fitted too, so that they do not pass for others."""
-_FEWEST_OF_SECTION, _LEAST_SHARE = 60, 0.8
-"""Points of a section, and the part of the whole pipe's arc (up to half of its circumference) that it shows."""
+_FEWEST_OF_SECTION = 60
+"""Points of a section."""
+_LEAST_SHARE = 0.8
+"""Part of the whole pipe's arc (up to half of its circumference) that a section shows."""
 _MOST_SECTIONS = 12
 MOST_OFF_SHARE = 0.06
 """Of the radius: the deepest blemish or ovality that still counts as the pipe's surface."""

@@ -42,8 +42,10 @@ _FEWEST = 500
 _TO_START = 20_000
 _DRAWS = 32
 """The standard deviation of so many is right to 13 %."""
-_TOGETHER_HIGH, _TOGETHER_DEEP = 3, 5
-"""Neighbouring sections of which the largest height and undercut are means: single ones would be the noise's."""
+_TOGETHER_HIGH = 3
+"""Neighbouring sections of which the largest height is the mean: that of a single one would be the noise's."""
+_TOGETHER_DEEP = 5
+"""Neighbouring sections of which the largest undercut is the mean."""
 _MOST_SECTIONS = 100
 _POINTS_IN_SECTION = 80
 _BANDWIDTH_SHARE = 0.04

@@ -33,8 +33,10 @@ _NEGLIGIBLE_MM = 5e-5
 _FEWEST_NEIGHBOURS = 10
 # Points by which patterns are chosen: their root mean square is within some percent that of all.
 _SAMPLED = 500
-_TABLE_TOLERANCE_MM, _LEFT_OUT_MM = 1e-6, 1e-9
-"""Error of tabulated moves of points, and by what their last terms may add up that are left out."""
+_TABLE_TOLERANCE_MM = 1e-6
+"""Error of tabulated moves of points."""
+_LEFT_OUT_MM = 1e-9
+"""Sum of the last terms of a table that may be left out."""
 
 
 def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:

@@ -26,10 +26,16 @@ from uwlts.fitting.patches import (
 )
 from uwlts.registration.marker_spheres import MarkerSphere, common_markers
 
-_FEWEST = 12
-"""Patches of an overlap; a movement has six parameters."""
+FEWEST_OF_PAIR = 12
+"""Patches of an overlap that counts: two for each of the six parameters of a movement."""
 _OWN_PART = 1e-4
 """Variance of a pattern that no other scan has, of one: a hundredth of its errors, as temperature and load change."""
+NARROWER = 0.8
+"""Reach of a round relative to that of the round before."""
+_PAIR_REACH = 4.0
+"""Reach of the first round of a pair's own fit, in patch radii: a search is right to about one."""
+_PAIR_ROUNDS = 12
+"""Rounds of a pair's own fit: after seven the reach is one patch radius."""
 _SPHERE_REACH = 0.25
 """Of the diameter: how far the centres of one sphere lie apart in two scans, at most."""
 
@@ -115,29 +121,34 @@ class JointRegistration:
 
     def evidence(self, reach_mm: float) -> dict[tuple[int, int], PairEvidence]:
         """What all pairs of scans that overlap or share spheres say, about the present state."""
-        moved = [self._moved(number) for number in range(len(self.patches))]
-        found: dict[tuple[int, int], PatchDistances] = {}
-        others = [np.ones(len(each)) for each in moved]
-        for a, b in permutations(range(len(moved)), 2):
-            distances = distances_between(moved[a], self.poses[a], moved[b], self.poses[b], reach_mm=reach_mm)
-            if len(distances.source):
-                found[a, b] = distances
-                others[a][distances.source] += 1
+        found = self._distances(reach_mm)
+        others = [np.ones(len(each)) for each in self.patches]
+        for (a, _), distances in found.items():
+            others[a][distances.source] += 1
         centres = [self._centres(number) for number in range(len(self.markers))]
         common = common_markers(centres, _SPHERE_REACH * (self.sphere_mm or 0.0))
         pairs = {}
-        for a, b in combinations(range(len(moved)), 2):
+        for a, b in combinations(range(len(self.patches)), 2):
             ways = [
                 (source, target, found[source, target])
                 for source, target in ((a, b), (b, a))
                 if (source, target) in found
             ]
-            if sum(len(distances.source) for *_, distances in ways) < _FEWEST:
+            if sum(len(distances.source) for *_, distances in ways) < FEWEST_OF_PAIR:
                 ways = []
             shared = [(views[a], views[b], len(views)) for views in common if a in views and b in views]
             if ways or shared:
                 pairs[a, b] = self._pair(a, b, ways, others, shared)
         return pairs
+
+    def narrow_overlaps(self, reach_mm: float) -> tuple[tuple[int, int, int], ...]:
+        """Return the pairs of scans that overlap too little to count, with the number of patches."""
+        found = self._distances(reach_mm)
+        counts = {
+            (a, b): sum(len(found[way].source) for way in ((a, b), (b, a)) if way in found)
+            for a, b in combinations(range(len(self.patches)), 2)
+        }
+        return tuple((a, b, count) for (a, b), count in counts.items() if 0 < count < FEWEST_OF_PAIR)
 
     def solved(self, pairs: Sequence[PairEvidence]) -> Solved:
         """The least-squares step by the evidence of pairs and what is known beforehand."""
@@ -205,6 +216,15 @@ class JointRegistration:
                 f"{', '.join(lost)}: no overlap with {names[0]} or with what overlaps it. Give better poses at the "
                 "start, a larger reach, spheres, or search the start (search)"
             )
+
+    def _distances(self, reach_mm: float) -> dict[tuple[int, int], PatchDistances]:
+        """Distances of the patches of each scan from each other one that it overlaps."""
+        moved = [self._moved(number) for number in range(len(self.patches))]
+        found = {
+            (a, b): distances_between(moved[a], self.poses[a], moved[b], self.poses[b], reach_mm=reach_mm)
+            for a, b in permutations(range(len(moved)), 2)
+        }
+        return {pair: distances for pair, distances in found.items() if len(distances.source)}
 
     def _moved(self, number: int) -> Patches:
         patches, amounts = self.patches[number], self.patterns[number]
@@ -301,6 +321,25 @@ class JointRegistration:
         turned = Rotation.from_matrix(self.poses[1:, :3, :3] @ self.start[1:, :3, :3].transpose(0, 2, 1)).as_rotvec()
         before = np.einsum("nij,nj->ni", self.start[1:, :3, :3], self.local_middles[1:]) + self.start[1:, :3, 3]
         return np.hstack([self.middles_mm[1:] - before, turned]).ravel()
+
+
+def fit_pair(source: Patches, target: Patches, start: np.ndarray) -> tuple[np.ndarray, PatchDistances] | None:
+    """Fit a pose (4, 4) that brings patches onto others, from a start; return it and the distances then.
+
+    None if they do not overlap, or if their shape leaves a direction open, as a pipe or a plane does: any place along
+    it would fit as well.
+    """
+    joint = JointRegistration([target, source], [[], []], np.array([np.eye(4), start]), start_std=None, sphere_mm=None)
+    reach = _PAIR_REACH * max(source.radius_mm, target.radius_mm)
+    for _ in range(_PAIR_ROUNDS):
+        if not (pairs := joint.evidence(reach)):
+            return None
+        joint.move(joint.solved(list(pairs.values())).step)
+        reach = max(NARROWER * reach, source.radius_mm)
+    pairs = joint.evidence(reach)
+    if not pairs or len(joint.solved(list(pairs.values())).open_directions):
+        return None
+    return joint.poses[1], distances_between(source, joint.poses[1], target, np.eye(4), reach_mm=reach)
 
 
 def _alike(patterns: Sequence[np.ndarray], shared: Sequence[dict[str, np.ndarray]]) -> np.ndarray:
