@@ -16,7 +16,7 @@ from scipy.linalg import eigh
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.storage.cloud import PAIRS, PointUncertainty
+from uwlts.storage.cloud import PointUncertainty, variance_along
 
 _CELLS_PER_RADIUS = 3.0
 """Points are averaged in cubes of a third of the disc's radius: 28 of them fill a disc, enough for 6 coefficients."""
@@ -240,6 +240,10 @@ class PatchDistances:
     std_mm: np.ndarray
     slope_variance: np.ndarray
 
+    def __getitem__(self, selection: np.ndarray) -> PatchDistances:
+        """Some of the distances, by indices or a mask."""
+        return PatchDistances(*(values[selection] for values in vars(self).values()))
+
 
 def distances_between(
     source: Patches, source_pose: np.ndarray, target: Patches, target_pose: np.ndarray, *, reach_mm: float
@@ -315,11 +319,6 @@ def _columns(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
-def averaged_points(points_mm: np.ndarray, cell_mm: float) -> np.ndarray:
-    """Means (C, 3) of the points (N, 3) in each cube of a size."""
-    return _averaged(points_mm, cell_mm)[1]
-
-
 def _averaged(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cube (N,) of each point, and means (C, 3) and counts (C,) of the points of each cube."""
     cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
@@ -372,11 +371,8 @@ def _along(
 ) -> np.ndarray:
     """Stated variance (P,) of one point along the normals of patches: single points, and images."""
     at = _first_points(owner)[middle]
-    pairs = known.random_mm2[at]
-    variance = np.einsum("pi,pi->p", known.position_mm[at], normals) ** 2
-    for column, (i, j) in enumerate(PAIRS):
-        variance += (1 if i == j else 2) * pairs[:, column] * normals[:, i] * normals[:, j]
-    return variance
+    of_image = np.einsum("pi,pi->p", known.position_mm[at], normals)
+    return of_image**2 + variance_along(known.random_mm2[at], normals)
 
 
 def _first_points(owner: np.ndarray) -> np.ndarray:
