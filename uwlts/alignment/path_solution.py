@@ -16,7 +16,13 @@ from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_prior import PathPrior
 from uwlts.alignment.pieces import Survey, fit_piece
 from uwlts.fitting.least_squares import biweight, noise_factor
-from uwlts.fitting.patches import LEAST_INFORMATION, PatchDistances, information_of_slopes, ways_of_moving
+from uwlts.fitting.patches import (
+    LEAST_INFORMATION,
+    PatchDistances,
+    information_of_slopes,
+    rigid_derivatives,
+    ways_of_moving,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +176,7 @@ def _add_pair(estimate: PathEstimate, pair: Pair, normal: np.ndarray, gradient: 
     middle = np.vstack([used.places_mm for _, _, used, _ in ways]).mean(axis=0)
     observable = _observable([each[2:] for each in ways], middle)
     for source, target, used, weight in ways:
-        twists = _twists(used.places_mm, used.normals, middle) @ observable
+        twists = rigid_derivatives(used.places_mm, used.normals, middle) @ observable
         derivatives = np.zeros((len(weight), 6, estimate.prior.count))
         for number, at, sign in ((source, used.source, 1.0), (target, used.target, -1.0)):
             piece, by = estimate.pieces[number], twists.copy()
@@ -189,22 +195,17 @@ def _add_pair(estimate: PathEstimate, pair: Pair, normal: np.ndarray, gradient: 
         gradient[near] += derivatives.T @ (weight * used.distance_mm)
 
 
-def _twists(places: np.ndarray, directions: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """Movement (Q, 6) of places (Q, 3) along directions (Q, 3) by shift and turn about a middle."""
-    return np.hstack([directions, np.cross(places - middle, directions)])
-
-
 def _observable(ways: list[tuple[PatchDistances, np.ndarray]], middle: np.ndarray) -> np.ndarray:
     """Projection (6, 6) of shift and turn to the part that the surfaces determine."""
     normal, feigned = np.zeros((6, 6)), np.zeros((6, 6))
     places = np.vstack([used.places_mm for used, _ in ways]) - middle
     scale = np.repeat([1.0, 1 / float(np.sqrt(np.mean(np.sum(places**2, axis=1))))], 3)
     for used, weight in ways:
-        by = _twists(used.places_mm, used.normals, middle) * scale
+        by = rigid_derivatives(used.places_mm, used.normals, middle) * scale
         normal += by.T @ (weight[:, None] * by)
 
         def scaled_twists(directions: np.ndarray, places: np.ndarray = used.places_mm) -> np.ndarray:
-            return _twists(places, directions, middle) * scale
+            return rigid_derivatives(places, directions, middle) * scale
 
         feigned += information_of_slopes(used.normals, weight * used.slope_variance, scaled_twists)
     information, movements, metric = ways_of_moving(normal, feigned)

@@ -288,6 +288,11 @@ def distances_between(
     )
 
 
+def rigid_derivatives(places_mm: np.ndarray, directions: np.ndarray, middle_mm: np.ndarray) -> np.ndarray:
+    """Return the motion (Q, 6) of places (Q, 3) along directions (Q, 3) by a shift, then a turn about a middle (3,)."""
+    return np.hstack([directions, np.cross(places_mm - middle_mm, directions)])
+
+
 def information_of_slopes(
     normals: np.ndarray, noise: np.ndarray, derivatives: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:

@@ -22,6 +22,7 @@ from uwlts.fitting.patches import (
     Patches,
     distances_between,
     information_of_slopes,
+    rigid_derivatives,
     ways_of_moving,
 )
 from uwlts.registration.marker_spheres import MarkerSphere, common_markers
@@ -253,7 +254,7 @@ class JointRegistration:
         others: list[np.ndarray],
         spheres: list[tuple[MarkerSphere, MarkerSphere, int]],
     ) -> PairEvidence:
-        unknown, count = len(self.units), self.unknown_poses
+        unknown, count, middles = len(self.units), self.unknown_poses, self.middles_mm
         relative = np.concatenate([each.distance_mm / each.std_mm for *_, each in ways]) if ways else np.empty(0)
         spread = noise_factor(relative)
         blocks, residuals, weights, deviations = [], [], [], []
@@ -266,7 +267,7 @@ class JointRegistration:
             block = np.zeros((len(weight), unknown))
             for number, rows, sign in ((source, found.source, 1.0), (target, found.target, -1.0)):
                 if len(columns := self.pose_columns[number]):
-                    block[:, columns] = sign * self._by_pose(number, found.places_mm, found.normals)
+                    block[:, columns] = sign * rigid_derivatives(found.places_mm, found.normals, middles[number])
                 turned = self.patches[number].patterns_mm[:, rows] @ self.poses[number, :3, :3].T
                 block[:, self.pattern_columns[number]] = sign * np.einsum("mqi,qi->qm", turned, found.normals)
             blocks.append(block)
@@ -281,7 +282,9 @@ class JointRegistration:
             block = np.zeros((3, unknown))
             for number, marker, sign in ((a, first, 1.0), (b, second, -1.0)):
                 if len(columns := self.pose_columns[number]):
-                    block[:, columns] = sign * self._by_pose(number, np.tile(marker.centre_mm, (3, 1)), root)
+                    block[:, columns] = sign * rigid_derivatives(
+                        np.tile(marker.centre_mm, (3, 1)), root, middles[number]
+                    )
                 block[:, self.pattern_columns[number]] = sign * root @ marker.patterns_mm.T
             blocks.append(block)
             residuals.append(off)
@@ -300,18 +303,15 @@ class JointRegistration:
             len(spheres),
         )
 
-    def _by_pose(self, number: int, places: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Motion (Q, 6) of places (Q, 3) along directions (Q, 3) by shift and turn of a scan."""
-        return np.hstack([directions, np.cross(places - self.middles_mm[number], directions)])
-
     def _spurious(self, source: int, target: int, found: PatchDistances, weight: np.ndarray) -> np.ndarray:
         """Information (P, P) that the noise of the normals alone would give."""
+        middles = self.middles_mm
 
         def by_poses(directions: np.ndarray) -> np.ndarray:
             block = np.zeros((len(weight), self.unknown_poses))
             for number, sign in ((source, 1.0), (target, -1.0)):
                 if len(columns := self.pose_columns[number]):
-                    block[:, columns] = sign * self._by_pose(number, found.places_mm, directions)
+                    block[:, columns] = sign * rigid_derivatives(found.places_mm, directions, middles[number])
             return block
 
         return information_of_slopes(found.normals, weight * found.slope_variance, by_poses)

@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import biweight, noise_factor
+from uwlts.fitting.patches import rigid_derivatives
 from uwlts.fitting.propagation import covariance_of_groups
 from uwlts.storage.cloud import PointUncertainty, images_along, variance_along
 
@@ -232,7 +233,7 @@ def _size(points: np.ndarray, middle: np.ndarray) -> float:
 
 def _by_movement(points: np.ndarray, normals: np.ndarray, middle: np.ndarray, *, sized: bool = False) -> np.ndarray:
     """Derivatives (N, 6) of distances along normals by shift and turn, (N, 7) with the radius of the cloud's shape."""
-    by = np.hstack([normals, np.cross(points - middle, normals)])
+    by = rigid_derivatives(points, normals, middle)
     return np.hstack([by, np.ones((len(by), 1))]) if sized else by
 
 
