@@ -173,12 +173,12 @@ def _no_crossing(search: Search, left_out: tuple[tuple[float, float], ...]) -> s
 
 
 def _require_gain(estimate: PathEstimate) -> None:
-    """EvaluationError unless a shift at a crossing is known at least twice as well as by the navigation."""
+    """EvaluationError unless a shift at a crossing is known ``least_gain`` times as well as by the navigation."""
     navigation = replace(estimate, factor=np.eye(len(estimate.factor)))
     for pair in estimate.pairs:
         middle = estimate.surfaces[pair[1]].places_mm.mean(axis=0)
         after, before = (each.relative_covariance(pair, middle)[:3, :3] for each in (estimate, navigation))
-        if eigh(after, before, eigvals_only=True)[0] < 1 / 4:
+        if eigh(after, before, eigvals_only=True)[0] < 1 / estimate.options.least_gain**2:
             return
     raise EvaluationError(
         f"the {len(estimate.pairs)} crossings do not determine a correction: the navigation is known about as well as "

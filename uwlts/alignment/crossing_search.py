@@ -25,6 +25,8 @@ from uwlts.registration.joint_registration import fit_pair
 
 _PIXEL = 0.5
 """Pixel of height maps in patch radii: patches resolve no more."""
+_LEAST_SPREAD = 1e-3
+"""Product of both maps' variances in an overlap, relative to the usual one: with less there is no structure."""
 
 
 @dataclass(frozen=True)
@@ -202,7 +204,7 @@ def correlate_heights(
     enough = count > options.fewest_patches / _PIXEL**2
     usual = max(float(np.median(spread[enough])), 0.0) if enough.any() else 0.0
     with np.errstate(invalid="ignore", divide="ignore"):
-        alike = np.where(enough & (spread > 1e-3 * usual), both / np.sqrt(spread), 0.0)
+        alike = np.where(enough & (spread > _LEAST_SPREAD * usual), both / np.sqrt(spread), 0.0)
     score = np.where(alike > options.least_correlation, alike * np.sqrt(count), -np.inf)
     steps = [np.where(np.arange(n) > n // 2, np.arange(n) - n, np.arange(n)) for n in sizes]
     outside = [np.abs(each * pixel_mm) > reach + pixel_mm for each, reach in zip(steps, reach_mm[:2], strict=True)]

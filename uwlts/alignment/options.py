@@ -27,15 +27,22 @@ class AlignmentOptions:
         Pieces after which a hypothesis is decided: a crossing and its doubles are seen within as many swath widths.
     rival_share : float
         Patches of another place, relative to the best one, that make a crossing doubtful if it holds too.
+    least_gain : float
+        Standard deviation of a shift at some crossing by the navigation, relative to that after the alignment: with
+        less the trajectory is used as it is.
     fewest_patches : int
         Patches of a crossing: five for each parameter of a rigid movement.
     least_agreeing, least_held_out : float
         Share of all patches of a crossing, and of its held-out patches, that agree within ``agreeing_sigmas``. Wrong
         places reach 0.8 of all, since the path bends, but few of the held-out ones. Chosen on rendered passes.
+    fewest_held_out : int
+        Held-out patches of a crossing whose share is judged: that of fewer says little.
     agreeing_sigmas : float
         Standard deviations of a distance, by the noise of the points alone, within which a patch agrees.
     held_out_every : int
-        One of so many cubes of four patch radii is held out of the estimate and judges it.
+        One of so many cubes is held out of the estimate and judges it.
+    held_out_cube : float
+        Side of these cubes in patch radii: neighbouring patches share points.
     intervals : int
         Intervals between even nodes of the path: a random walk moves by a tenth of its whole within one.
     most_nodes : int
@@ -61,11 +68,14 @@ class AlignmentOptions:
     least_lying: float = 0.6
     decided_after: int = 4
     rival_share: float = 0.5
+    least_gain: float = 2.0
     fewest_patches: int = 30
     least_agreeing: float = 0.9
     least_held_out: float = 0.8
+    fewest_held_out: int = 10
     agreeing_sigmas: float = 5.0
     held_out_every: int = 5
+    held_out_cube: float = 4.0
     intervals: int = 100
     most_nodes: int = 400
     node_spacing: float = 0.5

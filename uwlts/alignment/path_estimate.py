@@ -90,8 +90,7 @@ class PathEstimate:
         fits = np.abs(found.distance_mm) < options.agreeing_sigmas * found.std_mm
         if np.count_nonzero(fits) < options.fewest_patches or np.mean(fits) < options.least_agreeing:
             return False
-        # The share of a few says little.
-        judged = np.count_nonzero(held_out) >= options.fewest_patches / 3
+        judged = np.count_nonzero(held_out) >= options.fewest_held_out
         return bool(not judged or np.mean(fits[held_out]) >= options.least_held_out)
 
     def relative_movement(self, pair: Pair, at_mm: np.ndarray) -> np.ndarray:

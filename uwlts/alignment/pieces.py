@@ -16,6 +16,10 @@ from uwlts.storage.cloud import PointCloud
 
 _FEWEST_POINTS = 200
 """Points of a piece: fewer hold no patches."""
+_ACROSS = 1e-6
+"""Ridge relative to the extent of the neighbours of a patch: across a surface times do not grow."""
+_ALONE_MM2 = 1e-9
+"""Ridge of a patch without neighbours, about which times do not grow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +155,7 @@ def fit_piece(
     platform, times = survey.platform_mm[image], survey.moments_s[image]
     turned_back = Rotation.from_rotvec(-corrections[image, 3:])
     places = turned_back.apply(patches.places_mm - platform - corrections[image, :3]) + platform
-    cubes = np.floor(places / (4 * survey.radius_mm)).astype(np.int64)
+    cubes = np.floor(places / (options.held_out_cube * survey.radius_mm)).astype(np.int64)
     held_out = (cubes @ np.array([1, 2, 3])) % options.held_out_every == 0
     slopes = _slopes(places, times, 2 * survey.radius_mm)
     piece = Piece(part, patches, np.empty(0), places, times, slopes, platform, survey.velocity_mm_s[image], held_out)
@@ -166,8 +170,8 @@ def _slopes(places: np.ndarray, times: np.ndarray, reach_mm: float) -> np.ndarra
     normal, right = np.zeros((len(places), 3, 3)), np.zeros((len(places), 3))
     np.add.at(normal, first, about[:, :, None] * about[:, None])
     np.add.at(right, first, about * later[:, None])
-    # Times do not grow across a surface, nor where a patch has no neighbour.
-    normal += (1e-6 * np.trace(normal, axis1=1, axis2=2) + 1e-9)[:, None, None] * np.eye(3)
+    ridge = _ACROSS * np.trace(normal, axis1=1, axis2=2) + _ALONE_MM2
+    normal += ridge[:, None, None] * np.eye(3)
     return np.linalg.solve(normal, right[:, :, None])[:, :, 0]
 
 
