@@ -27,7 +27,7 @@ from uwlts.fitting.point_spacing import disc_of
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.registration.surface_registration import Registration, SampledSurface, register_to_surface
-from uwlts.storage.cloud import PAIRS, WATER, PointCloud, PointUncertainty
+from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, turned_pairs
 from uwlts.storage.cloud_files import loaded_cloud
 from uwlts.storage.pose_files import Unit
 
@@ -420,14 +420,6 @@ def _spread(points: np.ndarray, apart: float) -> tuple[np.ndarray, float]:
         apart *= max(np.sqrt(len(first) / _MOST_PLACES), 1.02)
 
 
-def _matrices(pairs: np.ndarray) -> np.ndarray:
-    """Symmetric matrices (N, 3, 3) of the six numbers each of `PAIRS`."""
-    result = np.empty((len(pairs), 3, 3))
-    for column, (i, j) in enumerate(PAIRS):
-        result[:, i, j] = result[:, j, i] = pairs[:, column]
-    return result
-
-
 def _moved(
     points: np.ndarray, known: PointUncertainty | None, found: Registration
 ) -> tuple[np.ndarray, PointUncertainty | None]:
@@ -436,11 +428,10 @@ def _moved(
     points = points @ rotation.T + found.transform[:3, 3]
     if known is None:
         return points, None
-    matrices = rotation @ _matrices(known.random_mm2) @ rotation.T
-    pairs = np.stack([matrices[:, i, j] for i, j in PAIRS], axis=1)
     patterns = known.patterns_mm @ rotation.T
     followed = [found.moves_mm(step, points) for step in found.by_cloud]
     patterns = patterns + np.array(followed, np.float32).reshape(patterns.shape)
     poses = None if known.poses_mm is None else known.poses_mm @ rotation.T
     position = known.position_mm @ rotation.T
-    return points, PointUncertainty(pairs, position, patterns.astype(np.float32), poses, known.shared)
+    random = turned_pairs(known.random_mm2, rotation)
+    return points, PointUncertainty(random, position, patterns.astype(np.float32), poses, known.shared)

@@ -21,7 +21,10 @@ from uwlts.model.sensor import Table
 _MOST_BYTES = 64 * 2**20
 _POOLED_ABOVE = 0.25
 """Probability of the interaction's F from which AIAG takes it for noise and pools it with the repeatability."""
-_DRAWS, _SEED = 20_000, 7
+_DRAWS = 20_000
+"""Draws of the mean squares: five hundred are beyond either end of a 95 % interval."""
+_SEED = 7
+"""Of the draws, so that the same study has the same intervals."""
 _SIGMAS = 6.0
 """Width of a process in standard deviations, as in %P/T (AIAG, Measurement Systems Analysis, 4th ed., ch. III-B)."""
 _DISTINCT = 1.41

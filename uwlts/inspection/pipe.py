@@ -8,20 +8,21 @@ from dataclasses import replace
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import robust_std
 from uwlts.fitting.point_spacing import footprint_on
+from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.blemish_search import BlemishSearch, Indication, UnrolledSurface, search_blemishes
 from uwlts.inspection.blemishes import Blemish, measure_blemish
 from uwlts.inspection.features import Feature, FeatureKind, Inspection
 from uwlts.inspection.pipe_form import LARGEST_OVALITY, MOST_OFF_SHARE, PipeForm, fit_pipe, pipe_features, refit_pipe
-from uwlts.inspection.propagation import normal_errors
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import loaded_cloud
 
-_OVERLAP, _SEARCHED = 0.6, 0.1
-"""Radians by which both sides of a pipe that is cut open overlap, unless as many without a point part them; and by
-which findings count beyond the cut. Farther beyond it points are surroundings alone: findings there have less of these
-than on the other side, where they are found, too."""
+_OVERLAP = 0.6
+"""Angle, rad, by which both sides of a pipe that is cut open overlap, unless as much without a point parts them."""
+_SEARCHED = 0.1
+"""Angle, rad, by which findings count beyond the cut. Farther beyond it points are surroundings alone: findings there
+have less of these than on the other side, where they are found, too."""
 _FEWEST = 500
 """Points from which a pipe's surface can be searched."""
 
@@ -149,9 +150,9 @@ def _joined(search: BlemishSearch, copied: np.ndarray, count: int) -> BlemishSea
 
 def _unrolled(cloud: PointCloud, form: PipeForm, chosen: np.ndarray, angle: np.ndarray) -> UnrolledSurface:
     """The surface of the chosen points (M,), unrolled by angles (M,), which may count from anywhere."""
-    errors = normal_errors(cloud, chosen, form.outwards[chosen])
+    errors = PointErrors.along(cloud, chosen, form.outwards[chosen])
     heights = form.distance_mm[chosen]
-    spread = max(MAD_TO_STD * float(np.median(np.abs(heights - np.median(heights)))), 1e-9)
+    spread = max(robust_std(heights - np.median(heights)), 1e-9)
     std = errors.single_mm if np.all(errors.single_mm > 0) else np.full(len(heights), spread)
     axis = np.broadcast_to(form.frame.axes[2], (len(chosen), 3))
     tangents = np.stack([axis, np.cross(axis, form.outwards[chosen])], axis=1)
@@ -163,7 +164,7 @@ def _blemish_features(
     cloud: PointCloud, form: PipeForm, chosen: np.ndarray, search: BlemishSearch, wall_mm: float | None
 ) -> tuple[list[Feature], list[str]]:
     """What was found, as features, and a note for each that became none."""
-    errors = normal_errors(cloud, chosen, form.outwards[chosen])
+    errors = PointErrors.along(cloud, chosen, form.outwards[chosen])
     flat = _unrolled(cloud, form, chosen, form.angle[chosen])
     measured: list[tuple[Blemish, float, float]] = []
     notes = [_left_out(cloud, chosen[[each.point]], each.height_mm, each.reason) for each in search.unresolved]

@@ -22,10 +22,9 @@ from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import Table
 from uwlts.registration.coarse_registration import coarse_poses
-from uwlts.registration.joint_registration import JointRegistration, PairEvidence, Solved
+from uwlts.registration.joint_registration import FEWEST_OF_PAIR, NARROWER, JointRegistration, PairEvidence, Solved
 from uwlts.registration.marker_spheres import find_markers
 from uwlts.registration.merging import merged_cloud
-from uwlts.registration.open_movements import OpenMovement, open_movements
 from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import loaded_cloud
@@ -36,8 +35,12 @@ _STILL_MM = 1e-5
 """A step that moves the usual point by less changes nothing that can be measured."""
 _REACH = 0.05
 """Of a scan's size: how far overlapping surfaces lie apart at the start, at most, unless that is given."""
-_NARROWER = 0.8
 _ROUNDED = 1e-6
+"""Largest error of a rotation's elements that is rounding of a file."""
+_PART = 0.1
+"""Part of a scan in an open direction, relative to the largest, below which it does not move in it."""
+_NO_TURN = 0.05
+"""Shift of the usual point by the turn of a movement, relative to the movement, below which it is a shift alone."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,25 @@ class Overlap:
     distance_mm: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class OpenMovement:
+    """A movement of a scan that is open: a shift along a unit direction, or a turn about a line through a point.
+
+    ``point_mm`` is None for a shift; for a turn it is the point of the line that lies nearest to the scan's middle.
+    """
+
+    scan: int
+    direction: np.ndarray
+    point_mm: np.ndarray | None
+
+    def words(self) -> str:
+        """The movement in words, in the common frame."""
+        along = "({:.3f}, {:.3f}, {:.3f})".format(*(self.direction + 0.0))
+        if self.point_mm is None:
+            return f"shift along {along}"
+        return "turn about the line through ({:.1f}, {:.1f}, {:.1f}) mm along ".format(*self.point_mm) + along
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class RegisteredScans(Brief):
     """Several scans in the frame of the first.
@@ -86,6 +108,8 @@ class RegisteredScans(Brief):
     pairs : tuple of PairFit
     overlaps : tuple of Overlap
         Where each pair overlaps, in the order of the pairs.
+    narrow_overlaps : tuple of (int, int, int)
+        Numbers of two scans, and of the patches of their overlap: too few to count.
     scale : float
         Patterns that were found, root mean square over all in units of what the calibration expects; NaN without.
     cloud : PointCloud
@@ -99,6 +123,7 @@ class RegisteredScans(Brief):
     open_movements: tuple[OpenMovement, ...]
     pairs: tuple[PairFit, ...]
     overlaps: tuple[Overlap, ...] = field(repr=False)
+    narrow_overlaps: tuple[tuple[int, int, int], ...]
     scale: float
     cloud: PointCloud
 
@@ -131,6 +156,10 @@ class RegisteredScans(Brief):
                 }
                 for pair in self.pairs
             ],
+            "narrow_overlaps": [
+                {"scans": [self.names[first], self.names[second]], "patches": patches}
+                for first, second, patches in self.narrow_overlaps
+            ],
             "pattern_scale": self.scale if np.isfinite(self.scale) else None,
             "points": len(self.cloud),
         }
@@ -152,6 +181,11 @@ class RegisteredScans(Brief):
                 f"  {first} - {second}: {pair.patches} patches, mm: mean {pair.mean_mm:+.4f}, rms {pair.rms_mm:.4f}"
                 f"{closure}{spheres}"
             )
+        lines += [
+            f"  {self.names[first]} - {self.names[second]}: left out, "
+            f"{patches} patches overlap, fewer than {FEWEST_OF_PAIR}"
+            for first, second, patches in self.narrow_overlaps
+        ]
         for name, std in list(zip(self.names, self.std, strict=True))[1:]:
             shift, turn = np.linalg.norm(std[:3]), np.degrees(np.linalg.norm(std[3:]))
             lines.append(f"  {name}: standard uncertainty {shift:.4f} mm, {turn:.5f} deg")
@@ -254,7 +288,7 @@ def register(
             and np.abs(step[: joint.unknown_poses] / joint.units[: joint.unknown_poses]).max() < _STILL_MM
         ):
             break
-        reach = max(_NARROWER * reach, least)
+        reach = max(NARROWER * reach, least)
     progress(steps, steps)
     pairs = joint.evidence(reach)
     solved = joint.solved(list(pairs.values()))
@@ -267,9 +301,10 @@ def register(
         poses=joint.poses,
         covariance=covariance,
         middles_mm=joint.middles_mm,
-        open_movements=open_movements(solved.open_directions, joint.middles_mm, joint.sizes),
+        open_movements=_open_movements(solved.open_directions, joint.middles_mm, joint.sizes),
         pairs=tuple(_fit_of(joint, key, pairs, solved) for key in pairs),
         overlaps=tuple(_overlap(pair) for pair in pairs.values()),
+        narrow_overlaps=joint.narrow_overlaps(reach),
         scale=float(np.sqrt(np.mean(amounts**2))) if len(amounts) else np.nan,
         cloud=merged_cloud(scans, names, joint, solved.covariance),
     )
@@ -308,6 +343,37 @@ def _fit_of(
 def _overlap(pair: PairEvidence) -> Overlap:
     counted = pair.counted[: pair.patches]
     return Overlap(pair.places_mm[counted], pair.residuals[: pair.patches][counted])
+
+
+def _open_movements(directions: np.ndarray, middles_mm: np.ndarray, sizes_mm: np.ndarray) -> tuple[OpenMovement, ...]:
+    """Movements of N scans, the first fixed, from open directions (K, 6 (N - 1)): shifts, then turns about middles."""
+    found = []
+    for number in range(1, len(middles_mm)):
+        twists = directions[:, 6 * (number - 1) : 6 * number] * np.repeat([1.0, sizes_mm[number]], 3)
+        if not len(twists):
+            continue
+        _, strengths, rows = np.linalg.svd(twists, full_matrices=False)
+        basis = rows[strengths > _PART]
+        if not len(basis):
+            continue
+        # Combinations without a turn first, each as a row of coefficients.
+        left, turns, _ = np.linalg.svd(basis[:, 3:], full_matrices=True)
+        turns = np.append(turns, np.zeros(len(basis) - len(turns)))
+        for coefficients, turn in zip(left.T[::-1], turns[::-1], strict=True):
+            shift, turned = (coefficients @ basis).reshape(2, 3)
+            turned = turned / sizes_mm[number]
+            if turn < _NO_TURN:
+                found.append(OpenMovement(number, _pointing(shift), None))
+            else:
+                nearest = middles_mm[number] + np.cross(turned, shift) / (turned @ turned)
+                found.append(OpenMovement(number, _pointing(turned), nearest))
+    return tuple(found)
+
+
+def _pointing(direction: np.ndarray) -> np.ndarray:
+    """The unit vector along a direction whose largest part is positive."""
+    unit = direction / np.linalg.norm(direction)
+    return unit * np.sign(unit[np.argmax(np.abs(unit))])
 
 
 def _closure(

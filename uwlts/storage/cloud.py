@@ -80,12 +80,11 @@ class PointUncertainty:
 
     def covariance_mm2(self) -> np.ndarray:
         """Covariance (N, 3, 3) of the coordinates of each point, of all kinds together."""
-        order = [PAIRS.index((min(i, j), max(i, j))) for i in range(3) for j in range(3)]
         result = np.empty((len(self.random_mm2), 3, 3), self.random_mm2.dtype)
         for start in range(0, len(result), _BLOCK):
             some = self[start : start + _BLOCK]
             pairs = _pairs_of(some.by_image_mm()) + (some.random_mm2 + some.systematic_mm2())
-            result[start : start + _BLOCK] = pairs[:, order].reshape(-1, 3, 3)
+            result[start : start + _BLOCK] = matrices_of(pairs)
         return result
 
     def std_mm(self) -> np.ndarray:
@@ -97,6 +96,17 @@ def _pairs_of(parts_mm: np.ndarray) -> np.ndarray:
     """Covariance (N, 6) of points that independent parts (M, N, 3) move; see `PAIRS`."""
     axes = np.ascontiguousarray(parts_mm.transpose(2, 0, 1))
     return np.stack([np.einsum("mn,mn->n", axes[i], axes[j]) for i, j in PAIRS], axis=1)
+
+
+def matrices_of(pairs: np.ndarray) -> np.ndarray:
+    """Return the symmetric matrices (N, 3, 3) of six numbers each (N, 6), in the order of `PAIRS`."""
+    return pairs[:, [PAIRS.index((min(i, j), max(i, j))) for i in range(3) for j in range(3)]].reshape(-1, 3, 3)
+
+
+def turned_pairs(pairs: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return covariances (N, 6), in the order of `PAIRS`, after rotations (3, 3) or (N, 3, 3)."""
+    matrices = rotations @ matrices_of(pairs) @ np.swapaxes(rotations, -1, -2)
+    return np.stack([matrices[:, i, j] for i, j in PAIRS], axis=1)
 
 
 def images_along(known: PointUncertainty, normals: np.ndarray) -> np.ndarray:

@@ -14,7 +14,8 @@ from uwlts.calibration.joint.stored_estimate import stored_estimate
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
-from uwlts.evaluation.figure_uncertainty import MovedSpheres, figure_uncertainties, noise_mm, shift_std_mm
+from uwlts.evaluation.figure_uncertainty import MovedSpheres, figure_uncertainties, shift_std_mm
+from uwlts.fitting.propagation import noise_mm
 from uwlts.fitting.shapes import fit_sphere
 from uwlts.model.artefacts import PlaneStandard, SphereStandard
 from uwlts.model.calibration import KnownMedium, KnownStage

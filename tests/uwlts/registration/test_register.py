@@ -14,6 +14,7 @@ from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import evaluate_pipe
 from uwlts.fitting.patches import distances_between, surface_patches
 from uwlts.model.artefacts import PipeStandard
+from uwlts.registration.joint_registration import FEWEST_OF_PAIR, JointRegistration
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.pose_files import read_poses, write_poses
 
@@ -63,6 +64,19 @@ def test_a_pipe_with_pits_is_closed(pits):
     errors = pose_errors(found.poses, true, found.middles_mm)
     assert np.abs(errors[:, :3]).max() < 0.1 and np.degrees(np.abs(errors[:, 3:]).max()) < 0.05
     assert max(pair.closure_mm for pair in found.pairs) < 0.1
+
+
+def test_overlaps_of_few_patches_are_named_and_do_not_count():
+    rng, patches = np.random.default_rng(SEED), []
+    # The third strip overlaps the first by 1 mm, half the radius of a patch, and the second by 52 mm.
+    for start in (0.0, 47.0, 99.0):
+        points = np.column_stack([rng.uniform(start, start + 100, 2500), rng.uniform(0, 5, 2500), np.zeros(2500)])
+        patches.append(surface_patches(points + [0, 0, 300] + 0.02 * rng.standard_normal(points.shape), None))
+    start = np.tile(np.eye(4), (3, 1, 1))
+    joint = JointRegistration(patches, [[], [], []], start, start_std=None, sphere_mm=None)
+    ((first, third, count),) = joint.narrow_overlaps(1.0)
+    assert (first, third) == (0, 2) and 0 < count < FEWEST_OF_PAIR
+    assert set(joint.evidence(1.0)) == {(0, 1), (1, 2)}
 
 
 def test_a_registration_that_does_not_settle_is_an_error(monkeypatch):

@@ -1,9 +1,9 @@
-"""Size and kind of a drift by the covariance that a navigation states, propagated here step by step."""
+"""Model of a drift by the covariance that a navigation states, propagated here step by step."""
 
 import numpy as np
 import pytest
 
-from uwlts.alignment.stated_drift import stated_drift
+from uwlts.alignment.drift_model import drift_of
 from uwlts.errors import EvaluationError
 from uwlts.model.trajectory import Trajectory
 
@@ -40,29 +40,41 @@ def navigated(*, by_heading: bool) -> Trajectory:
 
 @pytest.mark.parametrize("by_heading", [True, False])
 def test_rates_walks_and_dead_reckoning_are_found_from_the_covariance(by_heading: bool):
-    found = stated_drift(navigated(by_heading=by_heading), None, None)
-    assert found.kind is not None
-    assert found.kind.by_heading == by_heading
-    assert found.measured.tolist() == [False, False, True, True, True, False]
+    found = drift_of(navigated(by_heading=by_heading), None, None)
+    assert found.stated
+    assert found.dead_reckoned == by_heading
+    size, walk = found.std**2, found.std**2 * found.walk
+    # What is measured all along walks within the bounds of twice its variance.
+    np.testing.assert_allclose(size[2:5], 2 * np.array([DEPTH_MM, TILT, TILT]) ** 2)
+    np.testing.assert_allclose(found.walk[2:5], 1.0)
     # The part that the heading causes is taken off; its random walk leaves some of it.
-    np.testing.assert_allclose(found.size[[0, 1, 5]], np.array([BIAS_MM_S, BIAS_MM_S, GYRO]) * SECONDS, rtol=0.05)
-    np.testing.assert_allclose(found.size[2:5] ** 2, 2 * np.array([DEPTH_MM, TILT, TILT]) ** 2)
+    rates = np.sqrt((size - walk)[[0, 1, 5]])
+    np.testing.assert_allclose(rates, np.array([BIAS_MM_S, BIAS_MM_S, GYRO]) * SECONDS, rtol=0.05)
     # The rate has drifted for 2 s before: v(t) - v(0) is no square alone.
-    assert found.kind.walk == pytest.approx(NOISE**2 / (BIAS_MM_S**2 * SECONDS), rel=0.5)
-    assert found.kind.turn_walk == pytest.approx(HEADING_NOISE**2 / (GYRO**2 * SECONDS), rel=0.1)
-    assert found.kind.wandering < 0.01
+    np.testing.assert_allclose(walk[:2], NOISE**2 * SECONDS, rtol=0.5)
+    np.testing.assert_allclose(walk[5], HEADING_NOISE**2 * SECONDS, rtol=0.1)
 
 
-def test_a_drift_that_is_given_is_of_no_known_kind():
-    found = stated_drift(navigated(by_heading=True), 300.0, 1.0)
-    assert found.kind is None
-    np.testing.assert_allclose(found.size, np.repeat([300.0, np.radians(1.0)], 3))
-    assert not found.measured.any()
+@pytest.mark.parametrize("rate", [0.0, 0.3])
+def test_a_walk_is_told_from_a_rate_that_began_before(rate: float):
+    times = np.linspace(0, SECONDS, 200)
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, 0, 3] = times
+    grown = times + (rate * times) ** 2
+    found = drift_of(Trajectory(times, poses, grown[:, None, None] * np.diag(np.repeat([4.0, 1e-6], 3))), None, None)
+    np.testing.assert_allclose(found.std**2, grown[-1] * np.repeat([4.0, 1e-6], 3), rtol=0.01)
+    np.testing.assert_allclose(found.walk, SECONDS / grown[-1], rtol=0.01)
+
+
+def test_a_drift_that_is_given_states_its_size_alone():
+    found = drift_of(navigated(by_heading=True), 300.0, 1.0)
+    assert not found.stated and not found.dead_reckoned
+    np.testing.assert_allclose(found.std, np.repeat([300.0, np.radians(1.0)], 3))
 
 
 def test_a_path_without_covariance_needs_the_size_of_its_drift():
     path = navigated(by_heading=False)
     with pytest.raises(EvaluationError, match="give drift_mm and drift_deg"):
-        stated_drift(Trajectory(path.times_s, path.poses), None, None)
+        drift_of(Trajectory(path.times_s, path.poses), None, None)
     with pytest.raises(EvaluationError, match="both parts"):
-        stated_drift(path, 300.0, None)
+        drift_of(path, 300.0, None)
