@@ -158,6 +158,9 @@ def single_viewpoint(medium):
         (CALIBRATION, AIR, None),
         (CALIBRATION, FRESH, None),
         (CALIBRATION, SEA, None),
+        # With a window it holds in all media, whichever it is a nominal one of.
+        (nominal_calibration(small_sensor(), FRESH), AIR, None),
+        (nominal_calibration(small_sensor(), FRESH), SEA, None),
     ],
 )
 def test_a_calibration_without_a_window_holds_in_its_own_medium(tmp_path, calibration, medium, refusal):
