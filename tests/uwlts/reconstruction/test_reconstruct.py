@@ -154,7 +154,7 @@ def single_viewpoint(medium):
         (single_viewpoint(FRESH), SEA, "the calibration is for fresh only"),
         (single_viewpoint(SEA), SEA, None),
         (single_viewpoint(AIR), AIR, None),
-        (single_viewpoint(AIR), FRESH, r"the calibration is for air only: .*--step"),
+        (single_viewpoint(AIR), FRESH, r"the calibration is for air only: .*`step`"),
         (CALIBRATION, AIR, None),
         (CALIBRATION, FRESH, None),
         (CALIBRATION, SEA, None),
