@@ -11,11 +11,11 @@ from .comparison.surface_mesh import mesh as mesh
 from .desk.guided import record_guided as record_guided
 from .desk.operator_page import serve_desk as serve_desk
 from .desk.recording_view import watch as watch
+from .desk.scan import scan as scan
 from .doctor import examine as examine
 from .errors import Error as Error
 from .evaluation.evaluate import Evaluation as Evaluation, evaluate as evaluate
 from .evaluation.gauge import gauge_study as gauge_study
-from .hardware.scanning import scan as scan
 from .inspection.features import Inspection as Inspection
 from .inspection.flat import inspect_flange as inspect_flange, inspect_gap as inspect_gap, inspect_step as inspect_step
 from .inspection.pipe import inspect_pipe as inspect_pipe
@@ -28,7 +28,7 @@ from .model.sensor import Sensor as Sensor
 from .model.trajectory import Trajectory as Trajectory
 from .optics.design_table import design as design
 from .optics.nominal import nominal as nominal
-from .reconstruction.reconstruct import ScanCloud as ScanCloud, reconstruct as reconstruct
+from .reconstruction.reconstruct import reconstruct as reconstruct
 from .reconstruction.verify import verify as verify
 from .registration.register import register as register
 from .report import plot as plot

@@ -49,7 +49,7 @@ from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.stripe import FoundStripes
+from uwlts.stripe import CaptureStripes
 
 CAMPAIGNS = 200
 NORMAL_95 = 1.96
@@ -207,7 +207,7 @@ def _scan(
         lean=np.tan(np.radians(known.stage_alignment_deg)) * real.rng.standard_normal(2),
     )
     bright, wide = np.full(len(stripes.line), 100.0), np.full(len(stripes.line), 4.0)
-    found = FoundStripes(stripes.frame, stripes.line, stripes.centre_px, bright, wide, {})
+    found = CaptureStripes(stripes.frame, stripes.line, stripes.centre_px, bright, wide, {})
     with tempfile.TemporaryDirectory() as folder, _empty_capture(Path(folder), sensor, medium, positions) as capture:
         cloud = reconstruct_stripes(capture, found, calibration, with_uncertainty=True)
     evaluation = evaluate_cloud(cloud, SPHERES)

@@ -13,7 +13,7 @@ from cyclopts import App
 from tests.system.in_process import run_program, uwlts
 from twin.cli import app as twin_app
 from uwlts.cli import app as uwlts_app
-from uwlts.files.command_files import OUTPUTS
+from uwlts.files.inputs import OUTPUTS
 from uwlts.pages.toolkit import json_beside
 
 ROOT = Path(__file__).resolve().parents[2]

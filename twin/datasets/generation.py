@@ -27,8 +27,8 @@ from twin.datasets.shards import SUFFIXES, Sample, written_shard
 from twin.options import CPU, Variant, use_variant
 from twin.recording.campaigns import PLAN, keep_to_plan
 from uwlts.errors import DescriptionError, DesignError, OutputError
-from uwlts.files.command_files import keeps_inputs
-from uwlts.files.one_writer import lock_path, one_writer
+from uwlts.files.inputs import inputs_kept
+from uwlts.files.writing import OtherWriterError, one_writer
 from uwlts.model.placement import camera_from_object
 from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import work_through
@@ -47,7 +47,7 @@ _OUTPUT = re.compile(
 _UNFINISHED = re.compile(r"\.[0-9a-f]{16}\.(tar|h5|json|md|html)")
 
 
-@keeps_inputs
+@inputs_kept()
 def dataset(
     description: str | Path | DataSetDescription,
     *,
@@ -177,10 +177,9 @@ def _prepare(folder: Path, jobs: list[_Job], plan: dict[str, JsonValue], *, over
     """Make the folder ready for a plan; OutputError where another run is at work in what is to be replaced."""
     try:
         for job in jobs:
-            if lock_path(job.path).exists():
-                with one_writer(job.path):
-                    pass
-    except OutputError:
+            with one_writer(job.path):
+                pass
+    except OtherWriterError:
         if overwrite:
             raise
     else:
@@ -207,9 +206,7 @@ def _render_shard(patience_s: float, job: _Job, report: Callable[[None], None]) 
             if not job.path.is_file():
                 _render(job, report)
                 return
-    except OutputError:
-        if not lock_path(job.path).exists():
-            raise
+    except OtherWriterError:
         return
     # Another process has written it meanwhile.
     for _ in range(job.frames):

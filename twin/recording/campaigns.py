@@ -11,10 +11,9 @@ from pydantic import JsonValue
 from twin.options import CPU, Flaws, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, load_campaign, takes
 from uwlts.errors import CaptureError, DescriptionError, Error, OutputError
-from uwlts.files.command_files import own_files
+from uwlts.files.inputs import note_made, refuse_input
 from uwlts.files.json_files import another, read_json
-from uwlts.files.one_writer import one_writer
-from uwlts.files.writing import written_aside
+from uwlts.files.writing import one_writer, written_aside
 from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import part_path
@@ -192,9 +191,10 @@ def keep_to_plan(
     except OSError as error:
         raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
     try:
-        # Not an input of the command, which may replace it.
-        with own_files():
-            known = read_json(path, called="plan") if path.is_file() else None
+        # No input of the command, which may replace it.
+        refuse_input(path)
+        note_made(path)
+        known = read_json(path, called="plan") if path.is_file() else None
     except CaptureError:
         known = None
     if known == plan:

@@ -15,7 +15,7 @@ import numpy as np
 from twin.options import CPU, Options, Variant, use_variant
 from twin.scene.description import Scene, load_scene
 from uwlts.errors import DescriptionError
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import require_ending
 from uwlts.model.brief import Brief
 from uwlts.model.library import load_sensor, validated
@@ -119,7 +119,7 @@ def render(
     )
 
 
-@keeps_inputs
+@inputs_kept()
 def simulate(
     scene: AnyScene,
     *,

@@ -24,7 +24,7 @@ from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.recording_view import RecordingView
 from uwlts.errors import DescriptionError, Error, HardwareError
-from uwlts.files.command_files import own_files
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import CameraDevice
@@ -196,7 +196,7 @@ class Instrument:
 
     def _do(self, work: Callable[[], None]) -> None:
         try:
-            with own_files():
+            with inputs_kept():
                 work()
         except Ended:
             self._board.say("stopped")

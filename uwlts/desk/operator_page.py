@@ -23,7 +23,6 @@ from uwlts.desk.instrument import Instrument, InstrumentState
 from uwlts.desk.server import DeskServer
 from uwlts.desk.thinned_cloud import table_of
 from uwlts.errors import DescriptionError, Error
-from uwlts.files.command_files import own_files
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
@@ -143,7 +142,7 @@ class _Desk:
             paths.append(self.plan_path)
         found = {}
         for path in paths:
-            with suppress(Error), own_files():
+            with suppress(Error):
                 load(path)
                 found[str(path)] = path.name
         return found
@@ -247,10 +246,9 @@ class _OperatorPage:
 
         async def pressed() -> None:
             try:
-                with own_files():
-                    done = press()
-                    if isinstance(done, Awaitable):
-                        await done
+                done = press()
+                if isinstance(done, Awaitable):
+                    await done
             except Error as error:
                 self._board.say(str(error), "error")
                 ui.notify(str(error), type="negative", multi_line=True, timeout=10_000)
@@ -303,8 +301,7 @@ class _OperatorPage:
         if not self._plan.value or Path(self._plan.value) == self._desk.plan_path:
             return
         try:
-            with own_files():
-                plan = load_plan(Path(self._plan.value))
+            plan = load_plan(Path(self._plan.value))
         except Error as error:
             self._board.say(str(error), "error")
             return
@@ -442,8 +439,7 @@ class _OperatorPage:
     def _list(self) -> None:
         """Bring the list of files and the choices up to date where the folder has changed."""
         try:
-            with own_files():
-                files = listed(self._desk.folder)
+            files = listed(self._desk.folder)
         except Error as error:
             self._board.say(str(error), "error")
             return

@@ -15,7 +15,7 @@ from uwlts.model.any_calibration import AnyCalibration
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable, part_path, picture_of
-from uwlts.stripe import FoundStripes, stripe_in, warm_up
+from uwlts.stripe import CaptureStripes, stripe_in, warm_up
 
 LOOK_S = 0.1
 """Time between two looks for new images; one takes some ms."""
@@ -87,7 +87,7 @@ def _profile(frame: Frame, header: CaptureHeader, calibration: AnyCalibration | 
     centre = stripe.centre_px[line]
     if calibration is not None and len(line):
         own = np.zeros(len(line), dtype=int)
-        stripes = FoundStripes(own, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
+        stripes = CaptureStripes(own, line, centre, stripe.amplitude[line], stripe.width_px[line], {})
         cloud = reconstruct_stripes(FrameTable.of(header, [frame]), stripes, calibration)
         points, intensity = cloud.points_mm, cloud.intensity
     saturated, remarks = None, []

@@ -1,4 +1,4 @@
-"""Stripe centres of one image, one per profile line, and how they follow from the numbers of a 3D camera.
+"""Stripe centres of an image and of a capture, and how they follow from the numbers of a 3D camera.
 
 A 3D camera finds the stripe itself and gives one number per profile line, in the pixel format Coord3D_C16 or as 16-bit
 images, tables or arrays. A place on a line is ``scale`` times the number plus ``offset`` (GenICam Standard Features
@@ -13,7 +13,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from uwlts.errors import ImageError
+from uwlts.errors import ImageError, RangeError
 
 
 class StripeStatus(IntEnum):
@@ -65,9 +65,115 @@ class Stripe:
         """(M,) int: indices of the lines with a centre."""
         return np.flatnonzero(self.status == _OK)
 
+    @classmethod
+    def on_lines(
+        cls,
+        lines: np.ndarray,
+        centre_px: np.ndarray,
+        amplitude: np.ndarray,
+        width_px: np.ndarray,
+        *,
+        status: np.ndarray,
+        stripe_along: str,
+    ) -> Stripe:
+        """Return the stripe with centres on some lines (M,) alone; ``status`` (L,) is that of all lines."""
+        centre = np.full(len(status), np.nan)
+        height, width = np.full((2, len(status)), np.nan, np.float32)
+        centre[lines], height[lines], width[lines] = centre_px, amplitude, width_px
+        return cls(centre, height, width, status, stripe_along)
+
+    def without(self, lines: np.ndarray, reason: StripeStatus) -> Stripe:
+        """Return the stripe with no centre on some lines (M,), for the reason that a status names."""
+        centre, amplitude, width, status = (getattr(self, row).copy() for row in ROWS)
+        centre[lines], amplitude[lines], width[lines], status[lines] = np.nan, np.nan, np.nan, reason
+        return Stripe(centre, amplitude, width, status, self.stripe_along)
+
     def pixels(self) -> np.ndarray:
         """(M, 2) float64: image coordinates (u = column, v = row) of the centres of `lines`, px."""
         return pixels_of(self.lines, self.centre_px[self.lines], stripe_along=self.stripe_along)
+
+
+@dataclass(frozen=True)
+class StripeCandidates:
+    """All stripes of one image, M of them, in the order of lines and places: of several sheets, of reflections.
+
+    Attributes
+    ----------
+    line : (M,) int
+        Profile line of each; a line may have none, one, or several.
+    centre_px, amplitude, width_px : (M,) float64, float32, float32
+        As of `Stripe`.
+    log_likelihood : (M,) float64
+        Logarithm of the likelihood that the pixels have with the stripe over that without it, for the background's
+        white noise.
+    count : int
+        Number L of profile lines.
+    stripe_along : str
+        As of `Stripe`.
+    """
+
+    line: np.ndarray
+    centre_px: np.ndarray
+    amplitude: np.ndarray
+    width_px: np.ndarray
+    log_likelihood: np.ndarray
+    count: int
+    stripe_along: str
+
+    def __getitem__(self, some: np.ndarray) -> StripeCandidates:
+        """Those that an index array or a mask chooses."""
+        columns = self.line, self.centre_px, self.amplitude, self.width_px, self.log_likelihood
+        return StripeCandidates(*(column[some] for column in columns), self.count, self.stripe_along)
+
+    def split(self, sheets: int = 2) -> list[Stripe]:
+        """Return one `Stripe` for each of so many sheets of light, in the order of growing places.
+
+        Lines with another number of stripes than sheets do not show which is which: they are AMBIGUOUS, those without
+        any NO_STRIPE. RangeError for a number of sheets below 1.
+        """
+        if sheets < 1:
+            raise RangeError(f"sheets is {sheets}; expected 1 or more")
+        on_line = np.bincount(self.line, minlength=self.count)
+        status = np.full(self.count, StripeStatus.AMBIGUOUS, np.uint8)
+        status[on_line == 0], status[on_line == sheets] = StripeStatus.NO_STRIPE, StripeStatus.OK
+        lines = np.flatnonzero(on_line == sheets)
+        found = []
+        for number in range(sheets):
+            own = self[np.searchsorted(self.line, lines) + number]
+            columns = own.centre_px, own.amplitude, own.width_px
+            found.append(Stripe.on_lines(lines, *columns, status=status.copy(), stripe_along=self.stripe_along))
+        return found
+
+    def pixels(self) -> np.ndarray:
+        """(M, 2) float64: image coordinates (u = column, v = row), px."""
+        return pixels_of(self.line, self.centre_px, stripe_along=self.stripe_along)
+
+
+@dataclass(frozen=True, eq=False)
+class CaptureStripes:
+    """Stripe centres of all laser images of a capture, joined: N of them.
+
+    Attributes
+    ----------
+    frame, line : (N,) int
+        Image and profile line of each centre.
+    centre_px, amplitude, width_px : (N,) float64, float32, float32
+        As of `Stripe`; amplitude and width are NaN where a 3D camera does not give them.
+    lines_by_status : dict
+        Numbers of the profile lines of all images by the names of `StripeStatus`.
+    """
+
+    frame: np.ndarray
+    line: np.ndarray
+    centre_px: np.ndarray
+    amplitude: np.ndarray
+    width_px: np.ndarray
+    lines_by_status: dict[str, int]
+
+    def __getitem__(self, some: np.ndarray | slice) -> CaptureStripes:
+        """Those that a slice, an index array or a mask chooses."""
+        columns = self.frame, self.line, self.centre_px, self.amplitude, self.width_px
+        return CaptureStripes(*(column[some] for column in columns), lines_by_status=self.lines_by_status)
 
 
 def pixels_of(lines: np.ndarray, places_px: np.ndarray, *, stripe_along: str) -> np.ndarray:

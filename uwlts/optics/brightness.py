@@ -20,12 +20,11 @@ import numpy as np
 from uwlts.model.calibration import Calibration
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Laser, Sensor, Uncertainty, Vector
-from uwlts.model.stripe import pixels_of
+from uwlts.model.stripe import CaptureStripes, pixels_of
 from uwlts.optics.line_table import LineTable
 from uwlts.optics.triangulation import MeasuredPoints, rays_on_sheet, to_object
 from uwlts.optics.window import RayStatus
 from uwlts.runtime.compiled import compiled, compiled_with_arrays
-from uwlts.stripe.capture_stripes import FoundStripes
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 
 BLUR_STD = 1.0 / math.sqrt(3.0)
@@ -254,7 +253,7 @@ def moved_by_blur_px(
     return variance * (lean * fading + 0.5 * bend)
 
 
-def sharp_lines(stripes: FoundStripes) -> tuple[np.ndarray, np.ndarray]:
+def sharp_lines(stripes: CaptureStripes) -> tuple[np.ndarray, np.ndarray]:
     """Numbers (M,) of the stripe centres that blur hardly moves, and by how much it may, px.
 
     All of them, and 0, if a 3D camera does not give all amplitudes and widths, by which it is known.

@@ -14,7 +14,8 @@ from uwlts.fitting.least_squares import MAD_TO_STD
 
 _LARGEST_S = 0.5
 """Latency that is looked for at most: that of slow drivers."""
-_MOST_BENT_PX, _MOST_BENT = 2.0, 0.5
+_MOST_BENT_PX = 2.0
+_MOST_BENT = 0.5
 """Largest change of the stripe's motion from one frame to the next, in px or as a share of the motion. Beyond is an
 edge, unless the motion changes alike beside it. (At a jump it changes by twice its mean, and next by the opposite.)"""
 _FEWEST = 200
@@ -25,7 +26,10 @@ _LEAST_RELIEF = 0.5
 """Passes are compared where they share so much of the most relief that they share at any shift."""
 _FAR_PX = 20.0
 """Distances beyond are those of something else."""
-_ROUNDS, _OUTLIER = 8, 4.0
+_ROUNDS = 8
+"""Rounds, at most, in which outliers are found anew."""
+_OUTLIER = 4.0
+"""Standard deviations beyond which a distance is left out: one in 16,000 of Gaussian ones."""
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,10 @@ from uwlts.storage.cloud import PointUncertainty
 
 _MOST_SHAPES = 8
 """Shapes in time of errors along a path; faster ones are taken as independent from image to image."""
-_LEFT, _LEFT_OF_SHAPES = 0.01, 1e-3
-"""Share of the variance that may be left to these, in time and of all parts of the poses together."""
+_LEFT = 0.01
+"""Share of the variance in time that may be left to these."""
+_LEFT_OF_SHAPES = 1e-3
+"""The same of all parts of the poses together."""
 _MOST_MOMENTS = 400
 """By which shapes are found: they change slowly."""
 _LEAST = 1e-6

@@ -30,11 +30,14 @@ from uwlts.storage.cloud import WATER, PointUncertainty
 
 # Patterns that together move the points by no more than this (root mean square) are left out.
 _NEGLIGIBLE_MM = 5e-5
+# Centres between two neighbours from which noise is measured: its relative standard error is then a third.
 _FEWEST_NEIGHBOURS = 10
 # Points by which patterns are chosen: their root mean square is within some percent that of all.
 _SAMPLED = 500
-_TABLE_TOLERANCE_MM, _LEFT_OUT_MM = 1e-6, 1e-9
-"""Error of tabulated moves of points, and by what their last terms may add up that are left out."""
+_TABLE_TOLERANCE_MM = 1e-6
+"""Error of tabulated moves of points: far below any of them that matters."""
+_LEFT_OUT_MM = 1e-9
+"""Sum of the last terms of tables that may be left out."""
 
 
 def stripe_noise_px(frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Reconstruction of captures: point clouds from the stripes of all laser images by a calibration of any kind."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Table
+from uwlts.model.stripe import CaptureStripes
 from uwlts.model.trajectory import Trajectory
 from uwlts.optics.brightness import LitSheet, footprint_std, sharp_lines, slopes_of_brightness
 from uwlts.optics.fitness import check_fits
@@ -25,29 +26,7 @@ from uwlts.storage.capture import Capture, FrameTable, opened_capture, sensor_po
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
 from uwlts.storage.mount_files import read_mount
 from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
-from uwlts.stripe import FoundStripes, StripeSettings, find_stripes
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
-class ScanCloud(PointCloud):
-    """The cloud of a capture, and what became of the profile lines of all its laser images.
-
-    Attributes
-    ----------
-    stripe : (N,) int
-        Number, in the capture's `FoundStripes`, of the stripe centre that each point comes from.
-    lines_by_status : dict
-        Number of profile lines by the name of their `StripeStatus`, and ``blurred`` by a joint calibration.
-    rays_by_status : dict
-        Number of stripe centres by the name of their `RayStatus`.
-    warnings : list of str
-        What speaks against the calibration's being that of the sensor.
-    """
-
-    stripe: np.ndarray
-    lines_by_status: dict[str, int]
-    rays_by_status: dict[str, int]
-    warnings: list[str]
+from uwlts.stripe import StripeSettings, find_stripes
 
 
 def reconstruct(
@@ -65,7 +44,7 @@ def reconstruct(
     index: float | None = None,
     with_uncertainty: bool | None = None,
     progress: ProgressListener = unheard,
-) -> ScanCloud:
+) -> PointCloud:
     """Turn a capture into a point cloud: find the stripes of all laser images and triangulate them.
 
     Parameters
@@ -107,7 +86,7 @@ def reconstruct(
 
     Returns
     -------
-    ScanCloud
+    PointCloud
         ``points_mm`` (N, 3) in the object coordinate system, or in the frame in which poses or trajectory are given;
         ``covariance_mm2`` (N, 3, 3) or None, to which mount, time offset and poses of known covariance add theirs.
         ``time_s`` (N,) is each point's time of scans by a platform.
@@ -153,13 +132,13 @@ def reconstruct(
 
 def reconstruct_stripes(
     capture: Capture | FrameTable,
-    stripes: FoundStripes,
+    stripes: CaptureStripes,
     calibration: AnyCalibration,
     *,
     index: float | None = None,
     with_uncertainty: bool = False,
     mount_by: np.ndarray | None = None,
-) -> ScanCloud:
+) -> PointCloud:
     """Point cloud of a capture in the OCS, with the stage's motion added (or the pose, where a frame has one).
 
     ``index`` replaces the refractive index that follows from the capture's medium. ``with_uncertainty`` adds the
@@ -211,7 +190,7 @@ def reconstruct_stripes(
         moved = {"blur_px": blur[good], "beside_mm": beside[good], "mount_by": mount_by}
         known = point_uncertainty(capture, exact, *where, **moved, digest=digest)
     rays = np.bincount(found.status, minlength=len(RayStatus))
-    return ScanCloud(
+    return PointCloud(
         points_mm=points[good],
         intensity=kept.amplitude,
         frame=kept.frame,
@@ -226,7 +205,6 @@ def reconstruct_stripes(
             "calibration": digest,
             **({} if sheet is None else _footprint(capture, sheet, stripes)),
         },
-        stripe=sharp[good],
         lines_by_status=lines,
         rays_by_status={status.name.lower(): int(rays[status]) for status in RayStatus},
         warnings=doubts,
@@ -234,7 +212,7 @@ def reconstruct_stripes(
 
 
 def _lit_sheet(
-    capture: Capture | FrameTable, calibration: AnyCalibration, stripes: FoundStripes, index: float, digest: str
+    capture: Capture | FrameTable, calibration: AnyCalibration, stripes: CaptureStripes, index: float, digest: str
 ) -> LitSheet | None:
     """What stripe centres see of the sheet; none with poses, or by polynomials."""
     if isinstance(calibration, PolynomialCalibration) or np.isfinite(capture.pose).any():
@@ -246,7 +224,7 @@ def _lit_sheet(
 def _points(
     capture: Capture | FrameTable,
     calibration: AnyCalibration,
-    stripes: FoundStripes,
+    stripes: CaptureStripes,
     index: float,
     sheet: LitSheet | None,
 ) -> MeasuredPoints:
@@ -265,7 +243,7 @@ def _points(
     return reconstruct_profile(calibration, line, centre, medium_index=index, stage_mm=stage, stage_direction=direction)
 
 
-def _row_delay_s(capture: Capture | FrameTable, stripes: FoundStripes) -> np.ndarray | float:
+def _row_delay_s(capture: Capture | FrameTable, stripes: CaptureStripes) -> np.ndarray | float:
     """Time (N,) by which the rows of stripe centres are exposed after the middle row."""
     camera, detector = capture.header.sensor.camera, capture.header.sensor.detector
     if detector.shutter == "global":
@@ -274,13 +252,13 @@ def _row_delay_s(capture: Capture | FrameTable, stripes: FoundStripes) -> np.nda
     return 1e-6 * detector.line_time_us * (row - (camera.height_px - 1) / 2)
 
 
-def _beside(capture: Capture | FrameTable, sheet: LitSheet, stripes: FoundStripes) -> np.ndarray:
+def _beside(capture: Capture | FrameTable, sheet: LitSheet, stripes: CaptureStripes) -> np.ndarray:
     """From points on the sheet's middle to where their light comes from (N, 3), OCS."""
     slopes = slopes_of_brightness(stripes.frame, stripes.line, stripes.amplitude, capture.stage_mm, capture.exposure_ms)
     return sheet.beside(stripes.width_px, slopes, stage_direction=capture.header.stage_direction)
 
 
-def _footprint(capture: Capture | FrameTable, sheet: LitSheet, stripes: FoundStripes) -> Table:
+def _footprint(capture: Capture | FrameTable, sheet: LitSheet, stripes: CaptureStripes) -> Table:
     """Metadata of how much of the surface a point is the mean of; none where that is not known."""
     if not np.isfinite(stripes.width_px[sheet.found.status == RayStatus.OK]).any():
         return {}

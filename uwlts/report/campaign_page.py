@@ -11,7 +11,7 @@ from typing import Any
 from uwlts._version import __version__
 from uwlts.errors import OutputError, RangeError
 from uwlts.evaluation.evaluate import TruthComparisons
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import refuse_unsuitable, require_ending
 from uwlts.model.brief import Brief
 from uwlts.pages.numbers import fixed, is_number, small_length, unit_of, words_of
@@ -63,7 +63,7 @@ class Report(Brief):
         return summary_table(self.campaign, self.reference)
 
 
-@keeps_inputs
+@inputs_kept()
 def write_campaign(
     folder: str | Path,
     *,

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from uwlts.calibration.joint.observability import regions
 from uwlts.calibration.joint.stored_estimate import require_joint
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit, Origin
 from uwlts.model.parameter_keys import ParameterKey
@@ -43,7 +43,7 @@ from uwlts.storage.calibration_file import read_calibration
 _WORST_IMAGES = 5
 
 
-@keeps_inputs
+@inputs_kept()
 def write_certificate(
     calibration: str | Path, *, out: str | Path | None = None, before: str | Path | None = None, overwrite: bool = False
 ) -> tuple[Path, AnyCertificate]:

@@ -14,7 +14,7 @@ import numpy as np
 from uwlts._version import __version__
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.evaluate import read_evaluation
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.json_files import json_text
 from uwlts.files.writing import refuse_unsuitable, sha256_of
 from uwlts.inspection.features import (
@@ -83,7 +83,7 @@ class _CheckedFigure:
     expanded_mm: float | None
 
 
-@keeps_inputs
+@inputs_kept()
 def write_findings(
     cloud: str | os.PathLike[str],
     kind: InspectionKind = "pipe",

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from uwlts.errors import Error
-from uwlts.files.command_files import command_files
+from uwlts.files.inputs import inputs_kept, refuse_named_inputs
 from uwlts.runtime.interrupts import interrupts_kept
 from uwlts.runtime.progress import ProgressListener, unheard
 
@@ -60,7 +60,8 @@ def run(app: App) -> int:
     try:
         with interrupts_kept():
             command, bound, _ = app.parse_args(sys.argv[1:], exit_on_error=False, print_error=True)
-            with command_files(bound.arguments):
+            with inputs_kept():
+                refuse_named_inputs(bound.arguments)
                 command(*bound.args, **bound.kwargs)
         sys.stdout.flush()
     except CycloptsError:

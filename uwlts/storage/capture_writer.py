@@ -12,10 +12,9 @@ import hdf5plugin
 import numpy as np
 
 from uwlts.errors import CaptureError, ImageError, OutputError
-from uwlts.files.command_files import note_made, refuse_input
+from uwlts.files.inputs import note_made, refuse_input
 from uwlts.files.json_files import differences
-from uwlts.files.one_writer import one_writer
-from uwlts.files.writing import refuse_unsuitable
+from uwlts.files.writing import one_writer, refuse_unsuitable
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import CaptureHeader, Table
 from uwlts.model.stripe import ROWS, Stripe, rows_of
@@ -270,6 +269,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 if self._plan is not None:
                     forget_plan(self._part)
                 _cut_to_used(self._part)
+                refuse_input(self.path)
                 os.replace(self._part, self.path)
                 note_made(self.path)
 

@@ -133,6 +133,13 @@ class PointCloud(Brief):
         How well the points are known.
     metadata : dict
         Medium, sensor, artefact, capture, digest of the calibration; of a foreign cloud anything that JSON can hold.
+    lines_by_status : dict
+        Of the cloud of a whole capture, not kept in files: number of profile lines by the name of their `StripeStatus`,
+        and ``blurred`` by a joint calibration.
+    rays_by_status : dict
+        The same for stripe centres by the name of their `RayStatus`.
+    warnings : list of str
+        The same: what speaks against the calibration's being that of the sensor.
 
     Raises
     ------
@@ -148,6 +155,9 @@ class PointCloud(Brief):
     uncertainty: PointUncertainty | None = None
     time_s: np.ndarray | None = None
     metadata: Table = field(default_factory=dict)
+    lines_by_status: dict[str, int] = field(default_factory=dict)
+    rays_by_status: dict[str, int] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
     writer: ClassVar[Callable[..., None]]
     """How clouds are written: `uwlts.storage.cloud_files`, which knows the formats, sets it."""
 
@@ -201,6 +211,27 @@ class PointCloud(Brief):
     def covariance_mm2(self) -> np.ndarray | None:
         """Covariance (N, 3, 3) of the coordinates of each point, mm2, of all kinds together; None where not known."""
         return None if self.uncertainty is None else self.uncertainty.covariance_mm2()
+
+
+def cloud_of(
+    points_mm: np.ndarray,
+    *,
+    intensity: np.ndarray | None = None,
+    frame: np.ndarray | None = None,
+    line: np.ndarray | None = None,
+    deviation_mm: np.ndarray | None = None,
+    time_s: np.ndarray | None = None,
+) -> PointCloud:
+    """A cloud of another program, whose intensity, frame or line may be unknown; CaptureError as from `PointCloud`."""
+    unknown = np.full(len(points_mm), NO_INDEX)
+    return PointCloud(
+        points_mm,
+        np.full(len(points_mm), np.nan) if intensity is None else intensity,
+        unknown if frame is None else frame,
+        unknown if line is None else line,
+        deviation_mm=deviation_mm,
+        time_s=time_s,
+    )
 
 
 def joined(parts: Sequence[PointCloud]) -> PointCloud:

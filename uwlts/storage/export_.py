@@ -12,7 +12,7 @@ import numpy as np
 import tomli_w
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import require_possible_name
 from uwlts.model.stripe import rows_of
 from uwlts.runtime.progress import ProgressListener, unheard
@@ -39,7 +39,7 @@ _COLUMNS = ("file", "light", "stage_mm", "exposure_ms", "time_s")
 Corner = tuple[float, float, float]
 
 
-@keeps_inputs
+@inputs_kept()
 def export(
     file: str | Path,
     out: str | Path,

@@ -12,7 +12,7 @@ from uwlts.files.reading import require_regular_file
 from uwlts.files.writing import written_aside
 from uwlts.model.brief import Brief
 from uwlts.model.sensor import Description, Medium, Sensor, Table
-from uwlts.storage.hdf5_file import read_array, read_label, write_label
+from uwlts.storage.hdf5_file import DAMAGE, read_array, read_label, write_label
 
 FORMAT = "uwlts-truth"
 VERSION = 1
@@ -80,7 +80,7 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
             header = read_label(file, TruthHeader, path=path, format=FORMAT, version=VERSION)
             pose = _array(file, _POSE, path, dimensions=3) if _POSE in file else None
             truth = Truth(**{name: _array(file, name, path) for name in _DIMENSIONS}, pose=pose)
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+    except DAMAGE as error:
         raise CaptureError(f"{path} is not a truth file, or is damaged: {error}") from error
     lines = truth.status.shape
     shapes = {name: getattr(truth, name).shape for name in _DIMENSIONS if name != "depth_mm"}

@@ -1,19 +1,19 @@
 """The stripes of all laser images of a recording, and why images show none."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Literal
 
 import cv2
 import numpy as np
 
 from uwlts.errors import CaptureError, ImageError
-from uwlts.model.stripe import StripeStatus
+from uwlts.model.stripe import CaptureStripes, Stripe, StripeCandidates, StripeStatus
 from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.stripe.direct import SeenStripes, direct_stripes, farther
+from uwlts.stripe.direct import direct_stripes, farther
 from uwlts.stripe.exposures import BracketImages, fused_images
-from uwlts.stripe.extract import extract_stripe, see_stripes
-from uwlts.stripe.result import StripeOptions, StripeSettings
+from uwlts.stripe.extract import LARGEST, extract_stripe, stripe_and_rivals
+from uwlts.stripe.options import PeakRule, StripeOptions, StripeSettings
 
 BLACK = 0.02
 """Share of the full scale that no pixel of a black image reaches: above offset and noise of a covered lens."""
@@ -24,39 +24,17 @@ WHITE = 0.5
 FEWEST_LINES = 20
 """Profile lines with a stripe from which an image shows one; noise passes for it on single lines."""
 
+_WARM_LINES = 200
+"""Lines of the image that warms up: enough for stripes to go on."""
+
 _CLEARLY = 3
 """A stripe runs across if so many times as many lines show it when the image is read the other way; a right one is
 seen on a fifth of as many, at its steep places."""
 
 
-@dataclass(frozen=True, eq=False)
-class FoundStripes:
-    """Stripe centres of all laser images of a recording, joined: N of them.
-
-    Attributes
-    ----------
-    frame, line : (N,) int; image and profile line of each centre
-    centre_px, amplitude, width_px : (N,); place on the line, height in grey levels and full width at half maximum; the
-        latter two are NaN where a 3D camera does not give them
-    lines_by_status : numbers of the profile lines of all images by the names of `StripeStatus`
-    """
-
-    frame: np.ndarray
-    line: np.ndarray
-    centre_px: np.ndarray
-    amplitude: np.ndarray
-    width_px: np.ndarray
-    lines_by_status: dict[str, int]
-
-    def __getitem__(self, some: np.ndarray | slice) -> "FoundStripes":
-        """Those that a slice, an index array or a mask chooses."""
-        columns = self.frame, self.line, self.centre_px, self.amplitude, self.width_px
-        return FoundStripes(*(column[some] for column in columns), lines_by_status=self.lines_by_status)
-
-
 def find_stripes(
     capture: BracketImages, *, options: StripeSettings = None, progress: ProgressListener = unheard
-) -> FoundStripes:
+) -> CaptureStripes:
     """Find the stripe in all laser images of a recording, such as an opened `uwlts.storage.capture.Capture`.
 
     Centre lines of a 3D camera are taken as they are, less the lines at their ends (`StripeOptions.end_lines`).
@@ -73,10 +51,10 @@ def find_stripes(
     found: list[tuple[np.ndarray, ...]] = []
     numbers: list[int] = []
 
-    def images() -> Iterator[SeenStripes]:
+    def images() -> Iterator[tuple[Stripe, StripeCandidates | None, StripeOptions]]:
         for number, seen, saturation in fused_images(capture):
             numbers.append(number)
-            yield see_stripes(seen, stripe_along=along, options=chosen, saturation=saturation)
+            yield stripe_and_rivals(seen, stripe_along=along, options=chosen, saturation=saturation)
             progress(number + 1, len(capture))
 
     for stripe in direct_stripes(images(), farther=farther(capture.header.sensor)):
@@ -100,7 +78,26 @@ def find_stripes(
         reason = why_no_stripe(lit, stripe_along=along, full_dn=full_dn)
         raise CaptureError(f"no stripe in any of the {len(found)} laser images of {capture.path.name}: {reason}")
     frame = np.repeat(numbers, [len(good) for _, good, *_ in found])
-    return FoundStripes(frame, *columns, lines_by_status=by_status)
+    return CaptureStripes(frame, *columns, lines_by_status=by_status)
+
+
+def warm_up(dtype: np.dtype | type = np.uint8, options: StripeOptions = StripeOptions()) -> None:
+    """Load all that finding stripes in images of a type needs, or compile it where that was never done on this machine.
+
+    Otherwise the first images of a stream wait for it: some tenths of a second, and some seconds once. The rule of
+    direct light and `extract_candidates` are among it, and what only saturated stripes need.
+    """
+    half = options.half_window_px
+    place, lines = np.arange(8 * half), np.arange(_WARM_LINES)[:, None]
+    # A stripe, and beside it a dimmer one that comes and goes.
+    beside = 0.3 * (lines % 20 < 10)
+    seen = [share * np.exp(-0.5 * np.square((place - at * half) / 2.0)) for share, at in ((1.0, 2), (beside, 5))]
+    image = np.broadcast_to(100.0 * sum(seen), (_WARM_LINES, 8 * half)).astype(dtype)
+    for method in (options.method, "quadratic"):
+        extract_stripe(image, stripe_along="height", options=replace(options, method=method))
+    rivals = replace(options, peak=PeakRule.DIRECT)
+    how = {"stripe_along": "height", "options": rivals, "saturation": LARGEST[image.dtype]}
+    list(direct_stripes((stripe_and_rivals(image, **how) for _ in "ab"), farther=1))
 
 
 def is_black(image: np.ndarray, full_dn: float) -> bool:

@@ -16,11 +16,11 @@ import numpy as np
 
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Sensor
-from uwlts.model.stripe import Stripe, StripeStatus
+from uwlts.model.stripe import Stripe, StripeCandidates, StripeStatus
 from uwlts.runtime.compiled import compiled, compiled_part, compiled_with_arrays
-from uwlts.stripe.ends import leave_ends_out
+from uwlts.stripe.extract import leave_ends_out
+from uwlts.stripe.options import StripeOptions
 from uwlts.stripe.path_cost import CROSSING_LINES, GAP, LONGEST_CROSSING, OPENING, SLACK_PX, own_cost, path_margins
-from uwlts.stripe.result import StripeCandidates
 
 _TURN = 0.3
 """Share of a new step in the slope with which a stripe is expected to go on."""
@@ -49,59 +49,43 @@ may reach too, within so many px of a straight line of no more than so many px p
 _TAKEN, _OPEN, _REFUSED = 1, 0, -1
 """States of a candidate."""
 
-_OK, _AMBIGUOUS = np.uint8(StripeStatus.OK), np.uint8(StripeStatus.AMBIGUOUS)
 
-
-@dataclass(frozen=True, eq=False)
-class SeenStripes:
-    """The stripe of an image, before ends are left out, and the candidates where there are several, None for no line.
-
-    Candidates without a width cannot be measured: two stripes that run into each other, or one too wide. The path goes
-    on through them, but their lines have no point.
-
-    ``least`` is the least height of a stripe in grey levels, ``jump_px`` how far apart neighbouring lines' centres are
-    on two stripes, ``end_lines`` as of `StripeOptions`.
-    """
-
-    stripe: Stripe
-    rivals: StripeCandidates | None
-    least: float
-    jump_px: float
-    end_lines: int
-
-
-def direct_stripes(images: Iterable[SeenStripes], *, farther: int) -> Iterator[Stripe]:
+def direct_stripes(
+    images: Iterable[tuple[Stripe, StripeCandidates | None, StripeOptions]], *, farther: int
+) -> Iterator[Stripe]:
     """The stripe of each of a recording's images without reflections; images without rivals keep theirs.
 
-    ``images`` follow each other along the scan; ``farther`` is as of `farther`, 0 where unknown. Lines on which it
-    stays open which stripe is the laser's own are AMBIGUOUS, and ends are left out. Each
-    stripe is given when the next image has come.
+    ``images`` follow each other along the scan, as of `uwlts.stripe.extract.stripe_and_rivals`: the stripe with its
+    ends, the candidates where there are several, and the options that found them. Candidates without a width cannot be
+    measured: two stripes that run into each other, or one too wide. The path goes on through them, but their lines have
+    no point. ``farther`` is as of `farther`, 0 where unknown.
+
+    Lines on which it stays open which stripe is the laser's own are AMBIGUOUS, and ends are left out. Each stripe is
+    given when the next image has come.
     """
     before: _Paths | None = None
-    last: tuple[SeenStripes, _Paths | None] | None = None
-    for image in images:
-        path = None
-        if image.rivals is not None:
-            path = _Paths.of(image.stripe, image.rivals, farther=farther, least=image.least, jump_px=image.jump_px)
+    last: tuple[Stripe, _Paths | None, StripeOptions] | None = None
+    for stripe, rivals, options in images:
+        path = None if rivals is None else _Paths.of(stripe, rivals, options, farther=farther)
+        if path is not None:
             path.decide(np.zeros(len(path.line)))
         if last is not None:
             yield _chosen(*last, beside=(before, path))
             before = last[1]
-        last = image, path
+        last = stripe, path, options
     if last is not None:
         yield _chosen(*last, beside=(before,))
 
 
-def _chosen(image: SeenStripes, path: _Paths | None, *, beside: Sequence[_Paths | None]) -> Stripe:
+def _chosen(stripe: Stripe, path: _Paths | None, options: StripeOptions, *, beside: Sequence[_Paths | None]) -> Stripe:
     """The direct stripe of an image: decided once more where the images beside it, which show nearly the same, vote."""
-    stripe = image.stripe
     if path is not None:
         vote = sum((path.vote(other) for other in beside if other is not None), np.zeros(len(path.line)))
         if vote.any():
             path = replace(path, state=path.state.copy())
             path.decide(vote)
         stripe = path.stripe(stripe)
-    return leave_ends_out(stripe, lines=image.end_lines, jump_px=image.jump_px)
+    return leave_ends_out(stripe, options)
 
 
 @dataclass(eq=False)
@@ -124,8 +108,9 @@ class _Paths:
     jump_px: float
 
     @classmethod
-    def of(cls, stripe: Stripe, rivals: StripeCandidates, *, farther: int, least: float, jump_px: float) -> _Paths:
-        """The candidates of an image."""
+    def of(cls, stripe: Stripe, rivals: StripeCandidates, options: StripeOptions, *, farther: int) -> _Paths:
+        """The candidates of an image; those that are alone on their lines are the stripe's."""
+        least, jump_px = options.threshold_floor, options.jump_px
         alone = np.setdiff1d(stripe.lines, rivals.line)
         line = np.concatenate([alone, rivals.line])
         order = np.argsort(line, kind="stable")
@@ -160,14 +145,11 @@ class _Paths:
 
     def stripe(self, before: Stripe) -> Stripe:
         """The stripe of the taken candidates; lines without any that had one are AMBIGUOUS."""
-        centre, amplitude = np.full(len(before.status), np.nan), np.full(len(before.status), np.nan, np.float32)
-        width, status = amplitude.copy(), before.status.copy()
         taken = (self.state == _TAKEN) & np.isfinite(self.width_px)
-        status[self.line], lines = _AMBIGUOUS, self.line[taken]
-        status[lines] = _OK
-        centre[lines], amplitude[lines] = self.centre_px[taken], self.amplitude[taken]
-        width[lines] = self.width_px[taken]
-        return Stripe(centre, amplitude, width, status, before.stripe_along)
+        status, lines = before.status.copy(), self.line[taken]
+        status[self.line], status[lines] = StripeStatus.AMBIGUOUS, StripeStatus.OK
+        columns = self.centre_px[taken], self.amplitude[taken], self.width_px[taken]
+        return Stripe.on_lines(lines, *columns, status=status, stripe_along=before.stripe_along)
 
 
 def farther(sensor: Sensor) -> int:

@@ -21,7 +21,8 @@ _SLACK = 0.98
 _SAME_PLACE_MM = 1e-3
 """Readings of a stage at rest differ by less."""
 
-_ROLL_OFF = 0.85, 0.95
+_ROLL_OFF_FROM = 0.85
+_ROLL_OFF_TO = 0.95
 """Shares of the full scale between which a pixel loses its weight: the full well and the gain differ from pixel to
 pixel, and a step at the full scale itself would show in the stripe's profile."""
 
@@ -31,8 +32,14 @@ _WELL_EXPOSED = 0.3
 _FEWEST_PIXELS = 200
 """Well exposed pixels from which the ratio of two images is measured rather than taken from the exposures."""
 
-_DARK_DN, _DARK_SIGMAS, _SIGMA_PER_MAD = 3.0, 4.0, 1.4826
-"""Pixels about the median by so many grey values, or standard deviations, show the background."""
+_DARK_DN = 3.0
+"""Grey values about the median within which pixels show the background, whatever its noise: rounding and offsets."""
+
+_DARK_SIGMAS = 4.0
+"""Standard deviations about the median within which pixels show the background: all but one in 16,000 of them."""
+
+_SIGMA_PER_MAD = 1.4826
+"""Standard deviation of Gaussian noise over its median absolute deviation."""
 
 
 class BracketImages(Protocol):
@@ -123,7 +130,7 @@ def fused(images: Sequence[np.ndarray], exposure_ms: np.ndarray, *, full_dn: flo
     """
     pixels = [image.astype(np.float32) for image in images]
     offset = _offset_dn(pixels[0], pixels[-1], float(exposure_ms[-1] / exposure_ms[0]))
-    low, high = (share * (full_dn - offset) for share in _ROLL_OFF)
+    low, high = (share * (full_dn - offset) for share in (_ROLL_OFF_FROM, _ROLL_OFF_TO))
     # From the longest exposure to the shortest, whose scale is that of all longer ones multiplied.
     scale, total, weight = 1.0, np.zeros_like(pixels[0]), np.zeros_like(pixels[0])
     for k in range(len(pixels) - 1, -1, -1):

@@ -6,6 +6,7 @@ import numpy as np
 
 from uwlts.model.stripe import StripeStatus
 from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
+from uwlts.stripe.options import PeakRule, StripeOptions
 from uwlts.stripe.peak_window import (
     FIRST,
     FLANK,
@@ -20,7 +21,6 @@ from uwlts.stripe.peak_window import (
     low_pass,
     measured,
 )
-from uwlts.stripe.result import PeakRule, StripeOptions
 
 _LOOKS = 4
 """Places looked at per line: hot pixels in front of the stripe and a second stripe after it."""

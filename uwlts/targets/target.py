@@ -11,9 +11,10 @@ from pydantic import ValidationError
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Description, NotNegative
 
-# A target seen in part is found from about a dozen points, or from this share of a larger one: fewer are too likely to
+# A target seen in part is found from about a dozen points, or from a share of a larger one: fewer are too likely to
 # miss the marks or markers that number them.
-_FEWEST_POINTS, _SMALLEST_SHARE = 12, 0.15
+_FEWEST_POINTS = 12
+_SMALLEST_SHARE = 0.15
 
 
 @dataclass(frozen=True)

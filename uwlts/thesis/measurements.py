@@ -31,7 +31,7 @@ from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import write_cloud
 from uwlts.storage.truth import read_truth, truth_path
-from uwlts.stripe import FoundStripes, find_stripes
+from uwlts.stripe import CaptureStripes, find_stripes
 from uwlts.thesis.campaign_folder import CampaignFolder, ScanFile
 from uwlts.thesis.results import Measurement
 
@@ -95,8 +95,8 @@ _SEARCHED_PX = 8
 
 
 def thesis_stripes(
-    capture: Capture, found: FoundStripes, *, tolerance: float = 0.4, fitted_px: int = 5
-) -> FoundStripes:
+    capture: Capture, found: CaptureStripes, *, tolerance: float = 0.4, fitted_px: int = 5
+) -> CaptureStripes:
     """The same lines of the same images with the centres that the thesis's processing gives.
 
     ``tolerance`` is the low-pass filter's; 0 makes it a mean of the neighbours. ``fitted_px`` is an odd number.

@@ -57,7 +57,8 @@ def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str
     radii = np.array(standard.diameters_mm) / 2
     used = np.isfinite(evaluation.deviation_mm)
     away = np.abs(np.linalg.norm(scan.points_mm[used, None] - centres, axis=2) - radii)
-    kept = scan.stripe[used]
+    lines = int(stripes.line.max()) + 1
+    kept = np.flatnonzero(np.isin(lines * stripes.frame + stripes.line, (lines * scan.frame + scan.line)[used]))
     line, centre = stripes.line[kept], stripes.centre_px[kept]
     return SphereScan(
         placement=placement,

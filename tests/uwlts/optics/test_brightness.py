@@ -12,7 +12,7 @@ from uwlts.optics.nominal import nominal_calibration
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.stripe import FoundStripes, extract_stripe
+from uwlts.stripe import CaptureStripes, extract_stripe
 
 STAGE = 3.0 + np.arange(7.0)
 LINES = np.arange(600, 641)
@@ -102,7 +102,7 @@ def test_points_lie_where_the_light_comes_from(thesis, tmp_path):
     centres = np.concatenate([thick_stripe(thesis, stage) for stage in STAGE])
     frame = np.repeat(np.arange(len(STAGE)), len(LINES))
     bright = 50.0 * np.exp(FADING * (STAGE[frame] - STAGE.mean()))
-    stripes = FoundStripes(frame, np.tile(LINES, len(STAGE)), centres, bright, np.full(len(frame), 4.0), {})
+    stripes = CaptureStripes(frame, np.tile(LINES, len(STAGE)), centres, bright, np.full(len(frame), 4.0), {})
     plain = nominal_calibration(thesis, thesis.media["water"])
     joint = plain.model_copy(update={"joint": JointEstimate.model_construct()})
     with Capture(tmp_path / "scan.h5") as capture:

@@ -284,7 +284,8 @@ def test_rows_of_a_rolling_shutter_are_where_the_stage_was_when_they_were_expose
     rows = reconstruct_stripes(FrameTable.of(rolling, moving), stripes, CALIBRATION)
     np.testing.assert_array_equal(together.points_mm, at_rest.points_mm)
     # The stripe's rows are 1e-6 line_time later than the middle row for each row below it; the stage moves along X.
-    delay_s = 1e-6 * line_time_us * (stripes.centre_px[rows.stripe] - (HEIGHT - 1) / 2)
+    np.testing.assert_array_equal(rows.line, stripes.line)
+    delay_s = 1e-6 * line_time_us * (stripes.centre_px - (HEIGHT - 1) / 2)
     np.testing.assert_allclose((rows.points_mm - at_rest.points_mm)[:, 0], speed * delay_s, atol=1e-9)
     np.testing.assert_allclose((rows.points_mm - at_rest.points_mm)[:, 1:], 0, atol=1e-9)
     assert np.ptp(speed * delay_s) > 0.01

@@ -7,7 +7,7 @@ from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Medium
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.stripe import FoundStripes
+from uwlts.stripe import CaptureStripes
 from uwlts.thesis.measurements import low_passed, thesis_stripes
 
 LINES, LENGTH = 40, 64
@@ -83,7 +83,7 @@ def capture(path, images, *, stripe_along):
 def found(centres):
     """Stripes of images at centres (F, LINES), on every line."""
     frames, lines = np.indices(centres.shape)
-    return FoundStripes(
+    return CaptureStripes(
         frames.ravel(),
         lines.ravel(),
         centres.ravel(),

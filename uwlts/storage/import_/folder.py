@@ -9,7 +9,7 @@ import numpy as np
 
 from uwlts._version import __version__
 from uwlts.errors import DescriptionError, ImageError
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.sensor import Sensor, Table
 from uwlts.runtime.progress import ProgressListener, unheard
@@ -18,7 +18,6 @@ from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import ImageHeader
 from uwlts.storage.import_.centre_lines import profile_rows
-from uwlts.storage.import_.channels import is_formula, one_channel
 from uwlts.storage.import_.folder_description import (
     NAME,
     ImportDescription,
@@ -26,7 +25,7 @@ from uwlts.storage.import_.folder_description import (
     described_sensor,
     read_description,
 )
-from uwlts.storage.import_.images import bits_of, grey_values, without_background
+from uwlts.storage.import_.grey_values import bits_of, grey_values, is_formula, one_channel, without_background
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
 from uwlts.stripe import Stripe
 from uwlts.stripe.capture_stripes import BLACK, FEWEST_LINES, WHITE, is_black, shown_stripe, white_share
@@ -118,7 +117,7 @@ class Imported:
     warnings: tuple[str, ...]
 
 
-@keeps_inputs
+@inputs_kept()
 def import_images(
     folder: str | Path,
     out: str | Path,

@@ -15,8 +15,11 @@ from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
 from uwlts.stripe.methods import quadratic
 from uwlts.stripe.peak_window import FLANK, FWHM_PER_SIGMA, PeakWindow
 
-_STEPS, _FIRST_STEPS = 5, 2
-"""Steps in all, and those before the contrast is taken from what the fit leaves."""
+_STEPS = 5
+"""Steps of the fit in all, as many for each line, so that those fitted side by side end together."""
+
+_FIRST_STEPS = 2
+"""Steps before the contrast is taken from what the fit leaves."""
 
 _UNMODELLED = 0.02
 """Part of the height by which haze, flare and blur may make a stripe differ from a Gaussian. Pixels count ever less
@@ -25,15 +28,30 @@ where the wings fall below that part over the contrast, 2.5 sigma from the centr
 _LEAST_NOISE = 0.5
 """Grey levels: values are rounded to whole ones, and cut off at black."""
 
-_USUAL_CONTRAST, _PRIOR_PIXELS = 0.3, 5.0
-"""Speckle contrast assumed before anything is measured, and the number of pixels whose evidence it counts as."""
+_USUAL_CONTRAST = 0.3
+"""Speckle contrast assumed before anything is measured; fully developed speckle that a pixel resolves has 1."""
 
-_NARROWEST, _WIDENING, _LONGEST_STEP = 0.4, 1.5, 0.5
-"""Least sigma in px, its largest ratio to the half-height width's, and the largest change of a parameter at a time."""
+_PRIOR_PIXELS = 5.0
+"""Number of pixels whose evidence the assumed contrast counts as: less than one stripe has."""
 
-_SPECKLED_HALO, _MOSTLY, _PLATEAU = 0.023, 0.5, 5
-"""Noise beside a stripe over its height, and plateau over width and in px, above which its flanks tell less than its
-middle."""
+_NARROWEST = 0.4
+"""Least sigma, px: a stripe within one pixel has 0.29."""
+
+_WIDENING = 1.5
+"""Largest ratio of the fitted sigma to that of the half-height width."""
+
+_LONGEST_STEP = 0.5
+"""Largest change at a time of the height's and width's logarithms, and of the centre in sigmas: beyond, the linearised
+model says nothing."""
+
+_SPECKLED_HALO = 0.023
+"""Noise beside a stripe over its height above which the flanks of a plateau tell less than its middle."""
+
+_MOSTLY = 0.5
+"""Share of the width that a plateau has above which it is most of the stripe."""
+
+_PLATEAU = 5
+"""Pixels of a plateau, at least, and of a stripe with one."""
 
 _SAMPLED = 256
 """Lines from which noise and contrast are taken; more would not make the fit better."""

@@ -1,6 +1,7 @@
 """Closed bright or dark blobs of an unevenly lit image, as candidates for the images of circles."""
 
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import cv2
 import numpy as np
@@ -16,6 +17,10 @@ BLOCK_PX = 4
 MIN_AREA_PX = 10.0  # a blob of fewer pixels has no measurable shape (a disc of 4 px diameter covers 12.6)
 # Pure noise, which the median filter has more than halved, shows 0.7 of its standard deviation between both levels.
 CONTRAST_OVER_NOISE = 3.0
+SMOOTH_SHARE = 0.2  # of the pixels, in which even a fine pattern leaves no edge
+# Most difference of a blob's area from that of the ellipse with its moments, as a share. Rectangles, at 0.05, pass; the
+# fit to the edge leaves them out.
+ELLIPSE_LIKE = 0.12
 CONTRAST_OVER_RANGE = 0.04  # below this fraction of the image's grey range a contrast is dirt or compression noise
 
 
@@ -62,9 +67,8 @@ def noise_level(image):
     """
     counts = np.zeros(8 * np.iinfo(image.dtype).max + 1, np.int64)
     _count_responses(image, counts)
-    lower_fifth = np.searchsorted(np.cumsum(counts), 0.2 * counts.sum())
-    lower_fifth_of_unit_normal = 0.2533
-    return float(lower_fifth) / (6 * lower_fifth_of_unit_normal)
+    lower_part = np.searchsorted(np.cumsum(counts), SMOOTH_SHARE * counts.sum())
+    return float(lower_part) / (6 * NormalDist().inv_cdf(0.5 + SMOOTH_SHARE / 2))
 
 
 @compiled
@@ -223,7 +227,7 @@ def _ellipse_like(mask, *, bright, fewest=0):
     determinant = covariances[:, 0] * covariances[:, 2] - covariances[:, 1] ** 2
     # The uniform disc of radius r has the variance r^2 / 4, so an ellipse has area 4 pi sqrt(det covariance).
     expected = 4 * np.pi * np.sqrt(np.maximum(determinant, 0))
-    like = np.abs(area - expected) <= 0.12 * expected
+    like = np.abs(area - expected) <= ELLIPSE_LIKE * expected
     centres, shapes = found[like, 2:4] / area[like, None], covariances[like][:, [0, 1, 1, 2]]
     values, vectors = np.linalg.eigh(shapes.reshape(-1, 2, 2))
     semi_axes = 2 * np.sqrt(values) + 0.5

@@ -8,13 +8,16 @@ from uwlts.targets.detection.lattice import agreeing
 _SIGMA = 1.5  # blur before squares are compared, px
 _LARGEST_RESIDUAL = 1 / 30  # of a square's side, rms
 _ALTERNATING = 0.9  # share of neighbouring squares of which the one that should be is the darker
-_IN_SQUARE, _UNLIKE = 0.3, 0.6
-"""Offset at which the four squares around a corner are sampled, in side lengths; largest difference between opposite
-squares, as a share of that between dark and bright ones."""
-_WINDOW_SHARE, _LEAST_WINDOW, _LARGEST_WINDOW = 0.3, 2, 20
-"""Half the side of the window in which a corner is refined: as a share of a square's, and its limits in px."""
-_SMOOTHING, _CUT_OFF = 0.8, 0.3  # px; share of the contrast to either side of the middle level
-_REFINEMENT = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)
+_IN_SQUARE = 0.3  # side lengths from a corner at which the squares around it are sampled: clear of its edges
+_UNLIKE = 0.6  # most difference between opposite squares, as a share of that between dark and bright ones
+_WINDOW_SHARE = (
+    0.3  # of a square's side: half the side of the window in which a corner is refined, clear of the next one
+)
+_LEAST_WINDOW = 2  # px, half a side: five pixels across hold an edge in focus
+_LARGEST_WINDOW = 20  # px, half a side, as time grows with the window's area
+_SMOOTHING = 0.8  # px, sigma of the blur before refinement, about that of a lens in focus
+_CUT_OFF = 0.3  # share of the contrast on either side of the middle level from which levels are taken as even
+_REFINEMENT = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-4)  # most passes, and px at which they end
 
 
 def without_doubtful(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:

@@ -13,17 +13,20 @@ from uwlts.targets.detection.lattice import STEPS, TOLERANCE
 
 _SCALES = (1.0, 0.5, 0.25)
 """Sizes at which an image is searched: where it is blurred or large, corners are sharper at a smaller one."""
-_SIGMA, _RING_PX, _RING = 1.5, 6.0, 24
-"""Blur before derivatives, radius of the circle about a corner, and the places on it; px of the scaled image."""
-_LEAST_SHARE, _LEAST_IN_PHASE = 0.7, 0.9
-"""Of the variation around a corner that comes twice a turn, as two dark and two bright sectors do; how well that of
-a circle of 0.6 times the radius goes with it."""
-_LEAST_CONTRAST = 2.0  # grey levels around a corner
-_EDGE_SHARE, _EDGE_BESIDE, _EDGE_PLACES = 0.4, 0.12, (0.25, 0.5, 0.75)
-"""An edge between neighbours has this share of their contrast, so far beside it in its lengths, at these places."""
+_SIGMA = 1.5  # px of the scaled image, blur before derivatives
+_RING_PX = 6.0  # px of the scaled image, radius of the circle about a corner: within squares of more than 6 px
+_INNER_RING = 0.6  # of that radius: a second circle
+_RING = 24  # places on a circle, one every 1.6 px
+_LEAST_SHARE = 0.7  # of the variation around a corner that comes twice a turn, as two dark and two bright sectors do
+_LEAST_IN_PHASE = 0.9  # cosine between the sectors of both circles, which go straight outwards from a corner
+_LEAST_CONTRAST = 2.0  # grey levels around a corner, above the rounding
+_EDGE_SHARE = 0.4  # of two neighbours' contrast that the edge between them has at least
+_EDGE_BESIDE = 0.12  # lengths of the edge, how far beside it its levels are taken: beyond blur, within its squares
+_EDGE_PLACES = (0.25, 0.5, 0.75)  # lengths of the edge, where along it
 _MOST_RATIO = 4.0  # between the contrasts of neighbours
 _OPPOSITE = -0.5  # cosine between the phases of neighbours at most; they are opposite but for perspective
-_NEIGHBOURS, _MOST_SEEDS = 24, 40
+_NEIGHBOURS = 24  # corners about one that may be its neighbours: two rings of a square lattice
+_MOST_SEEDS = 40  # pieces of lattice that are tried; the clearest corners come first
 _SEED_SINE = 0.3  # of the angle between the two edges that a lattice grows from
 _CLEAR_OF_RIM_PX = _RING_PX + 6.0  # of the scaled image; a corner so far inside would have been found
 
@@ -48,7 +51,7 @@ class _Corners:
         rim = int(_RING_PX) + 2
         highest[:rim], highest[-rim:], highest[:, :rim], highest[:, -rim:] = False, False, False, False
         pixels = np.argwhere(highest)[:, ::-1].astype(np.float64)
-        outer, inner = _harmonics(grey, pixels, _RING_PX), _harmonics(grey, pixels, 0.6 * _RING_PX)
+        outer, inner = _harmonics(grey, pixels, _RING_PX), _harmonics(grey, pixels, _INNER_RING * _RING_PX)
         power = np.abs(outer[:, 1:]) ** 2
         share = power[:, 1] / np.maximum(power.sum(axis=1), 1e-9)
         in_phase = np.cos(np.angle(outer[:, 2]) - np.angle(inner[:, 2]))

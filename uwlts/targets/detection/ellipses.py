@@ -9,12 +9,12 @@ from scipy.spatial import KDTree
 from uwlts.runtime.compiled import compiled, compiled_part, compiled_with_arrays
 from uwlts.targets.detection.blobs import Blobs, checked_grey, find_blobs, noise_level
 
-PASSES = 2
+PASSES = 2  # of both fits; the second one measures along the normals of the first
 # The edge of Gaussian blur s has the slope 0.4 / s over its contrast; 1.2 / slope is therefore three s.
 REACH_TIMES_SLOPE = 1.2
-MIN_REACH_PX = 2.5
-MAX_REACH_PX = 8.0
-MIN_RELATIVE_CONTRAST = 0.25
+MIN_REACH_PX = 2.5  # three s of a lens in focus
+MAX_REACH_PX = 8.0  # three s of a blur of 2.7 px
+MIN_RELATIVE_CONTRAST = 0.25  # of the middle's, to which the contrast of planes that meet is raised
 NEIGHBOURS = 12  # their levels show the shading
 MAX_LEVEL_DEPARTURE = 0.25  # a neighbour that differs by more differs by its print, or is no circle
 _ON_A_LINE = 1e-3  # ratio of squares across and along a line, below which places lie on it

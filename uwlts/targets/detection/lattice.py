@@ -11,7 +11,7 @@ from uwlts.targets.detection.ellipses import Ellipses, find_circles
 # Half the side of the square of neighbours: 24 of them determine the six terms of a quadratic with room for gaps.
 NEIGHBOURHOOD = 2
 MIN_NEIGHBOURS = 3  # fewer neither support nor contradict a place
-MAX_OVER_SPREAD = 8.0
+MAX_OVER_SPREAD = 8.0  # of the median distance from predictions: wrong points lie a good part of a step off
 MODEL_ERROR = 0.002  # what a quadratic leaves of perspective and distortion over two steps, as a share of one step
 
 
@@ -57,10 +57,10 @@ def _excess(points, around, present, terms, valid):
     weight = present.astype(float)
     normal = np.einsum("np,pa,pb->nab", weight, terms, terms)
     # Too few neighbours for a quadratic: keep its second-order terms at zero.
-    spare = np.linalg.eigvalsh(normal)[:, 0] < 1e-6
+    spare = np.linalg.eigvalsh(normal)[:, 0] < NO_RANK
     normal[spare, 3:, :], normal[spare, :, 3:] = 0.0, 0.0
     normal[spare] += np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
-    line = np.linalg.eigvalsh(normal)[:, 0] < 1e-6
+    line = np.linalg.eigvalsh(normal)[:, 0] < NO_RANK
     normal[line] = np.eye(6)
     steps = (points[around] - points[:, None]) * weight[:, :, None]
     right = terms.T @ steps
@@ -73,13 +73,15 @@ def _excess(points, around, present, terms, valid):
     judged = valid & ~line & ~spare
     usual = np.median(distance[judged]) if judged.any() else 0.0
     allowed = MAX_OVER_SPREAD * usual + MODEL_ERROR * step
-    # Perspective alone bends the affine prediction by up to a tenth of a step.
-    allowed = np.where(spare, allowed + 0.15 * step, allowed)
+    allowed = np.where(spare, allowed + AFFINE_ERROR * step, allowed)
     return np.where(valid & ~line, distance / np.maximum(allowed, 1e-12), 0.0)
 
 
-NEIGHBOURS = 16
+NEIGHBOURS = 16  # circles among which the next ones along both axes are, for sides of up to 1 : 7
 STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
+
+AFFINE_ERROR = 0.15  # of a step: perspective alone bends an affine prediction by up to a tenth of one
+NO_RANK = 1e-6  # eigenvalue of normal equations in steps, below which neighbours do not determine the terms
 
 # A neighbour is taken where it lies within this share of a step of its predicted place. One step changes by up to a
 # tenth from one circle to the next in strong perspective; half a step would reach the neighbour's neighbour.
@@ -91,8 +93,8 @@ MAX_SIZE_RATIO = 1.5  # of the radii of neighbouring circles
 MIN_SINE = 0.95
 
 MAX_CELL_RATIO = 1.4  # of the area of a seed's cell to the median, half-way between one and two cells
-MIN_LABELLED = 4
-MAX_SEEDS = 20
+MIN_LABELLED = 4  # circles: one cell
+MAX_SEEDS = 20  # pieces of lattice that are tried, the most regular ones first
 
 
 @dataclass(frozen=True)

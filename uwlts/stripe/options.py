@@ -11,7 +11,6 @@ import numpy as np
 
 from uwlts.errors import DescriptionError, RangeError
 from uwlts.model.sensor import Sensor
-from uwlts.model.stripe import Stripe, StripeStatus, pixels_of
 from uwlts.stripe.methods import method_names
 
 LEARNED = "learned"
@@ -105,10 +104,13 @@ class StripeOptions:
             "half_window_px": (8, 512),
             "widest_window_px": (8, 512),
             "smoothing_px": (0.5, self.half_window_px / 4),
+            "smoothing_lines": (1, 101),
+            "threshold_sigmas": (1.0, 1e6),
+            "threshold_floor": (0.0, 1e9),
+            "min_fwhm_px": (0.0, self.half_window_px),
+            "ambiguous_ratio": (0.05, 1.0),
+            "end_lines": (0, 100),
         }
-        ranges |= {"smoothing_lines": (1, 101), "end_lines": (0, 100), "threshold_sigmas": (1.0, 1e6)}
-        ranges |= {"threshold_floor": (0.0, 1e9), "min_fwhm_px": (0.0, self.half_window_px)}
-        ranges |= {"ambiguous_ratio": (0.05, 1.0)}
         for name, (low, high) in ranges.items():
             if not low <= (value := getattr(self, name)) <= high:
                 raise RangeError(f"{name} is {value!r}; expected a number from {low:g} to {high:g}")
@@ -132,63 +134,15 @@ class StripeOptions:
         except (RangeError, TypeError) as error:
             raise DescriptionError(f"settings of the stripe: {error}") from error
 
+    @property
+    def jump_px(self) -> float:
+        """Distance of neighbouring lines' centres above which they belong to two stripes."""
+        return self.half_window_px / 2
+
     def doubled(self) -> StripeOptions:
-        """The same for stripes twice as wide."""
+        """Return the options for stripes twice as wide."""
         return replace(self, half_window_px=2 * self.half_window_px, smoothing_px=2 * self.smoothing_px)
 
 
 StripeSettings = StripeOptions | Mapping[str, Any] | None
 """How the stripe is found: all options; some, in place of the sensor's own; or None, the sensor's own."""
-
-
-@dataclass(frozen=True)
-class StripeCandidates:
-    """All stripes of one image, M of them, in the order of lines and places: of several sheets, of reflections.
-
-    Attributes
-    ----------
-    line : (M,) int
-        Profile line of each; a line may have none, one, or several.
-    centre_px, amplitude, width_px : (M,) float64, float32, float32
-        As of `Stripe`.
-    log_likelihood : (M,) float64
-        Logarithm of the likelihood that the pixels have with the stripe over that without it, for the background's
-        white noise.
-    count : int
-        Number L of profile lines.
-    stripe_along : str
-        As of `Stripe`.
-    """
-
-    line: np.ndarray
-    centre_px: np.ndarray
-    amplitude: np.ndarray
-    width_px: np.ndarray
-    log_likelihood: np.ndarray
-    count: int
-    stripe_along: str
-
-    def split(self, sheets: int = 2) -> list[Stripe]:
-        """One `Stripe` for each of so many sheets of light, in the order of growing places.
-
-        Lines with another number of stripes than sheets do not show which is which: they are AMBIGUOUS, those without
-        any NO_STRIPE. RangeError for a number of sheets below 1.
-        """
-        if sheets < 1:
-            raise RangeError(f"sheets is {sheets}; expected 1 or more")
-        on_line = np.bincount(self.line, minlength=self.count)
-        status = np.full(self.count, StripeStatus.AMBIGUOUS, np.uint8)
-        status[on_line == 0], status[on_line == sheets] = StripeStatus.NO_STRIPE, StripeStatus.OK
-        lines = np.flatnonzero(on_line == sheets)
-        first = np.searchsorted(self.line, lines)
-        found = []
-        for number in range(sheets):
-            centre, amplitude, width = np.full(self.count, np.nan), *np.full((2, self.count), np.nan, np.float32)
-            for column, values in ((centre, self.centre_px), (amplitude, self.amplitude), (width, self.width_px)):
-                column[lines] = values[first + number]
-            found.append(Stripe(centre, amplitude, width, status.copy(), self.stripe_along))
-        return found
-
-    def pixels(self) -> np.ndarray:
-        """(M, 2) float64: image coordinates (u = column, v = row), px."""
-        return pixels_of(self.line, self.centre_px, stripe_along=self.stripe_along)

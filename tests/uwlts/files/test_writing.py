@@ -8,19 +8,17 @@ from typing import Any
 import pytest
 
 from uwlts.errors import OutputError
-from uwlts.files import one_writer, unfinished, writing as files
-from uwlts.files.writing import written_aside
-
-MODULES = {files.__file__, one_writer.__file__, unfinished.__file__}
+from uwlts.files import writing
+from uwlts.files.writing import one_writer, remove_unfinished, written_aside
 
 
 def interrupted_at(step: int, target: Path) -> bool:
-    """Write a file with an interrupt before instruction number ``step`` of the modules; False where there are fewer."""
+    """Write a file with an interrupt before instruction number ``step`` of the module; False where there are fewer."""
     left = step
 
     def trace(frame: FrameType, event: str, _: Any) -> Any:
         nonlocal left
-        if frame.f_code.co_filename not in MODULES:
+        if frame.f_code.co_filename != writing.__file__:
             return None
         frame.f_trace_opcodes = True
         if event == "opcode":
@@ -46,7 +44,7 @@ def test_an_interrupt_anywhere_leaves_the_whole_file_or_nothing(tmp_path):
     steps = whole = 0
     while interrupted_at(steps + 1, target := tmp_path / f"{steps}.txt"):
         steps += 1
-        unfinished.remove_unfinished()
+        remove_unfinished()
         assert [path for path in tmp_path.iterdir() if path.name.startswith(".")] == [], steps
         if target.exists():
             whole += 1
@@ -60,15 +58,15 @@ def test_locks_of_others_stay(tmp_path):
 
     target = tmp_path / "a.txt"
     program = (
-        "import sys, pathlib\nfrom uwlts.files.one_writer import one_writer\n"
+        "import sys, pathlib\nfrom uwlts.files.writing import one_writer\n"
         "with one_writer(pathlib.Path(sys.argv[1])):\n    print('held', flush=True)\n    sys.stdin.read()\n"
     )
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", program, str(target)], **pipes) as holder:
         assert holder.stdout is not None and holder.stdout.readline() == "held\n"
-        with pytest.raises(OutputError, match="is writing it"), one_writer.one_writer(target):
+        with pytest.raises(OutputError, match="is writing it"), one_writer(target):
             pass
-        unfinished.remove_unfinished()
-        assert one_writer.lock_path(target).exists()
+        remove_unfinished()
+        assert (tmp_path / ".a-txt.lock").exists()
         holder.communicate()
-    assert not one_writer.lock_path(target).exists()
+    assert list(tmp_path.iterdir()) == []

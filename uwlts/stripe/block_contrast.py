@@ -1,4 +1,4 @@
-"""Candidate places of a stripe on each profile line: blocks of pixels that stick out of both their surroundings.
+"""Contrast of blocks of pixels: blocks that stick out of both their surroundings may hold a stripe.
 
 A frame is reduced to the largest value and the background in blocks of a few pixels along each line, which is the
 only work done on all pixels. A block sticks out by its largest value minus the larger of the background values two

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from uwlts.hardware import page_beside
-from uwlts.hardware.page_beside import PageBeside
+from uwlts.desk import scan
+from uwlts.desk.scan import PageBeside
 
 
 def test_the_page_is_asked_for_at_the_port_that_is_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -16,7 +16,7 @@ def test_the_page_is_asked_for_at_the_port_that_is_wanted(tmp_path: Path, monkey
         asked.append(command)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(page_beside.subprocess, "Popen", started)
+    monkeypatch.setattr(scan.subprocess, "Popen", started)
     page = PageBeside(tmp_path / "a.h5", calibration=None, port=9123, say=print)
     with pytest.raises(KeyboardInterrupt):
         page.start()
