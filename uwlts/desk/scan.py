@@ -102,7 +102,7 @@ def scan(
     address, serial_port = camera or plan.camera, stage or plan.stage.port
     if address is None or serial_port is None:
         what = "camera" if address is None else "stage"
-        raise DescriptionError(f"neither the plan nor the command line gives the {what}: give --{what}")
+        raise DescriptionError(f"the plan names no {what}: give `{what}`")
     if calibration:
         if not watch:
             raise DescriptionError("`calibration` is for the cloud on the page: give `watch` too")

@@ -60,9 +60,9 @@ def check_fits(header: CaptureHeader, calibration: AnyCalibration, *, source: st
     elif header.medium.kind not in ("air", calibration.medium_kind) and calibration.window is None:
         raise CalibrationError(
             f"{source} was made in {header.medium_name}, but the calibration is for "
-            f"{calibration.medium_kind} only: calibrate again with step images taken in the medium (--step)"
+            f"{calibration.medium_kind} only: calibrate again with step images taken in the medium (`step`)"
         )
-    elif header.medium.kind == "air" and calibration.medium_kind != "air":
+    elif header.medium.kind == "air" and calibration.medium_kind != "air" and calibration.window is None:
         raise CalibrationError(
             f"{source} was made in air, but the calibration is that of a single viewpoint in water "
             f"({calibration.medium_kind}): its camera holds the refraction; calibrate in air"

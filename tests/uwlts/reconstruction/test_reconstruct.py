@@ -154,10 +154,13 @@ def single_viewpoint(medium):
         (single_viewpoint(FRESH), SEA, "the calibration is for fresh only"),
         (single_viewpoint(SEA), SEA, None),
         (single_viewpoint(AIR), AIR, None),
-        (single_viewpoint(AIR), FRESH, r"the calibration is for air only: .*--step"),
+        (single_viewpoint(AIR), FRESH, r"the calibration is for air only: .*`step`"),
         (CALIBRATION, AIR, None),
         (CALIBRATION, FRESH, None),
         (CALIBRATION, SEA, None),
+        # With a window it holds in all media, whichever it is a nominal one of.
+        (nominal_calibration(small_sensor(), FRESH), AIR, None),
+        (nominal_calibration(small_sensor(), FRESH), SEA, None),
     ],
 )
 def test_a_calibration_without_a_window_holds_in_its_own_medium(tmp_path, calibration, medium, refusal):
