@@ -112,3 +112,10 @@ def test_the_oracles_use_numpy_and_the_standard_library_alone():
 
 def test_the_citation_names_the_version():
     assert f"\nversion: {uwlts.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
+def test_folders_of_tests_are_packages():
+    folders = {path.parent.relative_to(ROOT / "tests") for path in (ROOT / "tests").rglob("test_*.py")}
+    mirrored = {folder for folder in folders if folder.parts[:1] in (("uwlts",), ("twin",))}
+    assert len(mirrored) > 20
+    assert {str(folder) for folder in mirrored if not (ROOT / folder / "__init__.py").exists()} == set()

@@ -5,7 +5,7 @@
     python docs/studies/code_agreement.py /tmp/old --folder runs/agreement --only joint reconstruct
 
 Inputs are made once by the older checkout (`code_agreement_inputs.py`), and its results are kept as long as its commit
-and the command lines stay. Each version runs all jobs in one process, as ``python -m uwlts.cli`` does. Numbers have to
+and the command lines stay. Each version runs all jobs in one process, as ``python -m uwlts`` does. Numbers have to
 agree to 1e-9 (relative), and neither version may write files or keys that the other one does not; texts that differ are
 listed, as wording may change. The exit code is 1 where anything else differs.
 """
@@ -107,7 +107,7 @@ JOBS: dict[str, str] = {
         uwlts evaluate reconstruct/sequential.ply --truth inputs/scans/spheres.truth.h5 --out evaluate/sequential.json
         uwlts evaluate reconstruct/polynomials.ply --out evaluate/polynomials.json""",
     "verify": f"""
-        uwlts verify inputs/scans/spheres.h5 {TAKEN} --limit 0.5
+        uwlts verify inputs/scans/spheres.h5 {TAKEN} --limit-mm 0.5
         uwlts verify inputs/scans/step-scan.h5 {TAKEN}""",
     "clouds": "\n".join(
         f"uwlts reconstruct inputs/scans/{name}.h5 {TAKEN} --out clouds/{name}.ply"
@@ -310,7 +310,7 @@ def run_command(line: str) -> int:
         return 0
     sys.argv = [program, *arguments]
     try:
-        runpy.run_module(f"{program}.cli", run_name="__main__")
+        runpy.run_module(program, run_name="__main__")
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else int(ended.code is not None)
     except Exception:

@@ -158,7 +158,7 @@ def test_a_photograph_is_not_replaced_by_the_camera(tmp_path):
 @pytest.fixture(scope="module")
 def nominal(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("nominal") / "nominal.json"
-    uwlts.write_calibration(path, uwlts.nominal("thesis", medium="water"))
+    uwlts.nominal("thesis", medium="water").save(path)
     return path
 
 
@@ -175,15 +175,15 @@ def test_functions_keep_their_inputs_too(tmp_path, nominal):
     calibration = tmp_path / "a.json"
     calibration.write_bytes(nominal.read_bytes())
     with pytest.raises(OutputError, match="is an input"):
-        uwlts.write_certificate(calibration, out=tmp_path / "a.html", overwrite=True)
+        uwlts.report.write_certificate(calibration, out=tmp_path / "a.html", overwrite=True)
     cloud = tmp_path / "cloud.ply"
-    uwlts.write_cloud(cloud, PointCloud(np.eye(3), np.ones(3), np.zeros(3), np.arange(3)))
+    PointCloud(np.eye(3), np.ones(3), np.zeros(3), np.arange(3)).save(cloud)
     before = cloud.read_bytes()
     with pytest.raises(OutputError, match="is an input"):
         uwlts.export(cloud, cloud, overwrite=True)
     assert cloud.read_bytes() == before
     # Who reads and writes in steps of his own knows what he does.
-    uwlts.write_cloud(cloud, uwlts.read_cloud(cloud), overwrite=True)
+    uwlts.read(cloud).save(cloud, overwrite=True)
 
 
 def test_what_is_read_meanwhile_is_not_replaced_but_what_was_made_may_be_read_and_replaced(tmp_path):

@@ -7,8 +7,8 @@ finds the correction and `crossing_search` the crossings.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,12 +18,16 @@ from uwlts.alignment.path_estimate import Pair, PathEstimate
 from uwlts.alignment.path_prior import USUAL_DRIFT, DriftKind, PathSpline
 from uwlts.alignment.stated_drift import stated_drift
 from uwlts.errors import EvaluationError
+from uwlts.files.json_files import write_record
 from uwlts.fitting.patches import scatter
+from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory, on_clock
 from uwlts.reconstruction.path_uncertainty import along_corrected_path
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.cloud_files import loaded_cloud
+from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
 
 _ROUGH = DriftKind(smooth=0.0, wandering=0.3, walk=0.3, turn_walk=0.3)
 """Kind of drift that is assumed in the search where the stated or usual one finds no crossing: fewer false crossings
@@ -48,8 +52,8 @@ class Crossing:
     missed_mm: float
 
 
-@dataclass(frozen=True, eq=False)
-class AlignedTrajectory:
+@dataclass(frozen=True, eq=False, repr=False)
+class AlignedTrajectory(Brief):
     """A path that agrees with the surfaces that it shows.
 
     Attributes
@@ -70,7 +74,7 @@ class AlignedTrajectory:
     correction: np.ndarray
     crossings: tuple[Crossing, ...]
     doubtful_s: tuple[tuple[float, float], ...]
-    cloud: PointCloud = field(repr=False)
+    cloud: PointCloud
 
     def record(self) -> Table:
         """Crossings and size of the correction as JSON."""
@@ -84,6 +88,11 @@ class AlignedTrajectory:
             ],
             "doubtful_s": [list(each) for each in self.doubtful_s],
         }
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the corrected trajectory as CSV with covariances, and the crossings as JSON beside it."""
+        self.trajectory.save(path, overwrite=overwrite)
+        write_record(Path(path).with_suffix(".json"), self.record(), overwrite=overwrite)
 
     def lines(self) -> list[str]:
         """The summary as text."""
@@ -106,29 +115,40 @@ class AlignedTrajectory:
 
 def align_trajectory(
     cloud: PointCloud | str | os.PathLike[str],
-    trajectory: Trajectory,
+    trajectory: Trajectory | str | os.PathLike[str],
     *,
+    pose_format: PoseFormat = "quaternion-xyzw",
+    pose_unit: Unit = "mm",
     clock_offset_s: float = 0.0,
     clock_drift_ppm: float = 0.0,
     drift_mm: float | None = None,
     drift_deg: float | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> AlignedTrajectory:
-    """Correct a trajectory so that surfaces which it shows twice agree, and move the cloud with it.
+    """Correct a trajectory so that surfaces which the scan shows twice agree, and move the cloud with it.
+
+    Reconstruct the scan along the corrected trajectory afterwards: its points then have the uncertainty that is left.
 
     Parameters
     ----------
     cloud
-        Cloud or its file, in the base frame by the trajectory, with the time of each point (`reconstruct`).
+        Cloud along the trajectory with the time of each point (uwlts reconstruct --trajectory).
     trajectory
-        Path of the platform (of the sensor without a mount).
-    clock_offset_s, clock_drift_ppm
-        What to add to the times of the points for those of the trajectory, and by how many parts in a million its clock
-        runs faster than theirs.
-    drift_mm, drift_deg
+        CSV file or ROS bag with times and poses of the platform, as the cloud was reconstructed with.
+    pose_format, pose_unit
+        As for `reconstruct`.
+    clock_offset_s
+        What to add to the times of the points for those of the trajectory.
+    clock_drift_ppm
+        By how many parts in a million the trajectory's clock runs faster, as for `reconstruct`.
+    drift_mm
         Standard uncertainty that the navigation has gathered at the end, along each axis. Of which kind the drift is, a
         steady or changing rate or a random walk, is estimated then. Unless given the covariance of the trajectory tells
         both, and what of the kind the surfaces strongly contradict is estimated.
+    drift_deg
+        The same of its turns.
+    progress
+        Called with the number of steps done and the number in all.
 
     Raises
     ------
@@ -139,7 +159,9 @@ def align_trajectory(
     EvaluationError
         Points have no times, the drift is not known, or the path shows no surface twice that tells where it is.
     """
-    cloud = cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
+    cloud = loaded_cloud(cloud)
+    if not isinstance(trajectory, Trajectory):
+        trajectory = read_trajectory(Path(trajectory), pose_format=pose_format, unit=pose_unit)
     if cloud.time_s is None:
         raise EvaluationError("the cloud has no times of its points: reconstruct it with a trajectory")
     times = on_clock(cloud.time_s, offset_s=clock_offset_s, drift_ppm=clock_drift_ppm)
@@ -149,7 +171,7 @@ def align_trajectory(
     for turn, kind in enumerate((drift.kind or USUAL_DRIFT, _ROUGH)):
         estimate = PathEstimate(cloud, times, path, kind, stated=drift.kind)
 
-        def searched(done: int, total: int, turn: int = turn) -> None:
+        def searched(done: int, total: int, stage: str = "", turn: int = turn) -> None:
             progress(turn * total + done, (turn + 1) * total)
 
         doubtful = close_crossings(estimate, searched)

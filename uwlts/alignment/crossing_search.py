@@ -8,7 +8,6 @@ with the most agreeing patches is tested first, and none is closed where another
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +19,7 @@ from uwlts.alignment.height_correlation import shifts_of_heights
 from uwlts.alignment.path_estimate import FEWEST, Pair, PathEstimate
 from uwlts.fitting.patches import Patches, distances_between
 from uwlts.registration.joint_registration import JointRegistration
+from uwlts.runtime.progress import ProgressListener, unheard
 
 SIGMAS = 3.0
 """Search range of crossings, in standard deviations of the drift."""
@@ -44,9 +44,7 @@ class Hypothesis:
     patches: int
 
 
-def close_crossings(
-    estimate: PathEstimate, progress: Callable[[int, int], None] = lambda done, total: None
-) -> list[Pair]:
+def close_crossings(estimate: PathEstimate, progress: ProgressListener = unheard) -> list[Pair]:
     """Find and close the crossings of a path, in the order of time; returns pairs that were left out as doubtful."""
     waiting: list[Hypothesis] = []
     doubtful: list[Pair] = []

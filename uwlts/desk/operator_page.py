@@ -52,21 +52,24 @@ class _Opened:
 
 
 def serve_desk(
-    folder: str | Path = Path(),
+    folder: str | Path = ".",
     *,
     plan: str | Path | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     report: Callable[[str], None] = print,
 ) -> None:
-    """Serve the operator's page until Ctrl-C: connect, look, move, scan, reconstruct and measure in a browser.
+    """Serve the operator's page until Ctrl-C: connect, look, calibrate, scan, reconstruct and measure in a browser.
+
+    The address with the token is the operator's; at the other one everybody who reaches it may look. The page works
+    without internet.
 
     Parameters
     ----------
     folder : str or Path
-        Folder with plans, calibrations, captures and clouds; results are written there.
+        Folder with plans, calibrations, captures and clouds; the present one unless given. Results are written there.
     plan : str or Path, optional
-        Plan of a scan to begin with, with the addresses of camera and stage.
+        Plan of a scan (docs/how-to/scan.md) to begin with; others can be chosen on the page.
     host : str
         Address at which the page is served; the default can be reached from this machine only.
     port : int

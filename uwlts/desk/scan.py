@@ -18,6 +18,7 @@ from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.scan_plan import ScanPlan, load_plan
 from uwlts.hardware.scanning import ScanProgress, record_scan
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import CAPTURES
 
@@ -42,11 +43,13 @@ def scan(
     port: int = 8080,
     resume: bool = False,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
     report: Callable[[str], None] = lambda line: None,
     warn: Callable[[str], None] = lambda text: None,
 ) -> ScanProgress:
-    """Connect camera and stage and record a scan into a capture.
+    """Record a scan with a camera and a stage into a capture.
+
+    Moves, lets the stage settle, switches the laser, takes an image and stores it with the position read back.
 
     The plan is checked against travel and volume before anything moves; the laser goes off however the scan ends. An
     interrupted scan leaves its complete images in ``out.part``; ``resume`` goes on after them, at exposures that the
@@ -55,23 +58,27 @@ def scan(
     Parameters
     ----------
     plan : ScanPlan or path of a TOML file
-        Sensor, medium, positions, lights and exposures.
+        TOML file with sensor, medium, positions, lights and exposures (docs/how-to/scan.md).
     out : str or Path
         Capture to write.
     camera : str, optional
         Address of the camera, in place of the plan's: gige:NAME, genicam:PRODUCER.cti or replay:PATH.
     stage : str, optional
         Serial port of the stage, in place of the plan's.
-    home, unlock : bool
-        Find the limit switch first; or take the stage's position as it is, without homing.
+    home : bool
+        Find the limit switch first.
+    unlock : bool
+        Take the stage's position as it is, without homing.
     watch : bool
-        Show the recording in a browser meanwhile, as `watch` does.
+        Show the recording in a browser meanwhile, as uwlts watch does.
     calibration : str or Path, optional
-        Calibration of any kind for the cloud on that page.
+        Watched: calibration of the sensor, or one by polynomials, for the cloud.
     port : int
-        Port of that page; the next free one is taken if it is in use.
-    resume, overwrite : bool
-        Continue an interrupted scan; replace an existing capture.
+        Watched: port of the page; the next free one is taken if it is in use.
+    resume : bool
+        Continue an interrupted scan; refused if the plan is another than the one it began with.
+    overwrite : bool
+        Replace an existing capture.
     progress : callable, optional
         Called with the number of images done and the number in all.
     report, warn : callable, optional
@@ -98,7 +105,7 @@ def scan(
         raise DescriptionError(f"neither the plan nor the command line gives the {what}: give --{what}")
     if calibration:
         if not watch:
-            raise DescriptionError("--calibration is for the cloud on the page: give --watch too")
+            raise DescriptionError("`calibration` is for the cloud on the page: give `watch` too")
         load_calibration(calibration)
     with ExitStack() as stack:
         page = stack.enter_context(PageBeside(out, calibration=calibration, port=port, say=report)) if watch else None
@@ -131,7 +138,7 @@ class PageBeside:
     """
 
     def __init__(self, capture: Path, *, calibration: str | Path | None, port: int, say: Callable[[str], None]):
-        command = [sys.executable, "-m", "uwlts.cli", "watch", str(capture), "--port", str(port)]
+        command = [sys.executable, "-m", "uwlts", "watch", str(capture), "--port", str(port)]
         self._command = [*command, "--calibration", str(calibration)] if calibration else command
         self._say = say
         self._process: subprocess.Popen[str] | None = None

@@ -13,7 +13,9 @@ import numpy as np
 from scipy.stats import f as f_distribution, t as t_distribution
 
 from uwlts.errors import DescriptionError, EvaluationError
+from uwlts.files.json_files import RecordFile
 from uwlts.files.reading import read_bytes
+from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 
 _MOST_BYTES = 64 * 2**20
@@ -50,8 +52,8 @@ class Variance:
     probability: float | None
 
 
-@dataclass(frozen=True)
-class GaugeStudy:
+@dataclass(frozen=True, repr=False)
+class GaugeStudy(Brief, RecordFile):
     """A crossed study: every operator measures every part equally often.
 
     ``components`` by their names: repeatability (EV), reproducibility (AV, with the interaction), gauge (GRR), parts
@@ -87,8 +89,8 @@ class GaugeStudy:
         return [*lines, f"distinct categories       {self.distinct}"]
 
 
-@dataclass(frozen=True)
-class RepeatedReference:
+@dataclass(frozen=True, repr=False)
+class RepeatedReference(Brief, RecordFile):
     """One part of known size measured again and again (type-1 study).
 
     ``bias`` is the mean less the reference, significant where its 95 % interval does not hold 0. With a tolerance T:
@@ -126,7 +128,7 @@ def gauge_study(
     tolerance: float | None = None,
     reference: float | None = None,
 ) -> GaugeStudy | RepeatedReference:
-    """Judge a gauge by repeated measurements of one figure.
+    """Judge a gauge by repeated measurements of a figure: repeatability, reproducibility, share of a tolerance.
 
     Several parts and operators, each part measured by each operator equally often, make a crossed study by analysis of
     variance with random effects (AIAG, Measurement Systems Analysis, 4th ed., chapter III-B and appendix A); an
@@ -142,7 +144,7 @@ def gauge_study(
     tolerance
         Width of the tolerance, in the unit of the values.
     reference
-        True value of the only part.
+        True value of the only part: a type-1 study with Cg and Cgk.
 
     Raises
     ------

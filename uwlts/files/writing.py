@@ -95,7 +95,7 @@ def _require_suitable(target: Path, *, overwrite: bool) -> None:
         raise OutputError(f"cannot write {target}: it exists and is not a regular file; choose another name")
     refuse_input(target)
     if target.exists() and not overwrite:
-        raise OutputError(f"{target} exists already; give another name, or --overwrite to replace it")
+        raise OutputError(f"{target} exists already; give another name, or `overwrite` to replace it")
 
 
 def require_possible_name(target: Path) -> None:

@@ -22,6 +22,7 @@ from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, stripe_of,
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scan_watch import LOOKS, LaserWatch, LitPlace, Place, SlipWatch, centres_of, shows_laser, spread
 from uwlts.model.sensor import Sensor
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.import_.grey_values import without_background
@@ -75,7 +76,7 @@ def record_scan(
     stage: GrblStage,
     resume: bool = False,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
     report: Callable[[str], None] = lambda line: None,
     warn: Callable[[str], None] = lambda text: None,
     between: Callable[[], None] = lambda: None,
@@ -112,7 +113,7 @@ def record_scan(
     )
     if plan.continuous is not None:
         if resume:
-            raise DescriptionError("a continuous scan cannot be resumed: give --overwrite to scan again")
+            raise DescriptionError("a continuous scan cannot be resumed: give `overwrite` to scan again")
         ways_of(plan, plan.continuous, stage)
         rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
         seen = ScanProgress()
@@ -312,8 +313,8 @@ class _Taking:
         raise HardwareError(
             f"the stage has lost steps, or sensor or object were moved: the image back at {place.position_mm:g} mm "
             f"{seen}. All images are recorded, but from somewhere on at wrong positions: find the cause (feed, "
-            "acceleration, something in the way) and scan again with --overwrite, or take them as they are with "
-            "--resume"
+            "acceleration, something in the way) and scan again with `overwrite`, or take them as they are with "
+            "`resume`"
         )
 
     def _shorten(self, light: Light, position_mm: float) -> bool:

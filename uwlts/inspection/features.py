@@ -5,6 +5,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from uwlts.files.json_files import RecordFile
+from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 
 COVERAGE = 0.95
@@ -226,8 +228,8 @@ class Feature:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Inspection:
+@dataclass(frozen=True, eq=False, repr=False)
+class Inspection(Brief, RecordFile):
     """What an inspection found in a cloud.
 
     Attributes

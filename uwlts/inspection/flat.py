@@ -6,6 +6,7 @@ has left to the last point on a face, and are known to half a point's spacing.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -25,6 +26,7 @@ from uwlts.fitting.shapes import fit_plane
 from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, Inspection
 from uwlts.inspection.propagation import NormalErrors, normal_errors, plain_value
 from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import loaded_cloud
 
 _FEWEST = 200
 _PROPOSALS, _THINNED = 600, 3000
@@ -61,11 +63,22 @@ _DRAWS, _SEED = 48, 635
 _facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
 
 
-def inspect_step(cloud: PointCloud) -> Inspection:
+def inspect_step(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     """Measure the step between the two largest parallel faces of a cloud.
 
-    EvaluationError where there are no two such faces.
+    Parameters
+    ----------
+    cloud
+        As for `inspect_pipe`.
+
+    Raises
+    ------
+    CaptureError
+        The file cannot be read.
+    EvaluationError
+        There are no two such faces.
     """
+    cloud = loaded_cloud(cloud)
     _require_points(cloud)
     normal = _largest_plane(cloud.points_mm)[0]
     labels = label_step_faces(cloud.points_mm, height_mm=_height_between(cloud.points_mm @ normal))
@@ -94,12 +107,28 @@ def inspect_step(cloud: PointCloud) -> Inspection:
     return _inspection("step", cloud, (feature,), [(lower, base), (upper, other)])
 
 
-def inspect_flange(cloud: PointCloud, *, datum: PointCloud | None = None) -> Inspection:
+def inspect_flange(
+    cloud: PointCloud | str | os.PathLike[str], *, datum: PointCloud | str | os.PathLike[str] | None = None
+) -> Inspection:
     """Measure a flange's face: flatness, holes, bolt circle, and its parallelism to the face of another cloud.
 
-    The ``datum`` is in the same frame. Of the holes the largest is the bore, those of like diameter are for bolts.
-    EvaluationError where the cloud has no frames and lines, or no face.
+    Of the holes the largest is the bore, those of like diameter are for bolts.
+
+    Parameters
+    ----------
+    cloud
+        As for `inspect_pipe`.
+    datum
+        Cloud of another face in the same frame, to which the flange's face is to be parallel, or its file.
+
+    Raises
+    ------
+    CaptureError
+        The file cannot be read.
+    EvaluationError
+        The cloud has no frames and lines, or no face.
     """
+    cloud, datum = loaded_cloud(cloud), None if datum is None else loaded_cloud(datum)
     _require_points(cloud)
     on_face = _largest_plane(cloud.points_mm)[1]
     face = _face_of(cloud, on_face)
@@ -143,11 +172,22 @@ def inspect_flange(cloud: PointCloud, *, datum: PointCloud | None = None) -> Ins
     return _inspection("flange", cloud, (whole, *features), [(used, face)], notes)
 
 
-def inspect_gap(cloud: PointCloud) -> Inspection:
+def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     """Measure the gap between two plates that the profiles cross: width, parallelism and flush.
 
-    EvaluationError where the cloud has no frames and lines, or no gap goes through it.
+    Parameters
+    ----------
+    cloud
+        As for `inspect_pipe`.
+
+    Raises
+    ------
+    CaptureError
+        The file cannot be read.
+    EvaluationError
+        The cloud has no frames and lines, or no gap goes through it.
     """
+    cloud = loaded_cloud(cloud)
     _require_points(cloud)
     # Both plates, which may be offset: everything on either side of the widest hole in the profiles.
     everything = np.arange(len(cloud))

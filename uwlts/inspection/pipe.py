@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from uwlts.inspection.features import Feature, FeatureKind, Inspection
 from uwlts.inspection.pipe_form import LARGEST_OVALITY, MOST_OFF_SHARE, PipeForm, fit_pipe, pipe_features, refit_pipe
 from uwlts.inspection.propagation import normal_errors
 from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import loaded_cloud
 
 _OVERLAP, _SEARCHED = 0.6, 0.1
 """Radians by which both sides of a pipe that is cut open overlap, unless as many without a point part them; and by
@@ -25,7 +27,7 @@ _FEWEST = 500
 
 
 def inspect_pipe(
-    cloud: PointCloud,
+    cloud: PointCloud | str | os.PathLike[str],
     *,
     section_mm: float | None = None,
     wall_mm: float | None = None,
@@ -43,13 +45,13 @@ def inspect_pipe(
     Parameters
     ----------
     cloud
-        Cloud of the pipe's outside.
+        Cloud of the object, or its file (.ply, .h5, .copc.laz; of other programs .las, .e57, and text in mm).
     section_mm
-        Length of a section; up to twelve sections unless given.
+        Length of a section along the pipe (or a weld); up to twelve sections unless given.
     wall_mm
-        Thickness of the undamaged wall, for the wall that remains.
+        Thickness of the pipe's undamaged wall, for the wall that remains.
     false_alarm
-        Probability that anything is found on the whole pipe where nothing is.
+        Probability that anything is found on the whole of a pipe's surface where nothing is.
     largest_ovality
         Ovality over the diameter that the pipe may have where less than half of its circumference was seen: the
         tolerance of its specification, where it still holds.
@@ -66,6 +68,7 @@ def inspect_pipe(
     >>> found = uwlts.inspect_pipe("pipe.ply", wall_mm=9.5)
     >>> print("\\n".join(found.lines()))
     """
+    cloud = loaded_cloud(cloud)
     if wall_mm is not None and not 0 < wall_mm < np.inf:
         raise EvaluationError(f"wall_mm is {wall_mm:g}; expected a positive thickness in mm")
     if not 0 < false_alarm < 1:

@@ -8,6 +8,7 @@ so that the points' errors run through to every value: by each pattern that all 
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,7 @@ from uwlts.inspection.features import COVERAGE_FACTOR, DEFINITIONS, Feature, Fea
 from uwlts.inspection.noisy_extremes import Largest, largest_mean
 from uwlts.inspection.propagation import NormalErrors, normal_errors, plain_value
 from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import loaded_cloud
 
 _FEWEST = 500
 _TO_START = 20_000
@@ -58,13 +60,27 @@ _TUKEY = 4.685
 _NOTHING = 1e-9
 
 
-def inspect_weld(cloud: PointCloud, *, section_mm: float | None = None) -> Inspection:
+def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: float | None = None) -> Inspection:
     """Measure the highest weld bead of a cloud: height, width, undercut, toe angles and misalignment.
 
     The plates on both sides are fitted robustly; the bead runs along the longest extent of what stands out of them.
-    Sections are ``section_mm`` long, or as short as their points allow. Toes are where the lines through the flanks,
-    from 10 to 50 % of the height, meet the plates. EvaluationError where no bead stands out.
+    Toes are where the lines through the flanks, from 10 to 50 % of the height, meet the plates.
+
+    Parameters
+    ----------
+    cloud
+        As for `inspect_pipe`.
+    section_mm
+        Length of a section along the weld; as short as its points allow unless given.
+
+    Raises
+    ------
+    CaptureError
+        The file cannot be read.
+    EvaluationError
+        No bead stands out, or the length is not positive.
     """
+    cloud = loaded_cloud(cloud)
     if section_mm is not None and not 0 < section_mm < np.inf:
         raise EvaluationError(f"section_mm is {section_mm:g}; expected a positive length in mm")
     if len(cloud) < _FEWEST:

@@ -10,7 +10,7 @@ surface.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +18,7 @@ import numpy as np
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.patches import surface_patches
+from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import Table
 from uwlts.registration.coarse_registration import coarse_poses
@@ -25,8 +26,10 @@ from uwlts.registration.joint_registration import JointRegistration, PairEvidenc
 from uwlts.registration.marker_spheres import find_markers
 from uwlts.registration.merging import merged_cloud
 from uwlts.registration.open_movements import OpenMovement, open_movements
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.cloud_files import loaded_cloud
+from uwlts.storage.pose_files import PoseFormat, Unit, read_poses, write_poses
 
 _ROUNDS = 60
 _STILL_MM = 1e-5
@@ -65,8 +68,8 @@ class Overlap:
     distance_mm: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class RegisteredScans:
+@dataclass(frozen=True, eq=False, repr=False)
+class RegisteredScans(Brief):
     """Several scans in the frame of the first.
 
     Attributes
@@ -97,7 +100,7 @@ class RegisteredScans:
     pairs: tuple[PairFit, ...]
     overlaps: tuple[Overlap, ...] = field(repr=False)
     scale: float
-    cloud: PointCloud = field(repr=False)
+    cloud: PointCloud
 
     @property
     def std(self) -> np.ndarray:
@@ -132,6 +135,10 @@ class RegisteredScans:
             "points": len(self.cloud),
         }
 
+    def save_poses(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the poses of the scans as CSV of the format matrix, mm; OutputError if that fails."""
+        write_poses(path, self.poses, overwrite=overwrite)
+
     def lines(self) -> list[str]:
         """The summary as text."""
         lines = [f"{len(self.names)} scans, {len(self.cloud)} points, {len(self.pairs)} overlaps"]
@@ -157,27 +164,34 @@ class RegisteredScans:
 def register(
     clouds: Sequence[PointCloud | str | os.PathLike[str]],
     *,
-    poses: np.ndarray | None = None,
+    poses: np.ndarray | str | os.PathLike[str] | None = None,
+    pose_format: PoseFormat = "matrix",
+    pose_unit: Unit = "mm",
     start_std_mm: float | None = None,
     start_std_deg: float | None = None,
     search: bool = False,
     sphere_mm: float | None = None,
     reach_mm: float | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> RegisteredScans:
-    """Bring scans that overlap into the frame of the first, and merge them.
+    """Bring scans that overlap into the frame of the first, and merge them into one cloud with its uncertainty.
 
     Parameters
     ----------
     clouds
         Two or more clouds or their files, in any order; every one overlaps another, not necessarily the first.
-    poses : (N, 4, 4), optional
-        Poses at the start, common frame from each scan's; the scans' frames are taken as one frame unless given.
-    start_std_mm, start_std_deg : float, optional
-        Standard uncertainty of the poses at the start, of each scan's shift and of its turn about its middle, by axis.
-        They count as evidence then, and decide what surfaces leave open.
+    poses : (N, 4, 4) or path, optional
+        Pose of every scan at the start, in the order of the clouds, common frame from each scan's: an array, or a CSV
+        file. The scans' frames are taken as one unless given.
+    pose_format, pose_unit
+        As for `reconstruct`.
+    start_std_mm : float, optional
+        Standard uncertainty of each scan's shift at the start along each axis. The start counts as evidence then, and
+        decides what surfaces leave open.
+    start_std_deg : float, optional
+        The same of its turn about its middle.
     search : bool
-        Search the start by the shape of the surfaces (KISS-Matcher), or by spheres; whatever the frames and poses are.
+        Search the start by the shape of the surfaces (KISS-Matcher), or by spheres, whatever the frames and poses are.
     sphere_mm : float, optional
         Diameter of spheres that stand in the scene: their centres tie scans together that do not see one surface.
     reach_mm : float, optional
@@ -197,10 +211,12 @@ def register(
     Examples
     --------
     >>> found = uwlts.register(["top.ply", "left.ply", "right.ply"])
-    >>> uwlts.write_cloud("pipe.ply", found.cloud)
+    >>> found.cloud.save("pipe.ply")
     """
     names = tuple(_name(each, number) for number, each in enumerate(clouds))
     scans = [_opened(each) for each in clouds]
+    if isinstance(poses, str | os.PathLike):
+        poses = read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0]
     if len(scans) < 2:
         raise EvaluationError(f"found {len(scans)} cloud; two or more are needed for a registration")
     for name, length in (("sphere_mm", sphere_mm), ("reach_mm", reach_mm), ("start_std_mm", start_std_mm)):
@@ -326,7 +342,7 @@ def _size(cloud: PointCloud) -> float:
 
 
 def _opened(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
-    return cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
+    return loaded_cloud(cloud)
 
 
 def _name(cloud: PointCloud | str | os.PathLike[str], number: int) -> str:

@@ -302,6 +302,10 @@ class Capture(AbstractContextManager["Capture"]):
             )
         return dataset
 
+    def __repr__(self) -> str:
+        """Name of the file, and numbers of images."""
+        return f"Capture: {self.path.name}, {len(self)} images, {int(self.laser_on.sum())} with the laser on"
+
     def __len__(self) -> int:
         return self._count
 
@@ -371,20 +375,6 @@ class Capture(AbstractContextManager["Capture"]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def open_capture(path: str | Path) -> Capture:
-    """Open a capture file (HDF5) for reading; CaptureError as from `Capture`.
-
-    Per-frame values are read at once, images when they are asked for: ``capture[12]`` is a `Frame`. A recording that is
-    still being written can be opened by its name ``NAME.part``; it has the frames that were complete then.
-
-    Examples
-    --------
-    >>> with uwlts.open_capture("spheres.h5") as capture:
-    ...     images = [frame.image for frame in capture if frame.laser_on]
-    """
-    return Capture(path)
 
 
 @contextmanager

@@ -76,7 +76,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 refuse_input(self._part)
             if self._part.exists() and not (resume or overwrite):
                 raise OutputError(
-                    f"{self._part} is left from an interrupted run; give --resume to go on or --overwrite"
+                    f"{self._part} is left from an interrupted run; give `resume` to go on or `overwrite`"
                 )
             with self._left_over() if resume and self._part.exists() else nullcontext(()) as unfinished:
                 self._begin(unfinished)
@@ -91,7 +91,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         try:
             unfinished = Capture(self._part)
         except CaptureError as error:
-            raise CaptureError(f"cannot resume: {error}; give --overwrite to start afresh") from error
+            raise CaptureError(f"cannot resume: {error}; give `overwrite` to start afresh") from error
         held = unfinished.header, unfinished.dtype, unfinished.plan()
         there = _recording_table(*held, lines=unfinished.holds_lines, moving=unfinished.moving)
         kinds = {"lines": bool(self._lines), "moving": self._moving}
@@ -100,7 +100,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             unfinished.close()
             raise CaptureError(
                 f"{self._part} belongs to another recording: {others}. Go on with the plan of that one, give "
-                "another name, or --overwrite to start afresh"
+                "another name, or `overwrite` to start afresh"
             )
         return unfinished
 

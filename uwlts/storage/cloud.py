@@ -1,14 +1,16 @@
 """A measured point cloud: points, what is known of each, and its uncertainty. `cloud_files` reads and writes it."""
 
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from uwlts.errors import CaptureError
 from uwlts.files.reading import require_plain
+from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -108,8 +110,8 @@ def variance_along(pairs: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return np.einsum("ni,in->n", pairs, np.stack(parts))
 
 
-@dataclass(frozen=True, eq=False)
-class PointCloud:
+@dataclass(frozen=True, eq=False, repr=False)
+class PointCloud(Brief):
     """Points in the object coordinate system (OCS) and what is known of each.
 
     OCS: X normal to the laser sheet (the direction of the scan), Y along the stripe, Z parallel to the laser's axis,
@@ -146,6 +148,8 @@ class PointCloud:
     uncertainty: PointUncertainty | None = None
     time_s: np.ndarray | None = None
     metadata: Table = field(default_factory=dict)
+    writer: ClassVar[Callable[..., None]]
+    """How clouds are written: `uwlts.storage.cloud_files`, which knows the formats, sets it."""
 
     def __post_init__(self) -> None:
         for name, kind in KINDS.items():
@@ -174,6 +178,13 @@ class PointCloud:
 
     def __len__(self) -> int:
         return len(self.points_mm)
+
+    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write the cloud in the format that the ending names; errors as `uwlts.storage.cloud_files.write_cloud`.
+
+        .ply, .h5, .xyz (text), .laz, .las, .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers).
+        """
+        self.writer(path, self, overwrite=overwrite)
 
     def selected(self, selection: slice | np.ndarray) -> "PointCloud":
         """The cloud of a selection of the points, by a slice, indices or a mask."""

@@ -113,6 +113,9 @@ def write_cloud(
     write_ply_points(path, columns, comments=_comments(_with_shared(cloud)), overwrite=overwrite)
 
 
+PointCloud.writer = staticmethod(write_cloud)
+
+
 def write_ply_points(
     path: Path, columns: Mapping[str, np.ndarray], *, comments: Sequence[str] = (), overwrite: bool
 ) -> None:
@@ -153,6 +156,11 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
         The file is missing, no cloud, truncated, without vertices' x, y, z, or its metadata is damaged.
     """
     return read_thinned_cloud(path)[0]
+
+
+def loaded_cloud(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
+    """The cloud itself, or the one in a file; CaptureError as from `read_cloud`."""
+    return cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
 
 
 def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None) -> tuple[PointCloud, int]:

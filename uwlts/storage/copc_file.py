@@ -18,6 +18,7 @@ import numpy as np
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import opened
 from uwlts.files.writing import written_aside
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud, cloud_of
 from uwlts.storage.las_file import INTENSITY_LIMITS, LAZ_STEP_M, brief, las_middle, library
 
@@ -28,8 +29,6 @@ _POINTS_OF_NODE = 60_000
 _DEEPEST = 7
 _MOST_LEVELS = 16
 _FIELDS: dict[str, type] = {"amplitude": np.float32, "frame": np.int32, "line": np.int32, "deviation_mm": np.float32}
-
-Progress = Callable[[int, int], None]
 
 
 def is_copc(path: str | os.PathLike[str]) -> bool:
@@ -73,7 +72,7 @@ def write_copc(
     parts: Callable[[], Iterable[PointCloud]],
     *,
     overwrite: bool = False,
-    progress: Progress = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> int:
     """Write the parts of a cloud as COPC, whole or not at all; returns the number of points.
 

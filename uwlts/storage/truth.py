@@ -10,6 +10,7 @@ import numpy as np
 from uwlts.errors import CaptureError
 from uwlts.files.reading import require_regular_file
 from uwlts.files.writing import written_aside
+from uwlts.model.brief import Brief
 from uwlts.model.sensor import Description, Medium, Sensor, Table
 from uwlts.storage.hdf5_file import DAMAGE, read_array, read_label, write_label
 
@@ -34,8 +35,8 @@ class TruthHeader(Description):
     scene: Table
 
 
-@dataclass(frozen=True)
-class Truth:
+@dataclass(frozen=True, repr=False)
+class Truth(Brief):
     """True stripe of every profile line of every frame; F frames, L lines.
 
     ``centre_px (F, L)`` is the image coordinate across the stripe where the line's centre sees the middle of the

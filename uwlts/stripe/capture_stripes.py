@@ -1,6 +1,6 @@
 """The stripes of all laser images of a recording, and why images show none."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from uwlts.errors import CaptureError, ImageError
 from uwlts.model.stripe import StripeStatus
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.stripe.direct import SeenStripes, direct_stripes, farther
 from uwlts.stripe.exposures import BracketImages, fused_images
 from uwlts.stripe.extract import extract_stripe, see_stripes
@@ -54,10 +55,7 @@ class FoundStripes:
 
 
 def find_stripes(
-    capture: BracketImages,
-    *,
-    options: StripeSettings = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    capture: BracketImages, *, options: StripeSettings = None, progress: ProgressListener = unheard
 ) -> FoundStripes:
     """Find the stripe in all laser images of a recording, such as an opened `uwlts.storage.capture.Capture`.
 

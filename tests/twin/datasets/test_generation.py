@@ -232,7 +232,7 @@ def test_damaged_files_are_named(folder, tmp_path):
 @pytest.mark.slow
 def test_ctrl_c_leaves_complete_shards_only(tmp_path):
     out = tmp_path / "set"
-    line = [sys.executable, "-m", "twin.cli", "dataset", "stripe-clean", "--scenes", "40", "--out", str(out)]
+    line = [sys.executable, "-m", "twin", "dataset", "stripe-clean", "--scenes", "40", "--out", str(out)]
     process = subprocess.Popen([*line, "--workers", "2"], stderr=subprocess.PIPE, text=True)
     until = time.monotonic() + 120
     while not list(out.glob(".*.tar")) and time.monotonic() < until:

@@ -178,12 +178,12 @@ def test_wrong_input_is_refused(loop):
 def test_the_command_writes_a_trajectory_with_covariance(loop, tmp_path, monkeypatch):
     cloud, reported, _ = loop
     monkeypatch.chdir(tmp_path)
-    uwlts.write_cloud("pass.h5", cloud)
-    uwlts.write_trajectory("pass.csv", reported)
+    cloud.save("pass.h5")
+    reported.save("pass.csv")
     words = ["align", "pass.h5", "--trajectory", "pass.csv", "--drift-mm", "60", "--drift-deg", "0.3"]
     app([*words, "--out", "corrected.csv", "--aligned", "aligned.h5"], result_action="return_value")
-    corrected = uwlts.read_trajectory("corrected.csv", pose_format="quaternion-xyzw")
+    corrected = uwlts.read("corrected.csv", pose_format="quaternion-xyzw")
     assert corrected.covariance is not None and len(corrected.times_s) == len(reported.times_s)
     record = json.loads((tmp_path / "corrected.json").read_text())
     assert record["crossings"] and record["largest_shift_mm"] > 10
-    assert len(uwlts.read_cloud("aligned.h5")) == len(cloud)
+    assert len(uwlts.read("aligned.h5")) == len(cloud)

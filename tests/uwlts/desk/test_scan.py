@@ -20,4 +20,4 @@ def test_the_page_is_asked_for_at_the_port_that_is_wanted(tmp_path: Path, monkey
     page = PageBeside(tmp_path / "a.h5", calibration=None, port=9123, say=print)
     with pytest.raises(KeyboardInterrupt):
         page.start()
-    assert asked == [[sys.executable, "-m", "uwlts.cli", "watch", str(tmp_path / "a.h5"), "--port", "9123"]]
+    assert asked == [[sys.executable, "-m", "uwlts", "watch", str(tmp_path / "a.h5"), "--port", "9123"]]

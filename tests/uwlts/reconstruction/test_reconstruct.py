@@ -15,13 +15,13 @@ from uwlts.calibration.sequential.sequential_calibration import (
     solve,
 )
 from uwlts.errors import CalibrationError, CaptureError, RangeError
-from uwlts.model.any_calibration import check_fits
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Medium
+from uwlts.optics.fitness import check_fits
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_profile
 from uwlts.reconstruction.reconstruct import reconstruct, reconstruct_stripes
-from uwlts.storage.calibration_file import read_calibration, write_calibration
+from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import StripeOptions, find_stripes
@@ -239,7 +239,7 @@ def test_the_medium_of_the_targets_images_is_kept(tmp_path):
     for medium_kind in ("fresh", "air"):
         solved = solve(replace(evidence, medium_kind=medium_kind), options=CalibrationOptions()).calibration
         assert (solved.medium_kind, solved.window) == (medium_kind, None)
-        write_calibration(tmp_path / f"{medium_kind}.json", solved)
+        solved.save(tmp_path / f"{medium_kind}.json")
         assert read_calibration(tmp_path / f"{medium_kind}.json").medium_kind == medium_kind
 
 

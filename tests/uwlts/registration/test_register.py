@@ -15,6 +15,7 @@ from uwlts.evaluation.artefact_figures import evaluate_pipe
 from uwlts.fitting.patches import distances_between, surface_patches
 from uwlts.model.artefacts import PipeStandard
 from uwlts.storage.cloud import PointCloud
+from uwlts.storage.pose_files import read_poses, write_poses
 
 SEED = 11
 PIPE = PipeStandard(diameter_mm=2 * RADIUS_MM)
@@ -219,14 +220,14 @@ def test_the_command_writes_cloud_poses_and_page(tmp_path, monkeypatch):
     scans, _, wrong = views(np.random.default_rng(SEED), count=5, radius=oval)
     monkeypatch.chdir(tmp_path)
     for number in range(2):
-        uwlts.write_cloud(f"view-{number}.ply", scans[number])
-    uwlts.write_poses("start.csv", wrong[:2])
+        scans[number].save(f"view-{number}.ply")
+    write_poses("start.csv", wrong[:2])
     words = ["register", "view-0.ply", "view-1.ply", "--poses", "start.csv", "--out", "pipe.h5"]
     app([*words, "--page", "pipe.html", "--poses-out", "found.csv"], result_action="return_value")
-    merged, record = uwlts.read_cloud("pipe.h5"), json.loads((tmp_path / "pipe.registration.json").read_text())
+    merged, record = uwlts.read("pipe.h5"), json.loads((tmp_path / "pipe.registration.json").read_text())
     assert len(merged) == len(scans[0]) + len(scans[1]) and merged.uncertainty is not None
     assert [each["name"] for each in merged.metadata["scans"]] == ["view-0", "view-1"]
-    poses, _ = uwlts.read_poses("found.csv")
+    poses, _ = read_poses("found.csv")
     np.testing.assert_allclose(poses, [each["transform"] for each in record["scans"]], atol=1e-11)
     page = (tmp_path / "pipe.html").read_text()
     assert "shift along (1.000" in page and "Not determined" in page

@@ -1,4 +1,4 @@
-"""The image of light on longer ways: where random walks begin, and the smooth light that is made of what they find.
+"""The image of multiply scattered and secondary light: where random walks begin, and smooth light of what they find.
 
 Walks begin in square cells of the image: large ones away from the stripe, more of them beside it, and the small cells
 of the stripe's pixels. Where water scatters, `twin.light.smoothing` takes the noise out with the help of what is known

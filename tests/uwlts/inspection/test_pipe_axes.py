@@ -29,7 +29,7 @@ def cloud_of(pipe: ScannedPipe) -> PointCloud:
 
 
 def inspected(pipe: ScannedPipe) -> Inspection:
-    return uwlts.inspect(cloud_of(pipe), false_alarm=FALSE_ALARM)
+    return uwlts.inspect_pipe(cloud_of(pipe), false_alarm=FALSE_ALARM)
 
 
 def matched(pipe: ScannedPipe, found: Inspection, bumps: list[Bump]) -> list[Feature]:

@@ -213,7 +213,7 @@ def led(setting: Setting, wanted: Wanted, rng: np.random.Generator, *, most: int
     """Follow the wishes as a hand does: to some 3 deg and 5 mm."""
     poses: list[np.ndarray] = []
     state = state_of([], setting, wanted)
-    while not state.enough and len(poses) < most:
+    while missing(state) and len(poses) < most:
         wish = best_pose(state)
         # What is held as it was wished is what is wanted, and there is nothing more to say.
         assert format_pose_advice(wish, state, wish.candidate.pose) == "hold it still, just like this"
@@ -228,7 +228,7 @@ def led(setting: Setting, wanted: Wanted, rng: np.random.Generator, *, most: int
 def test_following_the_advice_leads_to_a_good_camera_soon(setting, thesis_as_built):
     wanted = Wanted(focal_std_px=0.5, centre_std_px=0.4, coverage=0.85, fewest_images=5)
     state = led(setting, wanted, np.random.default_rng(3), most=14)
-    assert state.enough and missing(state) == []
+    assert missing(state) == []
     assert 5 <= len(state.recorded) <= 9
     true, std = lens_of(thesis_as_built), state.solution.std()
     assert std["f"] <= 0.5 and std["cx"] <= 0.4 and state.coverage.share >= 0.85

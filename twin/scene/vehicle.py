@@ -1,4 +1,4 @@
-"""The sea that moves an underwater vehicle, and the drift of the vehicle's navigation.
+"""Underwater vehicle: the sea that moves it, and the drift of its navigation.
 
 Formulas follow T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control (Wiley, 2011; "Fossen"), and
 J. A. Farrell, Aided Navigation (McGraw-Hill, 2008; "Farrell").
@@ -6,9 +6,13 @@ J. A. Farrell, Aided Navigation (McGraw-Hill, 2008; "Farrell").
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from pydantic import model_validator
+from scipy.spatial.transform import Rotation
 
+from twin.scene.platforms import LEAD_S, Carried, Route
 from uwlts.model.sensor import Description, NotNegative, Positive
 
 _GRAVITY = 9.81
@@ -146,3 +150,46 @@ def drift_of(
         state = step @ state + drawn[number]
         spread = step @ spread @ step.T + np.diag(noise)
     return Drift(times, values[:, :6], covariances[:, :6, :6])
+
+
+class Vehicle(Route):
+    """An underwater vehicle that waves move and thrusters shake, and that navigates by INS and DVL.
+
+    The scene's Z points down. `Sea` moves it, and its `Navigation` drifts. The sensor
+    vibrates along each axis by ``vibration_mm`` and turns by ``vibration_deg`` at ``vibration_hz`` (amplitudes).
+    """
+
+    kind: Literal["vehicle"]
+    sea: Sea = Sea()
+    navigation: Navigation = Navigation()
+    vibration_hz: Positive = 25.0
+    vibration_mm: NotNegative = 0.0
+    vibration_deg: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _moves(self) -> "Vehicle":
+        if self.stops:
+            raise ValueError("a vehicle does not stop: give speed_mm_per_s, or a trajectory")
+        return self
+
+    def carried(self, rng: np.random.Generator) -> Carried:
+        commanded = self.commanded()
+        waves, phases = waves_of(self.sea, rng), rng.uniform(0, 2 * np.pi, 6)
+        sizes = np.append(np.full(3, self.vibration_mm), np.full(3, np.radians(self.vibration_deg)))
+
+        def true(times: np.ndarray) -> np.ndarray:
+            poses = commanded(times).copy()
+            moved = waves(times) + sizes * np.sin(2 * np.pi * self.vibration_hz * times[:, None] + phases)
+            poses[:, :3, 3] += moved[:, :3]
+            poses[:, :3, :3] = Rotation.from_rotvec(moved[:, 3:]).as_matrix() @ poses[:, :3, :3]
+            return poses
+
+        drift = drift_of(self.navigation, true, lead_s=2 * LEAD_S, lasting_s=float(self._knots[0][-1]), rng=rng)
+
+        def reported(times: np.ndarray) -> np.ndarray:
+            poses, errors = true(times).copy(), drift.errors(times)
+            poses[:, :3, 3] += errors[:, :3]
+            poses[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
+            return poses
+
+        return Carried(true, reported, drift.covariance)

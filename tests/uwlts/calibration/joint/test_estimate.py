@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.calibration.joint.noise import judged
+from uwlts.calibration.joint.estimate import judged
 from uwlts.calibration.joint.residuals import TARGET, Residuals
 
 IMAGES = 9
