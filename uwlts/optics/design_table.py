@@ -33,9 +33,16 @@ class DesignRow(NamedTuple):
 
 
 def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
-    """Resolution, line length, depth range and speckle limit of a sensor in one of its media by the design
+    """Calculate what a sensor can do by the design formulas: resolution, line length, depth range, speckle limit.
 
     Depths and ranges run along the camera's axis unless named otherwise.
+
+    Parameters
+    ----------
+    sensor : str, Path or Sensor
+        Name or path of a sensor description, or the description itself.
+    medium : str
+        One of the sensor's media.
 
     Raises
     ------
