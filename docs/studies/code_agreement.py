@@ -14,6 +14,7 @@ import argparse
 import contextlib
 import hashlib
 import importlib
+import importlib.util
 import json
 import os
 import runpy
@@ -107,7 +108,7 @@ JOBS: dict[str, str] = {
         uwlts evaluate reconstruct/sequential.ply --truth inputs/scans/spheres.truth.h5 --out evaluate/sequential.json
         uwlts evaluate reconstruct/polynomials.ply --out evaluate/polynomials.json""",
     "verify": f"""
-        uwlts verify inputs/scans/spheres.h5 {TAKEN} --limit-mm 0.5
+        uwlts verify inputs/scans/spheres.h5 {TAKEN} --limit 0.5
         uwlts verify inputs/scans/step-scan.h5 {TAKEN}""",
     "clouds": "\n".join(
         f"uwlts reconstruct inputs/scans/{name}.h5 {TAKEN} --out clouds/{name}.ply"
@@ -157,7 +158,7 @@ JOBS: dict[str, str] = {
 }
 """Command lines of each job, in the order in which they need each other's files."""
 
-NEW_JOBS: dict[str, str] = {}
+NEW_JOBS: dict[str, str] = {"verify": JOBS["verify"].replace("--limit", "--limit-mm")}
 """Jobs whose command lines the new code spells otherwise."""
 SAID = ("design", "verify", "info")
 """Jobs whose results are what they print."""
@@ -310,7 +311,9 @@ def run_command(line: str) -> int:
         return 0
     sys.argv = [program, *arguments]
     try:
-        runpy.run_module(program, run_name="__main__")
+        # Version 0.1 has no ``python -m uwlts``.
+        module = program if importlib.util.find_spec(f"{program}.__main__") else f"{program}.cli"
+        runpy.run_module(module, run_name="__main__")
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else int(ended.code is not None)
     except Exception:

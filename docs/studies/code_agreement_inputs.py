@@ -174,8 +174,8 @@ def write_crossing(folder: Path) -> None:
 
     rng = np.random.default_rng(SEED)
     cloud, reported, _ = ride(rng, LOOP_MM, drift_mm=DRIFT_MM, drift_deg=DRIFT_DEG)
-    cloud.save(folder / "crossing.ply", overwrite=True)
-    reported.save(folder / "crossing.csv", overwrite=True)
+    uwlts.write_cloud(folder / "crossing.ply", cloud, overwrite=True)
+    uwlts.write_trajectory(folder / "crossing.csv", reported, overwrite=True)
 
 
 def write_gauge(path: Path) -> None:

@@ -187,11 +187,23 @@ def require_plain(content: Content, *, finite: bool = True) -> Content:
                 below.extend(each)
             elif kind is float:
                 if finite and not math.isfinite(each):
-                    raise ValueError(f"it holds {each}; expected a finite number in its place")
+                    raise ValueError(f"{_place_of(each, content)} is {each}; expected a finite number")
             elif kind is int and not -_LARGEST_INT <= each < _LARGEST_INT:
                 raise ValueError("it holds a whole number of more than 64 bits")
         level, depth = below, depth + 1
     return content
+
+
+def _place_of(wanted: object, content: object) -> str:
+    """Return the keys and numbers that lead to a value."""
+    waiting: list[tuple[object, str]] = [(content, "")]
+    while waiting:
+        each, place = waiting.pop()
+        if each is wanted:
+            return shortened(place.removeprefix(".")) or "it"
+        inside = each.items() if isinstance(each, dict) else enumerate(each) if isinstance(each, list | tuple) else ()
+        waiting.extend((below, f"{place}.{key}") for key, below in inside)
+    return "it"
 
 
 def _unique(pairs: "list[tuple[str, JsonValue]]") -> "dict[str, JsonValue]":
