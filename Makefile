@@ -114,7 +114,7 @@ $(1) 2>/dev/null || { \
 		echo "setup: installing $(2) (apt-get install)"; \
 		for step in install update install; do \
 			if [ $$step = update ]; then apt-get update; \
-			else DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends $(2) && break; \
+			else DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends -o DPkg::Lock::Timeout=120 $(2) && break; \
 			fi; \
 		done >/dev/null 2>&1 </dev/null; \
 	fi; \
