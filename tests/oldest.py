@@ -32,7 +32,7 @@ def requirements(project: dict[str, Any], extras: tuple[str, ...]) -> Iterator[R
     lists = [project["dependencies"], *(project["optional-dependencies"][extra] for extra in extras)]
     for one in (Requirement(line) for lines in lists for line in lines):
         if one.name == project["name"]:
-            yield from requirements(project | {"dependencies": []}, tuple(one.extras))
+            yield from requirements(project | {"dependencies": []}, tuple(sorted(one.extras)))
         else:
             yield one
 
