@@ -4,6 +4,7 @@ VENV := .venv
 PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 OLDEST := .venv-oldest
+ARAVIS := $(PYTHON) -m uwlts.runtime.shared_library
 
 # An activated environment, or settings that redirect Python or pip, must not reach into .venv.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIRE_VIRTUALENV
@@ -28,15 +29,15 @@ help:
 	@echo "make clean   remove .venv, $(OLDEST), caches and build results"
 
 demo: setup
-	@$(PYTHON) -m twin.cli demo
+	@$(PYTHON) -m twin demo
 
 test: PYTEST_OPTIONS := -m "not slow"
 # Threads of two test processes on two cores would wait for each other in every small product of matrices.
 test test-full: export OPENBLAS_NUM_THREADS := 1
 test test-full: style
-	@$(PYTHON) -m twin.devices.aravis_install
-	@# Without a browser only the tests of pages fail.
-	-@$(PYTHON) -m tests.browser
+	@$(call with_packages,$(ARAVIS),libaravis-0.8-0)
+	@# Without a browser only the tests of pages fail; without any font a page shows no text.
+	-@$(call with_packages,$(PYTHON) -m tests.browser,chromium-headless-shell fonts-dejavu-core)
 	@# Types are checked beside the tests, in time that those leave: many wait for simulated hardware and for pages.
 	@found=$$(mktemp); nice $(VENV)/bin/basedpyright >$$found 2>&1 & checking=$$!; \
 	trap 'kill $$checking 2>/dev/null; rm -f $$found' EXIT; trap 'exit 130' INT TERM; \
@@ -49,7 +50,7 @@ test-full: oldest
 oldest: export NUMBA_CACHE_DIR := $(CURDIR)/$(OLDEST)/numba
 oldest: export OPENBLAS_NUM_THREADS := 1
 oldest: setup $(OLDEST)/.installed
-	@$(PYTHON) -m twin.devices.aravis_install
+	@$(call with_packages,$(ARAVIS),libaravis-0.8-0)
 	@echo "oldest: documented commands with the oldest allowed libraries"
 	@# They use what newer libraries below them call outdated.
 	@$(OLDEST)/bin/python -m pytest -q -n 2 -W default::DeprecationWarning \
@@ -70,8 +71,8 @@ fuzz: setup
 	@$(PYTHON) -m tests.fuzz $(if $(CASES),--cases $(CASES)) $(READERS)
 
 soak: setup
-	@$(PYTHON) -m twin.devices.aravis_install
-	@$(PYTHON) -m tests.browser
+	@$(call with_packages,$(ARAVIS),libaravis-0.8-0)
+	@$(call with_packages,$(PYTHON) -m tests.browser,chromium-headless-shell fonts-dejavu-core)
 	@$(PYTHON) -m tests.soak $(IMAGES)
 
 bench: setup
@@ -83,7 +84,7 @@ docs: setup
 	@echo "documentation: docs/_build/html/index.html"
 
 setup: $(INSTALLED)
-	@$(PYTHON) -m twin.backend.llvm --install
+	@$(call with_packages,$(PYTHON) -m twin.backend.llvm,libatomic1$(if $(filter x86_64,$(shell uname -m)),, libllvm19))
 
 $(INSTALLED): pyproject.toml
 	@$(PYTHON) -m pip --version >/dev/null 2>&1 || { \
@@ -104,6 +105,22 @@ $(OLDEST)/.installed: pyproject.toml tests/oldest.py | $(INSTALLED)
 clean:
 	@rm -rf $(VENV) $(OLDEST) build dist docs/_build *.egg-info .pytest_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Runs the command $(1), which fails where a library or program is missing; as root on Debian and Ubuntu the packages $(2)
+# are installed then, and it runs again.
+define with_packages
+$(1) 2>/dev/null || { \
+	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "setup: installing $(2) (apt-get install)"; \
+		for step in install update install; do \
+			if [ $$step = update ]; then apt-get update; \
+			else DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends -o DPkg::Lock::Timeout=120 $(2) && break; \
+			fi; \
+		done >/dev/null 2>&1 </dev/null; \
+	fi; \
+	$(1); \
+}
+endef
 
 # Makes the environment $(1) with the first of the Pythons $(2) that is new enough and brings pip along; on Debian pip
 # comes with an extra package.

@@ -1,20 +1,19 @@
-"""Finds, installs and starts the Chromium in which tests open web pages.
+"""Finds and starts the Chromium in which tests open web pages.
 
-`python -m tests.browser` prints the one in use, and installs one first by apt-get (as root) if there is none. Exit
-status 0, or 2 if there is none.
+`python -m tests.browser` prints the one in use. Exit status 0, or 1 if there is none.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from twin.backend.packages import Report, obtain, run_as_command, run_command
 from uwlts.errors import SetupError
 
 if TYPE_CHECKING:
@@ -23,8 +22,6 @@ if TYPE_CHECKING:
 VARIABLE = "CHROMIUM"
 NAMES = ("chromium-headless-shell", "chromium", "google-chrome", "google-chrome-stable", "chromium-browser")
 """Names on PATH. Ubuntu's chromium-browser is only a script that asks for a snap, and is refused where it is."""
-DEBIAN_PACKAGES = ("chromium-headless-shell", "fonts-dejavu-core")
-"""Without any font a page shows no text."""
 SOFTWARE_WEBGL = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
@@ -67,15 +64,15 @@ def _started(path: Path) -> Path:
     """The path of a Chromium that starts here, with all its libraries; SetupError where it does not."""
     if not os.access(path, os.X_OK) or path.is_dir():
         raise SetupError(f"{path}: it is not there, or no program")
-    version = run_command([str(path), "--version"], seconds=START_SECONDS, shown=f"{path}: starting it")
-    if "chrom" not in version.lower():
-        raise SetupError(f"{path}: it is no Chromium, it calls itself {version.strip()[:80]!r}")
+    try:
+        started = subprocess.run([path, "--version"], capture_output=True, text=True, timeout=START_SECONDS)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise SetupError(f"{path}: it does not start: {error}") from error
+    if started.returncode != 0:
+        raise SetupError(f"{path}: it does not start: {started.stderr.strip()[-300:]}")
+    if "chrom" not in started.stdout.lower():
+        raise SetupError(f"{path}: it is no Chromium, it calls itself {started.stdout.strip()[:80]!r}")
     return path
-
-
-def install_chromium(report: Report = lambda line: None) -> Path:
-    """Find a Chromium, or install one with a font by apt-get (as root); raise SetupError if there is none."""
-    return obtain(find_chromium, DEBIAN_PACKAGES, report)
 
 
 @contextmanager
@@ -98,4 +95,7 @@ def open_chromium(path: Path) -> Iterator[Browser]:
 
 
 if __name__ == "__main__":
-    sys.exit(run_as_command("Chromium", install_chromium, sys.argv[1:]))
+    try:
+        print(f"Chromium: {find_chromium()}")
+    except SetupError as error:
+        sys.exit(f"error: {error}")

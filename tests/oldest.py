@@ -19,7 +19,7 @@ def oldest(*extras: str) -> list[str]:
     """Requirements ``name==version`` of the project's dependencies and those of its extras, sorted by name."""
     project = tomllib.loads(PROJECT.read_text(encoding="utf-8"))["project"]
     lowest = {}
-    for one in _requirements(project, extras):
+    for one in requirements(project, extras):
         name = f"{one.name}[{','.join(one.extras)}]" if one.extras else one.name
         for part in one.specifier:
             if part.operator == ">=":
@@ -27,11 +27,12 @@ def oldest(*extras: str) -> list[str]:
     return sorted(f"{name}=={version}" for name, version in lowest.items())
 
 
-def _requirements(project: dict[str, Any], extras: tuple[str, ...]) -> Iterator[Requirement]:
+def requirements(project: dict[str, Any], extras: tuple[str, ...]) -> Iterator[Requirement]:
+    """Requirements of a project table and of its extras, those that they include in turn too."""
     lists = [project["dependencies"], *(project["optional-dependencies"][extra] for extra in extras)]
     for one in (Requirement(line) for lines in lists for line in lines):
         if one.name == project["name"]:
-            yield from _requirements(project | {"dependencies": []}, tuple(one.extras))
+            yield from requirements(project | {"dependencies": []}, tuple(one.extras))
         else:
             yield one
 

@@ -55,11 +55,9 @@ def main(images: int = 100_000) -> int:
 def _soak(folder: Path, images: int) -> int:
     with GrblController(settings=STAGE, speed_up=SPEED_UP) as controller, DrawnCamera(controller) as camera:
         plan = write_plan(folder, camera, controller, count=images, step_mm=RESOLUTION_MM)
-        uwlts.write_calibration(folder / "nominal.json", uwlts.nominal(folder / "sensor.toml", medium="air"))
+        uwlts.nominal(folder / "sensor.toml", medium="air").save(folder / "nominal.json")
         desk = subprocess.Popen(
-            [sys.executable, "-m", "uwlts.cli", "desk", str(folder), "--plan", str(plan)],
-            stdout=subprocess.PIPE,
-            text=True,
+            [sys.executable, "-m", "uwlts", "desk", str(folder), "--plan", str(plan)], stdout=subprocess.PIPE, text=True
         )
         try:
             address = (desk.stdout.readline() if desk.stdout else "").split()[1]

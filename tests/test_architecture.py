@@ -63,7 +63,7 @@ def test_the_contracts_notice_forbidden_imports(tmp_path: Path):
 def test_no_module_is_imported_by_a_name_in_quotes():
     """A module imported by `import_module("...")` is invisible to the contracts; lazy faces may do so."""
     faces = {"uwlts/targets/__init__.py", "uwlts/stripe/methods/__init__.py"}
-    allowed = faces | {"uwlts/storage/las_file.py"}  # loads the optional library of a format
+    allowed = faces | {"uwlts/runtime/optional_library.py"}
     found = set()
     for package in ("uwlts", "twin"):
         for path in (ROOT / package).rglob("*.py"):
@@ -112,3 +112,10 @@ def test_the_oracles_use_numpy_and_the_standard_library_alone():
 
 def test_the_citation_names_the_version():
     assert f"\nversion: {uwlts.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
+def test_folders_of_tests_are_packages():
+    folders = {path.parent.relative_to(ROOT / "tests") for path in (ROOT / "tests").rglob("test_*.py")}
+    mirrored = {folder for folder in folders if folder.parts[:1] in (("uwlts",), ("twin",))}
+    assert len(mirrored) > 20
+    assert {str(folder) for folder in mirrored if not (ROOT / folder / "__init__.py").exists()} == set()

@@ -73,6 +73,14 @@ class HardwareError(Error):
     """A camera, stage or laser does not answer, answers wrongly, or reports a fault."""
 
 
+class CommandFailed(Error):
+    """A command that a function ran has failed, and has printed why; ``returncode`` is its exit code."""
+
+    def __init__(self, line: str, returncode: int):
+        super().__init__(f"{line} ended with exit code {returncode}")
+        self.returncode = returncode
+
+
 def first_problems(error: "ValidationError", most: int) -> "list[ErrorDetails]":
     """The first problems that a validation found; none where there are too many to list them."""
     return error.errors(include_url=False)[:most] if error.error_count() <= _MOST_LISTED else []

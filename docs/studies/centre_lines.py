@@ -30,7 +30,7 @@ def main() -> None:
                 for place in PLACES:
                     path = Path(folder) / "scan.h5"
                     twin.simulate("spheres", placement=place, water=water, effects=effects, out=path, overwrite=True)
-                    with uwlts.open_capture(path) as capture:
+                    with uwlts.read(path) as capture:
                         uwlts.reconstruct(capture, calibration)
                         began = time.process_time()
                         cloud = uwlts.reconstruct(capture, calibration)

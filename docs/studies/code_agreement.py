@@ -5,7 +5,7 @@
     python docs/studies/code_agreement.py /tmp/old --folder runs/agreement --only joint reconstruct
 
 Inputs are made once by the older checkout (`code_agreement_inputs.py`), and its results are kept as long as its commit
-and the command lines stay. Each version runs all jobs in one process, as ``python -m uwlts.cli`` does. Numbers have to
+and the command lines stay. Each version runs all jobs in one process, as ``python -m uwlts`` does. Numbers have to
 agree to 1e-9 (relative), and neither version may write files or keys that the other one does not; texts that differ are
 listed, as wording may change. The exit code is 1 where anything else differs.
 """
@@ -14,6 +14,7 @@ import argparse
 import contextlib
 import hashlib
 import importlib
+import importlib.util
 import json
 import os
 import runpy
@@ -157,7 +158,7 @@ JOBS: dict[str, str] = {
 }
 """Command lines of each job, in the order in which they need each other's files."""
 
-NEW_JOBS: dict[str, str] = {}
+NEW_JOBS: dict[str, str] = {"verify": JOBS["verify"].replace("--limit", "--limit-mm")}
 """Jobs whose command lines the new code spells otherwise."""
 SAID = ("design", "verify", "info")
 """Jobs whose results are what they print."""
@@ -310,7 +311,9 @@ def run_command(line: str) -> int:
         return 0
     sys.argv = [program, *arguments]
     try:
-        runpy.run_module(f"{program}.cli", run_name="__main__")
+        # Version 0.1 has no ``python -m uwlts``.
+        module = program if importlib.util.find_spec(f"{program}.__main__") else f"{program}.cli"
+        runpy.run_module(module, run_name="__main__")
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else int(ended.code is not None)
     except Exception:

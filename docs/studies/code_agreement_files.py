@@ -30,7 +30,7 @@ and 1 without a unit; and one step of coordinates that are stored as integers.
 """
 SINGLE = 2.0 * np.finfo(np.float32).eps
 """Relative difference of numbers stored with single precision: one rounding to either side."""
-NOT_COMPARED = re.compile(r"(version|software|date|issued|sha256|digest|seal|seconds|platform|created|host)$")
+NOT_COMPARED = re.compile(r"(version|software|date|issued|sha256|digest|seal|seconds|platform|created|made|host)$")
 """Keys of what differs between any two runs or versions."""
 DIGEST = re.compile(r"\b[0-9a-f]{16,64}\b")
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?(?![\w.]*:\d\d)")
@@ -88,7 +88,8 @@ def _difference(one: np.ndarray, other: np.ndarray, key: str) -> tuple[float, in
         size = np.maximum(np.abs(one), np.abs(other))
     off = np.where(np.isfinite(off), off, np.inf)
     counts = off > _floor(one, key)
-    relative = np.where(counts, off / np.where(size > 0, size, 1.0), 0.0)
+    with np.errstate(invalid="ignore"):
+        relative = np.where(counts, off / np.where(size > 0, size, 1.0), 0.0)
     relative = np.where(np.isnan(relative), np.inf, relative)
     return float(relative.max(initial=0.0)), int(np.count_nonzero(relative > (SINGLE if single else RELATIVE)))
 
@@ -140,7 +141,8 @@ def read_values(path: Path) -> Values:
 
 
 def of_text(text: str) -> Iterator[tuple[str, np.ndarray | str]]:
-    """Numbers in a text, in their order, and the words between them."""
+    """Numbers in a text, in their order, and the words between them; digests are words."""
+    text = DIGEST.sub("DIGEST", text)
     yield "numbers", np.array([float(each) for each in NUMBER.findall(text)])
     yield "words", NUMBER.sub("#", text)
 
@@ -236,7 +238,7 @@ def _of_laz(path: Path) -> Iterator[tuple[str, np.ndarray | str]]:
 def _of_e57(path: Path) -> Iterator[tuple[str, np.ndarray | str]]:
     file = pye57.E57(str(path), mode="r")
     for number in range(file.scan_count):
-        scan = file.read_scan_raw(number)
+        scan = file.read_scan_raw(number, ignore_unsupported_fields=True)
         yield from ((f"{number}.{column}", np.asarray(values)) for column, values in scan.items())
 
 

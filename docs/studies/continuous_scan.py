@@ -52,7 +52,7 @@ def main(*options: Annotated[str, Parameter(allow_leading_hyphen=True)]) -> None
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "fast.toml").write_text(SENSOR)
-        command = [sys.executable, "-m", "twin.cli", "serve", "spheres", "--sensor", str(folder / "fast.toml")]
+        command = [sys.executable, "-m", "twin", "serve", "spheres", "--sensor", str(folder / "fast.toml")]
         command += ["--water", "clear", *options]
         served = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
         try:

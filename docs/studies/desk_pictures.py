@@ -48,7 +48,7 @@ def main(calibration: Path, folder: Path, pictures: Path) -> None:
         plan |= {"stage": stage | {"feed_mm_per_min": 900.0}, "artefact": take.scene.artefact}
         (tank / "plan.toml").write_text(tomli_w.dumps(plan), encoding="utf-8")
         words = ["desk", str(tank), "--plan", str(tank / "plan.toml"), "--port", "18400"]
-        running = subprocess.Popen([sys.executable, "-m", "uwlts.cli", *words], stdout=subprocess.PIPE, text=True)
+        running = subprocess.Popen([sys.executable, "-m", "uwlts", *words], stdout=subprocess.PIPE, text=True)
         try:
             assert running.stdout
             found = re.search(r"open (\S+) to work", running.stdout.readline())
@@ -84,7 +84,7 @@ def drive(page: Page, tank: Path, pictures: Path) -> None:
     tab(page, "Files")
     press(page, "reconstruct")
     page.locator(".log").get_by_text(re.compile(r"wrote .*\.ply")).wait_for()
-    cloud = uwlts.read_cloud(next(tank.glob("*.ply")))
+    cloud = uwlts.read(next(tank.glob("*.ply")))
     page.locator(f'.cloud-view[data-points="{len(cloud)}"]').wait_for()
     press(page, "fit")
     page.wait_for_timeout(1500)

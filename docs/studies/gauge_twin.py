@@ -42,7 +42,7 @@ def main(folder: Path) -> None:
                 scan = folder / f"{part}-{operator}-{seed}.h5"
                 if not scan.exists():
                     twin.simulate(scene, out=scan, placement=operator, seed=seed)
-                measured = uwlts.inspect(uwlts.reconstruct(scan, calibration), "step").features[0]["height"]
+                measured = uwlts.inspect_step(uwlts.reconstruct(scan, calibration)).features[0]["height"]
                 rows.append((part, operator, measured.value))
                 print(*rows[-1], flush=True)
     lines = ["part,operator,value", *(f"{part},{operator},{value:.5f}" for part, operator, value in rows)]

@@ -39,20 +39,20 @@ def cloud_of(folder: Path, water: str, name: str) -> uwlts.PointCloud:
     path = folder / water / f"{name}.cloud.h5"
     if not path.exists():
         cloud = uwlts.reconstruct(folder / water / f"{name}.h5", folder / "calibration" / "calibration.json")
-        uwlts.write_cloud(path, cloud)
-    return uwlts.read_cloud(path)
+        cloud.save(path)
+    return uwlts.read(path)
 
 
 def around(folder: Path, water: str) -> uwlts.PointCloud:
     """The pipe from six sides as one scan with known poses, in the pipe's frame."""
     joined = folder / water / "pipe-around.h5"
     if not joined.exists():
-        with uwlts.open_capture(folder / water / f"pipe-side-{SIDES_DEG[0]}.h5") as first:
+        with uwlts.read(folder / water / f"pipe-side-{SIDES_DEG[0]}.h5") as first:
             header, kind = first.header, first.dtype
         time_s = 0.0
         with CaptureWriter(joined, header, dtype=kind) as writer:
             for side in SIDES_DEG:
-                with uwlts.open_capture(folder / water / f"pipe-side-{side}.h5") as capture:
+                with uwlts.read(folder / water / f"pipe-side-{side}.h5") as capture:
                     for frame in capture:
                         pose = np.eye(4)
                         pose[:3, :3] = Rotation.from_euler("x", -side, degrees=True).as_matrix()
@@ -182,10 +182,10 @@ def pit_pairs(found: list[Feature | None], pits: Pits, chosen: np.ndarray) -> li
 
 def small_pits_in(folder: Path, water: str, draw: int = 0) -> tuple[list[list[str]], list[list[str]], dict]:
     """Rows of detection and of figures, and what a curve of each diameter is drawn from."""
-    pits, inspected = small_pits(draw), uwlts.inspect(cloud_of(folder, water, "pipe-after"))
+    pits, inspected = small_pits(draw), uwlts.inspect_pipe(cloud_of(folder, water, "pipe-after"))
     found = matched(inspected, pits)
     hit = np.array([each is not None for each in found])
-    plain = uwlts.inspect(cloud_of(folder, water, "pipe-before"))
+    plain = uwlts.inspect_pipe(cloud_of(folder, water, "pipe-before"))
     false = false_ones(inspected, pits), len(plain.of(*BLEMISHES))
     print(f"{water}: indications that are no pit: {false[0]} with pits, {false[1]} without; {inspected.notes[-1]}")
     seen, figures, curves = [], [], {}
@@ -201,7 +201,7 @@ def small_pits_in(folder: Path, water: str, draw: int = 0) -> tuple[list[list[st
 
 def large_pits_in(folder: Path, water: str, draw: int = 0) -> list[list[str]]:
     """Rows of the figures of large pits; each is printed."""
-    pits, inspected = large_pits(draw), uwlts.inspect(cloud_of(folder, water, "pipe-corroded"), wall_mm=9.5)
+    pits, inspected = large_pits(draw), uwlts.inspect_pipe(cloud_of(folder, water, "pipe-corroded"), wall_mm=9.5)
     found = matched(inspected, pits)
     print(f"{water}: large pits found: {sum(each is not None for each in found)}, false: {false_ones(inspected, pits)}")
     for k, each in enumerate(found):
@@ -212,7 +212,7 @@ def large_pits_in(folder: Path, water: str, draw: int = 0) -> list[list[str]]:
 
 def wholes_in(folder: Path, water: str) -> list[list[str]]:
     """Rows of the figures of the pipe from six sides and of the weld."""
-    pipe = uwlts.inspect(around(folder, water))
+    pipe = uwlts.inspect_pipe(around(folder, water))
     truth = {"diameter": DIAMETER_MM, "ovality": DIAMETER_MM * OVALITY, "ovality share": 100 * OVALITY}
     rows = figure_rows(f"{water}, pipe", [(pipe.features[0], truth | {"straightness": 0.0})])
     sections = pipe.of(FeatureKind.SECTION)
@@ -227,7 +227,7 @@ def welds_in(folder: Path, water: str) -> list[list[str]]:
     for path in sorted(folder.glob(f"weld*-{water}.toml")):
         weld = load_scene(str(path)).objects[0]
         assert isinstance(weld, Weld)
-        found = uwlts.inspect(cloud_of(folder, water, path.stem.removesuffix(f"-{water}")), "weld")
+        found = uwlts.inspect_weld(cloud_of(folder, water, path.stem.removesuffix(f"-{water}")))
         pairs.append((found.features[0], true_weld(weld)))
     return figure_rows(f"{water}, weld", pairs)
 
@@ -249,7 +249,7 @@ def flanges_in(folder: Path, water: str) -> list[list[str]]:
     """Rows of the figures of a flange and its holes."""
     scene = load_scene(str(folder / f"flange-{water}.toml")).objects[0]
     assert isinstance(scene, Flange)
-    found = uwlts.inspect(cloud_of(folder, "flanges", f"flange-{water}"), "flange")
+    found = uwlts.inspect_flange(cloud_of(folder, "flanges", f"flange-{water}"))
     truth = {"flatness": scene.flatness_mm, "bore": scene.bore_diameter_mm, "bolt circle": scene.bolt_circle_mm}
     holes = [(hole, {"diameter": scene.hole_diameter_mm, "position": 0.0}) for hole in found.of(FeatureKind.HOLE)]
     rows = figure_rows(f"{water}, flange", [(found.features[0], truth)])
@@ -315,7 +315,7 @@ def draw_curves(curves: dict, path: Path) -> None:
 def draw_map(folder: Path, path: Path) -> None:
     """The corroded pipe unrolled, with the pits that were found and their depths."""
     cloud = cloud_of(folder, "coastal", "pipe-corroded")
-    found = uwlts.inspect(cloud, wall_mm=9.5)
+    found = uwlts.inspect_pipe(cloud, wall_mm=9.5)
     x, y, z = cloud.points_mm[::2].T
     figure, ax = plt.subplots(figsize=(9, 4.4), layout="constrained")
     colours = ax.scatter(

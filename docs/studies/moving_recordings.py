@@ -16,7 +16,7 @@ import numpy as np
 import twin
 import uwlts
 from twin.options import CPU, Options, use_variant
-from twin.recording.studio import record_scene
+from twin.recording.record_scene import record_scene
 from twin.scene.campaign import load_campaign, takes
 from twin.scene.description import load_scene
 
@@ -54,7 +54,7 @@ def main() -> None:
                 water=[folder / "target-water.h5"],
                 step=sorted(path for path in folder.glob("step-*.h5") if ".truth." not in path.name),
             )
-            uwlts.write_calibration(folder / "calibration.json", calibration)
+            calibration.save(folder / "calibration.json")
         take = takes(load_campaign(plan), seed=number)[0]
         for name in given.scenes:
             for seed in given.seeds:

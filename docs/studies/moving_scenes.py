@@ -41,9 +41,9 @@ def truth_of(path: Path) -> tuple[Platform, Truth]:
 
 def captured(path: Path) -> CapturedProfiles:
     """Profiles by the calibration beside the capture."""
-    calibration = uwlts.load_calibration(path.parent / "calibration.json")
+    calibration = uwlts.read(path.parent / "calibration.json")
     assert isinstance(calibration, Calibration)
-    with uwlts.open_capture(path) as capture:
+    with uwlts.read(path) as capture:
         return profiles_of(capture, calibration, None, None)
 
 
@@ -117,8 +117,8 @@ def form(points: np.ndarray, view: np.ndarray) -> Form:
 def vehicle(path: Path) -> str:
     """How far points are off with what the navigation reports, and with the true path and mount."""
     motion, truth = truth_of(path)
-    reported = uwlts.read_trajectory(str(path).replace(".h5", ".trajectory.csv"), pose_format="quaternion-xyzw")
-    with uwlts.open_capture(path) as capture:
+    reported = uwlts.read(str(path).replace(".h5", ".trajectory.csv"), pose_format="quaternion-xyzw")
+    with uwlts.read(path) as capture:
         times, stated = capture.time_s[:] + motion.clock_offset_s, np.trace(capture.pose_covariance[-1, :3, :3])
     cloud = uwlts.reconstruct(
         path, uwlts.nominal("thesis-small", medium="water"), trajectory=reported, clock_offset_s=motion.clock_offset_s
@@ -148,7 +148,7 @@ def main(folder: Path) -> None:
         print(rotary(path), flush=True)
     rows = []
     for path in recorded("pipe-five-sides"):
-        calibration = uwlts.load_calibration(path.parent / "calibration.json")
+        calibration = uwlts.read(path.parent / "calibration.json")
         assert isinstance(calibration, Calibration)
         robot = captured(path.parent / path.name.replace("pipe-five-sides", "robot-sphere"))
         mount = uwlts.calibrate_mount(robot.selected(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)

@@ -18,7 +18,7 @@ from stripe_tables import table
 
 import uwlts
 from twin.scene.description import Scene
-from twin.scene.platforms import Robot
+from twin.scene.robot import Robot
 from uwlts.calibration.mount.sensor import CapturedProfiles, profiles_of
 from uwlts.fitting.shapes import fit_sphere
 from uwlts.model.calibration import Calibration
@@ -53,13 +53,13 @@ def main(folder: Path) -> None:
     for path in sorted(folder.glob("sensor-*/robot-sphere-*.h5")):
         if ".truth." in path.name:
             continue
-        calibration = uwlts.load_calibration(path.parent / "calibration.json")
+        calibration = uwlts.read(path.parent / "calibration.json")
         assert isinstance(calibration, Calibration)
         header, truth = read_truth(truth_path(path))
         motion = Scene.model_validate(header.scene).motion
         assert isinstance(motion, Robot) and truth.pose is not None
         true = (motion.true_mount or motion.mount).matrix()
-        with uwlts.open_capture(path) as capture:
+        with uwlts.read(path) as capture:
             reported = profiles_of(capture, calibration, None, None)
         ideal = profiles_of_poses(reported, truth.pose @ np.linalg.inv(true))
         for name, captured in {"ideal": ideal, "as reported": reported}.items():

@@ -49,7 +49,7 @@ def render(kind: str, water: str, out: Path, *, seed: int) -> None:
 
 def reference(renderer: "Renderer", distance: np.ndarray, *, seed: int) -> np.ndarray:
     """Means (rows, columns) of what walks found per cell of an image (H, W) of distances from the stripe."""
-    import twin.light.longer_ways as ways
+    import twin.light.multiple_scattering as ways
     from twin.light.illumination import lights
     from twin.light.pose import SensorPose
     from twin.light.walk import Walker

@@ -69,7 +69,7 @@ def side_cloud(folder: Path, side: str) -> uwlts.PointCloud:
     if not posed.exists():
         turned = Rotation.from_euler("x", -SIDES[side], degrees=True).as_matrix()
         with (
-            uwlts.open_capture(folder / "plate" / f"plate-{side}.h5") as capture,
+            uwlts.read(folder / "plate" / f"plate-{side}.h5") as capture,
             CaptureWriter(posed, capture.header, dtype=capture.dtype) as writer,
         ):
             for number, frame in enumerate(capture):

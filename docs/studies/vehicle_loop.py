@@ -79,13 +79,13 @@ def main(folder: Path) -> None:
     motion, truth = truth_of(capture)
     assert truth.pose is not None
     offset = motion.clock_offset_s
-    reported = uwlts.read_trajectory(trajectory_path(capture), pose_format="quaternion-xyzw")
+    reported = uwlts.read(trajectory_path(capture), pose_format="quaternion-xyzw")
     cloud = uwlts.reconstruct(
         capture, uwlts.nominal("thesis-small", medium="water"), trajectory=reported, clock_offset_s=offset
     )
     found = uwlts.align_trajectory(cloud, reported, clock_offset_s=offset)
     print(*found.lines(), sep="\n")
-    with uwlts.open_capture(capture) as images:
+    with uwlts.read(capture) as images:
         times = images.time_s[:] + offset
     true = truth.pose @ np.linalg.inv(motion.mount.matrix())
     before, after = (

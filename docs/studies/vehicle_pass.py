@@ -22,7 +22,7 @@ from robot_campaigns import FOR_THE_MOUNT, RADIUS_MM
 from stripe_tables import table
 
 import uwlts
-from twin.scene.platforms import Vehicle
+from twin.scene.vehicle import Vehicle
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.pose_files import trajectory_path
 from uwlts.storage.truth import Truth
@@ -59,7 +59,7 @@ def aligned_pass(path: Path) -> Figures:
     assert isinstance(motion, Vehicle) and truth.pose is not None
     robot = captured(path.parent / path.name.replace("vehicle-pass", "robot-sphere"))
     mount = uwlts.calibrate_mount(robot.selected(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
-    reported = uwlts.read_trajectory(trajectory_path(path), pose_format="quaternion-xyzw")
+    reported = uwlts.read(trajectory_path(path), pose_format="quaternion-xyzw")
     offset = motion.clock_offset_s
     cloud = uwlts.reconstruct(
         path,
@@ -69,7 +69,7 @@ def aligned_pass(path: Path) -> Figures:
         with_uncertainty=False,
         clock_offset_s=offset,
     )
-    with uwlts.open_capture(path) as capture:
+    with uwlts.read(path) as capture:
         times = capture.time_s[:]
     true = truth.pose @ np.linalg.inv((motion.true_mount or motion.mount).matrix())
     before = reported.poses_at(times + offset)

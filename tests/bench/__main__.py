@@ -266,7 +266,7 @@ def demo() -> list[Row]:
     environment = os.environ | {"PYTHONPATH": str(Path.cwd())}
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        command = [sys.executable, "-m", "twin.cli", "demo"]
+        command = [sys.executable, "-m", "twin", "demo"]
         subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
         seconds = time.perf_counter() - start
     # ru_maxrss of the children is the largest single process; the demo runs two at a time.
@@ -281,7 +281,7 @@ def commands() -> list[Row]:
         return median_seconds(lambda k: subprocess.run([sys.executable, *arguments], check=True, capture_output=True))
 
     return [
-        at_most("uwlts --help", seconds("-m", "uwlts.cli", "--help"), "s", 0.3),
+        at_most("uwlts --help", seconds("-m", "uwlts", "--help"), "s", 0.3),
         at_most("import uwlts", seconds("-c", "import uwlts") - seconds("-c", ""), "s", 0.2),
     ]
 

@@ -15,7 +15,7 @@ from tests.stock_mitsuba import fog, stock_scene
 from tests.virtual_sensors import altered
 from twin.light.renderer import Renderer
 from twin.options import NONE, Options
-from twin.recording.studio import record_scene
+from twin.recording.record_scene import record_scene
 from twin.scene.description import load_scene
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Medium, Sensor

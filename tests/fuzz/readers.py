@@ -36,14 +36,14 @@ from uwlts.optics.nominal import nominal_calibration
 from uwlts.report.certificate import certificate_of, check_certificate
 from uwlts.report.gather import load_reference
 from uwlts.report.inventory import describe
-from uwlts.storage.calibration_file import load_calibration, read_calibration, write_calibration
+from uwlts.storage.calibration_file import load_calibration, read_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud, write_cloud
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import read_intrinsics, with_intrinsics
 from uwlts.storage.import_.folder_description import capture_header, described_sensor, read_description, read_header
 from uwlts.storage.import_.matching import read_rows
-from uwlts.storage.mount_files import read_mount, read_profiles, write_mount
+from uwlts.storage.mount_files import read_mount, read_profiles
 from uwlts.storage.pose_files import read_trajectory
 from uwlts.storage.truth import read_truth, write_truth
 from uwlts.thesis.published_tables import load_published
@@ -83,7 +83,7 @@ def _joint(path: Path) -> None:
 
 
 def _nominal(path: Path) -> None:
-    write_calibration(path, nominal_calibration(load_sensor("thesis")))
+    nominal_calibration(load_sensor("thesis")).save(path)
 
 
 def _certified(path: Path) -> Path:
@@ -205,7 +205,7 @@ def _table(path: Path) -> None:
 
 def _mount(path: Path) -> None:
     campaign = sphere_campaign(np.random.default_rng(3), poses=8)
-    write_mount(path, calibrate_mount(campaign.profiles, campaign.poses, radius_mm=20.0))
+    calibrate_mount(campaign.profiles, campaign.poses, radius_mm=20.0).save(path)
 
 
 def _trajectory(path: Path) -> None:

@@ -237,7 +237,7 @@ def _called(words: list[str]) -> list[str]:
     """Words that call a program of this environment."""
     match words:
         case [("uwlts" | "twin") as program, *rest]:
-            return [sys.executable, "-m", f"{program}.cli", *rest]
+            return [sys.executable, "-m", program, *rest]
         case ["python" | "python3" | ".venv/bin/python", *rest]:
             return [sys.executable, *rest]
         case ["pytest", *rest]:

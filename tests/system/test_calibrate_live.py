@@ -104,7 +104,7 @@ def plan(folder: Path, served: ServedTwin) -> Path:
 
 
 def command(*words: object) -> list[str]:
-    return [sys.executable, "-m", "uwlts.cli", "calibrate", *map(str, words), "--port", "8954"]
+    return [sys.executable, "-m", "uwlts", "calibrate", *map(str, words), "--port", "8954"]
 
 
 def run(*words: object) -> subprocess.CompletedProcess[str]:

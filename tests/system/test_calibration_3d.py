@@ -7,7 +7,7 @@ import pytest
 
 import uwlts
 from twin.options import Flaws, Options
-from twin.recording.studio import record_scene
+from twin.recording.record_scene import record_scene
 from twin.scene.description import altered, load_scene
 from uwlts.model.library import load_sensor
 from uwlts.storage.capture import Capture
@@ -34,7 +34,7 @@ def test_centre_lines_on_the_board_calibrate_the_sensor_that_scans_spheres(tmp_p
         assert len(cloud) > 800
         return uwlts.evaluate(cloud, truth=truth_path(tmp_path / "spheres.h5")).sphere_spacings[0]
 
-    found = spacing(uwlts.calibrate(air=[tmp_path / "board.h5"], method="joint"))
+    found = spacing(uwlts.calibrate(air=[tmp_path / "board.h5"], joint=True))
     known = found.uncertainty
     assert known is not None
     # Five combined standard uncertainties, some 0.1 mm: false alarm 6e-7.

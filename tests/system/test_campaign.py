@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from twin.options import ALL, NONE, Options
-from twin.recording.studio import record_scene
+from twin.recording.record_scene import record_scene
 from twin.scene.description import load_scene
 from uwlts.calibration.sequential.sequential_calibration import (
     CalibrationOptions,

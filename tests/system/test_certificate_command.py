@@ -13,7 +13,6 @@ from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
-from uwlts.storage.calibration_file import write_calibration
 
 pytestmark = pytest.mark.slow
 
@@ -22,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 
 def run(*arguments, folder: Path) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [sys.executable, "-m", "uwlts.cli", *map(str, arguments)],
+        [sys.executable, "-m", "uwlts", *map(str, arguments)],
         cwd=folder,
         capture_output=True,
         text=True,
@@ -37,7 +36,7 @@ def calibration(thesis, tmp_path_factory) -> Path:
     series = target_series(built_sensor(), medium=0, positions=np.arange(5) * 40.0 - 110.0, noise=noise, columns=15)
     options = CalibrationOptions(poses="stage", correct_circles=False)
     path = tmp_path_factory.mktemp("certificates") / "calibration.json"
-    write_calibration(path, solve_jointly(gathered(thesis, [series]), options=options).calibration)
+    solve_jointly(gathered(thesis, [series]), options=options).calibration.save(path)
     return path
 
 

@@ -23,7 +23,7 @@ from uwlts import cli as uwlts_cli
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Sensor
 from uwlts.report.plot import DEVIATIONS, colour_limit_mm
-from uwlts.storage.calibration_file import read_calibration, write_calibration
+from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud
@@ -169,8 +169,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "twin simulate scene.toml --sensor sensor.toml --out rendered.h5 --spp 1",
         ):
             assert exit_code(*line.split()) == 0, line
-    dry = read_calibration(folder / "calibration.json").model_copy(update={"window": None})
-    write_calibration(folder / "dry.json", dry)
+    dry = read_calibration(folder / "calibration.json").model_copy(update={"window": None, "medium_kind": "air"})
+    dry.save(folder / "dry.json")
     (folder / "campaigns" / "campaign-0").mkdir(parents=True)
     (folder / "campaign").mkdir()
     for name in ("scan.h5", "scan.ply", "scan.evaluation.json", "calibration.json"):
@@ -266,7 +266,7 @@ def test_wrong_command_line(fails, folder: Path, monkeypatch, line: str, says: s
 def test_as_a_process_of_its_own(tmp_path: Path, line: str):
     program, *arguments = line.split()
     ended = subprocess.run(
-        [sys.executable, "-m", f"{program}.cli", *arguments], cwd=tmp_path, capture_output=True, text=True, check=False
+        [sys.executable, "-m", program, *arguments], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert ended.returncode == 2
     assert ended.stdout == ""
@@ -276,7 +276,7 @@ def test_as_a_process_of_its_own(tmp_path: Path, line: str):
 
 
 def test_reader_that_leaves_early_is_no_error(tmp_path: Path):
-    code = f"{sys.executable} -m uwlts.cli info thesis"
+    code = f"{sys.executable} -m uwlts info thesis"
     process = subprocess.Popen(code.split(), cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     process.stdout.close()
     assert process.stderr.read() == b""
@@ -727,7 +727,7 @@ def test_interrupted_simulation_is_kept_and_resumed(command, folder: Path, tmp_p
     options = ["--sensor", str(folder / "sensor.toml"), "--spp", "2", "--seed", "5", *quick, "--out"]
     path = tmp_path / "a.h5"
     process = subprocess.Popen(
-        [sys.executable, "-m", "twin.cli", "simulate", str(scene), *options, str(path)],
+        [sys.executable, "-m", "twin", "simulate", str(scene), *options, str(path)],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

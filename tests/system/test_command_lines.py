@@ -13,7 +13,7 @@ from cyclopts import App
 from tests.system.in_process import run_program, uwlts
 from twin.cli import app as twin_app
 from uwlts.cli import app as uwlts_app
-from uwlts.files.command_files import OUTPUTS
+from uwlts.files.inputs import OUTPUTS
 from uwlts.pages.toolkit import json_beside
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -95,7 +95,8 @@ def test_a_region_takes_its_six_numbers():
 @pytest.mark.parametrize("command", ["camera", "calibrate"])
 def test_distortion_is_auto_or_each_coefficient_once(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    required = _required(uwlts_app, command, "--distortion")
+    named = {"x.h5": {"camera": "x.yaml", "calibrate": "x.json"}[command]}
+    required = [named.get(word, word) for word in _required(uwlts_app, command, "--distortion")]
     for wrong in ("auto k1", "k1 k1"):
         ended = uwlts(command, *required, "--distortion", *wrong.split())
         assert ended.returncode == 2
@@ -133,10 +134,11 @@ ENDINGS = {"align": "x.csv", "compare": "x.html", "evaluate": "x.json", "inspect
 def test_what_is_described_as_written_counts_as_an_output():
     # Else it would be refused as an input where it is to be replaced.
     described = {
-        name
+        argument.name.lower().removeprefix("--").replace("-", "_")
         for program, command, app in _commands()
-        for name, text in re.findall(r"^ +(\w+): (.*)", app[command].default_command.__doc__ or "", re.MULTILINE)
-        if program == "uwlts" and re.search(r"\bto write\b|^(Also w|W)rite ", text)
+        for argument in app[command].assemble_argument_collection()
+        if program == "uwlts"
+        and re.search(r"\bto write\b|^(Also w|W)rite |not written unless", argument.parameter.help)
     }
     assert described >= {"out", "coloured", "aligned", "page", "poses_out", "pictures"}
     assert described <= OUTPUTS

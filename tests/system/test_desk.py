@@ -55,10 +55,10 @@ class Desk:
             f'[stage]\nport = "{served.controller.port}"\nstart_mm = {served.track.start_mm}\nstep_mm = 1.5\n'
             f'count = {COUNT}\nfeed_mm_per_min = 900.0\n[artefact]\nkind = "plane"\n'
         )
-        uwlts.write_calibration(folder / "nominal.json", uwlts.nominal(folder / "sensor.toml", medium="air"))
+        uwlts.nominal(folder / "sensor.toml", medium="air").save(folder / "nominal.json")
         words = ["desk", str(folder), "--plan", str(folder / "plan.toml"), "--port", "18300"]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "uwlts.cli", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            [sys.executable, "-m", "uwlts", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         line = self.process.stdout.readline() if self.process.stdout else ""
         found = re.search(r"open (\S+) to work, (\S+) to look", line)
@@ -203,7 +203,7 @@ def test_the_whole_way_of_a_first_time_operator(desk, page, served):
     tab(page, "Files")
     press(page, "reconstruct")
     says(page, "wrote scan.ply")
-    cloud = uwlts.read_cloud(desk.folder / "scan.ply")
+    cloud = uwlts.read(desk.folder / "scan.ply")
     page.locator(f'.cloud-view[data-points="{len(cloud)}"]').wait_for()
     tab(page, "Measure")
     box = page.locator(".cloud-view canvas").first.bounding_box()
@@ -551,5 +551,5 @@ def test_ctrl_c_ends_a_scan_in_the_dark(desk, page, served):
 @pytest.mark.slow
 def test_a_folder_that_is_not_there_is_refused(tmp_path):
     words = ["desk", str(tmp_path / "nowhere")]
-    done = subprocess.run([sys.executable, "-m", "uwlts.cli", *words], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-m", "uwlts", *words], capture_output=True, text=True, timeout=60)
     assert done.returncode != 0 and "there is no folder" in done.stderr and "Traceback" not in done.stderr

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 def test_a_guided_calibration_is_led_through_and_calculated(plan, served, chromium: "Browser"):
     place = plan.parent
-    desk = subprocess.Popen([sys.executable, "-m", "uwlts.cli", "desk", str(place)], stdout=subprocess.PIPE, text=True)
+    desk = subprocess.Popen([sys.executable, "-m", "uwlts", "desk", str(place)], stdout=subprocess.PIPE, text=True)
     try:
         assert desk.stdout
         address = desk.stdout.readline().split()[1]

@@ -114,7 +114,7 @@ def profiles_of_a_table(runner: Runner) -> None:
 
 def poses_of_a_capture(runner: Runner) -> None:
     """The robot's poses at the images of board.h5, m, as its controller prints them."""
-    with uwlts.open_capture(runner.folder / "board.h5") as capture:
+    with uwlts.read(runner.folder / "board.h5") as capture:
         poses = np.array([frame.pose for frame in capture])
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
     np.savetxt(runner.folder / "poses.csv", np.hstack([poses[:, :3, 3] / 1e3, turns]), fmt="%.12f", delimiter=",")
@@ -172,7 +172,7 @@ PAGES_RUN = {
         given={name: name for name in ("target-air.h5", "target-water.h5", "step-near.h5", "step-far.h5", "spheres.h5")}
         | {"pipe.h5": "pipe.h5", "plane.h5": "plane.h5", "target.h5": "target-water.h5", "today.h5": "today.h5"}
         | {"step-today.h5": "step-today.h5", "last-year.json": "calibration.json"},
-        instead={"--limit 0.05": "--limit 0.5"},
+        instead={"--limit-mm 0.05": "--limit-mm 0.5"},
         again=("uwlts calibrate --air", "uwlts calibrate --joint", "uwlts calibrate --water target.h5")
         + ("uwlts certificate calibration.json --before",),
     ),

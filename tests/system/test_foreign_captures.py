@@ -16,7 +16,6 @@ from tests.uwlts.drawn_target import drawn_lamp, drawn_laser
 from uwlts import cli
 from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.targets import CircleTarget
@@ -292,7 +291,7 @@ def test_a_step_with_exchanged_sides(says, target_frames, tmp_path: Path):
 @pytest.fixture
 def calibration(tmp_path: Path) -> Path:
     path = tmp_path / "nominal.json"
-    write_calibration(path, nominal_calibration(WET, Medium(kind="custom", index=1.3312)))
+    nominal_calibration(WET, Medium(kind="custom", index=1.3312)).save(path)
     return path
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -20,9 +21,9 @@ import uwlts
 import uwlts.cli
 from tests.system.in_process import run_program
 from uwlts.errors import OutputError
-from uwlts.files.command_files import OUTPUTS, command_files, note_input, own_files
-from uwlts.files.one_writer import lock_path, one_writer
-from uwlts.files.writing import refuse_unsuitable, written_aside
+from uwlts.files.inputs import OUTPUTS, inputs_kept
+from uwlts.files.reading import read_text
+from uwlts.files.writing import one_writer, refuse_unsuitable, written_aside
 from uwlts.storage.cloud import PointCloud
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -157,7 +158,7 @@ def test_a_photograph_is_not_replaced_by_the_camera(tmp_path):
 @pytest.fixture(scope="module")
 def nominal(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("nominal") / "nominal.json"
-    uwlts.write_calibration(path, uwlts.nominal("thesis", medium="water"))
+    uwlts.nominal("thesis", medium="water").save(path)
     return path
 
 
@@ -174,28 +175,31 @@ def test_functions_keep_their_inputs_too(tmp_path, nominal):
     calibration = tmp_path / "a.json"
     calibration.write_bytes(nominal.read_bytes())
     with pytest.raises(OutputError, match="is an input"):
-        uwlts.write_certificate(calibration, out=tmp_path / "a.html", overwrite=True)
+        uwlts.report.write_certificate(calibration, out=tmp_path / "a.html", overwrite=True)
     cloud = tmp_path / "cloud.ply"
-    uwlts.write_cloud(cloud, PointCloud(np.eye(3), np.ones(3), np.zeros(3), np.arange(3)))
+    PointCloud(np.eye(3), np.ones(3), np.zeros(3), np.arange(3)).save(cloud)
     before = cloud.read_bytes()
     with pytest.raises(OutputError, match="is an input"):
         uwlts.export(cloud, cloud, overwrite=True)
     assert cloud.read_bytes() == before
     # Who reads and writes in steps of his own knows what he does.
-    uwlts.write_cloud(cloud, uwlts.read_cloud(cloud), overwrite=True)
+    uwlts.read(cloud).save(cloud, overwrite=True)
 
 
-def test_a_file_that_has_the_inode_of_one_replaced_may_be_read(tmp_path):
-    """File systems give the inode of a file that is gone to the next; a link keeps it here."""
+def test_what_is_read_meanwhile_is_not_replaced_but_what_was_made_may_be_read_and_replaced(tmp_path):
     out, other = tmp_path / "out.txt", tmp_path / "other.txt"
     out.write_text("old", encoding="utf-8")
     os.link(out, other)
-    with command_files({}):
-        with written_aside(out, overwrite=True) as aside:
-            with pytest.raises(OutputError, match="is an input"):
-                note_input(other)
-            aside.write_text("new", encoding="utf-8")
-        note_input(other)
+    with inputs_kept():
+        with pytest.raises(OutputError, match="is an input"), written_aside(out, overwrite=True) as aside:
+            aside.write_text(read_text(other, most_bytes=10), encoding="utf-8")
+        assert out.samefile(other)
+    with inputs_kept():
+        for words in ("new", "newer"):
+            with written_aside(out, overwrite=True) as aside:
+                aside.write_text(words, encoding="utf-8")
+            assert read_text(out, most_bytes=10) == words
+            assert read_text(other, most_bytes=10) == "old"
 
 
 def test_a_file_in_a_reported_folder_is_not_replaced_by_the_report(tmp_path, nominal):
@@ -218,7 +222,7 @@ def test_a_file_in_a_reported_folder_is_not_replaced_by_the_report(tmp_path, nom
 _HOLDER = """
 import sys, time
 from pathlib import Path
-from uwlts.files.one_writer import one_writer
+from uwlts.files.writing import one_writer
 with one_writer(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
@@ -270,7 +274,7 @@ def test_a_command_claims_its_output_before_the_work(tmp_path, holder, nominal):
     assert ended.returncode == 2, ended
     assert f"cannot write {tmp_path / 'a.json'}: process {holder.pid}" in ended.stderr
     assert time.monotonic() - begun < 5.0, "it waited"
-    assert [path.name for path in tmp_path.iterdir()] == [lock_path(tmp_path / "a.json").name]
+    assert [path.name for path in tmp_path.iterdir()] == [".a-json.lock"]
 
 
 def test_without_a_command_asking_claims_nothing(tmp_path):
@@ -288,17 +292,24 @@ def test_a_locked_hdf5_output_can_be_written(tmp_path):
 def test_the_works_of_a_program_that_goes_on_are_apart(tmp_path):
     path = tmp_path / "notes.txt"
     path.write_text("old", encoding="utf-8")
-    with command_files({"folder": tmp_path}):
-        with own_files():
-            note_input(path)
+
+    def read_and_replace() -> None:
+        with inputs_kept():
+            read_text(path, most_bytes=10)
             with pytest.raises(OutputError, match="it is an input of this command"):
                 refuse_unsuitable(path, overwrite=True)
-        # What one work has read another may replace, and it holds what it writes until its own end only.
-        with own_files():
+
+    def replace() -> None:
+        with inputs_kept():
             refuse_unsuitable(path, overwrite=True)
             with written_aside(path, overwrite=True) as aside:
                 aside.write_text("new", encoding="utf-8")
             assert writer_elsewhere(path) == "another"
+
+    with inputs_kept(), ThreadPoolExecutor(1) as thread:
+        thread.submit(read_and_replace).result()
+        # What one work has read another may replace, and it holds what it writes until its own end only.
+        thread.submit(replace).result()
         assert writer_elsewhere(path) == "none"
     assert path.read_text(encoding="utf-8") == "new"
 
@@ -307,7 +318,7 @@ def writer_elsewhere(path: Path) -> str:
     """What another process finds that wants to write a path."""
     program = (
         "import sys\nfrom pathlib import Path\nfrom uwlts.errors import OutputError\n"
-        "from uwlts.files.one_writer import one_writer\n"
+        "from uwlts.files.writing import one_writer\n"
         "try:\n    with one_writer(Path(sys.argv[1])):\n        print('none')\n"
         "except OutputError:\n    print('another')\n"
     )

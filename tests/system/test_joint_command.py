@@ -30,11 +30,7 @@ lights = ["lamp", "laser"]
 
 def run(package: str, *arguments, folder: Path) -> str:
     done = subprocess.run(
-        [sys.executable, "-m", f"{package}.cli", *map(str, arguments)],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
+        [sys.executable, "-m", package, *map(str, arguments)], cwd=folder, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -102,7 +98,7 @@ def test_verify_judges_a_known_object_by_both_uncertainties_and_a_limit(folder: 
     assert expanded == pytest.approx(math.hypot(own, certified), abs=1e-4)
     assert normalised == pytest.approx(abs(error) / expanded, abs=0.02)
     # The stated uncertainty exceeds a limit of 1 um, so nothing can conform to it.
-    tight = verify("--limit", 0.001)
+    tight = verify("--limit-mm", 0.001)
     assert (tight.returncode, tight.stdout.splitlines()[-1]) == (1, "FAIL")
-    generous = verify("--limit", 1.0)
+    generous = verify("--limit-mm", 1.0)
     assert (generous.returncode, generous.stdout.splitlines()[-1]) == (0, "pass")

@@ -33,7 +33,7 @@ PROGRAM = """
 import sys, time
 import numpy as np
 from uwlts import cli
-from uwlts.hardware import scanning
+from uwlts.desk import scan as scanning
 from uwlts.hardware.camera_interface import CameraDevice, CameraInfo, Delivered
 from uwlts.hardware.grbl import GrblStage
 from uwlts.runtime import console

@@ -94,7 +94,7 @@ class Scan(Lit):
     """A running scan and its camera."""
 
     def __init__(self, camera: "FaultyCamera | FreeCamera", controller: GrblController, plan: Path):
-        super().__init__(controller, "-m", "uwlts.cli", "scan", plan, "--out", plan.parent / "scan.h5", "--home")
+        super().__init__(controller, "-m", "uwlts", "scan", plan, "--out", plan.parent / "scan.h5", "--home")
         self.camera = camera
 
 

@@ -151,7 +151,7 @@ def test_the_page_is_served_to_this_machine_until_it_is_closed(thesis, tmp_path)
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     watching = subprocess.Popen(
-        [sys.executable, "-m", "uwlts.cli", "watch", str(tmp_path / "live.h5"), "--port", str(port)],
+        [sys.executable, "-m", "uwlts", "watch", str(tmp_path / "live.h5"), "--port", str(port)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -421,7 +421,7 @@ def test_the_desk_shows_bystanders_no_control_and_gives_out_nothing_but_its_fold
     (tmp_path / "outside.html").write_text("outside", encoding="utf-8")
     (folder / "link.html").symlink_to(tmp_path)
     desk = subprocess.Popen(
-        [sys.executable, "-m", "uwlts.cli", "desk", str(folder), "--port", "0"],
+        [sys.executable, "-m", "uwlts", "desk", str(folder), "--port", "0"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

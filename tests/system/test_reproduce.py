@@ -20,7 +20,7 @@ import pytest
 from twin import cli
 from twin.options import Options
 from twin.recording.campaigns import record as record_one, record_campaigns
-from twin.recording.studio import record_scene
+from twin.recording.record_scene import record_scene
 from twin.scene.campaign import load_campaign, takes
 from uwlts.errors import DescriptionError
 from uwlts.storage.capture import Capture, part_path
@@ -255,7 +255,7 @@ def test_another_plan_is_refused_and_nothing_is_lost(copied: Path, described: Pa
     before = contents(copied)
     with pytest.raises(
         DescriptionError,
-        match=rf"made with another {differing} \(.* in it, .* now.*\): give another folder.*--overwrite",
+        match=rf"made with another {differing} \(.* in it, .* now.*\): give another folder.*`overwrite`",
     ):
         record(described, copied, **how)
     assert contents(copied) == before
@@ -268,7 +268,7 @@ def test_recordings_of_an_unknown_plan_are_refused(copied: Path, described: Path
     if text is not None:
         (copied / "plan.json").write_text(text, encoding="utf-8")
     before = contents(copied)
-    with pytest.raises(DescriptionError, match=r"holds recordings.*--overwrite"):
+    with pytest.raises(DescriptionError, match=r"holds recordings.*`overwrite`"):
         record(described, copied)
     assert contents(copied) == before
 
@@ -342,7 +342,7 @@ def test_an_interrupt_ends_everything_within_seconds(described: Path, tmp_path: 
     """Ctrl-C on the terminal reaches all processes, a signal from elsewhere the command alone."""
     options = ["--out", tmp_path / "runs", "--campaigns", 1, "--spp", 1, "--workers", 2]
     command = subprocess.Popen(
-        [sys.executable, "-m", "twin.cli", "reproduce", described / "many.toml", *map(str, options)],
+        [sys.executable, "-m", "twin", "reproduce", described / "many.toml", *map(str, options)],
         start_new_session=True,
         cwd=tmp_path,
         stdout=subprocess.PIPE,

@@ -16,7 +16,7 @@ from tests.system.small_board import small_sensor, turned_board
 from tests.waiting import within
 from twin.devices.serve import ServedTwin, serve
 from twin.options import Options
-from twin.recording.studio import record_scene
+from twin.recording.record_scene import record_scene
 from twin.scene.description import Scene
 from uwlts.errors import CaptureError
 from uwlts.model.sensor import Sensor
@@ -52,7 +52,7 @@ def written(folder: Path, served: ServedTwin, *, name: str = "plan", top: str = 
 
 
 def command(plan: Path, out: Path, *more: str) -> list[str]:
-    return [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(out), "--home", *more]
+    return [sys.executable, "-m", "uwlts", "scan", str(plan), "--out", str(out), "--home", *more]
 
 
 def run(plan: Path, out: Path, *more: str) -> subprocess.CompletedProcess[str]:
@@ -94,7 +94,7 @@ def test_a_scan_of_the_served_twin_is_the_simulated_one(served, folder, board, s
             f"reconstruct {tmp_path / name}.h5 --calibration {tmp_path / name}.json --out {tmp_path / name}.ply",
             f"evaluate {tmp_path / name}.ply --out {tmp_path / name}.evaluation.json",
         ):
-            judged = subprocess.run([sys.executable, "-m", "uwlts.cli", *line.split()], capture_output=True, text=True)
+            judged = subprocess.run([sys.executable, "-m", "uwlts", *line.split()], capture_output=True, text=True)
             assert judged.returncode == 0, judged.stderr
         clouds.append((tmp_path / f"{name}.evaluation.json").read_text())
     # The served images' noise is of another draw than the simulated ones', so that the spreads differ by chance.

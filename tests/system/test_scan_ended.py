@@ -72,7 +72,7 @@ class Bench:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
 
         program = subprocess.Popen(
-            [sys.executable, "-m", "uwlts.cli", *self.words(plan)],
+            [sys.executable, "-m", "uwlts", *self.words(plan)],
             cwd=ROOT,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,

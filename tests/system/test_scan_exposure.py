@@ -65,7 +65,7 @@ def scanned(scene: Scene, served: ServedTwin, folder: Path, out: Path) -> str:
         encoding="utf-8",
     )
     done = subprocess.run(
-        [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(out), "--home"],
+        [sys.executable, "-m", "uwlts", "scan", str(plan), "--out", str(out), "--home"],
         capture_output=True,
         text=True,
         timeout=120,
@@ -131,7 +131,7 @@ def watched(folder: Path, served: ServedTwin, out: Path, *, count: int) -> subpr
         encoding="utf-8",
     )
     return subprocess.Popen(
-        [sys.executable, "-m", "uwlts.cli", "scan", str(plan), "--out", str(out), "--home", "--watch"],
+        [sys.executable, "-m", "uwlts", "scan", str(plan), "--out", str(out), "--home", "--watch"],
         stdout=subprocess.PIPE,
         text=True,
     )

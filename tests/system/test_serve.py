@@ -15,7 +15,7 @@ import pytest
 from tests.system.small_board import small_sensor, turned_board
 from twin.devices.serve import NAMES, Fault, ServedTwin, Track, parse_fault, serve
 from twin.options import Options
-from twin.recording.studio import record_scene
+from twin.recording.record_scene import record_scene
 from twin.scene.description import Scene, load_scene
 from uwlts.errors import DescriptionError, DesignError, HardwareError, ImageError
 from uwlts.hardware.camera_addresses import open_camera
@@ -299,7 +299,7 @@ def test_a_camera_that_is_gone_says_so_and_what_keeps_it_from_frames_ends_the_se
 def test_the_command_serves_until_it_is_interrupted(folder: Path, served):
     served.camera.disconnect()
     arguments = ["serve", folder / "board.toml", "--sensor", folder / "sensor.toml", "--ideal", "--spp", 1]
-    program = [sys.executable, "-m", "twin.cli", *map(str, arguments), "--stage-start", "50", "--speed-up", "50"]
+    program = [sys.executable, "-m", "twin", *map(str, arguments), "--stage-start", "50", "--speed-up", "50"]
     command = subprocess.Popen(
         program, start_new_session=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )

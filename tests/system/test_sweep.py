@@ -25,7 +25,7 @@ from uwlts.runtime.workers import open_workers
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[2]
-SWEEP = [sys.executable, "-m", "twin.cli", "sweep"]
+SWEEP = [sys.executable, "-m", "twin", "sweep"]
 STUDY = """
 title = "Small"
 follow = ["focus", "waist", "volume"]

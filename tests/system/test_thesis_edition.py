@@ -203,7 +203,7 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect:
 def test_models_are_chosen_as_the_sensor_was_built(edition: CampaignFolder, tmp_path: Path):
     """Camera's and laser's windows are tilted by 0.08 and 0.1 deg, the lens has k1 and k2, and the sheet no bow."""
     page, folder = tmp_path / "models.html", edition.path
-    command = [sys.executable, "-m", "uwlts.cli", "models", "--air", folder / "target-bare.h5", "--out", page]
+    command = [sys.executable, "-m", "uwlts", "models", "--air", folder / "target-bare.h5", "--out", page]
     command += ["--water", folder / "target-water.h5", "--step", *sorted(folder.glob("step-*-water.h5"))]
     done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -8,8 +8,8 @@ from tests.oracles.fermat import Face, directions_seen, plate, points_seen_on_pl
 from tests.uwlts.calibration_views import STEP_MM, WATER, inside, lattice, lens_of, nine_steps, through_window, turn
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence
-from uwlts.calibration.joint.earlier_estimate import ViewMedium
 from uwlts.calibration.joint.gathering import Gathered, Series
+from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.model.artefacts import StepStandard
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Medium, Sensor

@@ -46,6 +46,22 @@ def route(corners: np.ndarray, *, radius_mm: float = 250.0) -> np.ndarray:
     ]
 
 
+def scan(
+    rng: np.random.Generator, poses: np.ndarray, height: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Frame, line (N,) and points (N, 3) in the sensor's frame by its poses (F, 4, 4), Z to the bed of a height."""
+    fan = np.radians(np.linspace(-FAN_DEG / 2, FAN_DEG / 2, RAYS))
+    rays = np.column_stack([np.zeros(RAYS), np.sin(fan), np.cos(fan)])
+    frame, line = (each.ravel() for each in np.meshgrid(np.arange(len(poses)), np.arange(RAYS), indexing="ij"))
+    ray = np.einsum("nij,nj->ni", poses[frame, :3, :3], rays[line])
+    origin, length = poses[frame, :3, 3], np.full(len(frame), ALTITUDE_MM)
+    for _ in range(25):
+        point = origin + length[:, None] * ray
+        gap = point[:, 2] - height(point[:, 0], point[:, 1])
+        length = length - 0.9 * gap / ray[:, 2]
+    return frame, line, (length + NOISE_MM * rng.standard_normal(len(frame)))[:, None] * rays[line]
+
+
 def ride(
     rng: np.random.Generator,
     corners: np.ndarray,
@@ -54,13 +70,14 @@ def ride(
     drift_deg: float,
     walk: float = 0.0,
     ground: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+    navigation: Callable[[Trajectory], tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> tuple[PointCloud, Trajectory, Trajectory]:
     """Cloud by the reported path, the reported path, and the true one.
 
     The drift at the end is of the stated size along each axis: a steady rate with a slow wave of a fifth, and besides a
-    random walk of ``walk`` times that. The height over x and y is that of `bed` unless ``ground`` gives it.
+    random walk of ``walk`` times that. Or a ``navigation`` gives errors (N, 6) and their covariances (N, 6, 6) along
+    the true path. The height over x and y is that of `bed` unless ``ground`` gives it.
     """
-    height = bed().ev if ground is None else ground
     places = route(corners)
     heading = np.unwrap(np.arctan2(*np.gradient(places, axis=0).T[::-1]))
     times = np.arange(len(places)) * STEP_MM / SPEED_MM_S
@@ -70,25 +87,18 @@ def ride(
     turns = Rotation.from_euler("ZYX", np.column_stack([heading, rolling])) * down
     true[:, :3, :3] = turns.as_matrix()
     true[:, :3, 3] = np.column_stack([places, ALTITUDE_MM + 20 * np.sin(times / 3)])
-    fan = np.radians(np.linspace(-FAN_DEG / 2, FAN_DEG / 2, RAYS))
-    rays = np.column_stack([np.zeros(RAYS), np.sin(fan), np.cos(fan)])
-    frame, line = (each.ravel() for each in np.meshgrid(np.arange(len(places)), np.arange(RAYS), indexing="ij"))
-    ray = np.einsum("nij,nj->ni", true[frame, :3, :3], rays[line])
-    origin, length = true[frame, :3, 3], np.full(len(frame), ALTITUDE_MM)
-    for _ in range(25):
-        point = origin + length[:, None] * ray
-        gap = point[:, 2] - height(point[:, 0], point[:, 1])
-        length = length - 0.9 * gap / ray[:, 2]
-    local = (length + NOISE_MM * rng.standard_normal(len(frame)))[:, None] * rays[line]
+    frame, line, local = scan(rng, true, bed().ev if ground is None else ground)
     t = times / times[-1]
     sizes = np.array([drift_mm] * 3 + [np.radians(drift_deg)] * 3)
     rate, phase = rng.choice([-1, 1], 6) * rng.uniform(0.7, 1.2, 6), rng.uniform(0, 2 * np.pi, 6)
     drift = t[:, None] * rate + 0.2 * (np.sin(2 * np.pi * 0.8 * t[:, None] + phase) - np.sin(phase))
     drift += walk * np.cumsum(rng.standard_normal((len(t), 6)), axis=0) / np.sqrt(len(t))
-    drift = (drift - drift[0]) * sizes
+    drift, covariance = (drift - drift[0]) * sizes, None
+    if navigation is not None:
+        drift, covariance = navigation(Trajectory(times, true))
     reported = true.copy()
     reported[:, :3, :3] = Rotation.from_rotvec(drift[:, 3:]).as_matrix() @ true[:, :3, :3]
     reported[:, :3, 3] += drift[:, :3]
     points = np.einsum("nij,nj->ni", reported[frame, :3, :3], local) + reported[frame, :3, 3]
     cloud = PointCloud(points, np.ones(len(points)), frame, line, time_s=times[frame])
-    return cloud, Trajectory(times, reported), Trajectory(times, true)
+    return cloud, Trajectory(times, reported, covariance), Trajectory(times, true)

@@ -6,8 +6,8 @@ import numpy as np
 
 from tests.uwlts.calibration_views import WATER, built_sensor, inside
 from tests.uwlts.joint_views import Noise, seen
-from uwlts.calibration.joint.earlier_estimate import ViewMedium
 from uwlts.calibration.joint.gathering import ScanStripes
+from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor
 from uwlts.optics.brightness import moved_by_blur_px

@@ -69,7 +69,7 @@ def stripe_of_sphere(known: StoredEstimate, values: np.ndarray, centre_mm: np.nd
 
     def points(line: np.ndarray, centre_px: np.ndarray) -> np.ndarray:
         pixels = pixels_of(line, centre_px, stripe_along=known.calibration.stripe_along)
-        seen = parameters.on_sheet(values, known.view, pixels)
+        seen = parameters.stripe_points(values, known.view, pixels, across=0)
         assert seen is not None
         return (seen.points.T - frame[:3, 3]) @ frame[:3, :3]
 

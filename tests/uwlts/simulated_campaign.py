@@ -9,8 +9,8 @@ from tests.uwlts.calibration_views import STEP_MM, built_sensor, inside, lattice
 from tests.uwlts.joint_views import TARGET, gathered, lit_points, seen
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence
-from uwlts.calibration.joint.earlier_estimate import ViewMedium
 from uwlts.calibration.joint.gathering import Gathered, Series
+from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.model.artefacts import SphereStandard, StepStandard
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Medium, Sensor

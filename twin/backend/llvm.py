@@ -4,24 +4,20 @@ Call `prepare_llvm` before mitsuba or drjit is imported. Versions 14 to 16 are r
 abort the whole process (`LLVM ERROR: Cannot select: ... fminimum`), which no program can catch. On x86-64 Linux a
 suitable library is a dependency of this project; elsewhere it comes from the system.
 
-`python -m twin.backend.llvm` lists the libraries, chooses one and runs a kernel with it; with `--install` it first
-installs what is missing by apt-get (as root). Exit status 0, or 2 if there is none.
+`python -m twin.backend.llvm` chooses a library and runs a kernel with it. Exit status 0, or 2 if there is none.
 """
 
-import argparse
 import ctypes
-import json
 import os
 import re
+import subprocess
 import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
-from twin.backend.packages import obtain, run_command
 from uwlts.errors import SetupError
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
@@ -29,9 +25,6 @@ MINIMUM_MAJOR = 17
 """The oldest version with which Dr.Jit's kernels do not abort."""
 RUNTIME_LIBRARY = "libatomic.so.1"
 """Dr.Jit's own wheel is linked against it, and minimal systems without a compiler lack it."""
-DEBIAN_PACKAGES = ("libllvm19", "libatomic1")
-PROBE_SECONDS = 120
-"""Loading takes about 0.1 s; on a slow network drive much longer."""
 TRIAL_SECONDS = 300
 """A kernel takes a few seconds, and imports may come from a slow network drive."""
 SINGLE_PRECISION_INTEGERS = 2**24
@@ -41,16 +34,10 @@ _NAME = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.so(\..+)?")
 _SYSTEM_FOLDERS = ("local/lib", "local/lib64", "lib", "lib64", "lib/*-linux-gnu", "lib/llvm*/lib", "lib64/llvm*/lib")
 _HOW_TO_INSTALL = """\
 Install what is missing:
+  x86-64 Linux:    pip install 'karellen-llvm-core>=19.1.7,<20'   (libatomic comes from the system)
   Debian, Ubuntu:  apt-get install libllvm19 libatomic1   (as root; any of libllvm17 and newer)
   Fedora:          dnf install llvm-libs libatomic   (as root)
-  Arch:            pacman -S llvm-libs gcc-libs   (as root)
-  x86-64 Linux:    pip install 'karellen-llvm-core>=19.1.7,<20'   (without root; libatomic comes from the system)"""
-_EXAMINE = """
-import json, sys
-sys.path.insert(0, sys.argv[1])
-from twin.backend.llvm import describe
-print(json.dumps(describe(sys.argv[2])))
-"""
+  Arch:            pacman -S llvm-libs gcc-libs   (as root)"""
 # The number makes the kernel a new one, so that it is compiled rather than taken from Dr.Jit's cache on disk.
 _TRIAL = """
 from twin.backend.llvm import prepare_llvm
@@ -119,32 +106,27 @@ def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
     SetupError
         None is suitable; the message lists what was found and how to install one.
     """
-    if chosen := os.environ.get(VARIABLE):
+    chosen, faults = os.environ.get(VARIABLE), ""
+    for path in [Path(chosen)] if chosen else list_candidates(folders):
         try:
-            library = examine(Path(chosen))
+            library = examine(path)
         except SetupError as error:
-            raise SetupError(
-                f"the environment variable {VARIABLE} names {error}\n"
-                f"Let it name a libLLVM of version {MINIMUM_MAJOR} or newer, or unset it to have one searched."
-            ) from error
-    else:
-        library = _first_suitable(folders)
-    if sys.platform == "linux":
-        try:
-            ctypes.CDLL(RUNTIME_LIBRARY)
-        except OSError as error:
-            raise SetupError(f"Dr.Jit needs {RUNTIME_LIBRARY}, which this machine lacks.\n{_HOW_TO_INSTALL}") from error
-    return library
-
-
-def _first_suitable(folders: Iterable[Path] | None) -> LlvmLibrary:
-    unsuitable = ""
-    for path in list_candidates(folders):
-        try:
-            return examine(path)
-        except SetupError as error:
-            unsuitable += f"\n  {error}"
-    found = unsuitable or "\n  none"
+            faults += f"\n  {error}"
+            continue
+        if sys.platform == "linux":
+            try:
+                ctypes.CDLL(RUNTIME_LIBRARY)
+            except OSError as error:
+                raise SetupError(
+                    f"Dr.Jit needs {RUNTIME_LIBRARY}, which this machine lacks.\n{_HOW_TO_INSTALL}"
+                ) from error
+        return library
+    if chosen:
+        raise SetupError(
+            f"the environment variable {VARIABLE} names {faults.strip()}\n"
+            f"Let it name a libLLVM of version {MINIMUM_MAJOR} or newer, or unset it to have one searched."
+        )
+    found = faults or "\n  none"
     raise SetupError(
         f"no suitable libLLVM: Dr.Jit needs the shared library of LLVM {MINIMUM_MAJOR} or newer. Found:{found}\n"
         f"{_HOW_TO_INSTALL}\nor let the environment variable {VARIABLE} name a libLLVM."
@@ -154,38 +136,23 @@ def _first_suitable(folders: Iterable[Path] | None) -> LlvmLibrary:
 def examine(path: Path) -> LlvmLibrary:
     """Load a library and ask for its version, as the file name is not trusted.
 
-    A library of the wrong kind can end the process that loads it, and two libLLVM in one process may disturb each
-    other, so a child process loads it.
-
     Raises
     ------
     SetupError
         The library does not load, is no libLLVM, or is too old.
     """
-    child = [sys.executable, "-I", "-c", _EXAMINE, str(Path(__file__).parents[2]), str(path)]
-    found = json.loads(run_command(child, seconds=PROBE_SECONDS, shown=f"{path}: loading it"))
-    if "fault" in found:
-        raise SetupError(f"{path}: {found['fault']}")
-    return LlvmLibrary(path, tuple(found["version"]))
-
-
-def describe(library: str) -> dict[str, object]:
-    """Load a library into this process: its "version", or the "fault" that makes it unsuitable."""
     try:
-        handle = ctypes.CDLL(library)
+        library = ctypes.CDLL(str(path))
     except OSError as error:
-        return {"fault": f"it does not load: {error}"}
-    if not hasattr(handle, "LLVMContextCreate"):
-        return {"fault": "it is no libLLVM: it lacks the function LLVMContextCreate"}
-    wanted = f"version {MINIMUM_MAJOR} or newer is needed"
-    if not hasattr(handle, "LLVMGetVersion"):
-        return {"fault": f"too old: it has no LLVMGetVersion; {wanted}"}
+        raise SetupError(f"{path}: it does not load: {error}") from error
+    if not hasattr(library, "LLVMGetVersion"):
+        raise SetupError(f"{path}: it is no libLLVM, or too old: it lacks the function LLVMGetVersion")
     numbers = [ctypes.c_uint() for _ in range(3)]
-    handle.LLVMGetVersion(*map(ctypes.byref, numbers))
-    version = [number.value for number in numbers]
-    if version[0] < MINIMUM_MAJOR:
-        return {"fault": f"version {'.'.join(map(str, version))}; {wanted}"}
-    return {"version": version}
+    library.LLVMGetVersion(*map(ctypes.byref, numbers))
+    major, minor, patch = (number.value for number in numbers)
+    if major < MINIMUM_MAJOR:
+        raise SetupError(f"{path}: version {major}.{minor}.{patch}; version {MINIMUM_MAJOR} or newer is needed")
+    return LlvmLibrary(path, (major, minor, patch))
 
 
 def list_candidates(folders: Iterable[Path] | None = None) -> list[Path]:
@@ -207,26 +174,23 @@ def search_folders() -> list[Path]:
     return folders
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main() -> int:
     """Command line of this module; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m twin.backend.llvm", description="Find the libLLVM for Dr.Jit.")
-    parser.add_argument("--install", action="store_true", help="install what is missing by apt-get, as root")
-    install = parser.parse_args(arguments).install
+    try:
+        print(f"chosen: {find_llvm()}")
+    except SetupError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     # A child process compiles the kernel, where an abort inside LLVM does no harm.
     trial = [sys.executable, "-c", _TRIAL.format(number=float(time.time_ns() % SINGLE_PRECISION_INTEGERS))]
     try:
-        for path in () if install else list_candidates():
-            try:
-                print(f"found: {examine(path)}")
-            except SetupError as unsuitable:
-                print(f"found: {unsuitable}")
-        if install:
-            print(obtain(find_llvm, DEBIAN_PACKAGES, partial(print, flush=True)))
-        else:
-            print(f"chosen: {find_llvm()}")
-        run_command(trial, seconds=TRIAL_SECONDS, shown="a trial kernel of Dr.Jit")
-    except SetupError as error:
-        print(f"error: {error}", file=sys.stderr)
+        done = subprocess.run(trial, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TRIAL_SECONDS)
+    except subprocess.TimeoutExpired:
+        print(f"error: a trial kernel of Dr.Jit did not end within {TRIAL_SECONDS} s", file=sys.stderr)
+        return 2
+    if done.returncode != 0:
+        end = "\n  ".join(done.stderr.strip().splitlines()[-5:])
+        print(f"error: a trial kernel of Dr.Jit failed, exit status {done.returncode}:\n  {end}", file=sys.stderr)
         return 2
     return 0
 

@@ -26,6 +26,7 @@ from twin.datasets.data_set import (
     Split,
     Uniform,
 )
+from twin.datasets.labels import MEANINGS
 from twin.datasets.loading import CARD, CARD_FORMAT, CARD_VERSION, DataCard, DataSet, Shard
 from twin.scene.paths import Value
 from uwlts._version import __version__
@@ -33,7 +34,8 @@ from uwlts.files.json_files import write_model
 from uwlts.files.writing import sha256_of, written_aside
 from uwlts.pages.toolkit import BLUE, new_figure, plain_text, png_data_uri, render_page, svg_of, write_page
 
-README, PAGE = "README.md", "dataset.html"
+README = "README.md"
+PAGE = "dataset.html"
 _SHOWN = 12
 """Frames that the page shows."""
 _SHOWN_WIDTH_PX = 480
@@ -47,23 +49,6 @@ _OVERLAY = {
     Mask.SATURATED: (230, 40, 60),
 }
 """Colours (red, green, blue) of the masks on the page; later ones cover earlier ones."""
-MEANINGS = {
-    "centre_px": "(lines,) float32: true centre of the stripe on each profile line, in px across it; NaN without one",
-    "status": "(lines,) uint8: " + ", ".join(f"{one.value} {one.name.lower()}" for one in LineStatus),
-    "width_px": "(lines,) float32: full width at half maximum of the stripe across it, in px",
-    "snr": "(lines,) float32: signal over noise of the stripe's brightest pixel, speckle left out",
-    "bound_px": "(lines,) float32: Cramér-Rao bound of the centre's standard deviation, in px, speckle left out",
-    "point_mm": "(lines, 3) float32: surface at the centre, in scene coordinates",
-    "normal": "(lines, 3) float32: unit normal of the surface there",
-    "object": "(lines,) int16: number of the object there, -1 for none",
-    "target_px": "(points, 2) float32: where the points of the calibration target are seen; NaN where they are not",
-    "mask": "(height, width) uint8: sum of " + ", ".join(f"{one.value} {str(one.name).lower()}" for one in Mask),
-    "light_e": "(5, height, width) float16: mean photo-electrons of light straight from the lit surface, scattered "
-    "once, on longer ways, by grains and bubbles, and of lamp and day; without speckle and noise",
-    "depth_mm": "(height, width) float32: depth in the camera frame of what each pixel's middle sees; NaN for nothing",
-    "object_map": "(height, width) uint8: number of the object that each pixel's middle sees, 255 for none",
-}
-"""Meaning of the arrays of a sample, see `twin.datasets.labels`."""
 
 
 @dataclass

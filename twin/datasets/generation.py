@@ -27,10 +27,10 @@ from twin.datasets.shards import SUFFIXES, Sample, written_shard
 from twin.options import CPU, Variant, use_variant
 from twin.recording.campaigns import PLAN, keep_to_plan
 from uwlts.errors import DescriptionError, DesignError, OutputError
-from uwlts.files.command_files import keeps_inputs
-from uwlts.files.one_writer import lock_path, one_writer
+from uwlts.files.inputs import inputs_kept
+from uwlts.files.writing import OtherWriterError, one_writer
 from uwlts.model.placement import camera_from_object
-from uwlts.runtime.console import progress_bar
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import work_through
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ _OUTPUT = re.compile(
 _UNFINISHED = re.compile(r"\.[0-9a-f]{16}\.(tar|h5|json|md|html)")
 
 
-@keeps_inputs
+@inputs_kept()
 def dataset(
     description: str | Path | DataSetDescription,
     *,
@@ -57,7 +57,7 @@ def dataset(
     workers: int | None = None,
     overwrite: bool = False,
     variant: Variant = CPU,
-    show_progress: bool = False,
+    progress: ProgressListener = unheard,
 ) -> Path:
     """Render a data set of images with labels, for training and testing, from a description of what varies and how.
 
@@ -81,8 +81,8 @@ def dataset(
         Remove the data set that the folder holds, and start afresh.
     variant
         As for `simulate`.
-    show_progress
-        Draw a progress bar on the terminal.
+    progress
+        Called with the number of frames done, the number in all, and the name of the stage.
 
     Raises
     ------
@@ -112,24 +112,23 @@ def dataset(
         raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
     with one_writer(folder / PLAN, patience_s=_PATIENCE_S):
         _prepare(folder, jobs, plan, overwrite=overwrite)
-    with progress_bar(described.title, shown=show_progress) as progress:
-        waiting = [job for job in jobs if not job.path.is_file()]
-        total = sum(job.frames for job in jobs)
-        done = total - sum(job.frames for job in waiting)
+    waiting = [job for job in jobs if not job.path.is_file()]
+    total = sum(job.frames for job in jobs)
+    done = total - sum(job.frames for job in waiting)
+    progress(done, total)
+
+    def count(_: object) -> None:
+        nonlocal done
+        done += 1
         progress(done, total)
 
-        def count(_: object) -> None:
-            nonlocal done
-            done += 1
-            progress(done, total)
-
-        # What others are writing is left to them at first, and then waited for: should they fail, it is done here.
-        for patience_s in (0.0, math.inf):
-            waiting = [job for job in waiting if not job.path.is_file()]
-            work_through(partial(_render_shard, patience_s), waiting, workers=workers, on_message=count)
-        with one_writer(folder / CARD, patience_s=math.inf):
-            if not (folder / CARD).is_file():
-                write_card(folder, described, [(job.path, job.split, job.frames) for job in jobs], plan)
+    # What others are writing is left to them at first, and then waited for: should they fail, it is done here.
+    for patience_s in (0.0, math.inf):
+        waiting = [job for job in waiting if not job.path.is_file()]
+        work_through(partial(_render_shard, patience_s), waiting, workers=workers, on_message=count)
+    with one_writer(folder / CARD, patience_s=math.inf):
+        if not (folder / CARD).is_file():
+            write_card(folder, described, [(job.path, job.split, job.frames) for job in jobs], plan)
     return folder
 
 
@@ -178,10 +177,9 @@ def _prepare(folder: Path, jobs: list[_Job], plan: dict[str, JsonValue], *, over
     """Make the folder ready for a plan; OutputError where another run is at work in what is to be replaced."""
     try:
         for job in jobs:
-            if lock_path(job.path).exists():
-                with one_writer(job.path):
-                    pass
-    except OutputError:
+            with one_writer(job.path):
+                pass
+    except OtherWriterError:
         if overwrite:
             raise
     else:
@@ -208,9 +206,7 @@ def _render_shard(patience_s: float, job: _Job, report: Callable[[None], None]) 
             if not job.path.is_file():
                 _render(job, report)
                 return
-    except OutputError:
-        if not lock_path(job.path).exists():
-            raise
+    except OtherWriterError:
         return
     # Another process has written it meanwhile.
     for _ in range(job.frames):

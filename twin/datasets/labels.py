@@ -1,28 +1,7 @@
 """Labels of rendered images: what is known of every profile line and every pixel.
 
-The arrays of a frame by their names, for an image of H x W pixels with L profile lines; NaN where there is nothing:
-
-=============== ============ ========= ===============================================================================
-name            shape        label
-=============== ============ ========= ===============================================================================
-centre_px       (L,)         centre    coordinate across the stripe where the line's middle sees the sheet's middle
-status          (L,) uint8   centre    `LineStatus`
-width_px        (L,)         quality   full width at half maximum of the stripe's light across it
-snr             (L,)         quality   signal over noise of the stripe's brightest pixel
-bound_px        (L,)         quality   Cramér-Rao bound: least standard deviation of an unbiased estimate of the centre
-point_mm        (L, 3)       points    surface at the centre, in scene coordinates
-normal          (L, 3)       points    unit normal of the surface there
-object          (L,) int16   points    number of the object there, -1 for none
-target_px       (N, 2)       target    where the target's points are seen (x, y), in the order of its description
-mask            (H, W) uint8 masks     bits of `Mask`
-light_e         (5, H, W)    light     mean photo-electrons in float16: of light straight from the lit surface,
-                                       scattered once, on longer ways, by grains and bubbles, and of lamp and day;
-                                       without speckle
-depth_mm        (H, W)       depth     depth in the camera frame of what the pixel's middle sees
-object_map      (H, W) uint8 depth     number of the object that the pixel's middle sees, 255 for none
-=============== ============ ========= ===============================================================================
-
-Of several lit crossings on a line the brightest is labelled. Arrays are float32 unless another type is given.
+`MEANINGS` explains the arrays of a frame by their names; they are NaN where there is nothing.
+Of several lit crossings on a line the brightest is labelled.
 """
 
 from __future__ import annotations
@@ -48,6 +27,23 @@ _LEAST_E = 1e-6
 _LARGEST_HALF = 65504.0
 """Largest number of float16; brighter pixels are clipped to it, far above any full well of use."""
 NO_OBJECT = 255
+MEANINGS = {
+    "centre_px": "(lines,) float32: true centre of the stripe on each profile line, in px across it; NaN without one",
+    "status": "(lines,) uint8: " + ", ".join(f"{one.value} {one.name.lower()}" for one in LineStatus),
+    "width_px": "(lines,) float32: full width at half maximum of the stripe across it, in px",
+    "snr": "(lines,) float32: signal over noise of the stripe's brightest pixel, speckle left out",
+    "bound_px": "(lines,) float32: Cramér-Rao bound of the centre's standard deviation, in px, speckle left out",
+    "point_mm": "(lines, 3) float32: surface at the centre, in scene coordinates",
+    "normal": "(lines, 3) float32: unit normal of the surface there",
+    "object": "(lines,) int16: number of the object there, -1 for none",
+    "target_px": "(points, 2) float32: where the points of the calibration target are seen; NaN where they are not",
+    "mask": "(height, width) uint8: sum of " + ", ".join(f"{one.value} {str(one.name).lower()}" for one in Mask),
+    "light_e": "(5, height, width) float16: mean photo-electrons of light straight from the lit surface, scattered "
+    "once, on longer ways, by grains and bubbles, and of lamp and day; without speckle and noise",
+    "depth_mm": "(height, width) float32: depth in the camera frame of what each pixel's middle sees; NaN for nothing",
+    "object_map": "(height, width) uint8: number of the object that each pixel's middle sees, 255 for none",
+}
+"""Meaning of the arrays of a sample."""
 
 
 def labelled(studio: Studio, shot: Shot, taken: Exposed, wanted: tuple[Label, ...]) -> dict[str, np.ndarray]:

@@ -14,7 +14,9 @@ from uwlts.errors import CaptureError, DescriptionError
 from uwlts.files.json_files import read_model
 from uwlts.model.sensor import Description, Table
 
-CARD, CARD_FORMAT, CARD_VERSION = "dataset.json", "uwlts-dataset", 1
+CARD = "dataset.json"
+CARD_FORMAT = "uwlts-dataset"
+CARD_VERSION = 1
 
 
 class Shard(Description):

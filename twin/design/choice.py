@@ -177,8 +177,12 @@ def choose(study: Study, columns: Columns) -> Chosen:
 
 # --- refinement -------------------------------------------------------------------------------------------------------
 
-_STEPS, _TOLERANCE = 40, 1e-7
+_STEPS = 40
+"""At most: a search that does not converge ends."""
+_TOLERANCE = 1e-7
+"""Relative change of the objective at which the search ends: far below what can be built."""
 _HALVINGS = 12
+"""Of a step that is no better; a smaller one changes nothing that can be built."""
 
 Mean = Callable[..., Array]
 Smooth = Callable[[ModuleType, SensorArrays, Field, Mean], Array]

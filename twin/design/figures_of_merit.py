@@ -36,22 +36,27 @@ from twin.design.parameters import Follow, SensorArrays, following
 from twin.sensor.detector import PLANCK_TIMES_LIGHT
 from uwlts.errors import RangeError
 
-DEPTHS, PLACES = 5, 7
-"""Points of the measuring volume: so many depths, evenly from end to end of what the camera sees of it, and so many
-places along the stripe at each."""
+DEPTHS = 5
+"""Depths of the measuring volume that are judged, evenly from end to end of what the camera sees of it."""
+PLACES = 7
+"""Places along the stripe at each depth."""
 _EDGE_STEPS = 5
 _MANY = 200
 """Designs from which the time to compile the formulas for them comes back."""
 _BLOCK = 1000
 """Designs that compiled formulas take at once."""
-_NEAREST_MM, _FARTHEST_MM = 1.0, 1e6
-"""Largest distances at which the sheet leaves the image: from the window's outer face, and from the pupil."""
+_NEAREST_MM = 1.0
+"""The sheet enters the image no nearer to the window's outer face: what lies closer is no measuring volume."""
+_FARTHEST_MM = 1e6
+"""It leaves the image no farther from the pupil: farther than any water is clear."""
 _BRIGHT_LINES = 2.05
 """Automatic exposure lets 2 % of the profile lines be brighter: standard deviations of speckle above the mean."""
 _UNMODELLED = 0.02
 """Part of the height by which stripes differ from the Gaussian that is fitted to them; it limits the flanks' weight."""
-_FLANK, _NODES = 4.0, 16
-"""The profile is summed up to so many standard deviations, at so many places."""
+_FLANK = 4.0
+"""Standard deviations up to which the stripe's profile is summed: beyond lies less than 1e-4 of its light."""
+_NODES = 16
+"""Places of the sum on either side."""
 _DIFFRACTION = 0.42
 """Standard deviation of the Gaussian that is closest to an Airy pattern, in wavelengths times f-number."""
 
@@ -547,11 +552,20 @@ def _reasons(p: SensorArrays, figures: Figures, f: dict[str, np.ndarray]) -> lis
 
 
 CLASS_NAMES = {1: "1", 2: "2", 3: "3R", 4: "3B", 5: "4"}
-_PUPIL_MM, _AWAY_MM = 7.0, 100.0
-_CLASS_2_W, _CLASS_3R_W, _CLASS_3B_W = 1e-3, 5e-3, 0.5
+# IEC 60825-1:2014, condition 3 and Tables 3 to 8.
+_PUPIL_MM = 7.0
+_AWAY_MM = 100.0
+_CLASS_2_W = 1e-3
+_CLASS_3R_W = 5e-3
+_CLASS_3B_W = 0.5
 
-_GRAVITY, _WATER_KG_PER_M3 = 9.81, 1030.0
-_SILICA_STRENGTH_MPA, _CLAMPED, _SAFETY = 60.0, 0.75, 4.0
+_GRAVITY = 9.81
+_WATER_KG_PER_M3 = 1030.0
+"""Sea water, the heavier one."""
+# As in the thesis, Eq. 3.2.
+_SILICA_STRENGTH_MPA = 60.0
+_CLAMPED = 0.75
+_SAFETY = 4.0
 
 
 def laser_class(p: SensorArrays) -> np.ndarray:

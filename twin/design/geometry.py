@@ -21,8 +21,10 @@ Array = Any
 Vector = tuple[Array, Array, Array]
 
 _NEWTON_STEPS = 4
-_UNDISTORTING_STEPS, _UNDISTORTED_PX = 100, 1e-3
-"""Strong distortion converges slowly; what is left is far below what a drawing shows."""
+_UNDISTORTING_STEPS = 100
+"""Strong distortion converges slowly."""
+_UNDISTORTED_PX = 1e-3
+"""What may be left: far below what a drawing shows."""
 _TINY_MM = 1e-9
 """Keeps the direction of a point on the window's normal defined; far below anything that matters."""
 

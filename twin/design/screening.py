@@ -8,10 +8,9 @@ and nothing counts twice. An optimised study gets its designs from NSGA-II (Deb 
 from __future__ import annotations
 
 import csv
-import json
 import math
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,13 +22,15 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 from optuna.trial import Trial, TrialState
+from pydantic import JsonValue
 
 from twin.design.designs import Columns, Design, designs_of, failed, judged, number_of_designs
 from twin.design.study import Study
-from uwlts.errors import CaptureError, DescriptionError, OutputError
-from uwlts.files.json_files import another, read_json
+from twin.recording.campaigns import keep_to_plan
+from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import require_regular_file
 from uwlts.files.writing import written_aside
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import Lost, Workers
 
 _MOST_PART_BYTES = 2**28
@@ -151,8 +152,7 @@ def _report(search: optuna.Study, study: Study, columns: Columns) -> None:
             search.tell(number, state=TrialState.FAIL)
 
 
-Progress = Callable[[int, int], None]  # called with the number of designs that are done, and of how many
-PLAN, PARTS = "plan.json", "screen"
+PARTS = "screen"
 _FREE_TO_CHANGE = ("verify", "verify_tolerance", "refine", "title")
 """Settings that may differ when a sweep is resumed, besides the number of random, Sobol or optimised designs."""
 
@@ -176,13 +176,15 @@ def judged_part(batch: Batch) -> bytes:
     return as_part(judged(batch.study, batch.all()))
 
 
-def screen(study: Study, folder: Path, workers: Workers, *, progress: Progress = lambda done, total: None) -> None:
+def screen(study: Study, folder: Path, workers: Workers, *, progress: ProgressListener = unheard) -> None:
     """Judge all designs of a study that are not judged yet, into parts below ``folder``.
 
     DescriptionError where the folder holds another study, OutputError where a part cannot be written, SetupError where
     the workers' cluster is gone.
     """
-    keep_to_plan(study, folder)
+    made_folder(folder)
+    # Hidden files are being written by another machine that has just begun, or were by one that is gone.
+    keep_to_plan(folder, _plan(study), set(), recorded="[!.]*", called="files", overwrite=False)
     place = made_folder(folder / PARTS)
     if study.sampling.kind == "optimise":
         _optimise(study, folder, place, workers, progress)
@@ -209,7 +211,7 @@ def screen(study: Study, folder: Path, workers: Workers, *, progress: Progress =
         progress(done, total)
 
 
-def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progress: Progress) -> None:
+def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progress: ProgressListener) -> None:
     """Judge what the optimiser proposes, a generation at a time, shared among the workers."""
     search, free = _open_search(study, folder), study.free()
     space: dict[str, BaseDistribution] = {
@@ -244,29 +246,8 @@ def _content(batch: Batch, result: bytes | Lost) -> bytes:
     return as_part(failed(batch.study, batch.all(), [result.reason] * batch.count))
 
 
-def keep_to_plan(study: Study, folder: Path) -> None:
-    """Write down what a folder's study is, or make sure that it is the same. DescriptionError where the folder holds
-    another study, or other files."""
-    made_folder(folder)
-    plan = json.loads(study.model_dump_json(exclude=set(_FREE_TO_CHANGE)))
+def _plan(study: Study) -> dict[str, JsonValue]:
+    """What the results of a study follow from."""
+    plan = study.model_dump(mode="json", exclude=set(_FREE_TO_CHANGE))
     del plan["sampling"]["designs"]
-    plan["sensor"] = json.loads(study.sensor.model_dump_json())
-    path = folder / PLAN
-    if path.is_file():
-        try:
-            known = read_json(path, called="plan")
-        except CaptureError as error:
-            raise DescriptionError(f"{path} cannot be read: {error}; give another folder, or --overwrite") from error
-        if known != plan:
-            raise DescriptionError(
-                f"{folder} holds a study with {another(known, plan)}: give another folder, or --overwrite to start "
-                "afresh"
-            )
-        return
-    if any(not path.name.startswith(".") for path in folder.iterdir()):
-        if path.is_file():
-            # Another machine has just begun.
-            return keep_to_plan(study, folder)
-        raise DescriptionError(f"{folder} holds other files: give a folder of its own")
-    with written_aside(path, overwrite=True) as aside:
-        aside.write_text(json.dumps(plan, indent=2) + "\n", encoding="utf-8")
+    return plan | {"sensor": study.sensor.model_dump(mode="json")}

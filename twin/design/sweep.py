@@ -19,22 +19,27 @@ from pydantic import TypeAdapter
 from twin.design.choice import choose
 from twin.design.designs import Columns, Marked
 from twin.design.report.study_page import page_text
-from twin.design.screening import JOURNAL, PARTS, PLAN, read_parts, screen, write_csv
+from twin.design.screening import JOURNAL, PARTS, read_parts, screen, write_csv
 from twin.design.study import Study, load_study
 from twin.design.verification import Agreement, render
-from twin.options import CPU
+from twin.options import CPU, Variant
+from twin.recording.campaigns import PLAN
 from uwlts.errors import DescriptionError
 from uwlts.files.writing import written_aside
+from uwlts.model.brief import Brief
 from uwlts.pages.toolkit import write_page
-from uwlts.runtime.console import progress_bar
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import open_workers
 
 RENDERED = "verified"
-PAGE, TABLE, WINNER, SUMMARY = "report.html", "designs.csv", "winner.toml", "summary.json"
+PAGE = "report.html"
+TABLE = "designs.csv"
+WINNER = "winner.toml"
+SUMMARY = "summary.json"
 
 
-@dataclass(frozen=True)
-class SweepResult:
+@dataclass(frozen=True, repr=False)
+class SweepResult(Brief):
     """Result of a sweep.
 
     Attributes
@@ -96,31 +101,34 @@ def sweep(
     workers: int | None = None,
     scheduler: str | None = None,
     overwrite: bool = False,
-    variant: str = CPU,
-    show_progress: bool = False,
+    variant: Variant = CPU,
+    progress: ProgressListener = unheard,
 ) -> SweepResult:
-    """Judge the designs of a study by formulas, refine the best, render some, and write page, table and winner.
+    """Find the sensor to build: judge many designs by formulas, improve the best, and render some to make sure.
+
+    Run again, it goes on where it was stopped; several machines may run it on one folder at the same time. OUT holds
+    report.html, designs.csv, summary.json and the winning design as winner.toml, which twin simulate takes as --sensor.
 
     Parameters
     ----------
     study : str, Path or Study
-        Name of a shipped study, such as "baseline-angle", path of a TOML file, or a study.
+        Name (see: twin scenes) or path of the study's description, or a study.
     out : str or Path, optional
-        Folder for all results; runs/STUDY by default. A sweep that was stopped there continues.
+        Folder for all results; runs/STUDY unless given.
     designs : int, optional
-        Number of designs that a random, Sobol or optimised study judges, in place of the study's.
+        How many designs a random, Sobol or optimised study judges, in place of what the study says.
     verify : int, optional
-        Number of designs rendered in addition to the base sensor, 0 for no rendering, in place of the study's.
+        How many designs are rendered beside the base sensor, 0 for none at all, in place of what the study says.
     workers : int, optional
-        Processes of this machine; one per processor by default.
+        Processes of this machine; as many as there are processors unless given.
     scheduler : str, optional
         Address of a Dask scheduler, such as tcp://host:8786, whose workers are used in place of this machine's.
     overwrite : bool
         Remove what an earlier sweep has left in the folder.
     variant : str
-        Mitsuba variant for rendering: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
-    show_progress : bool
-        Draw a progress bar on the terminal.
+        As for `simulate`.
+    progress : callable
+        Called with the number of designs done, the number in all, and the name of the stage.
 
     Returns
     -------
@@ -151,10 +159,7 @@ def sweep(
     described = load_study(study, designs=designs, verify=verify)
     if overwrite:
         clear(folder)
-    with (
-        progress_bar(described.title, shown=show_progress) as progress,
-        open_workers(workers=workers, scheduler=scheduler) as pool,
-    ):
+    with open_workers(workers=workers, scheduler=scheduler) as pool:
         screen(described, folder, pool, progress=progress)
         columns = read_parts(folder / PARTS)
         write_csv(folder / TABLE, columns)

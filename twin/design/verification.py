@@ -34,6 +34,7 @@ from uwlts import errors
 from uwlts.errors import Error
 from uwlts.files.writing import written_aside
 from uwlts.model.sensor import Sensor
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import Lost, Workers, work_through
 from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.cloud_files import read_cloud
@@ -75,16 +76,13 @@ def verify(
     *,
     reflectance: float = 0.5,
     seed: int = 0,
-    spp: int = 16,
     variant: str = CPU,
     workers: int = 2,
-    keep: bool = False,
 ) -> Rendered:
     """Calibrate a sensor and measure a plane of a reflectance with it, all by rendered images, in one of its media.
 
-    What an earlier run left in ``folder`` is overwritten. The calibration stays there; captures, their truth and the
-    cloud stay only if ``keep`` is set. Equal arguments give equal results. With one worker the images are rendered in
-    this process, else in processes of their own.
+    What an earlier run left in ``folder`` is overwritten. The calibration stays there. Equal arguments give equal
+    results. With one worker the images are rendered in this process, else in processes of their own.
 
     DescriptionError or DesignError where the sensor cannot work in the medium, or not be calibrated; CalibrationError
     or CaptureError where its software cannot calibrate it or finds no stripe, with the software's message;
@@ -102,7 +100,7 @@ def verify(
         raise errors.OutputError(f"cannot replace {calibration}: {error.strerror}") from error
     # Noise must differ between recordings: each has a seed of its own.
     jobs = [
-        (recording, Options(spp=spp, seed=int(np.random.SeedSequence([seed, k]).generate_state(1)[0])))
+        (recording, Options(seed=int(np.random.SeedSequence([seed, k]).generate_state(1)[0])))
         for k, recording in enumerate(planned.all())
     ]
     times = [time.perf_counter()]
@@ -118,13 +116,13 @@ def verify(
         _run("reconstruct", str(capture), *known, fails_as=errors.CaptureError)
         with Capture(capture) as opened:
             exposure, stage = float(opened.exposure_ms[0]), np.array(opened.stage_mm)
-        profiles = _judged(_points(cloud), stage)
+        found = read_cloud(cloud)
+        profiles = _judged(np.column_stack([found.frame, found.points_mm[:, 1:]]), stage)
         times.append(time.perf_counter())
     finally:
-        if not keep:
-            captures = [_capture(folder, recording) for recording in planned.all()]
-            for path in (cloud, *captures, *map(truth_path, captures), *map(part_path, captures)):
-                path.unlink(missing_ok=True)
+        captures = [_capture(folder, recording) for recording in planned.all()]
+        for path in (cloud, *captures, *map(truth_path, captures), *map(part_path, captures)):
+            path.unlink(missing_ok=True)
     seconds = dict(zip(("render", "calibrate", "measure"), np.diff(times).tolist(), strict=True))
     return replace(profiles, exposure_ms=exposure, seconds=seconds)
 
@@ -140,7 +138,7 @@ def _record(
     use_variant(variant)
     import drjit as dr
 
-    from twin.recording.studio import record_scene
+    from twin.recording.record_scene import record_scene
 
     recording, options = job
     with threads_kept():
@@ -154,7 +152,7 @@ def _record(
 
 def _run(command: str, *arguments: str, fails_as: type[Error]) -> None:
     """Run a command of the sensor's software; its complaint as an error of a class where it fails."""
-    line = [sys.executable, "-m", "uwlts.cli", command, *arguments, "--overwrite"]
+    line = [sys.executable, "-m", "uwlts", command, *arguments, "--overwrite"]
     done = subprocess.run(line, check=False, capture_output=True, text=True)
     if done.returncode == 0:
         return
@@ -162,12 +160,6 @@ def _run(command: str, *arguments: str, fails_as: type[Error]) -> None:
     if done.returncode == _USER_ERROR:
         raise fails_as(said[-1].removeprefix("error: "))
     raise errors.SetupError(f"uwlts {command} has ended unexpectedly (exit code {done.returncode}): {said[-1]}")
-
-
-def _points(cloud: Path) -> np.ndarray:
-    """Frame, Y and Z in mm, scene coordinates, of a cloud's points: (N, 3)."""
-    found = read_cloud(cloud)
-    return np.column_stack([found.frame, found.points_mm[:, 1:]])
 
 
 def _judged(points: np.ndarray, stage_mm: np.ndarray) -> Rendered:
@@ -283,7 +275,7 @@ def render(
     workers: Workers,
     *,
     variant: str,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> list[Agreement]:
     """Verify candidates, in their order; each result is kept in a file of ``folder``.
 

@@ -113,10 +113,16 @@ _STEP_HEIGHT = 0.2
 """Share of the depth range. A high step constrains the window's distance better than the scatter on its faces."""
 _EDGE = 0.02
 """Share of the line's length beside the step's riser that is left out."""
-_NEARER, _FARTHER = 0.75, 1.5
-"""Without water and window the image rows of the volume lie so much nearer and farther from the camera at most."""
-_CIRCLE_PX, _SMALLEST_CIRCLE_PX, _CIRCLE_BLURS = 24.0, 12.0, 2.5
-"""Diameter of the circles in the middle of the range, at its far end, and in diameters of the blur."""
+_NEARER = 0.75
+"""Without water and window the image rows of the volume lie at most so much nearer to the camera."""
+_FARTHER = 1.5
+"""The same for the farthest ones."""
+_CIRCLE_PX = 24.0
+"""Diameter of the circles in the middle of the range."""
+_SMALLEST_CIRCLE_PX = 12.0
+"""The least one at its far end."""
+_CIRCLE_BLURS = 2.5
+"""The least one in diameters of the blur."""
 _DOT = 0.4
 """Diameter of a marking dot in diameters of its circle."""
 _LARGEST_BLUR_PX = 12.0
@@ -170,8 +176,8 @@ def recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recordings
     exposed = Exposure.model_validate(sensor.exposure.model_dump() | {"laser_ms": "auto", "lamp_ms": "auto"})
     calibrated = sensor.model_copy(update={"exposure": exposed})
     if not (sensor.camera.window.mounted and sight.index > 1 + 1e-6):
-        return Recordings(_target(calibrated, medium, sight, near, far, y), None, standard)
-    step = PlannedRecording("step", calibrated, _step(medium, near, far, y, length))
+        return Recordings(_target(calibrated, medium, sight, near=near, far=far, y=y), None, standard)
+    step = PlannedRecording("step", calibrated, _step(medium, near=near, far=far, y=y, length=length))
     wavelength, media = sensor.laser.wavelength_nm, dict(sensor.media)
     air = next(
         (name for name, one in media.items() if one.kind == "air" and one.refractive_index(wavelength) == 1), None
@@ -183,7 +189,7 @@ def recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recordings
     window = in_air.camera.window.model_copy(update={"mounted": False})
     camera = in_air.camera.model_copy(update={"window": window})
     bare = LineOfSight.of(in_air.model_copy(update={"camera": camera}), in_air.medium(air))
-    return Recordings(_target(in_air, air, bare, near, far, y), step, standard)
+    return Recordings(_target(in_air, air, bare, near=near, far=far, y=y), step, standard)
 
 
 def measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
@@ -211,7 +217,7 @@ def measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
     return float(lit[0] + margin), float(lit[-1] - margin)
 
 
-def _step(medium: str, near: float, far: float, y: float, length: float) -> Scene:
+def _step(medium: str, *, near: float, far: float, y: float, length: float) -> Scene:
     """Two blocks side by side along the line, their faces half a step before and behind the scene's origin."""
     height = round(_STEP_HEIGHT * (far - near), 3)
     back = 1.5 * height
@@ -243,7 +249,7 @@ def _scene(title: str, medium: str, **rest: object) -> Scene:
     return validated(Scene, {"title": title, "medium": medium} | rest, title)
 
 
-def _target(sensor: Sensor, medium: str, sight: LineOfSight, near: float, far: float, y: float) -> PlannedRecording:
+def _target(sensor: Sensor, medium: str, sight: LineOfSight, *, near: float, far: float, y: float) -> PlannedRecording:
     """A plate of circles square to Z, moved through the depths about a range at which its three marks are well seen.
 
     The marks stand about X = 0 and Y = ``y``; the stripe runs midway between two columns, over a plain ground.

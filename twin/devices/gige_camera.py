@@ -21,16 +21,28 @@ import numpy as np
 from uwlts.errors import HardwareError, ImageError
 from uwlts.runtime.shared_library import load_aravis
 
-# What 1 Gbit/s carries, and how many packets go out together, as sleeps are not exact.
-_BYTES_PER_S, _TOGETHER = 125e6, 8
+# What 1 Gbit/s carries.
+_BYTES_PER_S = 125e6
+# Packets that go out together, as sleeps are not exact.
+_TOGETHER = 8
 # Headers of IP, UDP and GVSP are counted in the size of a packet.
 _OVERHEAD_BYTES = 36
-_LEADER, _TRAILER, _PAYLOAD, _IMAGE, _MONO8 = 1, 2, 3, 1, 0x01080001
-# Of profiles: the pixel format (GenICam Pixel Format Naming Convention), and chunks by numbers of the camera's own.
-_COORD3D_C16, _WITH_CHUNKS = 0x011000B8, 0x4000
-_IMAGE_CHUNK, ENCODER_CHUNK, TIME_CHUNK = 0x45430000, 0x45430001, 0x45430002
-_CHUNK_BYTES, _ROW_BYTES = 3 * 8, 2 * 8
-"""Room of the chunks behind an image: what names them, and what they hold of each row."""
+# Kinds of packets and payload, and pixel formats (GigE Vision 2.0; GenICam Pixel Format Naming Convention).
+_LEADER = 1
+_TRAILER = 2
+_PAYLOAD = 3
+_IMAGE = 1
+_WITH_CHUNKS = 0x4000
+_MONO8 = 0x01080001
+_COORD3D_C16 = 0x011000B8
+# Chunks by numbers of the camera's own.
+_IMAGE_CHUNK = 0x45430000
+ENCODER_CHUNK = 0x45430001
+TIME_CHUNK = 0x45430002
+_CHUNK_BYTES = 3 * 8
+"""Room of what names the chunks behind an image."""
+_ROW_BYTES = 2 * 8
+"""Room of what they hold of each row."""
 
 
 def image_packets(

@@ -29,7 +29,9 @@ BENCH_SETTINGS: dict[int, float] = {
     100: 80, 101: 250, 102: 250, 110: 900, 111: 500, 112: 500, 120: 50, 121: 10, 122: 10, 130: 750, 131: 200, 132: 200,
 }
 # fmt: on
-_BUSY_MS, _IDLE_MS = 2, 20
+# Times between two looks at the line.
+_BUSY_MS = 2
+_IDLE_MS = 20
 
 
 @dataclass(frozen=True)

@@ -91,8 +91,12 @@ def _refuse_incomplete(commands: dict[str, str], values: dict[str, float], machi
 
 
 _DECIMALS = {11, 12, 24, 25, 27, *range(100, 133)}
-_PLANNER_BLOCKS, _RECEIVE_BYTES, _LONGEST_LINE = 15, 127, 79
-_WCO_IDLE, _WCO_BUSY = 10, 30
+# Grbl 1.1h's config.h: BLOCK_BUFFER_SIZE and RX_BUFFER_SIZE less one, LINE_BUFFER_SIZE, REPORT_WCO_REFRESH_*_COUNT.
+_PLANNER_BLOCKS = 15
+_RECEIVE_BYTES = 127
+_LONGEST_LINE = 79
+_WCO_IDLE = 10
+_WCO_BUSY = 30
 _DWELL_STEP_S = 0.05
 """DWELL_TIME_STEP: a dwell takes whole steps, at least what was asked for."""
 

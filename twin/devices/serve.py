@@ -29,7 +29,11 @@ if TYPE_CHECKING:  # it needs Mitsuba
     from twin.light.pose import Travel
     from twin.recording.studio import Studio
 
-_STEPS_PER_MM, _SPEED, _ACCELERATION, _TRAVEL = 100, 110, 120, 130
+# Numbers of Grbl's settings of the X axis.
+_STEPS_PER_MM = 100
+_SPEED = 110
+_ACCELERATION = 120
+_TRAVEL = 130
 _WATCH_S = 0.2
 _FORM = re.compile(r"(?P<name>[a-z-]+)(:(?P<argument>[^@]+))?(@(?P<frame>[1-9]\d*))?")
 
@@ -109,7 +113,8 @@ def parse_fault(text: str) -> Fault:
 
 
 # Keeps the random numbers of the walks, which follow the place, apart from those of the noise, which follow the frame.
-_WALKS, _NOISE = 0, 1
+_WALKS = 0
+_NOISE = 1
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,10 @@ from twin.scene.objects import Objects
 
 Body = Literal["particles", "bubbles"]
 
-_LEAST_MM, _MOST_MM = 0.1, 5.0
-"""Diameters that are resolved one by one; smaller ones are the water's turbidity."""
+_LEAST_MM = 0.1
+"""Least diameter that is resolved one by one; smaller bodies are the water's turbidity."""
+_MOST_MM = 5.0
+"""Largest diameter: of N(> d) as d^-3 one body in 125,000 is larger."""
 _SLOPE = 3.0
 """N(> d) goes as d^-3 (Bader, J. Geophys. Res. 75, 2822, 1970; Sheldon et al., Limnol. Oceanogr. 17, 327, 1972: equal
 volume in equal logarithmic intervals)."""

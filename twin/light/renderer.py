@@ -2,9 +2,9 @@
 
 A laser frame is made in three passes. Rays through the nodes of a coarse grid find the pixels near the lit stripe and
 the haze of the sheet; the stripe's pixels are rendered with many samples over pixel, pupil and exposure, with fewer
-within a wide stripe; random walks add the light that came on longer ways, which is smooth (`twin.light.longer_ways`).
-The windows stand still before the camera, so the nodes' rays behind the window are traced once; the objects stand still
-in the scene, so nothing is rebuilt or recompiled between frames.
+within a wide stripe; random walks add the light that came on longer ways, which is smooth
+(`twin.light.multiple_scattering`). The windows stand still before the camera, so the nodes' rays behind the window are
+traced once; the objects stand still in the scene, so nothing is rebuilt or recompiled between frames.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from twin.light.image_sampling import (
     repeated,
     widened,
 )
-from twin.light.longer_ways import LongerWays, Sources, falling_off
+from twin.light.multiple_scattering import LongerWays, Sources, falling_off
 from twin.light.particles import Body, spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet, SheetLight
@@ -52,9 +52,12 @@ CHANGE_SHARE = 2e-3
 """Under the lamp, pixels whose corners differ by more than this share of the brightest are rendered finely."""
 BEND_SHARE = 1e-3
 """Of a wide stripe, pixels are rendered finely where second differences exceed this share of the brightest light."""
-_FEWER_SAMPLES, _LEAST_SPP, _WIDE_PX = 4, 4, 64
-"""Elsewhere so many times fewer samples are taken, but no fewer than these: one for each quarter of the pupil. In
-stripes narrower than so many pixels on average, most pixels would be rendered twice."""
+_FEWER_SAMPLES = 4
+"""Elsewhere so many times fewer samples are taken."""
+_LEAST_SPP = 4
+"""But no fewer than these: one for each quarter of the pupil."""
+_WIDE_PX = 64
+"""In stripes narrower than so many pixels on average, most pixels would be rendered twice."""
 _MIRRORS = 2
 """Largest number of mirrors that the camera looks into one after the other."""
 _WALKS_PER_SAMPLE = 0.15
@@ -63,8 +66,10 @@ _SPOT_ASIDE = 0.25
 """Slope of an uneven lamp's axis against the camera's over that of the view's corner: the lamp is mounted beside it."""
 _DRIFTING_STREAM = 7
 """Keeps the random numbers of grains and bubbles apart from those of walks and noise."""
-_CAUSTIC_WAVES, _CAUSTIC_MM = 10, (20.0, 120.0)
-"""Waves of the surface that throw caustics, and their wavelengths in mm where they fall: a rippled tank or harbour."""
+_CAUSTIC_WAVES = 10
+"""Waves of the surface that throw caustics."""
+_CAUSTIC_MM = (20.0, 120.0)
+"""Their wavelengths where they fall: a rippled tank or harbour."""
 _TRAVEL_STEP_MM = 0.2
 """While the sensor travels, the lit pixels are looked for at places this far apart."""
 _REACH_SHARE = 1.5

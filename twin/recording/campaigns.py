@@ -11,11 +11,10 @@ from pydantic import JsonValue
 from twin.options import CPU, Flaws, Options, Variant, use_variant
 from twin.scene.campaign import Campaign, Take, load_campaign, takes
 from uwlts.errors import CaptureError, DescriptionError, Error, OutputError
-from uwlts.files.command_files import own_files
+from uwlts.files.inputs import note_made, refuse_input
 from uwlts.files.json_files import another, read_json
-from uwlts.files.one_writer import one_writer
-from uwlts.files.writing import written_aside
-from uwlts.runtime.console import progress_bar
+from uwlts.files.writing import one_writer, written_aside
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import part_path
 from uwlts.storage.truth import truth_path
@@ -34,7 +33,7 @@ def record(
     workers: int | None = None,
     overwrite: bool = False,
     variant: Variant = CPU,
-    show_progress: bool = False,
+    progress: ProgressListener = unheard,
 ) -> Path:
     """Render all recordings of a campaign into a folder, with the imperfections that a seed draws.
 
@@ -56,8 +55,8 @@ def record(
         Render everything anew.
     spp, effects, variant
         As for `simulate`.
-    show_progress
-        Draw a progress bar on the terminal.
+    progress
+        Called with the number of images done, the number in all, and the name of the stage.
 
     Raises
     ------
@@ -75,8 +74,7 @@ def record(
     flaws = Flaws.of(*effects)
     jobs = _jobs(described, folder, seed=seed, every=every, spp=spp, variant=variant, flaws=flaws)
     plan = _plan(described, every=every, spp=spp, variant=variant) | {"seed": seed, "effects": flaws.names()}
-    with progress_bar(f"rendering {described.title}", shown=show_progress) as progress:
-        _record_all(jobs, folder, plan, recorded="*.h5*", workers=workers, overwrite=overwrite, progress=progress)
+    _record_all(jobs, folder, plan, recorded="*.h5*", workers=workers, overwrite=overwrite, progress=progress)
     return folder
 
 
@@ -108,7 +106,7 @@ def record_campaigns(
     variant: str = CPU,
     workers: int | None = None,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> list[Path]:
     """Render all recordings of a campaign for each seed into ``folder/campaign-SEED``; returns these folders.
 
@@ -151,7 +149,7 @@ def _record_all(
     recorded: str,
     workers: int | None,
     overwrite: bool,
-    progress: Callable[[int, int], None],
+    progress: ProgressListener,
 ) -> None:
     """Render what is not complete into a folder that keeps to a plan; ``recorded`` is the pattern of its captures."""
     try:
@@ -193,9 +191,10 @@ def keep_to_plan(
     except OSError as error:
         raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
     try:
-        # Not an input of the command, which may replace it.
-        with own_files():
-            known = read_json(path, called="plan") if path.is_file() else None
+        # No input of the command, which may replace it.
+        refuse_input(path)
+        note_made(path)
+        known = read_json(path, called="plan") if path.is_file() else None
     except CaptureError:
         known = None
     if known == plan:
@@ -205,7 +204,7 @@ def keep_to_plan(
         how = f"made with {another(known, plan)}"
     if found and not overwrite:
         raise DescriptionError(
-            f"{folder} holds {called} {how}: give another folder, the same settings, or --overwrite to start afresh"
+            f"{folder} holds {called} {how}: give another folder, the same settings, or `overwrite` to start afresh"
         )
     if kept := found - files:
         raise DescriptionError(
@@ -220,7 +219,7 @@ def _record(job: _Job, report: Callable[[None], None]) -> None:
     use_variant(job.variant)
     import drjit as dr
 
-    from twin.recording.studio import record_scene
+    from twin.recording.record_scene import record_scene
 
     dr.set_thread_count(1)
     take = job.take
@@ -234,7 +233,7 @@ def _record(job: _Job, report: Callable[[None], None]) -> None:
             overwrite=True,
             # What is there of an incomplete recording is a part to go on with, or lacks its truth.
             resume=part_path(job.path).exists(),
-            progress=lambda images, total: report(None),
+            progress=lambda done, total, stage="": report(None),
         )
     except Error as error:
         raise type(error)(f"{job.path}: {error}") from error

@@ -4,7 +4,6 @@ import io
 import json
 import runpy
 import shlex
-import subprocess
 import sys
 import time
 from collections.abc import Iterable, Iterator
@@ -12,7 +11,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from itertools import groupby
 from pathlib import Path
 
-from uwlts.errors import SetupError
+from uwlts.errors import CommandFailed, SetupError
 from uwlts.runtime.console import INTERRUPTED
 from uwlts.runtime.workers import Lost, open_workers
 
@@ -62,7 +61,7 @@ def demo(out: str | Path = "runs/demo") -> Path:
 
     Raises
     ------
-    subprocess.CalledProcessError
+    CommandFailed
         A command failed; what it printed says why.
     SetupError
         A working process has ended unexpectedly.
@@ -85,7 +84,7 @@ def demo(out: str | Path = "runs/demo") -> Path:
                 print(output, end="", flush=True)
                 print(complaints, end="", file=sys.stderr, flush=True)
                 if code:
-                    raise subprocess.CalledProcessError(code, line)
+                    raise CommandFailed(line, code)
             seconds[stage] = round(time.perf_counter() - start, 2)
     total = ", ".join(f"{stage} {value:.1f} s" for stage, value in seconds.items())
     report = folder / "report.html"
@@ -109,7 +108,7 @@ def _run(line: str) -> tuple[int, str, str]:
     code = 0
     with redirect_stdout(output), redirect_stderr(complaints):
         try:
-            runpy.run_module(f"{program}.cli", run_name="__main__", alter_sys=True)
+            runpy.run_module(program, run_name="__main__", alter_sys=True)
         except SystemExit as end:
             code = int(end.code or 0)
     if code == INTERRUPTED:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +15,12 @@ import numpy as np
 from twin.options import CPU, Options, Variant, use_variant
 from twin.scene.description import Scene, load_scene
 from uwlts.errors import DescriptionError
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import require_ending
+from uwlts.model.brief import Brief
 from uwlts.model.library import load_sensor, validated
 from uwlts.model.sensor import Medium, Sensor
-from uwlts.runtime.console import progress_bar
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import CAPTURES
 from uwlts.storage.truth import Truth
 
@@ -27,8 +29,8 @@ AnySensor = str | Path | Sensor
 FRAME_DATA = ("stage_mm", "laser_on", "exposure_ms", "time_s")
 
 
-@dataclass(frozen=True)
-class Recording:
+@dataclass(frozen=True, repr=False)
+class Recording(Brief):
     """Images of a scan with what truly is to be seen in them; F images of H x W pixels.
 
     Attributes
@@ -101,7 +103,8 @@ def render(
             raise DescriptionError(f"frames is {list(frames)}; give numbers from 0 to {len(shots) - 1}")
         shots = [shots[number] for number in frames]
     use_variant(variant)
-    from twin.recording.studio import Studio, truth_of_recording
+    from twin.recording.record_scene import truth_of_recording
+    from twin.recording.studio import Studio
 
     studio = Studio(built, described, options)
     taken = [studio.frame(shot, number) for number, shot in shots]
@@ -116,7 +119,7 @@ def render(
     )
 
 
-@keeps_inputs
+@inputs_kept()
 def simulate(
     scene: AnyScene,
     *,
@@ -134,7 +137,7 @@ def simulate(
     resume: bool = False,
     overwrite: bool = False,
     variant: Variant = CPU,
-    show_progress: bool = False,
+    progress: ProgressListener = unheard,
     report: Callable[[str], object] = lambda line: None,
 ) -> list[Path]:
     """Render a scene into a capture, with the ground truth in a file beside it.
@@ -177,8 +180,8 @@ def simulate(
         Replace existing files.
     variant
         Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
-    show_progress
-        Draw a progress bar on the terminal.
+    progress
+        Called with the number of images done, the number in all, and the name of the stage.
     report
         Called with a line of text for each file that is written.
 
@@ -207,13 +210,13 @@ def simulate(
     nominal, built = choose_sensors(sensor, as_built)
     options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
     use_variant(variant)
-    from twin.recording.studio import record_scene
+    from twin.recording.record_scene import record_scene
 
     files, paths = {"overwrite": overwrite, "resume": resume}, []
     for each in described:
         path = out.with_name(out.name.replace("{placement}", each.placement))
-        with progress_bar(f"{each.title}, {each.placement}", shown=show_progress) as progress:
-            record_scene(each, nominal, path, as_built=built, options=options, progress=progress, **files)
+        told = partial(progress, stage=each.placement)
+        record_scene(each, nominal, path, as_built=built, options=options, progress=told, **files)
         report(f"wrote {path}")
         paths.append(path)
     return paths

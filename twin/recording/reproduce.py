@@ -7,8 +7,8 @@ from pathlib import Path
 from twin.options import CPU, Variant
 from twin.recording.campaigns import record_campaigns
 from twin.scene.campaign import load_campaign
-from uwlts.errors import DescriptionError
-from uwlts.runtime.console import progress_bar
+from uwlts.errors import CommandFailed, DescriptionError
+from uwlts.runtime.progress import ProgressListener, unheard
 
 _LEAST_TRIALS = 20
 """As `uwlts thesis` demands, to refuse fewer before anything is rendered."""
@@ -27,7 +27,7 @@ def reproduce(
     workers: int | None = None,
     overwrite: bool = False,
     variant: Variant = CPU,
-    show_progress: bool = False,
+    progress: ProgressListener = unheard,
 ) -> Path:
     """Render the thesis's whole evaluation, evaluate it by all its methods, and set its tables beside the results.
 
@@ -57,14 +57,14 @@ def reproduce(
         Render and evaluate everything anew.
     spp, variant
         As for `simulate`.
-    show_progress
-        Draw progress bars on the terminal.
+    progress
+        Called with the number of images rendered, the number in all, and the name of the stage.
 
     Raises
     ------
     DescriptionError, DesignError, OutputError, SetupError
         As `record_campaigns`, or an argument is out of its range.
-    subprocess.CalledProcessError
+    CommandFailed
         The evaluation failed; it has printed why.
     """
     for name, value in (("campaigns", campaigns), ("every", every), ("workers", 1 if workers is None else workers)):
@@ -77,22 +77,22 @@ def reproduce(
     campaign = campaign or ("joint" if joint else "thesis")
     folder = Path(out or Path("runs") / Path(campaign).stem)
     described = load_campaign(campaign)
-    with progress_bar(f"rendering {described.title}", shown=show_progress) as progress:
-        record_campaigns(
-            described,
-            folder,
-            seeds=range(first, first + campaigns),
-            every=every,
-            spp=spp,
-            variant=variant,
-            workers=workers,
-            overwrite=overwrite,
-            progress=progress,
-        )
+    record_campaigns(
+        described,
+        folder,
+        seeds=range(first, first + campaigns),
+        every=every,
+        spp=spp,
+        variant=variant,
+        workers=workers,
+        overwrite=overwrite,
+        progress=progress,
+    )
     # The sensor's software is a program of its own, which shares no mathematics with the twin.
-    command = [sys.executable, "-m", "uwlts.cli", "thesis", str(folder), "--trials", str(trials), "--overwrite"]
+    command = [sys.executable, "-m", "uwlts", "thesis", str(folder), "--trials", str(trials), "--overwrite"]
     command += ["--joint"] if joint else []
     command += ["--again"] if overwrite else []
     command += ["--workers", str(workers)] if workers else []
-    subprocess.run(command, check=True)
+    if code := subprocess.run(command, check=False).returncode:
+        raise CommandFailed("uwlts thesis", code)
     return folder / "report.html"

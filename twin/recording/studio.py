@@ -1,23 +1,15 @@
-"""A sensor before a scene: its images with exposures and noise, and their recording into a capture with the truth."""
+"""A sensor before a scene, ready to take shots: poses, exposures, images with noise, and the truth of each."""
 
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, fields
-from importlib.metadata import version
+from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from typing import Literal, TypeAlias
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-from twin.backend.llvm import threads_kept
 from twin.light.pose import Travel
 from twin.light.renderer import LaserFrame, Renderer
 from twin.options import Options
-from twin.recording.frame_truth import FrameTruth, depth_map, no_stripe, true_stripe
+from twin.recording.frame_truth import FrameTruth, no_stripe, true_stripe
 from twin.scene.description import Printed, Scene, altered
 from twin.scene.finish import shift_points
 from twin.scene.motion import Light, Shot
@@ -26,26 +18,23 @@ from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
 from twin.sensor.flaws import as_built, delivered, dirt, laser_shares, veiled, vignette
 from twin.sensor.peak_finder import INVALID, PeakFinder
 from twin.sensor.speckle import Speckle, coherence
-from uwlts.errors import DesignError, OutputError
+from uwlts.errors import DesignError
 from uwlts.model.library import validated
 from uwlts.model.placement import camera_from_object
-from uwlts.model.sensor import Medium, Sensor, Table
+from uwlts.model.sensor import Medium, Sensor
 from uwlts.model.stripe import Coordinates
-from uwlts.model.trajectory import Trajectory
-from uwlts.storage.capture import CaptureHeader, Frame, Seen
-from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.pose_files import trajectory_path, write_trajectory
-from uwlts.storage.truth import Truth, TruthHeader, truth_path, write_truth
+from uwlts.storage.capture import Frame, Seen
 
-Progress = Callable[[int, int], None]
 ShotLight: TypeAlias = tuple[np.ndarray, LaserFrame | None]
 """Irradiance (H, W) of lamp and day before the lens in W/mm2, and the laser's light, None where it is off."""
 PROBE_SPP = 4
 """Samples per lit pixel of the images from which the exposure follows, which need not be known to a percent."""
 BRIGHT_SHARE = 0.98
 """Automatic exposure looks at the brightest pixel of every profile line and lets 2 % of the lines be brighter."""
-STRAY_LINES, LIT_SHARE = 4, 0.05
-"""A line is lit from this share of the brightest one's light, which is not one of the few of single bright pixels."""
+STRAY_LINES = 4
+"""So many of the brightest lines may be those of single bright pixels."""
+LIT_SHARE = 0.05
+"""A line is lit from this share of the light of the brightest line that is none of these."""
 
 
 def medium_of(sensor: Sensor, scene: Scene) -> Medium:
@@ -390,113 +379,3 @@ def lit_level(peaks: np.ndarray) -> float:
     reference = np.sort(peaks)[-1 - min(STRAY_LINES, len(peaks) - 1)]
     lit = peaks[peaks > LIT_SHARE * reference]
     return float(np.quantile(lit, BRIGHT_SHARE)) if len(lit) else 0.0
-
-
-def _threads_for(shot: Shot, threads: int) -> int:
-    """How many of Dr.Jit's threads render a shot while another thread exposes and writes the one before.
-
-    Between the many small kernels of a laser image they would keep that one from its processor; a lamp image has few
-    large kernels.
-    """
-    return threads if shot.light == "lamp" else min(threads, max(1, (os.cpu_count() or 1) - 1))
-
-
-def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], shots: Sequence[Shot]) -> Truth:
-    """The truths of a recording's frames as one, with the depth map of the first of its ``shots``."""
-    stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
-    poses = np.stack([studio.pose(shot) for shot in shots])
-    return Truth(**stacked, depth_mm=depth_map(studio.renderer, poses[0]), pose=poses)
-
-
-def record_scene(
-    scene: Scene,
-    sensor: Sensor,
-    path: str | Path,
-    *,
-    as_built: Sensor | None = None,
-    options: Options = Options(),
-    overwrite: bool = False,
-    resume: bool = False,
-    progress: Progress | None = None,
-) -> None:
-    """Render a scene into a capture at ``path`` and its ground truth into the file beside it.
-
-    Images show ``as_built`` (the sensor itself unless given), the capture states ``sensor``. An interrupted run leaves
-    ``path.part`` with all complete frames; ``resume`` goes on from there and gives the same capture as an undisturbed
-    run. ``progress(done, total)`` is called after every frame. DesignError and DescriptionError where the sensor or the
-    scene cannot work; OutputError where a file exists already, or cannot be written.
-    """
-    path = Path(path)
-    if truth_path(path).exists() and not (overwrite or resume):
-        raise OutputError(f"{truth_path(path)} exists already; give another name, or --overwrite to replace it")
-    motion = scene.motion
-    report = motion.course().report if isinstance(motion, Platform) else None
-    if report is not None and trajectory_path(path).exists() and not (overwrite or resume):
-        raise OutputError(f"{trajectory_path(path)} exists already; give another name, or --overwrite to replace it")
-    studio = Studio(as_built or sensor, scene, options)
-    # What an operator would note: nominal values only.
-    header = CaptureHeader(
-        name=path.stem,
-        sensor=with_window(sensor, mounted=studio.sensor.camera.window.mounted),
-        medium_name=scene.medium,
-        medium=medium_of(sensor, scene),
-        stage_direction=(1.0, 0.0, 0.0) if isinstance(motion, Platform) else motion.recorded_direction(),
-        T_platform_sensor=tuple(map(tuple, motion.mount.matrix().tolist())) if isinstance(motion, Platform) else None,
-        saturation_dn=sensor.detector.full_scale_dn(),
-        target=scene.target,
-        artefact=scene.artefact,
-        provenance={
-            "source": "twin",
-            "seed": studio.options.seed,
-            "spp": studio.options.spp,
-            "effects": [*studio.options.names()],
-            "variant": mi.variant(),
-            **{package: version(package) for package in ("mitsuba", "drjit", "uwlts")},
-        },
-    )
-    shots = list(scene.motion.shots())
-    truths: list[FrameTruth] = []
-    dtype = np.dtype(np.uint8 if sensor.detector.bits == 8 else np.uint16)
-    # Whoever measures must not learn it, so it is not in the finished capture.
-    plan: Table = {
-        "scene": scene.model_dump(mode="json"),
-        "as_built": studio.sensor.model_dump(mode="json"),
-        "seed": studio.options.seed,
-        "spp": studio.options.spp,
-    }
-    known = isinstance(motion, Platform) and motion.states_covariance
-    lines = studio.peak_finder is not None
-    kinds = {"centre_lines": lines, "moving": studio.speed_mm_per_s() != 0, "covariances": known}
-    files = {"overwrite": overwrite, "resume": resume}
-    with (
-        CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer,
-        ThreadPoolExecutor(1) as camera,
-        threads_kept() as threads,
-    ):
-        done = len(writer)
-
-        def take(light: ShotLight, shot: Shot, index: int) -> None:
-            writer.append(studio.frame_of(light, shot, index))
-
-        def end(index: int, taken: Future[None] | None) -> None:
-            if taken is not None:
-                taken.result()
-            if progress is not None:
-                progress(index + 1, len(shots))
-
-        # An image is exposed and written while the light of the next one is rendered.
-        before: Future[None] | None = None
-        for index, shot in enumerate(shots):
-            dr.set_thread_count(_threads_for(shot, threads))
-            # The light first: the truth goes on from where it found the stripe.
-            light = studio.light(shot, index) if index >= done else None
-            truths.append(studio.truth(shot))
-            if index > 0:
-                end(index - 1, before)
-            before = None if light is None else camera.submit(take, light, shot, index)
-        end(len(shots) - 1, before)
-        if report is not None:
-            write_trajectory(trajectory_path(path), Trajectory(*report), overwrite=overwrite or resume)
-        described = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))
-        truth = truth_of_recording(studio, truths, shots)
-        write_truth(truth_path(path), described, truth, overwrite=overwrite or resume)

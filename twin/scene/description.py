@@ -13,9 +13,12 @@ import numpy as np
 from pydantic import BeforeValidator, Discriminator, Field, SerializeAsAny, Tag, model_validator
 
 from twin.scene.forms import AnyForm
+from twin.scene.guide_and_table import LinearGuide, RotaryTable
 from twin.scene.motion import Motion
 from twin.scene.placed import Flat, Placed, Pose, Reflectance
-from twin.scene.platforms import IdealPath, LinearGuide, Platform, Robot, RotaryTable, Vehicle
+from twin.scene.platforms import IdealPath, Platform
+from twin.scene.robot import Robot
+from twin.scene.vehicle import Vehicle
 from uwlts.errors import DescriptionError
 from uwlts.model.library import find, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Positive, Table

@@ -10,8 +10,10 @@ INVALID = 0
 """Number of a line without a stripe."""
 THRESHOLD = 0.06
 """Share of the full scale above which pixels count: above the noise, as such cameras are set up."""
-_FEWEST_PX, _REACH_PX = 2, 64
-"""Narrower things are hot pixels, wider ones no stripe."""
+_FEWEST_PX = 2
+"""Narrower things are hot pixels."""
+_REACH_PX = 64
+"""Things that reach farther from their brightest pixel are no stripe."""
 
 
 @dataclass(frozen=True)

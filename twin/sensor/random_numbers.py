@@ -26,8 +26,10 @@ _SEVERAL = 255
 """Marks a cell that does not belong to a single count."""
 
 _LAYERS = 256
-_LAST_EDGE, _LAYER_AREA = 3.6541528853610088, 4.92867323399e-3
-"""Of layers under exp(-x^2 / 2), all of one area, where the last one begins its tail (Marsaglia and Tsang 2000)."""
+_LAST_EDGE = 3.6541528853610088
+"""Of layers under exp(-x^2 / 2), where the last one begins its tail (Marsaglia and Tsang 2000)."""
+_LAYER_AREA = 4.92867323399e-3
+"""Area of each of them."""
 _MANTISSA = 2**24
 """Numbers that a layer is divided into: as many as 32 bits tell apart."""
 

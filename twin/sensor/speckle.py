@@ -32,9 +32,11 @@ _TILE_GRAINS = 16
 
 # Widest grain in pixels.
 _WIDEST_PX = 64.0
-# Up to this grain, in pixels, a field has the correlation of sums over pixels (to 0.01); wider grains are those of a
-# lens whose grain squared is larger by so many pixels squared (to 0.025 at first, to 0.005 from 4 pixels on).
-_FINE_PX, _WIDENED_PX2 = 1.25, 0.75
+# Up to this grain, in pixels, a field has the correlation of sums over pixels (to 0.01).
+_FINE_PX = 1.25
+# Wider grains are those of a lens whose grain squared is larger by so many pixels squared (to 0.025 at first, to 0.005
+# from 4 pixels on).
+_WIDENED_PX2 = 0.75
 # Finest grain, in pixels, whose sums' correlation is computed: that of neighbours is 0.02, and less for finer ones.
 _UNCORRELATED_PX = 0.1
 # Finest grain, in pixels, whose sums' third cumulant is computed: what it exceeds that of equal variables by comes from
@@ -48,8 +50,10 @@ _RENEWAL_GROUPS = 8
 
 _LEAST_CONTRAST = 1e-4
 
-# Nodes of the table of distributions: half the skewness, and the cube root of an exponential variable up to 27.
-_SKEWS, _ROOTS, _LARGEST_ROOT = 65, 513, 3.0
+# Nodes of the table of distributions, along half the skewness and along the cube root of an exponential variable.
+_SKEWS = 65
+_ROOTS = 513
+_LARGEST_ROOT = 3.0  # of an exponential variable of 27: one in 5e11 is larger
 
 
 class Speckle:

@@ -1,33 +1,37 @@
 """Self-consistency of a scan along a path: a correction of the path, by surfaces that it shows more than once.
 
-`path_prior` is the prior of the correction, `stated_drift` reads its size and kind from the trajectory, `path_estimate`
-finds the correction and `crossing_search` the crossings.
+`drift_model` describes how the navigation drifts, `path_prior` makes it the prior of the correction, `crossing_search`
+finds the crossings, and `path_estimate` the correction by them.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
-from uwlts.alignment.crossing_search import SIGMAS, close_crossings, complete
+from uwlts.alignment.crossing_search import Search, close_crossings
+from uwlts.alignment.drift_model import drift_of
+from uwlts.alignment.options import AlignmentOptions
 from uwlts.alignment.path_estimate import Pair, PathEstimate
-from uwlts.alignment.path_prior import USUAL_DRIFT, DriftKind, PathSpline
-from uwlts.alignment.stated_drift import stated_drift
+from uwlts.alignment.path_prior import PathPrior
+from uwlts.alignment.path_solution import settle, uncorrected
+from uwlts.alignment.pieces import Survey
 from uwlts.errors import EvaluationError
-from uwlts.fitting.patches import scatter
+from uwlts.files.json_files import write_record
+from uwlts.fitting.least_squares import noise_factor
+from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.model.trajectory import Trajectory, on_clock
 from uwlts.reconstruction.path_uncertainty import along_corrected_path
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import read_cloud
-
-_ROUGH = DriftKind(smooth=0.0, wandering=0.3, walk=0.3, turn_walk=0.3)
-"""Kind of drift that is assumed in the search where the stated or usual one finds no crossing: fewer false crossings
-fit a stiffer path."""
+from uwlts.storage.cloud_files import loaded_cloud
+from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
 
 
 @dataclass(frozen=True)
@@ -48,8 +52,8 @@ class Crossing:
     missed_mm: float
 
 
-@dataclass(frozen=True, eq=False)
-class AlignedTrajectory:
+@dataclass(frozen=True, eq=False, repr=False)
+class AlignedTrajectory(Brief):
     """A path that agrees with the surfaces that it shows.
 
     Attributes
@@ -70,7 +74,7 @@ class AlignedTrajectory:
     correction: np.ndarray
     crossings: tuple[Crossing, ...]
     doubtful_s: tuple[tuple[float, float], ...]
-    cloud: PointCloud = field(repr=False)
+    cloud: PointCloud
 
     def record(self) -> Table:
         """Crossings and size of the correction as JSON."""
@@ -84,6 +88,11 @@ class AlignedTrajectory:
             ],
             "doubtful_s": [list(each) for each in self.doubtful_s],
         }
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the corrected trajectory as CSV with covariances, and the crossings as JSON beside it."""
+        self.trajectory.save(path, overwrite=overwrite)
+        write_record(Path(path).with_suffix(".json"), self.record(), overwrite=overwrite)
 
     def lines(self) -> list[str]:
         """The summary as text."""
@@ -106,29 +115,39 @@ class AlignedTrajectory:
 
 def align_trajectory(
     cloud: PointCloud | str | os.PathLike[str],
-    trajectory: Trajectory,
+    trajectory: Trajectory | str | os.PathLike[str],
     *,
+    pose_format: PoseFormat = "quaternion-xyzw",
+    pose_unit: Unit = "mm",
     clock_offset_s: float = 0.0,
     clock_drift_ppm: float = 0.0,
     drift_mm: float | None = None,
     drift_deg: float | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> AlignedTrajectory:
-    """Correct a trajectory so that surfaces which it shows twice agree, and move the cloud with it.
+    """Correct a trajectory so that surfaces which the scan shows twice agree, and move the cloud with it.
+
+    Reconstruct the scan along the corrected trajectory afterwards: its points then have the uncertainty that is left.
 
     Parameters
     ----------
     cloud
-        Cloud or its file, in the base frame by the trajectory, with the time of each point (`reconstruct`).
+        Cloud along the trajectory with the time of each point (uwlts reconstruct --trajectory).
     trajectory
-        Path of the platform (of the sensor without a mount).
-    clock_offset_s, clock_drift_ppm
-        What to add to the times of the points for those of the trajectory, and by how many parts in a million its clock
-        runs faster than theirs.
-    drift_mm, drift_deg
-        Standard uncertainty that the navigation has gathered at the end, along each axis. Of which kind the drift is, a
-        steady or changing rate or a random walk, is estimated then. Unless given the covariance of the trajectory tells
-        both, and what of the kind the surfaces strongly contradict is estimated.
+        CSV file or ROS bag with times and poses of the platform, as the cloud was reconstructed with.
+    pose_format, pose_unit
+        As for `reconstruct`.
+    clock_offset_s
+        What to add to the times of the points for those of the trajectory.
+    clock_drift_ppm
+        By how many parts in a million the trajectory's clock runs faster, as for `reconstruct`.
+    drift_mm
+        Standard uncertainty that the navigation has gathered at the end, along each axis. The share of a random walk is
+        estimated then. Unless given the covariance of the trajectory states both.
+    drift_deg
+        The same of its turns.
+    progress
+        Called with the number of steps done and the number in all.
 
     Raises
     ------
@@ -137,53 +156,76 @@ def align_trajectory(
     DescriptionError
         Points were measured before or after the trajectory.
     EvaluationError
-        Points have no times, the drift is not known, or the path shows no surface twice that tells where it is.
+        Points have no times, the drift is not known, or no crossing determines the correction.
     """
-    cloud = cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
+    cloud = loaded_cloud(cloud)
+    if not isinstance(trajectory, Trajectory):
+        trajectory = read_trajectory(Path(trajectory), pose_format=pose_format, unit=pose_unit)
     if cloud.time_s is None:
         raise EvaluationError("the cloud has no times of its points: reconstruct it with a trajectory")
     times = on_clock(cloud.time_s, offset_s=clock_offset_s, drift_ppm=clock_drift_ppm)
-    drift = stated_drift(trajectory, drift_mm, drift_deg)
-    path = PathSpline.of(trajectory, drift.size, drift.measured, times)
-    left_out: tuple[tuple[float, float], ...] = ()
-    for turn, kind in enumerate((drift.kind or USUAL_DRIFT, _ROUGH)):
-        estimate = PathEstimate(cloud, times, path, kind, stated=drift.kind)
+    drift = drift_of(trajectory, drift_mm, drift_deg)
+    options = AlignmentOptions()
+    prior = PathPrior.over(times, drift, trajectory, intervals=options.intervals)
+    search = close_crossings(uncorrected(Survey.along(cloud, times, trajectory), prior, options), progress)
+    estimate = settle(search.estimate) if search.estimate.pairs else search.estimate
+    left_out = tuple(_times(estimate, pair) for pair in search.doubtful)
+    if not estimate.pairs:
+        raise EvaluationError(_no_crossing(search, left_out))
+    _require_gain(estimate)
+    return _result(estimate, trajectory, left_out)
 
-        def searched(done: int, total: int, turn: int = turn) -> None:
-            progress(turn * total + done, (turn + 1) * total)
 
-        doubtful = close_crossings(estimate, searched)
-        if estimate.pairs:
-            estimate.settle()
-            complete(estimate, len(estimate.pieces))
-            estimate.average()
-        left_out = tuple(_times(estimate, pair) for pair in doubtful if pair not in estimate.pairs)
-        if estimate.pairs:
-            return _result(estimate, trajectory, times, left_out)
-    at = "".join(f"; at {first:.1f} s and {second:.1f} s it fits in several places" for first, second in left_out)
+def _no_crossing(search: Search, left_out: tuple[tuple[float, float], ...]) -> str:
+    """The reason why no crossing was closed, and what to do."""
+    within = f"within {search.estimate.options.search_sigmas:g} standard deviations of its drift"
+    if not search.within_reach:
+        found = f"no part of the path is {within} above an earlier one: let it cross itself, or state a larger drift"
+    elif left_out:
+        at = ", ".join(f"{first:.1f} s and {second:.1f} s" for first, second in left_out)
+        found = f"at {at} it fits in several places: cross over a surface with features that differ"
+    elif not search.hypotheses:
+        found = f"the surfaces coincide nowhere {within}: cross over a surface with features, or state a larger drift"
+    else:
+        found = (
+            f"{search.hypotheses} places {within} fit roughly, none within the noise of the points: cross at a smaller "
+            "distance of the images, over a surface with features"
+        )
+    return f"the path shows no surface twice that determines its correction; {found}"
+
+
+def _require_gain(estimate: PathEstimate) -> None:
+    """EvaluationError unless a shift at a crossing is known ``least_gain`` times as well as by the navigation."""
+    navigation = replace(estimate, factor=np.eye(len(estimate.factor)))
+    for pair in estimate.pairs:
+        middle = estimate.surfaces[pair[1]].places_mm.mean(axis=0)
+        after, before = (each.relative_covariance(pair, middle)[:3, :3] for each in (estimate, navigation))
+        if eigh(after, before, eigvals_only=True)[0] < 1 / estimate.options.least_gain**2:
+            return
     raise EvaluationError(
-        f"the path shows no surface twice, within {SIGMAS:g} standard deviations of its drift, that tells where "
-        f"it is{at}: cross an earlier part of the path over a surface with features"
+        f"the {len(estimate.pairs)} crossings do not determine a correction: the navigation is known about as well as "
+        "they are; use the trajectory as it is"
     )
 
 
 def _result(
-    estimate: PathEstimate, trajectory: Trajectory, times: np.ndarray, doubtful: tuple[tuple[float, float], ...]
+    estimate: PathEstimate, trajectory: Trajectory, doubtful: tuple[tuple[float, float], ...]
 ) -> AlignedTrajectory:
-    cloud = estimate.cloud
+    cloud = estimate.survey.cloud
     correction = estimate.corrections(trajectory.times_s)
     poses = trajectory.poses.copy()
     poses[:, :3, :3] = Rotation.from_rotvec(correction[:, 3:]).as_matrix() @ poses[:, :3, :3]
     poses[:, :3, 3] += correction[:, :3]
     covariance = estimate.covariance_at(trajectory.times_s)
-    moments, image = np.unique(times, return_inverse=True)
-    by_point = estimate.corrections(moments)[image]
-    platform = trajectory.poses_at(moments)[image, :3, 3]
+    survey, image = estimate.survey, estimate.survey.image
+    by_point, platform = estimate.image_corrections[image], survey.platform_mm[image]
     levers = Rotation.from_rotvec(by_point[:, 3:]).apply(cloud.points_mm - platform)
     known = cloud.uncertainty
     if known is not None:
-        at_image, by_image = estimate.path.basis(moments), estimate.covariance_at(moments)
-        known = along_corrected_path(known, by_point[:, 3:], levers, image, at_image, estimate.covariance, by_image)
+        basis, by_image = estimate.prior.basis(survey.moments_s), estimate.covariance_at(survey.moments_s)
+        of_nodes = estimate.covariance.reshape(6, -1, 6, estimate.prior.count).transpose(1, 0, 3, 2)
+        of_nodes = of_nodes.reshape(estimate.covariance.shape)
+        known = along_corrected_path(known, by_point[:, 3:], levers, image, basis, of_nodes, by_image)
     return AlignedTrajectory(
         Trajectory(trajectory.times_s, poses, covariance),
         correction,
@@ -194,14 +236,15 @@ def _result(
 
 
 def _crossing(estimate: PathEstimate, pair: Pair) -> Crossing:
-    now = estimate.matched(pair)[0]
-    held = estimate.held_out(pair, now)
+    now, held = estimate.distances(pair[1], pair[0], reach_mm=2 * estimate.reach_mm)
     # The same patches, as they lay by the path as it was.
     shift = np.zeros_like(now.places_mm)
     for number, rows, sign in zip(pair, (now.target, now.source), (-1.0, 1.0), strict=True):
-        shift += sign * (estimate.moved(number).places_mm - estimate.pieces[number].places_mm)[rows]
+        shift += sign * (estimate.surfaces[number].places_mm - estimate.pieces[number].places_mm)[rows]
     before = now.distance_mm - np.einsum("qi,qi->q", shift, now.normals)
-    inside = np.abs(now.distance_mm) < 5 * now.std_mm * scatter(now.distance_mm / now.std_mm)
+    inside = np.abs(now.distance_mm) < estimate.options.agreeing_sigmas * now.std_mm * noise_factor(
+        now.distance_mm / now.std_mm
+    )
 
     def rms(values: np.ndarray, which: np.ndarray) -> float:
         return float(np.sqrt(np.mean(values[which] ** 2))) if which.any() else 0.0

@@ -1,228 +1,237 @@
-"""Search of the crossings of a path: hypotheses with their scores, of which those that hold are closed.
+"""Search of the crossings of a path: hypotheses with their scores, and the closing of those that hold.
 
-A hypothesis is a pose in which a piece of the path lies well on an earlier one, found by correlation of the maps of
-heights. It is tested by the drift that the navigation may have gathered, given all crossings that were closed before
-(chi-square of shift and turn), and by an estimate of the path with it. Of the hypotheses within a few pieces the one
-with the most agreeing patches is tested first, and none is closed where another place fits nearly as well.
+A hypothesis is a pose in which a piece of the path coincides with an earlier one, found by correlation of height maps.
+It is tested by the drift that the navigation may have gathered, given all crossings that were closed before (chi-square
+of shift and turn), and by an estimate of the path with it. Within a few pieces the hypothesis with the most agreeing
+patches is tested first. None is closed where another place fits nearly as well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.fft import irfft2, rfft2
+from scipy.fft import next_fast_len
+from scipy.ndimage import gaussian_filter, maximum_filter
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
-from uwlts.alignment.height_correlation import shifts_of_heights
-from uwlts.alignment.path_estimate import FEWEST, Pair, PathEstimate
-from uwlts.fitting.patches import Patches, distances_between
-from uwlts.registration.joint_registration import JointRegistration
+from uwlts.alignment.options import AlignmentOptions
+from uwlts.alignment.path_estimate import Pair, PathEstimate
+from uwlts.alignment.path_solution import Hypothesis, bring_together, refine_nodes, refit, solve
+from uwlts.registration.joint_registration import fit_pair
+from uwlts.runtime.progress import ProgressListener, unheard
 
-SIGMAS = 3.0
-"""Search range of crossings, in standard deviations of the drift."""
-_GATE = float(chi2.ppf(0.9973, 6))
-"""Of the squared Mahalanobis distance of a shift and a turn: as likely as three standard deviations of one number."""
-_REFINED = 12
-"""Rounds of a pair's own estimate."""
-_LYING = 0.6
-"""Share of the patches that lie on each other in a pose that is tested: pieces are bent as long as the drift is."""
-_AHEAD = 4
-"""Pieces after which a hypothesis is decided: a crossing and its doubles are seen within as many."""
-_RIVAL = 0.5
-"""Of the patches of the best hypothesis: another place with as many, that holds too, makes the crossing doubtful."""
+_PIXEL = 0.5
+"""Pixel of height maps in patch radii: patches resolve no more."""
+_LEAST_SPREAD = 1e-3
+"""Product of both maps' variances in an overlap, relative to the usual one: with less there is no structure."""
 
 
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """A pose (4, 4) in which the later piece of a pair lies on the earlier, and the number of patches that agree."""
+@dataclass(frozen=True)
+class Search:
+    """Outcome of the search: the estimate with its crossings, doubtful pairs, and the number of hypotheses."""
 
-    pair: Pair
-    pose: np.ndarray
-    patches: int
+    estimate: PathEstimate
+    doubtful: tuple[Pair, ...]
+    within_reach: int
+    hypotheses: int
 
 
-def close_crossings(
-    estimate: PathEstimate, progress: Callable[[int, int], None] = lambda done, total: None
-) -> list[Pair]:
-    """Find and close the crossings of a path, in the order of time; returns pairs that were left out as doubtful."""
+def close_crossings(estimate: PathEstimate, progress: ProgressListener = unheard) -> Search:
+    """Find and close the crossings of a path, in the order of time."""
     waiting: list[Hypothesis] = []
     doubtful: list[Pair] = []
-    count = len(estimate.pieces)
+    count, ahead = len(estimate.pieces), estimate.options.decided_after
+    within_reach = hypotheses = 0
+
+    def beside(pair: Pair, others: list[Pair]) -> bool:
+        return any(max(abs(pair[0] - first), abs(pair[1] - second)) <= ahead for first, second in others)
+
     for number in range(count):
-        waiting += [each for each in _hypotheses(estimate, number) if not _beside(each.pair, doubtful)]
-        while waiting and (number - min(each.pair[1] for each in waiting) >= _AHEAD or number == count - 1):
+        for pair in ((earlier, number) for earlier in range(number - 2)):
+            if pair in estimate.pairs or (reach := _reach(estimate, pair)) is None:
+                continue
+            found = _hypotheses(estimate, pair, reach)
+            within_reach, hypotheses = within_reach + 1, hypotheses + len(found)
+            waiting += [] if beside(pair, doubtful) else found
+        while waiting and (number - min(each.pair[1] for each in waiting) >= ahead or number == count - 1):
             best = max(waiting, key=lambda each: each.patches)
             waiting.remove(best)
-            before = estimate.state()
-            if not _closed(estimate, best):
+            closed = close_hypothesis(estimate, best)
+            if closed is None:
                 continue
-            closed = estimate.state()
-            if _has_rival(estimate, best, waiting, before):
+            if _has_rival(estimate, closed, best, [each for each in waiting if beside(each.pair, [best.pair])]):
                 doubtful.append(best.pair)
-                waiting = [each for each in waiting if not _beside(each.pair, doubtful)]
-                estimate.restore(before)
+                waiting = [each for each in waiting if not beside(each.pair, doubtful)]
                 continue
-            estimate.restore(closed)
-            complete(estimate, number + 1)
-            waiting = [each for each in waiting if each.pair not in estimate.pairs and _likely(estimate, each)]
+            estimate = add_overlaps(closed, number + 1)
+            waiting = [each for each in waiting if each.pair not in estimate.pairs and _is_likely(estimate, each)]
         progress(number + 1, count)
-    complete(estimate, count)
-    return [pair for pair in doubtful if pair not in estimate.pairs]
+    estimate = add_overlaps(estimate, count)
+    left_out = tuple(pair for pair in doubtful if pair not in estimate.pairs)
+    return Search(estimate, left_out, within_reach, hypotheses)
 
 
-def complete(estimate: PathEstimate, count: int) -> None:
-    """Add all pairs of the first pieces that must lie on each other, by the path as it is known now."""
-    closed = list(estimate.pairs)
-    places = [estimate.moved(number).places_mm for number in range(count)]
+def close_hypothesis(estimate: PathEstimate, hypothesis: Hypothesis) -> PathEstimate | None:
+    """Estimate the path with a hypothesis; None if the surfaces do not agree then."""
+    closed = solve(refine_nodes(solve(bring_together(estimate, hypothesis))))
+    closed = solve(refit(closed, hypothesis.pair))
+    return closed if closed.agrees(hypothesis.pair) else None
+
+
+def add_overlaps(estimate: PathEstimate, count: int) -> PathEstimate:
+    """Add all pairs of the first pieces that overlap by the path as it is known now, and whose surfaces agree."""
+    closed = estimate.pairs
+    places = [surface.places_mm for surface in estimate.surfaces[:count]]
     low, high = (np.array([of(each, axis=0) for each in places]) for of in (np.min, np.max))
+    new = []
     for later in range(count):
         near = np.all((low[later] < high + estimate.reach_mm) & (low < high[later] + estimate.reach_mm), axis=1)
         for earlier in np.flatnonzero(near[: max(later - 2, 0)]).tolist():
             pair = earlier, later
             reach = None if pair in closed else _reach(estimate, pair)
             if reach is not None and reach.max() < estimate.reach_mm:
-                found, _ = estimate.matched(pair)
-                if len(found.source) >= FEWEST:
-                    estimate.pairs.append(pair)
-    if len(estimate.pairs) > len(closed):
-        estimate.resolve({})
-        estimate.estimate({})
-        estimate.lay_anew({number for pair in estimate.pairs for number in pair})
-        estimate.estimate({})
-        agreeing = [pair for pair in estimate.pairs if pair in closed or estimate.agrees(pair)]
-        if len(agreeing) < len(estimate.pairs):
-            estimate.pairs = agreeing
-            estimate.estimate({})
-
-
-def _hypotheses(estimate: PathEstimate, number: int) -> list[Hypothesis]:
-    """Where a piece may lie on earlier ones, as the drift allows."""
-    found = []
-    for earlier in range(number - 2):
-        pair = earlier, number
-        if pair in estimate.pairs or (reach := _reach(estimate, pair)) is None:
-            continue
-        found += [each for each in _poses(estimate, pair, reach) if _likely(estimate, each)]
-    return found
+                found, _ = estimate.distances(later, earlier, reach_mm=2 * estimate.reach_mm)
+                new += [pair] if len(found.source) >= estimate.options.fewest_patches else []
+    if not new:
+        return estimate
+    estimate = solve(refine_nodes(replace(estimate, pairs=(*closed, *new))))
+    estimate = solve(refit(estimate, {number for pair in estimate.pairs for number in pair}))
+    agreeing = tuple(pair for pair in estimate.pairs if pair in closed or estimate.agrees(pair))
+    return estimate if len(agreeing) == len(estimate.pairs) else solve(replace(estimate, pairs=agreeing))
 
 
 def _reach(estimate: PathEstimate, pair: Pair) -> np.ndarray | None:
-    """How far (3,) the later piece may lie from where it is now; None where it reaches the earlier nowhere."""
-    other, own = (estimate.moved(number).places_mm for number in pair)
+    """How far (3,) the later piece may be from where it is now; None where it reaches the earlier nowhere."""
+    other, own = (estimate.surfaces[number].places_mm for number in pair)
     low, high = own.min(axis=0), own.max(axis=0)
-    std = np.sqrt(np.diag(_relative_covariance(estimate, pair, (low + high) / 2)))
-    reach = SIGMAS * (std[:3] + float(np.linalg.norm(high - low)) / 2 * std[3:].max())
+    std = np.sqrt(np.diag(estimate.relative_covariance(pair, (low + high) / 2)))
+    turned = float(np.linalg.norm(high - low)) / 2 * std[3:].max()
+    reach = estimate.options.search_sigmas * (std[:3] + turned)
     apart = np.maximum(low - reach - other.max(axis=0), other.min(axis=0) - high - reach)
     return None if (apart > 0).any() else reach
 
 
-def _relative_covariance(estimate: PathEstimate, pair: Pair, at_mm: np.ndarray) -> np.ndarray:
-    """Covariance (6, 6) of shift and turn of the later piece against the earlier, at a place (3,)."""
-    times, twists = estimate.relative_movement(pair, at_mm)
-    by = np.einsum("mc,mij->icj", estimate.path.basis(times), twists).reshape(6, -1)
-    used = np.flatnonzero(by.any(axis=0))
-    return by[:, used] @ estimate.covariance[np.ix_(used, used)] @ by[:, used].T
+def _hypotheses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> list[Hypothesis]:
+    """Poses in which the later piece coincides with the earlier, within reach (3,).
 
-
-def _poses(estimate: PathEstimate, pair: Pair, reach: np.ndarray) -> list[Hypothesis]:
-    """Poses in which the later piece lies well on the earlier, within reach (3,).
-
-    Maps of the heights of both, with what lies beside them on the path, are correlated for all shifts.
+    Height maps of both, with their neighbours on the path, are correlated for all shifts.
     """
-    earlier, number = pair
-    other, own = estimate.moved(earlier), estimate.moved(number)
+    other, own = (estimate.surfaces[number] for number in pair)
     normal = np.linalg.eigh(other.normals.T @ other.normals)[1][:, 2]
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)
     frame = np.stack([first, np.cross(normal, first), normal])
-    beside = [range(max(0, k - 1), min(len(estimate.pieces), k + 2)) for k in (number, earlier)]
-    clouds = [np.vstack([estimate.moved_points(k) for k in near]) @ frame.T for near in beside]
+    near = [range(max(0, k - 1), min(len(estimate.pieces), k + 2)) for k in pair[::-1]]
+    clouds = [np.vstack([estimate.points(k) for k in numbers]) @ frame.T for numbers in near]
+    options, drift, part = estimate.options, estimate.prior.drift, 1 / len(estimate.pieces)
+    # By its steady rate and by its random walk a piece is bent as long as the drift is unknown.
+    bent = float(np.max(drift.std[:3] * np.sqrt(part**2 + drift.walk[:3] * part)))
+    middle = own.places_mm.mean(axis=0)
+    size = float(np.sqrt(np.mean(np.sum((own.places_mm - middle) ** 2, axis=1))))
+    # A pose is as good as two bent pieces determine it, and a search within a patch radius.
+    std = max(bent, own.radius_mm) * np.repeat([1.0, 1 / size], 3)
     found = []
-    for shift in shifts_of_heights(*clouds, pixel_mm=0.5 * own.radius_mm, reach_mm=np.abs(frame) @ reach):
-        pose = np.eye(4)
-        pose[:3, 3] = shift @ frame
-        refined = _refined(own, other, pose, bent_mm=_bent(estimate))
-        if refined is not None:
-            found.append(Hypothesis(pair, refined[1], refined[0]))
-    return found
+    for shift in correlate_heights(
+        clouds[0], clouds[1], options, pixel_mm=_PIXEL * own.radius_mm, reach_mm=np.abs(frame) @ reach
+    ):
+        start = np.eye(4)
+        start[:3, 3] = shift @ frame
+        if (refined := fit_pair(own, other, start)) is None:
+            continue
+        pose, apart = refined
+        fits = np.abs(apart.distance_mm) < np.maximum(options.agreeing_sigmas * apart.std_mm, bent)
+        if np.count_nonzero(fits) >= options.fewest_patches and np.mean(fits) >= options.least_lying:
+            turn = Rotation.from_matrix(pose[:3, :3])
+            moved = np.append(turn.apply(middle) + pose[:3, 3] - middle, turn.as_rotvec())
+            relative = moved + estimate.relative_movement(pair, middle) @ estimate.values
+            found.append(Hypothesis(pair, middle, relative, std, int(np.count_nonzero(fits))))
+    return [each for each in found if _is_likely(estimate, each)]
 
 
-def _bent(estimate: PathEstimate) -> float:
-    """By how much a piece is bent as long as the drift is unknown, mm: by its steady rate and by its random walk."""
-    part = 1 / len(estimate.pieces)
-    return estimate.path.drift[:3].max() * float(np.sqrt(part**2 + estimate.prior.kind.walk * part))
+def _is_likely(estimate: PathEstimate, seen: Hypothesis) -> bool:
+    """Check whether the navigation may have drifted by a hypothesis, given the crossings that are closed."""
+    off = seen.relative - estimate.relative_movement(seen.pair, seen.at_mm) @ estimate.values
+    covariance = estimate.relative_covariance(seen.pair, seen.at_mm) + np.diag(seen.std**2)
+    return float(off @ np.linalg.solve(covariance, off)) < estimate.options.gate
 
 
-def _refined(own: Patches, other: Patches, pose: np.ndarray, *, bent_mm: float) -> tuple[int, np.ndarray] | None:
-    """Number of patches that agree, and pose (4, 4), after a pair's own estimate from a pose."""
-    joint = JointRegistration([other, own], [[], []], np.array([np.eye(4), pose]), start_std=None, sphere_mm=None)
-    reach = 4 * own.radius_mm
-    for _ in range(_REFINED):
-        if not (pairs := joint.evidence(reach)):
-            return None
-        step = joint.solved(list(pairs.values())).step
-        joint.move(step)
-        reach = max(0.8 * reach, own.radius_mm)
-    if not (pairs := joint.evidence(reach)) or len(joint.solved(list(pairs.values())).open_directions):
-        return None
-    found = distances_between(own, joint.poses[1], other, np.eye(4), reach_mm=reach)
-    fits = np.abs(found.distance_mm) < np.maximum(5 * found.std_mm, bent_mm)
-    if np.count_nonzero(fits) < FEWEST or np.mean(fits) < _LYING:
-        return None
-    return int(np.count_nonzero(fits)), joint.poses[1]
-
-
-def _likely(estimate: PathEstimate, hypothesis: Hypothesis) -> bool:
-    """Whether the navigation may have drifted by what a hypothesis says, given the crossings that are closed."""
-    places = estimate.moved(hypothesis.pair[1]).places_mm
-    middle = places.mean(axis=0)
-    size = float(np.sqrt(np.mean(np.sum((places - middle) ** 2, axis=1))))
-    covariance = _relative_covariance(estimate, hypothesis.pair, middle)
-    # The pose is as good as two bent pieces tell, and a search within a patch's radius.
-    bent = max(_bent(estimate), estimate.reach_mm / 2)
-    covariance += bent**2 * np.diag(np.repeat([1.0, 1 / size**2], 3))
-    rotation, shift = hypothesis.pose[:3, :3], hypothesis.pose[:3, 3]
-    off = np.append(rotation @ middle + shift - middle, Rotation.from_matrix(rotation).as_rotvec())
-    return float(off @ np.linalg.solve(covariance, off)) < _GATE
-
-
-def _closed(estimate: PathEstimate, hypothesis: Hypothesis) -> bool:
-    """Estimate the path with a hypothesis; whether it agrees then. Else the estimate stays as it was."""
-    before = estimate.state()
-    estimate.pairs.append(hypothesis.pair)
-    estimate.resolve({hypothesis.pair: hypothesis.pose})
-    estimate.estimate({hypothesis.pair: hypothesis.pose})
-    estimate.lay_anew(hypothesis.pair)
-    estimate.estimate({})
-    if estimate.agrees(hypothesis.pair) and estimate.is_overdetermined(hypothesis.pair):
-        return True
-    estimate.restore(before)
-    return False
-
-
-def _has_rival(estimate: PathEstimate, best: Hypothesis, waiting: list[Hypothesis], before: tuple[Any, ...]) -> bool:
-    """Whether another hypothesis contradicts the closed one, and holds as well from the estimate before."""
-    middle = estimate.moved(best.pair[1]).places_mm.mean(axis=0)
-    times, twists = estimate.relative_movement(best.pair, middle)
-    closed = estimate.corrections(times)
-    rivals = [
-        each
-        for each in waiting
-        if _beside(each.pair, [best.pair]) and each.patches >= _RIVAL * best.patches and not _likely(estimate, each)
-    ]
-    for rival in rivals:
-        estimate.restore(before)
-        if _closed(estimate, rival):
+def _has_rival(before: PathEstimate, closed: PathEstimate, best: Hypothesis, beside: list[Hypothesis]) -> bool:
+    """Check whether another hypothesis contradicts the closed one, and holds as well from the estimate before."""
+    for rival in beside:
+        if rival.patches < before.options.rival_share * best.patches or _is_likely(closed, rival):
+            continue
+        other = close_hypothesis(before, rival)
+        if other is not None:
             # A pose that was found badly may lead to the same place.
-            apart = np.einsum("mij,mj->i", twists, estimate.corrections(times) - closed)
-            if np.linalg.norm(apart[:3]) > estimate.reach_mm:
+            apart = (each.relative_movement(best.pair, best.at_mm) @ each.values for each in (other, closed))
+            if np.linalg.norm(np.subtract(*apart)[:3]) > before.reach_mm:
                 return True
     return False
 
 
-def _beside(pair: Pair, others: list[Pair]) -> bool:
-    """Whether a pair belongs to the crossing of one of the others."""
-    return any(max(abs(pair[0] - earlier), abs(pair[1] - later)) <= _AHEAD for earlier, later in others)
+def correlate_heights(
+    source_mm: np.ndarray, target_mm: np.ndarray, options: AlignmentOptions, *, pixel_mm: float, reach_mm: np.ndarray
+) -> list[np.ndarray]:
+    """Return the likeliest shifts (3,) of points (N, 3) onto others (M, 3), both with heights along z, the best first.
+
+    Shifts are within ``reach_mm`` (3,). The correlation is normalised within the overlap (Padfield, IEEE Transactions
+    on Image Processing 21, 2012) and counts by the root of its area.
+    """
+    low = np.minimum(source_mm[:, :2].min(axis=0), target_mm[:, :2].min(axis=0))
+    maps = [_height_map(points, low, pixel_mm) for points in (source_mm, target_mm)]
+    sizes: list[Any] = [
+        next_fast_len(a + b - 1, real=True) for a, b in zip(maps[0][0].shape, maps[1][0].shape, strict=True)
+    ]
+    details = [_detail(*each, options) for each in maps]
+    masks = [mask for _, mask in maps]
+    of_mask, of_height, of_detail, of_square = (
+        [rfft2(values * mask, sizes) for values, mask in zip(each, masks, strict=True)]
+        for each in (masks, [height for height, _ in maps], details, [detail**2 for detail in details])
+    )
+
+    def correlated(target: np.ndarray, source: np.ndarray) -> np.ndarray:
+        return irfft2(target * np.conj(source), sizes)
+
+    count = np.maximum(np.rint(correlated(of_mask[1], of_mask[0])), 1e-9)
+    of_target, of_source = correlated(of_detail[1], of_mask[0]), correlated(of_mask[1], of_detail[0])
+    both = correlated(of_detail[1], of_detail[0]) - of_target * of_source / count
+    spread = correlated(of_square[1], of_mask[0]) - of_target**2 / count
+    spread *= correlated(of_mask[1], of_square[0]) - of_source**2 / count
+    # The area of the fewest patches, one in each square of a radius, in pixels.
+    enough = count > options.fewest_patches / _PIXEL**2
+    usual = max(float(np.median(spread[enough])), 0.0) if enough.any() else 0.0
+    with np.errstate(invalid="ignore", divide="ignore"):
+        alike = np.where(enough & (spread > _LEAST_SPREAD * usual), both / np.sqrt(spread), 0.0)
+    score = np.where(alike > options.least_correlation, alike * np.sqrt(count), -np.inf)
+    steps = [np.where(np.arange(n) > n // 2, np.arange(n) - n, np.arange(n)) for n in sizes]
+    outside = [np.abs(each * pixel_mm) > reach + pixel_mm for each, reach in zip(steps, reach_mm[:2], strict=True)]
+    score[outside[0][:, None] | outside[1]] = -np.inf
+    # Peaks are as wide as the structures that are compared.
+    apart = 1 + 2 * int(options.coarsest_px / 4)
+    peaks = np.argwhere((score == maximum_filter(score, apart, mode="wrap")) & np.isfinite(score))
+    order = np.argsort(-score[tuple(peaks.T)])[: options.proposals]
+    along = (correlated(of_height[1], of_mask[0]) - correlated(of_mask[1], of_height[0])) / count
+    found = [np.array([steps[0][i] * pixel_mm, steps[1][j] * pixel_mm, along[i, j]]) for i, j in peaks[order]]
+    return [shift for shift in found if abs(shift[2]) <= reach_mm[2] + pixel_mm]
+
+
+def _height_map(points: np.ndarray, low: np.ndarray, pixel: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean heights (H, W), and a mask (H, W) of 1 where there are points."""
+    cells = np.floor((points[:, :2] - low) / pixel).astype(np.int64)
+    shape = tuple(cells.max(axis=0) + 1)
+    flat = np.ravel_multi_index(tuple(cells.T), shape)
+    count = np.bincount(flat, minlength=shape[0] * shape[1]).reshape(shape)
+    total = np.bincount(flat, points[:, 2], shape[0] * shape[1]).reshape(shape)
+    return total / np.maximum(count, 1), (count > 0).astype(float)
+
+
+def _detail(height: np.ndarray, mask: np.ndarray, options: AlignmentOptions) -> np.ndarray:
+    """Structures (H, W) of the compared sizes."""
+    smooth, coarse = (
+        gaussian_filter(height * mask, size) / np.maximum(gaussian_filter(mask, size), 1e-3)
+        for size in (options.finest_px, options.coarsest_px)
+    )
+    return smooth - coarse

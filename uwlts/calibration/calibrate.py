@@ -2,17 +2,17 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, assert_never
+from typing import Literal
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
-from uwlts.calibration.camera.lens import Distortion, LensChoice, Pixels
+from uwlts.calibration.camera.lens import Distortion, LensChoice, Pixels, require_coefficients
 from uwlts.calibration.camera.target_poses import Poses
-from uwlts.calibration.capture_evidence import Progress
 from uwlts.calibration.joint.procedure import calibrate_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, calibrate_sequentially
-from uwlts.errors import CalibrationError, DescriptionError
+from uwlts.errors import DescriptionError
 from uwlts.model.calibration import Calibration
 from uwlts.optics.window import require_index
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture, opened_captures
 from uwlts.stripe import StripeSettings
 
@@ -25,7 +25,7 @@ def calibrate(
     water: _Captures = (),
     step: _Captures = (),
     scan: _Captures = (),
-    method: Literal["auto", "sequential", "joint"] = "auto",
+    joint: bool = False,
     new_water: bool = False,
     unknown_sizes: bool = False,
     strict: bool = False,
@@ -35,49 +35,55 @@ def calibrate(
     pixels: Pixels = "auto",
     index: float | None = None,
     stripe: StripeSettings = None,
-    progress: Progress | None = None,
+    progress: ProgressListener = unheard,
 ) -> Calibration:
-    """Calibrate a sensor from captures, open ones or by their paths.
+    """Calibrate camera, window and sheet from images of a target in air or in water, and of a step standard in water.
+
+    From a target in air and steps the calibration is sequential: camera and sheet first, then the window's distance.
+    With a target in water, with scans, or with ``joint``, all parameters are estimated together, with their covariance
+    (docs: joint calibration).
 
     Parameters
     ----------
     air : sequence of Capture or path
-        A target in air, under the lamp and with the laser at the same stage positions.
+        Captures of the target in air: at every stage position one image under the lamp and one with the laser. If all
+        are taken in the medium of use, and without steps, the calibration has a single viewpoint for that medium.
     water : sequence of Capture or path
-        The same in the medium of use.
+        The same in the medium of use, seen through the window, whose distance is estimated too.
     step : sequence of Capture or path
-        A step standard in the medium of use.
+        Captures of the step standard in the medium of use; without any the calibration is for air only.
     scan : sequence of Capture or path
-        Scans of spheres, a plane or a pipe that stand still while the stage moves the sensor.
-    method : {"auto", "sequential", "joint"}
-        sequential: camera and sheet from ``air``, then the window's distance from ``step``. joint: all parameters from
-        all captures at once, with their covariance. auto: joint if ``water`` or ``scan`` needs it, else sequential.
+        Scans of spheres, a plane or a pipe that stand still: round objects determine the stage's direction and the
+        water's index, better if their size is known; a plane determines what bends it.
+    joint : bool
+        Estimate all parameters together, as always with ``water`` or ``scan``; the sensor's description states what is
+        known before and how well.
     new_water : bool
-        The scans were taken in other water than the target, or on another day: its index is a parameter of its own.
+        The scans were taken in other water than the target, or on another day: estimate its index too.
     unknown_sizes : bool
-        Estimate the diameters and spacings of what was scanned, even if the captures state their uncertainty.
+        Estimate diameters and spacings of what was scanned, even if its description states their uncertainty.
     strict : bool
-        Jointly: refuse images that do not fit the model. Otherwise single ones are left out, and what most images show
+        Refuse images that do not fit together. Jointly, single ones are otherwise left out, and what most images show
         is stated as an error of the model, which makes uncertainties larger; both with a warning.
     refractions : {1, 2}
-        2: a window of known thickness; the images in air are taken without it. 1: a single interface; the images in air
-        are taken through the window, whose effect goes into the distortion. The joint method ignores it.
+        2: window of known thickness, air images taken without it. 1: one interface, air images taken through the
+        window, whose effect goes into the distortion. The joint calibration takes this from the captures.
     poses : {"stage-normal", "stage", "free"}
-        stage-normal: one target pose, moved by the stage along the target's normal. stage: the same in a free
-        direction, as always in the joint method. free: every image has a pose of its own.
+        stage-normal: one target pose, moved by the stage along the target's normal (the thesis). stage: the same with a
+        free direction, as always in the joint calibration. free: every image has a pose of its own.
     distortion : "auto" or tuple of str
-        The coefficients among k1 to k6, p1 and p2 to estimate; the others are 0. auto: with the poses stage and free
-        those that predict images of the target left out best; with stage-normal k1 and k2; jointly k1 and k2, p1
-        and p2 as far as the description leaves them open, and more where the images contradict that.
+        Distortion coefficients to estimate; the others stay 0. auto: with the poses stage and free those that predict
+        images left out best; with stage-normal k1 and k2; jointly k1 and k2, p1 and p2 as far as the description leaves
+        them open, and more where the images contradict that.
     pixels : {"auto", "square", "free"}
-        Whether one focal length or two are estimated. auto: as distortion, where poses are free; else one. Of one, the
-        other follows by the sensor's ``pixel_aspect``.
+        Whether pixels are square, or else as the sensor's description says, or free to be not; auto: as distortion,
+        with free poses; else square.
     index : float, optional
         Refractive index of the medium relative to air, in place of the one that follows from the captures.
     stripe : StripeOptions or dict, optional
-        How stripes are found: all options, or settings in place of those in the sensor's table [stripe].
+        As for `reconstruct`.
     progress : callable, optional
-        Called with the name of the stage, the number of images done, and the number in all.
+        Called with the number of images done, the number in all, and the name of the stage.
 
     Returns
     -------
@@ -87,7 +93,7 @@ def calibrate(
     Raises
     ------
     CalibrationError
-        The captures do not determine the calibration or contradict it, or the method cannot use them.
+        The captures do not determine the calibration or contradict it.
     DescriptionError
         There is no capture of a target, or one does not describe its target, its step standard or what it scans.
     CaptureError
@@ -97,10 +103,11 @@ def calibrate(
     """
     if index is not None:
         require_index(index)
+    require_coefficients(distortion)
     if not (air or water):
-        raise DescriptionError("nothing to calibrate from: give --air or --water with captures of a target, or --live")
+        raise DescriptionError("nothing to calibrate from: give `air` or `water` with captures of a target")
     if (new_water or unknown_sizes) and not scan:
-        raise DescriptionError("--new-water and --unknown-sizes are about scans: give these with --scan")
+        raise DescriptionError("`new_water` and `unknown_sizes` are about scans: give these with `scan`")
     options = CalibrationOptions(
         refractions=refractions,
         poses=poses,
@@ -114,8 +121,6 @@ def calibrate(
         sizes_known=not unknown_sizes,
         strict=strict,
     )
-    if method == "auto":
-        method = "joint" if water or scan else "sequential"
     with (
         opened_captures(air) as in_air,
         opened_captures(step) as steps,
@@ -125,19 +130,10 @@ def calibrate(
         for capture in in_water:
             if capture.header.medium.kind == "air":
                 raise DescriptionError(
-                    f"{capture.path.name} says that it was taken in air: give it with --air, or correct the medium in "
+                    f"{capture.path.name} says that it was taken in air: give it with `air`, or correct the medium in "
                     "its description"
                 )
-        match method:
-            case "joint":
-                targets = [*in_air, *in_water]
-                return calibrate_jointly(targets, steps, scans, options=options, progress=progress).calibration
-            case "sequential":
-                if in_water or scans:
-                    raise CalibrationError(
-                        "the sequential calibration takes a target in air and steps only: calibrate jointly with "
-                        "targets in water or scans"
-                    )
-                return calibrate_sequentially(in_air, steps, options=options, progress=progress).calibration
-            case _:
-                assert_never(method)
+        if joint or water or scan:
+            targets = [*in_air, *in_water]
+            return calibrate_jointly(targets, steps, scans, options=options, progress=progress).calibration
+        return calibrate_sequentially(in_air, steps, options=options, progress=progress).calibration

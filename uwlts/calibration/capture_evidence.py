@@ -1,7 +1,7 @@
 """Evidence of captures for a calibration: target points, stripes on the target, stripes on the step standard."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,14 +14,12 @@ from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.target_stripes import TargetStripe, stripe_on_target
 from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError, problems_of
 from uwlts.model.artefacts import StepStandard
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import in_threads
 from uwlts.storage.capture import Capture
 from uwlts.stripe import Stripe, StripeOptions, StripeSettings, stripe_in, why_no_stripe
 from uwlts.stripe.capture_stripes import shown_stripe
 from uwlts.targets import Target, TargetView, parse_target
-
-Progress = Callable[[str, int, int], None]
-"""Called with the name of the step, the number of images done and the number of all."""
 
 _SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
 _FEWEST_LINES = 20  # fewer are reflections or specks rather than the stripe
@@ -79,7 +77,7 @@ class StepEvidence:
 
 
 def air_evidence(
-    captures: Sequence[Capture], *, stripe: StripeSettings = None, progress: Progress | None = None
+    captures: Sequence[Capture], *, stripe: StripeSettings = None, progress: ProgressListener = unheard
 ) -> AirEvidence:
     """Find the target in the images with the laser off, and the stripe in those with it on at the same positions.
 
@@ -143,7 +141,7 @@ def step_evidence(
     *,
     medium_index: float | None = None,
     stripe: StripeSettings = None,
-    progress: Progress | None = None,
+    progress: ProgressListener = unheard,
 ) -> tuple[list[StepEvidence], list[str]]:
     """Stripes on the step standard in all images with the laser on, and warnings about images left out.
 
@@ -288,7 +286,6 @@ def _too_short(pixels: np.ndarray) -> str:
     return "" if enough else f"found on {len(pixels)} lines only, at least {_FEWEST_LINES} are of use"
 
 
-def _report(progress: Progress | None, name: str, done: int, total: int) -> int:
-    if progress is not None:
-        progress(name, done + 1, total)
+def _report(progress: ProgressListener, name: str, done: int, total: int) -> int:
+    progress(done + 1, total, name)
     return done + 1

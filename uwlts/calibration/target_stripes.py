@@ -12,7 +12,8 @@ from uwlts.targets import Target, TargetView
 _DEGREE = 4  # bends of lens, window, line optics and plate; more would follow outliers
 _TRIALS = 300  # parabolas through three points; with half the points outliers one in eight is free of them
 _BEYOND = 0.025  # of the plate's size; so far beyond it distortion may put its border in the image
-_OUTLIER, _LEAST_LIMIT_PX = 5.0, 1.0
+_OUTLIER = 5.0  # robust standard deviations from the curve; of a million normal values one is farther
+_LEAST_LIMIT_PX = 1.0  # within which a point lies on the curve, however little the others scatter
 _FEWEST = 20  # points of a curve
 _LOST = 0.05  # share of the lines on the plate that may have no point on the curve without a second look
 

@@ -24,10 +24,11 @@ from uwlts.comparison.ideal_shapes import IdealShape, place_shape
 from uwlts.comparison.local_means import TWO_SIDED, LocalMeans, local_means
 from uwlts.errors import EvaluationError
 from uwlts.fitting.point_spacing import disc_of
+from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 from uwlts.registration.surface_registration import Registration, SampledSurface, register_to_surface
-from uwlts.storage.cloud import PAIRS, WATER, PointCloud, PointUncertainty
-from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.cloud import WATER, PointCloud, PointUncertainty, turned_pairs
+from uwlts.storage.cloud_files import loaded_cloud
 from uwlts.storage.pose_files import Unit
 
 _MOST_PLACES = 20_000
@@ -59,8 +60,8 @@ class ChangedRegion:
         return {**asdict(self), "centre_mm": list(self.centre_mm)}
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceChange:
+@dataclass(frozen=True, eq=False, repr=False)
+class SurfaceChange(Brief):
     """Change at P places of a cloud.
 
     Attributes
@@ -218,17 +219,17 @@ def compare_clouds(
     Parameters
     ----------
     cloud
-        What was measured; a cloud or its file.
+        Cloud of the surface, or its file (.ply, .h5, .copc.laz; of other programs .las, .e57, and text in mm).
     reference
-        An earlier cloud; the file of a mesh (.stl, .obj, .off, or .ply with faces); or an ideal shape: "plane",
-        "sphere" or "cylinder" to fit one, or a TOML file with its kind and what is known of it.
+        Earlier cloud; the file of a mesh (.stl, .obj, .off, or .ply with faces); or an ideal shape: "plane",
+        "sphere" or "cylinder" to fit one, or a TOML file with its kind and what is known of it
+        (docs/how-to/compare-scans.md).
     register
-        Move the cloud onto the reference first (`uwlts.registration.surface_registration`). Otherwise both share one
-        frame.
-        An ideal shape without a place is fitted anyway.
+        Move the cloud onto the reference first; else both have one frame. An ideal shape without a place is fitted
+        anyway.
     datums
-        Spheres in the reference's frame that hold what has not changed, (K, 4) centre and radius in mm, or a TOML file
-        of tables [[datum]] with centre_mm and radius_mm: only points in them count for the registration or fit.
+        TOML file with spheres that hold what has not changed (tables [[datum]] with centre_mm and radius_mm), or these
+        as (K, 4) centre and radius in mm: only points in them count for the registration or fit.
     disc_mm
         Diameter of the disc; about 30 points of the sparser side unless given.
     deep_mm
@@ -254,7 +255,7 @@ def compare_clouds(
     >>> change.significant.mean(), change.distance_mm[change.significant].min()
     >>> uwlts.compare_clouds("pipe.ply", "cylinder").regions()
     """
-    new = cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
+    new = loaded_cloud(cloud)
     for name, length in (("disc_mm", disc_mm), ("deep_mm", deep_mm)):
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
@@ -266,7 +267,7 @@ def compare_clouds(
         if disc_mm is None and not surface.meshed:
             disc = max(disc, disc_of(surface.points_mm, surface.frame))
         if fixed is not None and not register:
-            raise EvaluationError("datums hold a registration: ask for that, too (--register)")
+            raise EvaluationError("datums hold a registration: ask for that, too (`register`)")
         deep = deep_mm or _DEEP * disc
         sides = _against_points(new, surface, fixed, register=register, disc=disc, deep=deep, same_water=same_water)
     else:
@@ -355,7 +356,7 @@ def _against_shape(
     points, known, chosen = new.points_mm, new.uncertainty, slice(None)
     if datums is not None:
         if not (register or shape.fitted):
-            raise EvaluationError("datums hold a registration or a fit, and this shape has a place: add --register")
+            raise EvaluationError("datums hold a registration or a fit, and this shape has a place: add `register`")
         away = np.linalg.norm(points[:, None] - datums[:, :3], axis=2)
         if shape.fitted:
             chosen = np.flatnonzero(np.any(away <= datums[:, 3], axis=1))
@@ -419,14 +420,6 @@ def _spread(points: np.ndarray, apart: float) -> tuple[np.ndarray, float]:
         apart *= max(np.sqrt(len(first) / _MOST_PLACES), 1.02)
 
 
-def _matrices(pairs: np.ndarray) -> np.ndarray:
-    """Symmetric matrices (N, 3, 3) of the six numbers each of `PAIRS`."""
-    result = np.empty((len(pairs), 3, 3))
-    for column, (i, j) in enumerate(PAIRS):
-        result[:, i, j] = result[:, j, i] = pairs[:, column]
-    return result
-
-
 def _moved(
     points: np.ndarray, known: PointUncertainty | None, found: Registration
 ) -> tuple[np.ndarray, PointUncertainty | None]:
@@ -435,11 +428,10 @@ def _moved(
     points = points @ rotation.T + found.transform[:3, 3]
     if known is None:
         return points, None
-    matrices = rotation @ _matrices(known.random_mm2) @ rotation.T
-    pairs = np.stack([matrices[:, i, j] for i, j in PAIRS], axis=1)
     patterns = known.patterns_mm @ rotation.T
     followed = [found.moves_mm(step, points) for step in found.by_cloud]
     patterns = patterns + np.array(followed, np.float32).reshape(patterns.shape)
     poses = None if known.poses_mm is None else known.poses_mm @ rotation.T
     position = known.position_mm @ rotation.T
-    return points, PointUncertainty(pairs, position, patterns.astype(np.float32), poses, known.shared)
+    random = turned_pairs(known.random_mm2, rotation)
+    return points, PointUncertainty(random, position, patterns.astype(np.float32), poses, known.shared)

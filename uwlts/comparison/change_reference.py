@@ -155,7 +155,7 @@ def require_same_unit(cloud: np.ndarray, reference: np.ndarray) -> None:
     sizes = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in (cloud, reference)]
     if sizes[0] > _OTHER_UNIT * sizes[1]:
         raise EvaluationError(
-            f"the cloud is {sizes[0]:.4g} mm across and the reference {sizes[1]:.4g}: is that in metres? Give --unit m"
+            f"the cloud is {sizes[0]:.4g} mm across and the reference {sizes[1]:.4g}: is that in metres? Give `unit` m"
         )
     if sizes[1] > 1000 * _OTHER_UNIT * sizes[0]:
         raise EvaluationError(f"the cloud is {sizes[0]:.4g} mm across, the reference {sizes[1]:.4g} mm: is it in mm?")

@@ -8,7 +8,7 @@ triangles, and the vertices are then moved onto their own patches.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
@@ -20,8 +20,9 @@ from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.fitting.local_surface import LocalSurface, SurfacePoints, surface_normals
 from uwlts.fitting.point_spacing import disc_of
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud, images_along, variance_along
-from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.cloud_files import loaded_cloud
 from uwlts.storage.mesh_file import SurfaceMesh
 
 _BLOCK = 48
@@ -44,10 +45,10 @@ def mesh(
     *clouds: PointCloud | str | os.PathLike[str],
     cube_mm: float | None = None,
     radius_mm: float | None = None,
-    towards: Sequence[Sequence[float]] | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    towards: Sequence[tuple[float, float, float]] | None = None,
+    progress: ProgressListener = unheard,
 ) -> SurfaceMesh:
-    """Make a mesh from one or several clouds of one frame.
+    """Make a mesh from one or several clouds of one frame, open where nothing was seen, with uncertainty.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ def mesh(
         Radius of the patches over which points are averaged: holes that are much smaller are closed. For some thirty
         points, and three images, unless given.
     towards
-        Direction from the surface to the sensor for each cloud; -Z turned as its scan was, unless given.
+        Direction x y z from the surface to the sensor, once for each cloud; -Z turned as its scan was, unless given.
     progress
         Called with the number of places done and the number in all.
 
@@ -80,14 +81,14 @@ def mesh(
     Examples
     --------
     >>> surface = uwlts.mesh("left.ply", "right.ply")
-    >>> uwlts.write_mesh("pipe.glb", surface)
+    >>> surface.save("pipe.glb")
     """
     for name, length in (("cube_mm", cube_mm), ("radius_mm", radius_mm)):
         if length is not None and not 0 < length < np.inf:
             raise EvaluationError(f"{name} is {length:g}; expected a positive length in mm")
     if not clouds:
         raise EvaluationError("a mesh needs at least one cloud")
-    read = [each if isinstance(each, PointCloud) else read_cloud(each) for each in clouds]
+    read = [loaded_cloud(each) for each in clouds]
     if towards is not None and (np.shape(towards) != (len(read), 3) or not np.all(np.linalg.norm(towards, axis=1) > 0)):
         raise EvaluationError(f"there are {len(read)} clouds: expected a direction of three numbers for each")
     scans = [
@@ -209,9 +210,7 @@ def _corners_near(cells: np.ndarray) -> np.ndarray:
     return np.stack(np.unravel_index(keys, tuple(shape)), axis=1) - 3
 
 
-def _distances(
-    surface: LocalSurface, places: np.ndarray, progress: Callable[[int, int], None]
-) -> tuple[np.ndarray, np.ndarray]:
+def _distances(surface: LocalSurface, places: np.ndarray, progress: ProgressListener) -> tuple[np.ndarray, np.ndarray]:
     """Signed distances (P,) of places from the surface, positive outside, and where they are known."""
     distance, known = np.zeros(len(places)), np.zeros(len(places), bool)
     for start in range(0, len(places), _PLACES_AT_A_TIME):

@@ -142,20 +142,21 @@ def record_guided(
     Parameters
     ----------
     plan : GuidedPlan or path of a TOML file
+        What is recorded, and with what (docs/how-to/calibrate-live.md).
     out : str or Path
         The calibration; captures are called like it, with ``-target.h5`` and ``-step.h5``.
     camera : str, optional
-        Address of the camera, in place of the plan's.
+        Guided: address of the camera, in place of the plan's.
     stage : str, optional
-        Serial port of the stage, in place of the plan's.
+        Guided: serial port of the stage, in place of the plan's.
     port : int
-        Port of the page for the browser; the next free one is taken if it is in use.
+        Guided: port of the page for the browser; the next free one is taken if it is in use.
     refractions, distortion
         As the calibration is going to be made; see `calibrate`.
     resume : bool
-        Continue with what is recorded, also with a finished capture of the target that is not enough.
+        Guided: continue with what is recorded, also with a finished capture of the target that is not enough.
     overwrite : bool
-        Replace earlier recordings; without effect with ``resume``.
+        Replace existing files; guided, and without ``resume``, earlier captures too.
     report : callable, optional
         Called with lines of text for the operator, who answers on standard input or on the page.
 

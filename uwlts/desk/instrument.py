@@ -24,7 +24,7 @@ from uwlts.desk.guided import BoardScreen, Ended, darken
 from uwlts.desk.laser_switch import LaserSwitch
 from uwlts.desk.recording_view import RecordingView
 from uwlts.errors import DescriptionError, Error, HardwareError
-from uwlts.files.command_files import own_files
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.camera_addresses import open_camera
 from uwlts.hardware.camera_interface import CameraDevice
@@ -37,7 +37,7 @@ from uwlts.hardware.scanning import check_camera, record_scan
 from uwlts.model.any_calibration import AnyCalibration
 from uwlts.model.sensor import Sensor
 from uwlts.report.inventory import calibration_lines
-from uwlts.storage.calibration_file import load_calibration, write_calibration
+from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture, Frame, part_path, picture_of
 
 _PREVIEW_S = 0.15
@@ -196,7 +196,7 @@ class Instrument:
 
     def _do(self, work: Callable[[], None]) -> None:
         try:
-            with own_files():
+            with inputs_kept():
                 work()
         except Ended:
             self._board.say("stopped")
@@ -374,7 +374,7 @@ class Instrument:
                 for number in range(0, len(earlier), -(-len(earlier) // _EARLIER) or 1):
                     view.see(earlier[number], number)
 
-        def progress(done: int, total: int) -> None:
+        def progress(done: int, total: int, stage: str = "") -> None:
             begun[:] = begun or [done - 1]
             board.count(done, total, before=begun[0])
             self._show_laser()
@@ -430,7 +430,7 @@ class Instrument:
         found = calibrate(
             air=recording.air, water=recording.water, step=recording.step, poses=recording.poses, refractions=2
         )
-        write_calibration(out, found, overwrite=overwrite)
+        found.save(out, overwrite=overwrite)
         for line in calibration_lines(found):
             board.say(line)
         for warning in found.origin().warnings:

@@ -23,7 +23,6 @@ from uwlts.desk.instrument import Instrument, InstrumentState
 from uwlts.desk.server import DeskServer
 from uwlts.desk.thinned_cloud import table_of
 from uwlts.errors import DescriptionError, Error
-from uwlts.files.command_files import own_files
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.hardware.guided.plan import load_guided_plan
 from uwlts.hardware.scan_plan import ScanPlan, StagePlan, load_plan
@@ -53,21 +52,24 @@ class _Opened:
 
 
 def serve_desk(
-    folder: str | Path = Path(),
+    folder: str | Path = ".",
     *,
     plan: str | Path | None = None,
     host: str = "127.0.0.1",
     port: int = 8080,
     report: Callable[[str], None] = print,
 ) -> None:
-    """Serve the operator's page until Ctrl-C: connect, look, move, scan, reconstruct and measure in a browser.
+    """Serve the operator's page until Ctrl-C: connect, look, calibrate, scan, reconstruct and measure in a browser.
+
+    The address with the token is the operator's; at the other one everybody who reaches it may look. The page works
+    without internet.
 
     Parameters
     ----------
     folder : str or Path
-        Folder with plans, calibrations, captures and clouds; results are written there.
+        Folder with plans, calibrations, captures and clouds; the present one unless given. Results are written there.
     plan : str or Path, optional
-        Plan of a scan to begin with, with the addresses of camera and stage.
+        Plan of a scan (docs/how-to/scan.md) to begin with; others can be chosen on the page.
     host : str
         Address at which the page is served; the default can be reached from this machine only.
     port : int
@@ -140,7 +142,7 @@ class _Desk:
             paths.append(self.plan_path)
         found = {}
         for path in paths:
-            with suppress(Error), own_files():
+            with suppress(Error):
                 load(path)
                 found[str(path)] = path.name
         return found
@@ -244,10 +246,9 @@ class _OperatorPage:
 
         async def pressed() -> None:
             try:
-                with own_files():
-                    done = press()
-                    if isinstance(done, Awaitable):
-                        await done
+                done = press()
+                if isinstance(done, Awaitable):
+                    await done
             except Error as error:
                 self._board.say(str(error), "error")
                 ui.notify(str(error), type="negative", multi_line=True, timeout=10_000)
@@ -300,8 +301,7 @@ class _OperatorPage:
         if not self._plan.value or Path(self._plan.value) == self._desk.plan_path:
             return
         try:
-            with own_files():
-                plan = load_plan(Path(self._plan.value))
+            plan = load_plan(Path(self._plan.value))
         except Error as error:
             self._board.say(str(error), "error")
             return
@@ -439,8 +439,7 @@ class _OperatorPage:
     def _list(self) -> None:
         """Bring the list of files and the choices up to date where the folder has changed."""
         try:
-            with own_files():
-                files = listed(self._desk.folder)
+            files = listed(self._desk.folder)
         except Error as error:
             self._board.say(str(error), "error")
             return

@@ -134,14 +134,16 @@ def watch(
     port: int = 8080,
     report: Callable[[str], None] = print,
 ) -> None:
-    """Show a recording while it grows, in a browser, until Ctrl-C.
+    """Show a recording while it grows, in a browser: the latest image with its stripe, and the cloud so far.
+
+    It ends by Ctrl-C.
 
     Parameters
     ----------
     capture : str or Path
         Capture that is being recorded, or is to be.
     calibration : Calibration, PolynomialCalibration or path, optional
-        Calibration of the sensor, for the cloud.
+        Calibration of the sensor, or one by polynomials, for the cloud.
     host : str
         Address at which the page is served; the default can be reached from this machine only.
     port : int

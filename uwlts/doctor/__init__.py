@@ -10,27 +10,28 @@ from pathlib import Path
 
 from uwlts.doctor import devices, machine
 from uwlts.doctor.machine import Finding, print_findings
+from uwlts.runtime.progress import ProgressListener, unheard
 
 __all__ = ["Finding", "examine", "print_findings"]
 
 
 def examine(
-    folder: Path = Path(),
-    *,
-    camera: str | None = None,
-    stage: str | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    folder: Path = Path(), *, camera: str | None = None, stage: str | None = None, progress: ProgressListener = unheard
 ) -> list[Finding]:
-    """Examine the machine; takes about ten seconds.
+    """Examine libraries, libLLVM, cameras, serial ports, permissions and speed of this machine, with advice.
+
+    It takes about ten seconds.
 
     Parameters
     ----------
     folder
-        Where captures are to be written.
+        Where captures are to be written; 64 MB are, and removed.
     camera
-        Address of a camera to open and take ten frames with. Its trigger is switched off, its whole image read out.
+        Address of a camera to take ten frames with: gige:NAME, genicam:PRODUCER.cti or replay:PATH. Its trigger is
+        switched off, its whole image read out.
     stage
-        Serial port of a stage to talk to. Opening it restarts an Arduino Uno: home before the next scan.
+        Serial port of a stage to ask for its version, settings and state. It is not moved and the laser stays off, but
+        an Arduino Uno restarts: home before the next scan.
     progress
         Called with the number of parts that are done and of all parts.
     """

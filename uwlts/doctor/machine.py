@@ -160,7 +160,7 @@ def examine_renderer() -> list[Finding]:
     said = asked.stderr.strip().splitlines() or [f"it ended with status {asked.returncode}"]
     # An own error says most in its first line, a traceback in its last.
     reason = said[0].removeprefix("error: ") if said[0].startswith("error: ") else said[-1]
-    advice = f"only for rendering by the twin:\n{shlex.join(command)} --install"
+    advice = f"only for rendering by the twin; how to install it says\n{shlex.join(command)}"
     return [Finding("libLLVM", "warning", f"the twin cannot render: {reason}", advice)]
 
 

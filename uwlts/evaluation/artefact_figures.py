@@ -16,12 +16,16 @@ from uwlts.fitting.shapes import CylinderFit, FlatFit, fit_cylinder, fit_plane
 from uwlts.model.artefacts import Artefact, PipeStandard, PlaneStandard, SphereStandard, StepStandard
 from uwlts.storage.cloud import PointCloud
 
-# A larger share of outliers is another surface; a diameter that differs by more is another pipe.
-_MOST_REJECTED, _DIAMETER_TOLERANCE = 0.1, 0.2
-# Arc in rad that must be seen for the ovality, counted in sectors of 5 deg.
-_LEAST_ARC, _SECTORS = np.pi, 72
-# Points on each face for the height of one profile; a line through fewer is uncertain by its own noise.
+_MOST_REJECTED = 0.1
+"""Share of outliers: a larger one is another surface."""
+_DIAMETER_TOLERANCE = 0.2
+"""Relative error of a diameter: one that differs by more is another pipe's."""
+_LEAST_ARC = np.pi
+"""Arc, rad, that must be seen for the ovality."""
+_SECTORS = 72
+"""Sectors of 5 deg, in which the arc is counted."""
 _LEAST_OF_PROFILE = 5
+"""Points on each face for the height of one profile; a line through fewer is uncertain by its own noise."""
 
 _fit_facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
 

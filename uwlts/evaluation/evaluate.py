@@ -14,6 +14,7 @@ from uwlts.evaluation.figures import ArtefactEvaluation, Figure, FigureKey, Quan
 from uwlts.evaluation.truth_comparison import TruthComparison, best_fit_motion, compare_with_truth
 from uwlts.files.json_files import read_model, write_model
 from uwlts.model.artefacts import Artefact, parse_artefact, read_artefact
+from uwlts.model.brief import Brief
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.storage.truth import Truth, read_truth
@@ -106,8 +107,8 @@ class EvaluationRecord(_Stored):
         return {key: value for key, value in plain(self).items() if key in self.model_fields_set}
 
 
-@dataclass(frozen=True, eq=False)
-class Evaluation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Evaluation(Brief):
     """Result of `evaluate`.
 
     Attributes
@@ -196,6 +197,10 @@ class Evaluation:
                 f"the metadata of the cloud {self.source} is not valid: {problems_of(error)}"
             ) from error
 
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the evaluation as indented JSON, whole or not at all; OutputError if that fails."""
+        write_model(path, self.record(), format=FORMAT, version=VERSION, overwrite=overwrite)
+
 
 def compared_with_truth(cloud: PointCloud, truth: Truth) -> TruthComparison:
     """Distances of a cloud's points to the true surface; EvaluationError where truth and cloud do not match."""
@@ -217,14 +222,14 @@ def evaluate(
     *,
     source: str | None = None,
 ) -> Evaluation:
-    """Compare a cloud with its artefact's calibrated sizes and, point by point, with ground truth.
+    """Compare a cloud with its artefact's calibrated values, and point by point with ground truth.
 
     Parameters
     ----------
     cloud : PointCloud or path
-        Points in the object coordinate system (OCS), mm.
+        Point cloud (.ply or .h5) in the object coordinate system (OCS), mm.
     artefact : Artefact, dict or path of a TOML file, optional
-        Kind and calibrated values; the one that the cloud's capture names unless given.
+        TOML file with the artefact's kind and calibrated values, in place of those in the capture.
     truth : Truth or path, optional
         Ground truth of the capture, if it was rendered.
     source : str, optional
@@ -251,7 +256,7 @@ def evaluate(
         truth = read_truth(truth)[1]
     if artefact is None and truth is None:
         raise EvaluationError(
-            "nothing to judge by: the capture names no artefact (give --artefact) and there is no truth file (--truth)"
+            "nothing to judge by: the capture names no artefact (give `artefact`) and there is no truth file (`truth`)"
         )
     compared = fitted = None
     if truth is not None:
@@ -269,11 +274,6 @@ def evaluate(
         deviation = found.deviation_mm
     name = source or str(cloud.metadata.get("capture", ""))
     return Evaluation(name, replace(cloud, deviation_mm=deviation), found, figures, compared, fitted)
-
-
-def write_evaluation(path: str | Path, evaluation: Evaluation, *, overwrite: bool = False) -> None:
-    """Write an evaluation as indented JSON, whole or not at all; OutputError where that fails."""
-    write_model(path, evaluation.record(), format=FORMAT, version=VERSION, overwrite=overwrite)
 
 
 def read_evaluation(path: str | Path) -> EvaluationRecord:

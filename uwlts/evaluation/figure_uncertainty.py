@@ -7,20 +7,21 @@ import numpy as np
 from uwlts.evaluation.artefact_figures import evaluate_cloud
 from uwlts.evaluation.figures import ArtefactEvaluation, FigureUncertainty, spread_mm
 from uwlts.evaluation.spheres import SphereEvaluation
+from uwlts.fitting.propagation import PointErrors, noise_mm
 from uwlts.fitting.shapes import fit_sphere
-from uwlts.storage.cloud import PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.cloud import PointCloud
 
-# The standard deviation of so many is right to 27 % and to 10 %.
-_DRAWS, _QUICK_DRAWS = 8, 50
-_SEED = 635
+_DRAWS = 8
+"""Draws for which the cloud is evaluated again: their standard deviation is right to 27 %."""
+_QUICK_DRAWS = 50
+"""Draws for spheres, whose fits follow the points linearly: their standard deviation is right to 10 %."""
 
 
 def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> dict[str, FigureUncertainty]:
     """Uncertainty of the figures of an evaluation of a cloud; nothing where the cloud's points have none.
 
-    Figures are calculated again with each pattern of the calibration added to the points; the squares of their changes
-    add up (GUM, section 5.1, with independent inputs). For the noise they are calculated with noise drawn anew
-    (GUM Supplement 1). Spheres are not searched for again. EvaluationError as `evaluate_cloud`.
+    Figures are calculated again with each pattern of the calibration added to the points, and with noise drawn anew
+    (`PointErrors.propagate`). Spheres are not searched for again. EvaluationError as `evaluate_cloud`.
     """
     if (uncertainty := cloud.uncertainty) is None:
         return {}
@@ -34,26 +35,12 @@ def figure_uncertainties(cloud: PointCloud, evaluation: ArtefactEvaluation) -> d
             figures = evaluate_cloud(replace(cloud, points_mm=cloud.points_mm + by), evaluation.artefact).figures_mm
         return np.array([figures[name] - value for name, value in plain.items()])
 
-    systematic = [changed(pattern) for pattern in uncertainty.patterns_mm]
-    rng, along = np.random.default_rng(_SEED), noise_mm(uncertainty)
-    images, image = np.unique(cloud.frame, return_inverse=True)
-    by_image, drawn = uncertainty.by_image_mm(), []
-    for _ in range(_DRAWS if spheres is None else _QUICK_DRAWS):
-        together = drawn_by_image(rng, by_image, image, len(images))
-        drawn.append(changed(rng.standard_normal((len(cloud), 1)) * along + together))
-    by_calibration = np.sqrt(np.sum(np.square(systematic), axis=0))
-    by_noise = np.std(drawn, axis=0, ddof=1)
+    draws = _DRAWS if spheres is None else _QUICK_DRAWS
+    by_noise, by_calibration = PointErrors.of(uncertainty, cloud.frame).propagate(changed, draws=draws)
+    assert by_calibration is not None
     return {
         name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(plain, by_noise, by_calibration, strict=True)
     }
-
-
-def drawn_by_image(rng: np.random.Generator, by_image_mm: np.ndarray, image: np.ndarray, images: int) -> np.ndarray:
-    """Moves (N, 3) of the points of ``image`` (N,) by parts (K, N, 3) that are drawn anew for each of the images."""
-    moved = np.zeros(by_image_mm.shape[1:])
-    for part in by_image_mm:
-        moved += rng.standard_normal((images, 1))[image] * part
-    return moved
 
 
 def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
@@ -71,18 +58,6 @@ def shift_std_mm(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
     ]
     moved = np.vstack([together, *by_image, noise_mm(uncertainty)[used]])
     return np.sqrt(np.sum(moved**2, axis=0)) / count
-
-
-def noise_mm(uncertainty: PointUncertainty) -> np.ndarray:
-    """Motion (N, 3) of each point for one standard deviation of its stripe centre; of either sign."""
-    covariance = np.zeros((len(uncertainty.random_mm2), 3, 3))
-    for column, (i, j) in enumerate(PAIRS):
-        covariance[:, i, j] = covariance[:, j, i] = uncertainty.random_mm2[:, column]
-    # The covariance is v v^T: its column with the largest element on the diagonal is v times that of v.
-    largest = np.argmax(np.einsum("nii->ni", covariance), axis=1)
-    rows = np.arange(len(covariance))
-    size = np.sqrt(covariance[rows, largest, largest])[:, None]
-    return np.divide(covariance[rows, largest], size, out=np.zeros((len(rows), 3)), where=size > 0)
 
 
 class _MovedFit:

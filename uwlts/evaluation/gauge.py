@@ -13,13 +13,18 @@ import numpy as np
 from scipy.stats import f as f_distribution, t as t_distribution
 
 from uwlts.errors import DescriptionError, EvaluationError
+from uwlts.files.json_files import RecordFile
 from uwlts.files.reading import read_bytes
+from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 
 _MOST_BYTES = 64 * 2**20
 _POOLED_ABOVE = 0.25
 """Probability of the interaction's F from which AIAG takes it for noise and pools it with the repeatability."""
-_DRAWS, _SEED = 20_000, 7
+_DRAWS = 20_000
+"""Draws of the mean squares: five hundred are beyond either end of a 95 % interval."""
+_SEED = 7
+"""Of the draws, so that the same study has the same intervals."""
 _SIGMAS = 6.0
 """Width of a process in standard deviations, as in %P/T (AIAG, Measurement Systems Analysis, 4th ed., ch. III-B)."""
 _DISTINCT = 1.41
@@ -50,8 +55,8 @@ class Variance:
     probability: float | None
 
 
-@dataclass(frozen=True)
-class GaugeStudy:
+@dataclass(frozen=True, repr=False)
+class GaugeStudy(Brief, RecordFile):
     """A crossed study: every operator measures every part equally often.
 
     ``components`` by their names: repeatability (EV), reproducibility (AV, with the interaction), gauge (GRR), parts
@@ -87,8 +92,8 @@ class GaugeStudy:
         return [*lines, f"distinct categories       {self.distinct}"]
 
 
-@dataclass(frozen=True)
-class RepeatedReference:
+@dataclass(frozen=True, repr=False)
+class RepeatedReference(Brief, RecordFile):
     """One part of known size measured again and again (type-1 study).
 
     ``bias`` is the mean less the reference, significant where its 95 % interval does not hold 0. With a tolerance T:
@@ -126,7 +131,7 @@ def gauge_study(
     tolerance: float | None = None,
     reference: float | None = None,
 ) -> GaugeStudy | RepeatedReference:
-    """Judge a gauge by repeated measurements of one figure.
+    """Judge a gauge by repeated measurements of a figure: repeatability, reproducibility, share of a tolerance.
 
     Several parts and operators, each part measured by each operator equally often, make a crossed study by analysis of
     variance with random effects (AIAG, Measurement Systems Analysis, 4th ed., chapter III-B and appendix A); an
@@ -142,7 +147,7 @@ def gauge_study(
     tolerance
         Width of the tolerance, in the unit of the values.
     reference
-        True value of the only part.
+        True value of the only part: a type-1 study with Cg and Cgk.
 
     Raises
     ------

@@ -10,22 +10,41 @@ from scipy.spatial.distance import cdist
 
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR, ArtefactEvaluation, FigureId, Quantity, spread_mm
-from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD, RobustFit, fit_robustly
+from uwlts.fitting.least_squares import DEFAULT_K, RobustFit, fit_robustly, robust_std
 from uwlts.fitting.shapes import SphereFit, fit_sphere
 from uwlts.model.artefacts import SphereStandard
 
 LEAST_POINTS = 50
 """A sphere is judged by at least so many points."""
 
-# Shares of the known radius: band in which support is counted, limits of the band of points, and the largest error of
-# a fitted radius by which points are still taken for the sphere's.
-_SEARCH_LIMIT, _LARGEST_LIMIT, _SMALLEST_LIMIT, _RADIUS_TOLERANCE = 0.05, 0.1, 1e-4, 0.1
-# Cells, in radii: of the patches in which other surfaces are noticed, and of the thinning.
-_CELL, _THINNING = 0.12, 1 / 15
-# Points and proposed centres that are judged; more take longer without finding more.
-_THINNED, _SCREENED, _SEEDS, _KEPT, _ATTEMPTS = 4000, 1000, 2000, (150, 8), 3
-# Least number and share of points beyond the limit, where noise alone puts 6 in ten million.
-_OUTER_SHARE, _OUTER_COUNT = 0.1, 2
+_SEARCH_LIMIT = 0.05
+"""Half width, in radii, of the band in which the points of a proposed sphere are counted."""
+_LARGEST_LIMIT = 0.1
+"""Largest limit, in radii, of the band of a sphere's points."""
+_SMALLEST_LIMIT = 1e-4
+"""Smallest limit, in radii: exact points have no scatter."""
+_RADIUS_TOLERANCE = 0.1
+"""Error of a fitted radius, relative to the known one, within which points are the sphere's."""
+_CELL = 0.12
+"""Cells, in radii, in which other surfaces are noticed."""
+_THINNING = 1 / 15
+"""Cells, in radii, of which one point each is kept for the search."""
+_THINNED = 4000
+"""Points on which centres are judged; more take longer without finding more."""
+_SCREENED = 1000
+"""Points of the first screening."""
+_SEEDS = 2000
+"""Centres that are proposed."""
+_KEPT_OF_SCREENING = 150
+"""Centres that remain after the screening."""
+_KEPT = 8
+"""Centres that are refined."""
+_ATTEMPTS = 3
+"""Searches, each with other seeds."""
+_OUTER_SHARE = 0.1
+"""Share of a cell's points beyond the limit that shows another surface; noise puts 6 in ten million there."""
+_OUTER_COUNT = 2
+"""Number of such points, at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +108,7 @@ def _best_centre(points: np.ndarray, radius: float, rng: np.random.Generator) ->
 
     if not len(centres):
         return None
-    centres = best(best(centres, points[:_SCREENED], _KEPT[0]), points, _KEPT[1])
+    centres = best(best(centres, points[:_SCREENED], _KEPT_OF_SCREENING), points, _KEPT)
     return best(np.array([_refined_centre(points, centre, radius) for centre in centres]), points, 1)[0]
 
 
@@ -143,7 +162,7 @@ def _accepted(points: np.ndarray, usable: np.ndarray, centre: np.ndarray, radius
         if abs(fit.radius_mm - radius) > _RADIUS_TOLERANCE * radius:
             return None
         centre, distances, last = fit.centre_mm, fit.distances_mm(points), limit
-        spread = MAD_TO_STD * float(np.median(np.abs(fit.residuals_mm - np.median(fit.residuals_mm))))
+        spread = robust_std(fit.residuals_mm - np.median(fit.residuals_mm))
         limit = min(max(DEFAULT_K * spread, _SMALLEST_LIMIT * radius), _LARGEST_LIMIT * radius)
         if abs(limit - last) <= 0.05 * last:
             break

@@ -11,15 +11,28 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import DEFAULT_K, MAD_TO_STD, accepted_points, evenly_thinned, principal_axes
+from uwlts.fitting.least_squares import DEFAULT_K, accepted_points, evenly_thinned, principal_axes, robust_std
 from uwlts.fitting.shapes import fit_line, fit_plane
 from uwlts.runtime.compiled import compiled
 
-# Shares of the height: band in which support is counted, error of the described height, limits of a face's band, and
-# the largest standard deviation of a face: a slope that fills the widest band has 0.17.
-_SEARCH_LIMIT, _HEIGHT_TOLERANCE, _LIMITS, _LARGEST_STD = 0.05, 0.25, (0.01, 0.3), 0.125
-# Pairs (triples) of points tried, points on which they are judged, least share of these on a face, and refinements.
-_PROPOSALS, _THINNED, _SMALLEST_FACE, _ROUNDS = 500, 800, 0.02, 5
+_SEARCH_LIMIT = 0.05
+"""Half width, in step heights, of the band in which the points of a proposed face are counted."""
+_HEIGHT_TOLERANCE = 0.25
+"""Error of the described height, relative to it."""
+_SMALLEST_LIMIT = 0.01
+"""Smallest limit, in step heights, of the band of a face."""
+_LARGEST_LIMIT = 0.3
+"""Largest limit, in step heights: the bands of both faces stay apart."""
+_LARGEST_STD = 0.125
+"""Standard deviation of a face, in step heights: a slope that fills the widest band has 0.17."""
+_PROPOSALS = 500
+"""Pairs (triples) of points that are tried."""
+_THINNED = 800
+"""Points on which they are judged."""
+_SMALLEST_FACE = 0.02
+"""Least share of these on a face."""
+_ROUNDS = 5
+"""Refinements of the best proposal."""
 
 
 class StepFace(IntEnum):
@@ -186,6 +199,6 @@ def _near_level(heights: np.ndarray, level: float, height: float) -> np.ndarray:
         if not len(near):
             break
         level = float(np.median(near))
-        spread = MAD_TO_STD * float(np.median(np.abs(near - level)))
-        limit = float(np.clip(DEFAULT_K * spread, _LIMITS[0] * height, _LIMITS[1] * height))
+        spread = robust_std(near - level)
+        limit = float(np.clip(DEFAULT_K * spread, _SMALLEST_LIMIT * height, _LARGEST_LIMIT * height))
     return np.abs(heights - level) <= limit

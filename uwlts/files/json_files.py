@@ -1,6 +1,7 @@
 """Files of JSON: one object, whose "format" and "version" say what it is; how two of them differ."""
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TypeVar
@@ -82,6 +83,18 @@ def write_record(path: str | Path, record: object, *, overwrite: bool) -> None:
     """Write the record of a result as indented JSON, whole or not at all; OutputError where that fails."""
     with written_aside(path, overwrite=overwrite) as aside:
         aside.write_text(json_text(record, indent=1), encoding="utf-8")
+
+
+class RecordFile(ABC):
+    """Result whose record is written as JSON."""
+
+    @abstractmethod
+    def record(self) -> object:
+        """The result as JSON."""
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the record as indented JSON, whole or not at all; OutputError if that fails."""
+        write_record(path, self.record(), overwrite=overwrite)
 
 
 def differences(there: object, now: object) -> str:

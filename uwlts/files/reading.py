@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from uwlts.errors import CaptureError, Error
-from uwlts.files.command_files import note_input
+from uwlts.files.inputs import note_input
 
 if TYPE_CHECKING:
     from pydantic import JsonValue
@@ -67,44 +67,31 @@ def opened(
 ) -> Iterator[BufferedReader]:
     """A context with a regular file, opened for reading bytes.
 
-    It is an input of the running command: OutputError where that is to write it.
+    It is an input of the running work, whose outputs do not replace it.
     ``error`` where it is missing, unreadable, no regular file (a pipe or device would block), larger than
     ``most_bytes``, or its name is too long or holds a null character. ``called`` is what it should be.
     """
-    note_input(path)
+    cannot = f"cannot read the {called} {_shown(path)}"
     try:
-        # Without waiting for a writer, should it be a pipe.
-        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+        found = os.stat(path)
     except FileNotFoundError as problem:
         raise error(f"no {called} at {_shown(path)}") from problem
     except OSError as problem:
-        raise error(f"cannot read the {called} {_shown(path)}: {problem.strerror}") from problem
+        raise error(f"{cannot}: {problem.strerror}") from problem
     except ValueError as problem:
-        raise error(f"cannot read the {called} {_shown(path)}: no file can have this name") from problem
-    with os.fdopen(descriptor, "rb") if _is_regular(descriptor) else _closed(descriptor) as file:
-        if file is None:
-            kind = "it is a directory" if os.path.isdir(path) else "it is no regular file, but a pipe or device"
-            raise error(f"cannot read the {called} {_shown(path)}: {kind}")
-        size = os.fstat(file.fileno()).st_size
-        if most_bytes is not None and size > most_bytes:
-            raise error(
-                f"the {called} {_shown(path)} has {size / MiB:,.1f} MiB; this program reads up to "
-                f"{most_bytes / MiB:,.1f} MiB"
-            )
-        try:
+        raise error(f"{cannot}: no file can have this name") from problem
+    if not stat.S_ISREG(found.st_mode):
+        is_folder = stat.S_ISDIR(found.st_mode)
+        raise error(f"{cannot}: it is {'a directory' if is_folder else 'no regular file, but a pipe or device'}")
+    if most_bytes is not None and found.st_size > most_bytes:
+        sizes = f"{found.st_size / MiB:,.1f} MiB; this program reads up to {most_bytes / MiB:,.1f} MiB"
+        raise error(f"the {called} {_shown(path)} has {sizes}")
+    note_input(path)
+    try:
+        with open(path, "rb") as file:
             yield file
-        except OSError as problem:
-            raise error(f"cannot read the {called} {_shown(path)}: {problem.strerror or problem}") from problem
-
-
-def _is_regular(descriptor: int) -> bool:
-    return stat.S_ISREG(os.fstat(descriptor).st_mode)
-
-
-@contextmanager
-def _closed(descriptor: int) -> Iterator[None]:
-    os.close(descriptor)
-    yield None
+    except OSError as problem:
+        raise error(f"{cannot}: {problem.strerror or problem}") from problem
 
 
 def _shown(path: str | Path) -> str:
@@ -208,7 +195,7 @@ def require_plain(content: Content, *, finite: bool = True) -> Content:
 
 
 def _place_of(wanted: object, content: object) -> str:
-    """The keys and numbers that lead to a value."""
+    """Return the keys and numbers that lead to a value."""
     waiting: list[tuple[object, str]] = [(content, "")]
     while waiting:
         each, place = waiting.pop()

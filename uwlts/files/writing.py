@@ -1,23 +1,39 @@
-"""Files that appear whole or not at all: outputs are written beside their place, flushed to the disk, then renamed."""
+"""Outputs: they appear whole or not at all, replace nothing unless asked, and have one writer at a time.
 
+An output is written beside its place, flushed to the disk, then renamed. Its lock is advisory (flock), on the hidden
+file ``.NAME.lock`` beside it, so that it also holds between machines that share the folder. The system ends the lock
+with the process, however that ends; what a killed process leaves of it the next writer takes over. On systems and file
+systems without flock nothing is locked.
+"""
+
+import atexit
 import errno
 import hashlib
 import os
 import secrets
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from functools import partial
+import socket
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from uwlts.errors import OutputError
-from uwlts.files.command_files import hold_until_end, note_made, refuse_input
-from uwlts.files.one_writer import one_writer
+from uwlts.files.inputs import hold_until_end, note_made, refuse_input
 from uwlts.files.reading import opened, shortened
-from uwlts.files.unfinished import unfinished
+
+try:
+    import fcntl
+except ImportError:
+    fcntl = None
 
 _PATIENCE_S = 10.0
 """How long a file that another process writes is waited for at the end of the work; results are written in less, and
 several machines may write those of one sweep."""
+_AGAIN_S = 0.05
+
+
+class OtherWriterError(OutputError):
+    """Another process is writing the same output."""
 
 
 @contextmanager
@@ -34,19 +50,11 @@ def written_aside(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     require_possible_name(Path(path))
     target = Path(os.path.realpath(path))
     _require_suitable(target, overwrite=overwrite)
-    with one_writer(target, patience_s=_PATIENCE_S):
-        yield from _aside(target, overwrite=overwrite)
-
-
-def _aside(target: Path, *, overwrite: bool) -> Iterator[Path]:
     aside = target.parent / f".{secrets.token_hex(8)}{target.suffix}"
-    with unfinished(aside, partial(aside.unlink, missing_ok=True)):
+    with one_writer(target, patience_s=_PATIENCE_S), _unfinished(aside, lambda file: file.unlink(missing_ok=True)):
         try:
             # Not tempfile: its files are private (mode 0600), and the finished one would stay so.
             os.close(os.open(aside, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-        except OSError as error:
-            raise OutputError(_cannot_write(target, error)) from error
-        try:
             yield aside
             _flush(aside, os.O_RDWR)
             _require_suitable(target, overwrite=overwrite)
@@ -67,7 +75,7 @@ def refuse_unsuitable(target: Path, *, overwrite: bool, endings: Sequence[str] =
     """
     _require_suitable(target, overwrite=overwrite)
     require_ending(target, endings)
-    hold_until_end(Path(os.path.realpath(target)), one_writer)
+    hold_until_end(one_writer(target))
 
 
 def require_ending(target: Path, endings: Sequence[str]) -> None:
@@ -87,7 +95,7 @@ def _require_suitable(target: Path, *, overwrite: bool) -> None:
         raise OutputError(f"cannot write {target}: it exists and is not a regular file; choose another name")
     refuse_input(target)
     if target.exists() and not overwrite:
-        raise OutputError(f"{target} exists already; give another name, or --overwrite to replace it")
+        raise OutputError(f"{target} exists already; give another name, or `overwrite` to replace it")
 
 
 def require_possible_name(target: Path) -> None:
@@ -125,3 +133,101 @@ def sha256_of(path: str | Path) -> str:
     """Hash of a file in hexadecimal; CaptureError where it cannot be read."""
     with opened(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+_locks: dict[Path, int] = {}
+"""Descriptors of the locks that this process has, or is about to have."""
+
+
+@contextmanager
+def one_writer(target: Path, *, patience_s: float = 0.0) -> Iterator[None]:
+    """Be the only process that writes a file; OtherWriterError where another one still does after ``patience_s``."""
+    target = Path(os.path.realpath(target))
+    # No suffix of the output's, by which folders are searched.
+    path = target.with_name(f".{target.name.replace('.', '-')}.lock")
+    if fcntl is None or path in _locks:
+        yield
+        return
+    until = time.monotonic() + patience_s
+    with _unfinished(path, _unlock):
+        while not _lock(path):
+            # The one before may just have ended.
+            if time.monotonic() >= until and path.exists():
+                raise OtherWriterError(
+                    f"cannot write {target}: {_holder(path)} is writing it; wait until it ends, or give another name"
+                )
+            time.sleep(_AGAIN_S)
+        yield
+
+
+def _lock(path: Path) -> bool:
+    """Whether this process has a lock now; also where nothing can be locked, and writing will say why."""
+    try:
+        descriptor = _locks[path] = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
+    except OSError:
+        return True
+    if _is_locked(descriptor, path):
+        # A full disk has room for the lock, which is empty then.
+        with suppress(OSError):
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
+        return True
+    del _locks[path]
+    os.close(descriptor)
+    return False
+
+
+def _holder(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace") or "another process"
+    except OSError:
+        return "another process"
+
+
+def _unlock(path: Path) -> None:
+    """Remove a lock unless another process has it; harmless the second time."""
+    try:
+        # An interrupt may have come before it was noted.
+        descriptor = _locks[path] if path in _locks else os.open(path, os.O_RDWR)
+    except OSError:
+        return
+    if _is_locked(descriptor, path):
+        # Before it is unlocked: whoever waits for it then sees that it is gone.
+        path.unlink(missing_ok=True)
+    _locks.pop(path, None)
+    os.close(descriptor)
+
+
+def _is_locked(descriptor: int, path: Path) -> bool:
+    """Whether a lock is this process's now; not if the one before has removed its file between opening and locking."""
+    assert fcntl is not None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return os.path.samestat(os.fstat(descriptor), os.stat(path))
+    except (BlockingIOError, FileNotFoundError):
+        return False
+    except OSError:
+        return True
+
+
+_removals: dict[Path, Callable[[Path], None]] = {}
+
+
+@contextmanager
+def _unfinished(path: Path, remove: Callable[[Path], None]) -> Iterator[None]:
+    """Remove a file when the body, which makes it, ends; `remove_unfinished` does it where an interrupt prevents it."""
+    _removals[path] = remove
+    try:
+        yield
+    finally:
+        remove(path)
+        _removals.pop(path, None)
+
+
+@atexit.register
+def remove_unfinished() -> None:
+    """Remove locks and outputs that are not complete, at the end of a process that may be within a library's code."""
+    for path, remove in list(_removals.items()):
+        with suppress(OSError):
+            remove(path)
+    _removals.clear()

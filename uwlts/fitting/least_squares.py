@@ -1,4 +1,9 @@
-"""Common parts of all fits: accepted points, a checked solution with its covariance, and outliers by a stated rule."""
+"""Common parts of all fits: accepted points, a checked solution with its covariance, and robust weights.
+
+Outliers are handled in two ways. `fit_robustly` leaves points out by a stated rule, as a standard of acceptance needs
+it. `fit_biweight` lowers their weights, and `biweight` gives these weights to a registration, which matches its points
+anew in each round.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +16,10 @@ from uwlts.errors import EvaluationError
 
 MAD_TO_STD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
+
+TUKEY_BOUND = 4.685
+"""Bound of Tukey's biweight, in standard deviations: 95 % efficient for normal noise (Holland and Welsch,
+Communications in Statistics A 6, 1977)."""
 
 VDI_OUTLIER_SHARE = 0.003
 """VDI/VDE 2634 lets at most 3 permille of the points be left out."""
@@ -84,6 +93,57 @@ def fit_robustly(fit: Callable[[np.ndarray], FitT], points: Any, *, k: float = D
         if np.array_equal(within, inliers):
             return RobustFit(shape, inliers, distances, limit, rounds)
         inliers = within
+
+
+_STEADY = 1e-6
+"""Change of every weight that ends the re-weighting."""
+_MOST_REWEIGHTED = 50
+"""Re-weighted fits at most; each usually divides the changes by three to ten."""
+_DEPENDENT = 1e-12
+"""Eigenvalue of a normal matrix, relative to the largest, below which columns of a design depend on each other."""
+
+
+def robust_std(residuals: np.ndarray) -> float:
+    """Return the standard deviation of residuals (N,) about zero by their median absolute deviation."""
+    return MAD_TO_STD * float(np.median(np.abs(residuals)))
+
+
+def noise_factor(relative: np.ndarray) -> float:
+    """Return by how much residuals (N,), in their stated standard deviations, scatter more than stated; at least 1."""
+    return max(robust_std(relative), 1.0) if len(relative) else 1.0
+
+
+def biweight(relative: np.ndarray) -> np.ndarray:
+    """Return Tukey's biweight (N,) of residuals in standard deviations: 1 at zero, 0 beyond `TUKEY_BOUND`."""
+    return np.square(np.clip(1 - np.square(relative / TUKEY_BOUND), 0, None))
+
+
+def fit_biweight(design: np.ndarray, values: np.ndarray, counted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fit a linear model by least squares with Tukey's biweight, until its weights are steady.
+
+    Parameters
+    ----------
+    design, values : (N, K) and (N,)
+    counted : (N,) bool
+        Rows of the fit; the others have no weight.
+
+    Returns
+    -------
+    rows : (K, N)
+        Their product with ``values`` is the coefficients; to first order they propagate errors of the values.
+    weights : (N,)
+    """
+    weights, inverse = counted.astype(float), np.zeros((design.shape[1],) * 2)
+    # Rounding alone must not make outliers of exact values.
+    smallest = 1e-12 + 1e-12 * float(np.abs(values[counted]).max(initial=0.0))
+    for _ in range(_MOST_REWEIGHTED):
+        before, loaded = weights, (design * weights[:, None]).T
+        inverse = np.linalg.pinv(loaded @ design, rcond=_DEPENDENT, hermitian=True)
+        left = values - design @ (inverse @ (loaded @ values))
+        weights = counted * biweight(left / max(robust_std(left[counted]), smallest))
+        if np.abs(weights - before).max(initial=0.0) < _STEADY:
+            break
+    return inverse @ (design * weights[:, None]).T, weights
 
 
 # Singular values this much smaller than the largest one are rounding noise of coordinates of size one.

@@ -6,16 +6,17 @@ and its covariance says how much of a distance, and of a slope, is noise.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import MAD_TO_STD
-from uwlts.storage.cloud import PAIRS, PointUncertainty
+from uwlts.storage.cloud import PointUncertainty, variance_along
 
 _CELLS_PER_RADIUS = 3.0
 """Points are averaged in cubes of a third of the disc's radius: 28 of them fill a disc, enough for 6 coefficients."""
@@ -34,6 +35,11 @@ _SAME_WAY = 0.8
 """Cosine of 37 deg: surfaces that lie on each other have normals that differ by less."""
 _FACING = 0.15
 """Cosine of 81 deg: a sensor sees hardly anything of a surface that leans more."""
+
+LEAST_INFORMATION = 5.0
+"""Information about a movement relative to that which the noise of normals alone would give: with less it is open."""
+_ROUNDING = 1e-9
+"""Information relative to that on the best determined movement: less is rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,6 +240,10 @@ class PatchDistances:
     std_mm: np.ndarray
     slope_variance: np.ndarray
 
+    def __getitem__(self, selection: np.ndarray) -> PatchDistances:
+        """Some of the distances, by indices or a mask."""
+        return PatchDistances(*(values[selection] for values in vars(self).values()))
+
 
 def distances_between(
     source: Patches, source_pose: np.ndarray, target: Patches, target_pose: np.ndarray, *, reach_mm: float
@@ -278,14 +288,40 @@ def distances_between(
     )
 
 
+def rigid_derivatives(places_mm: np.ndarray, directions: np.ndarray, middle_mm: np.ndarray) -> np.ndarray:
+    """Return the motion (Q, 6) of places (Q, 3) along directions (Q, 3) by a shift, then a turn about a middle (3,)."""
+    return np.hstack([directions, np.cross(places_mm - middle_mm, directions)])
+
+
+def information_of_slopes(
+    normals: np.ndarray, noise: np.ndarray, derivatives: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Return the information (K, K) on movements that the noise of the normals alone would give.
+
+    ``noise`` (Q,) is the weight of each distance times the variance of the slope there. ``derivatives`` gives those
+    (Q, K) of the distances by the movements, for directions (Q, 3) instead of the normals (Q, 3).
+    """
+    across = np.cross(normals, np.eye(3)[np.argmin(np.abs(normals), axis=1)])
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    parts = (derivatives(directions) for directions in (across, np.cross(normals, across)))
+    return sum((by.T @ (noise[:, None] * by) for by in parts), np.zeros(()))
+
+
+def ways_of_moving(information: np.ndarray, of_slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the information (K,) on independent movements relative to that of the normals' noise, and the movements.
+
+    Movements are columns (K, K), orthonormal in the metric (K, K) that is returned, too. One with less than
+    `LEAST_INFORMATION` is open.
+    """
+    rounding = _ROUNDING / LEAST_INFORMATION * float(np.linalg.eigvalsh(information)[-1])
+    metric = of_slopes + max(rounding, np.finfo(float).tiny) * np.eye(len(information))
+    values, vectors = eigh(information, metric)
+    return values, vectors, metric
+
+
 def _columns(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Terms (..., 6) of a second-order surface."""
     return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-
-
-def averaged_points(points_mm: np.ndarray, cell_mm: float) -> np.ndarray:
-    """Means (C, 3) of the points (N, 3) in each cube of a size."""
-    return _averaged(points_mm, cell_mm)[1]
 
 
 def _averaged(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -340,11 +376,8 @@ def _along(
 ) -> np.ndarray:
     """Stated variance (P,) of one point along the normals of patches: single points, and images."""
     at = _first_points(owner)[middle]
-    pairs = known.random_mm2[at]
-    variance = np.einsum("pi,pi->p", known.position_mm[at], normals) ** 2
-    for column, (i, j) in enumerate(PAIRS):
-        variance += (1 if i == j else 2) * pairs[:, column] * normals[:, i] * normals[:, j]
-    return variance
+    of_image = np.einsum("pi,pi->p", known.position_mm[at], normals)
+    return of_image**2 + variance_along(known.random_mm2[at], normals)
 
 
 def _first_points(owner: np.ndarray) -> np.ndarray:
@@ -374,8 +407,3 @@ def _patch_patterns(known: PointUncertainty | None, owner: np.ndarray, middle: n
             for pattern in known.patterns_mm
         ]
     ).reshape(-1, len(middle), 3)
-
-
-def scatter(relative: np.ndarray) -> float:
-    """Robust standard deviation of distances over their standard deviations, at least 1."""
-    return max(MAD_TO_STD * float(np.median(np.abs(relative))), 1.0) if len(relative) else 1.0

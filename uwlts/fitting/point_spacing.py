@@ -10,7 +10,11 @@ from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
 POINTS_PER_DISC = 30
 """Points of a disc over which they are averaged: their mean's noise is a fifth of theirs."""
 _IMAGES_PER_DISC = 3.0
-_SAMPLED, _ASKED = 2000, 64
+"""Images across a disc, at least: in fewer, errors of single images do not average."""
+_SAMPLED = 2000
+"""Points of which the spacing is the median: right to a few percent."""
+_ASKED = 64
+"""Neighbours among which one of another image is looked for."""
 _STEEPEST = 0.3
 """Least cosine of a surface towards the laser: on steeper ones a footprint counts as no longer."""
 

@@ -9,9 +9,10 @@ from uwlts.errors import CalibrationError
 
 _ROUNDS = 60  # several times what usual problems take
 _SMALLEST_STEP = 1e-11  # in the residuals' unit: rounding of sums over all of them
-# Damping beside columns of length one up to which a step is the full one, and the largest share of the cost that is
-# gained so near the solution that residuals are linear.
-_HARDLY_DAMPED, _SAFE = 1e-8, 1e-7
+# Damping beside columns of length one up to which a step is the full one.
+_HARDLY_DAMPED = 1e-8
+# Largest share of the cost that is gained so near the solution that residuals are linear.
+_SAFE = 1e-7
 # Columns are scaled to length one: a smaller eigenvalue of the global parameters' normal matrix is rounding.
 _SINGULAR = 1e-13
 

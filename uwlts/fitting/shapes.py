@@ -17,11 +17,16 @@ from uwlts.fitting.least_squares import (
     principal_axes,
 )
 
-# The search for a cylinder's axis: points, neighbours for a local normal, directions on the half sphere (some 15 deg
-# apart), and how many of the best are refined.
-_THINNED, _NEIGHBOURS, _DIRECTIONS, _TRIED = 600, 12, 80, 5
-# Standard uncertainty of the axis's slope from which the direction is open: 11 deg.
+_THINNED = 600
+"""Points for the search of a cylinder's axis."""
+_NEIGHBOURS = 12
+"""Neighbours of a point for its local normal."""
+_DIRECTIONS = 80
+"""Directions of the axis that are tried on the half sphere, some 15 deg apart."""
+_TRIED = 5
+"""Best directions that are refined."""
 _LARGEST_SLOPE_STD = 0.2
+"""Standard uncertainty of the axis's slope from which the direction is open: 11 deg."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,9 +31,7 @@ from uwlts.hardware.camera_interface import (
     CameraSettings,
     Delivered,
     Region,
-    require_uncalibrated,
 )
-from uwlts.model.stripe import Coordinates
 from uwlts.runtime.shared_library import load_aravis
 
 BUFFER_COMPLETE = 0
@@ -204,18 +202,11 @@ class AravisCamera(CameraDevice):
             raise
         return CameraInfo(f"{maker} {model}", serial, width, height, bits, coordinates)
 
-    def _coordinates(self) -> Coordinates:
-        """What the numbers of a 3D camera mean; HardwareError where they are no pixels."""
-        if self._offers("Scan3dOutputMode"):
-            mode = _text(self._call("get_string", b"Scan3dOutputMode"))
-            require_uncalibrated(mode, self.address)
-
-        def number(name: str, usual: float) -> float:
-            return self._call("get_float", name.encode()) if self._offers(name) else usual
-
-        marked = self._offers("Scan3dInvalidDataFlag") and self._call("get_boolean", b"Scan3dInvalidDataFlag")
-        scale, offset = number("Scan3dCoordinateScale", 1.0), number("Scan3dCoordinateOffset", 0.0)
-        return Coordinates(scale, offset, number("Scan3dInvalidDataValue", 0.0) if marked else None)
+    def _feature(self, name: str, kind: type[str] | type[float] | type[bool]) -> Any:
+        if not self._offers(name):
+            return None
+        value = self._call({str: "get_string", float: "get_float", bool: "get_boolean"}[kind], name.encode())
+        return _text(value) if kind is str else value
 
     def _offers(self, name: str) -> bool:
         return bool(self._call("is_feature_available", name.encode()))

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -119,15 +119,6 @@ class FrameCheck:
         """
         self._counts[counted] += 1
         self._last_id = self._last_time_s = None
-
-
-def require_uncalibrated(mode: str, address: str) -> None:
-    """HardwareError where a 3D camera's ``Scan3dOutputMode`` gives other than places on the image sensor, in px."""
-    if not mode.startswith("Uncalibrated"):
-        raise HardwareError(
-            f"the 3D camera {address} gives {mode}, which is not in pixels of its image sensor: set its "
-            "Scan3dOutputMode to UncalibratedC; the calibration is made here"
-        )
 
 
 def _advance(last: int, now: int) -> int:
@@ -470,6 +461,23 @@ class CameraDevice(ABC):
                 "AcquisitionLineRate: when its profiles were taken is not known; have it send 1 profile in a frame"
             )
         return [row / rate_hz for row in rows]
+
+    def _coordinates(self) -> Coordinates:
+        """What the numbers of a 3D camera mean; HardwareError where they are no places on its image sensor, in px."""
+        mode = self._feature("Scan3dOutputMode", str)
+        if mode is not None and not mode.startswith("Uncalibrated"):
+            raise HardwareError(
+                f"the 3D camera {self.address} gives {mode}, which is not in pixels of its image sensor: set its "
+                "Scan3dOutputMode to UncalibratedC; the calibration is made here"
+            )
+        scale, offset = (self._feature(f"Scan3dCoordinate{name}", float) for name in ("Scale", "Offset"))
+        marked = self._feature("Scan3dInvalidDataFlag", bool)
+        invalid = self._feature("Scan3dInvalidDataValue", float) if marked else None
+        return Coordinates(1.0 if scale is None else scale, offset or 0.0, invalid)
+
+    def _feature(self, name: str, kind: type[str] | type[float] | type[bool]) -> Any:
+        """Value of a feature of the camera, None where it has none of this name."""
+        return None
 
     def _require_running(self) -> None:
         if not self._started:

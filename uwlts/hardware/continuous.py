@@ -24,6 +24,7 @@ from uwlts.hardware.scan_plan import Continuous, ScanPlan
 from uwlts.model.sensor import CaptureHeader, Sensor
 from uwlts.model.stripe import Stripe
 from uwlts.reconstruction.latency import measure_latency
+from uwlts.runtime.progress import ProgressListener
 from uwlts.storage.capture import Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import stripe_in
@@ -107,7 +108,7 @@ def record_continuously(
     header: CaptureHeader,
     exposure_ms: float,
     overwrite: bool,
-    progress: Callable[[int, int], None],
+    progress: ProgressListener,
     report: Callable[[str], None],
     warn: Callable[[str], None],
     recorded: Callable[[Frame, int], None],

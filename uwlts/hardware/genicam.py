@@ -27,9 +27,7 @@ from uwlts.hardware.camera_interface import (
     CameraSettings,
     Delivered,
     Region,
-    require_uncalibrated,
 )
-from uwlts.model.stripe import Coordinates
 
 # GenApi's access modes count: not implemented, not available, write only, read only, both.
 _WRITE_ONLY = 2
@@ -94,14 +92,8 @@ class GenicamCamera(CameraDevice):
         name = f"{fitting[0].vendor} {fitting[0].model}"
         return CameraInfo(name, fitting[0].serial_number, width, height, bits, coordinates)
 
-    def _coordinates(self) -> Coordinates:
-        """What the numbers of a 3D camera mean; HardwareError where they are no pixels."""
-        if self._has("Scan3dOutputMode"):
-            require_uncalibrated(self._node("Scan3dOutputMode").value, self.address)
-        scale, offset = (self._number((f"Scan3dCoordinate{name}",)) for name in ("Scale", "Offset"))
-        marked = self._has("Scan3dInvalidDataFlag") and self._node("Scan3dInvalidDataFlag").value
-        invalid = self._number(("Scan3dInvalidDataValue",)) if marked else None
-        return Coordinates(1.0 if scale is None else scale, offset or 0.0, invalid)
+    def _feature(self, name: str, kind: type[str] | type[float] | type[bool]) -> Any:
+        return kind(self._node(name).value) if self._has(name) else None
 
     @contextmanager
     def _reporting(self, doing: str) -> Iterator[None]:

@@ -1,7 +1,6 @@
 """A folder of images or a capture, shown like a camera: at a frame rate of its own, or one frame for each trigger."""
 
 import math
-import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,7 @@ from uwlts.model.stripe import Coordinates, Stripe
 from uwlts.storage.capture import Capture
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import SUFFIXES
+from uwlts.storage.import_.matching import natural_key
 
 
 class ReplayCamera(CameraDevice):
@@ -40,7 +40,7 @@ class ReplayCamera(CameraDevice):
         self._shown = 0
         if self._path.is_dir():
             images = (path for path in self._path.iterdir() if path.suffix.lower() in SUFFIXES)
-            self._files = sorted(images, key=_natural)
+            self._files = sorted(images, key=lambda path: natural_key(path.name))
             if not self._files:
                 raise HardwareError(f"the folder {self._path} holds no image ({', '.join(SUFFIXES)})")
             first = _read(self._files[0])
@@ -132,11 +132,6 @@ class ReplayCamera(CameraDevice):
 
     def _answers(self) -> None:
         """Files need no check; reading a missing one raises an error."""
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sorts image-9 before image-10."""
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def _read(path: Path) -> np.ndarray:

@@ -117,7 +117,7 @@ class LaserWatch:
         also = f"; the {passed} images before this one were without a stripe too" if passed else ""
         raise HardwareError(
             f"the laser has failed: at {self.lit.position_mm:g} mm, where its stripe was seen before, images with the "
-            f"laser on and off show the same{also}. Check its supply, key and interlock, then go on with --resume"
+            f"laser on and off show the same{also}. Check its supply, key and interlock, then go on with `resume`"
         )
 
     def no_light(self, exposure_ms: float) -> HardwareError:

@@ -6,7 +6,6 @@ laser is on for its own images only; the stage's driver switches it off however 
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -14,22 +13,19 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.errors import DescriptionError, HardwareError
-from uwlts.files.command_files import keeps_inputs
-from uwlts.files.writing import refuse_unsuitable
-from uwlts.hardware.camera_addresses import open_camera
+from uwlts.files.inputs import inputs_kept
 from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.continuous import record_continuously, ways_of
 from uwlts.hardware.grbl import GrblStage
-from uwlts.hardware.page_beside import PageBeside
 from uwlts.hardware.replay import ReplayCamera
 from uwlts.hardware.rig import START_MS, Brightness, Rig, brightness, stripe_of, with_provenance
-from uwlts.hardware.scan_plan import Light, ScanPlan, load_plan
+from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scan_watch import LOOKS, LaserWatch, LitPlace, Place, SlipWatch, centres_of, shows_laser, spread
 from uwlts.model.sensor import Sensor
-from uwlts.storage.calibration_file import load_calibration
-from uwlts.storage.capture import CAPTURES, Capture, Frame, part_path
+from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.storage.capture import Capture, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.import_.images import without_background
+from uwlts.storage.import_.grey_values import without_background
 from uwlts.stripe import Stripe, StripeStatus
 
 _FAINT = 0.1
@@ -71,101 +67,7 @@ class ScanProgress:
         return said
 
 
-@keeps_inputs
-def scan(
-    plan: str | Path | ScanPlan,
-    out: str | Path,
-    *,
-    camera: str | None = None,
-    stage: str | None = None,
-    home: bool = False,
-    unlock: bool = False,
-    watch: bool = False,
-    calibration: str | Path | None = None,
-    port: int = 8080,
-    resume: bool = False,
-    overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-    report: Callable[[str], None] = lambda line: None,
-    warn: Callable[[str], None] = lambda text: None,
-) -> ScanProgress:
-    """Connect camera and stage and record a scan into a capture.
-
-    The plan is checked against travel and volume before anything moves; the laser goes off however the scan ends. An
-    interrupted scan leaves its complete images in ``out.part``; ``resume`` goes on after them, at exposures that the
-    recorded images have.
-
-    Parameters
-    ----------
-    plan : ScanPlan or path of a TOML file
-        Sensor, medium, positions, lights and exposures.
-    out : str or Path
-        Capture to write.
-    camera : str, optional
-        Address of the camera, in place of the plan's: gige:NAME, genicam:PRODUCER.cti or replay:PATH.
-    stage : str, optional
-        Serial port of the stage, in place of the plan's.
-    home, unlock : bool
-        Find the limit switch first; or take the stage's position as it is, without homing.
-    watch : bool
-        Show the recording in a browser meanwhile, as `watch` does.
-    calibration : str or Path, optional
-        Calibration of any kind for the cloud on that page.
-    port : int
-        Port of that page; the next free one is taken if it is in use.
-    resume, overwrite : bool
-        Continue an interrupted scan; replace an existing capture.
-    progress : callable, optional
-        Called with the number of images done and the number in all.
-    report, warn : callable, optional
-        Called with lines of text about the scan, and about what needs attention.
-
-    Raises
-    ------
-    DescriptionError
-        Camera or stage are not named; sensor, medium, target or artefact are not valid.
-    RangeError, DesignError
-        The plan cannot be carried out; nothing has moved.
-    HardwareError
-        Camera, stage or laser fail, or the camera has another image size than the sensor's description. Or the stage
-        has lost steps, which is seen at the end: all images are in ``out.part`` then, and ``resume`` takes them as they
-        are.
-    OutputError
-        The file exists, or cannot be written.
-    """
-    refuse_unsuitable(Path(out), overwrite=overwrite, endings=CAPTURES)
-    plan, out = plan if isinstance(plan, ScanPlan) else load_plan(Path(plan)), Path(out)
-    address, serial_port = camera or plan.camera, stage or plan.stage.port
-    if address is None or serial_port is None:
-        what = "camera" if address is None else "stage"
-        raise DescriptionError(f"neither the plan nor the command line gives the {what}: give --{what}")
-    if calibration:
-        if not watch:
-            raise DescriptionError("--calibration is for the cloud on the page: give --watch too")
-        load_calibration(calibration)
-    with ExitStack() as stack:
-        page = stack.enter_context(PageBeside(out, calibration=calibration, port=port, say=report)) if watch else None
-        moved, opened = stack.enter_context(GrblStage(serial_port)), stack.enter_context(open_camera(address))
-        if home:
-            report("homing")
-            moved.home()
-        elif unlock:
-            moved.unlock()
-        return record_scan(
-            plan,
-            out,
-            camera=opened,
-            stage=moved,
-            resume=resume,
-            overwrite=overwrite,
-            progress=progress,
-            report=report,
-            warn=warn,
-            recorded=lambda frame, number: None if page is None else page.start(),
-        )
-
-
-@keeps_inputs
+@inputs_kept()
 def record_scan(
     plan: ScanPlan,
     out: Path,
@@ -174,13 +76,15 @@ def record_scan(
     stage: GrblStage,
     resume: bool = False,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
     report: Callable[[str], None] = lambda line: None,
     warn: Callable[[str], None] = lambda text: None,
     between: Callable[[], None] = lambda: None,
     recorded: Callable[[Frame, int], None] = lambda frame, number: None,
 ) -> ScanProgress:
-    """Record a scan with a camera and a stage that are open and may move; parameters and errors as for `scan`.
+    """Record a scan with a camera and a stage that are open and may move.
+
+    Parameters and errors are those of `uwlts.desk.scan.scan`.
 
     ``between`` is called before every image, with the laser off: it may wait, or end the scan by an exception.
     ``recorded`` is called with every image that is in the file, and its number.
@@ -209,7 +113,7 @@ def record_scan(
     )
     if plan.continuous is not None:
         if resume:
-            raise DescriptionError("a continuous scan cannot be resumed: give --overwrite to scan again")
+            raise DescriptionError("a continuous scan cannot be resumed: give `overwrite` to scan again")
         ways_of(plan, plan.continuous, stage)
         rig = Rig(plan, plan.stage, sensor, camera, stage, ahead=plan.stage.step_mm)
         seen = ScanProgress()
@@ -409,8 +313,8 @@ class _Taking:
         raise HardwareError(
             f"the stage has lost steps, or sensor or object were moved: the image back at {place.position_mm:g} mm "
             f"{seen}. All images are recorded, but from somewhere on at wrong positions: find the cause (feed, "
-            "acceleration, something in the way) and scan again with --overwrite, or take them as they are with "
-            "--resume"
+            "acceleration, something in the way) and scan again with `overwrite`, or take them as they are with "
+            "`resume`"
         )
 
     def _shorten(self, light: Light, position_mm: float) -> bool:

@@ -18,7 +18,7 @@ from scipy import fft, ndimage, optimize, stats
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import MAD_TO_STD, fit_biweight, robust_std
 
 _POINTS_IN_SMALLEST = 12
 """Points in the disc of the smallest size: three profiles or more where points are far denser along than across."""
@@ -39,12 +39,16 @@ _MOST_CELLS = 4_000_000
 _ROUNDS = 10
 _FEWEST = 6
 """Points of an indication."""
-_NEIGHBOURS, _OUTLIER = 9, 6.0
-"""Nearest points with which each is compared, and robust standard deviations from their median that make an outlier."""
+_NEIGHBOURS = 9
+"""Nearest points with which each is compared."""
+_OUTLIER = 6.0
+"""Robust standard deviations from their median that make an outlier."""
 _EDGE_SHARE = 0.1
 """Of a blemish's depth, where its region ends."""
-_GROWN, _GROWTH = 3, 1.7
-"""Times that the window about a peak grows, where its region reaches the edge, and by how much."""
+_GROWN = 3
+"""Times that the window about a peak grows at most, if its region reaches the edge."""
+_GROWTH = 1.7
+"""Growth of the window's side."""
 _CORE = 0.8
 """Of the bell's radius: points that belong to the peak in any case."""
 _EDGE_STD = 3.0
@@ -306,7 +310,7 @@ def _moment(z: np.ndarray, axis: int, cell: float) -> float:
     step = step[np.isfinite(step)]
     if len(step) < 10:
         return 0.0
-    return MAD_TO_STD * float(np.median(np.abs(step))) / cell
+    return robust_std(step) / cell
 
 
 def _threshold(maps: Sequence[_Map], false_alarm: float) -> float:
@@ -393,7 +397,7 @@ def _region(
     if np.count_nonzero(ring) < 2 * _FEWEST:
         raise EvaluationError(f"{np.count_nonzero(ring)} undamaged points are around it; {2 * _FEWEST} are needed")
     base = np.column_stack([np.ones(len(places)), places])
-    left = heights - base @ _robust_plane(base[ring], heights[ring])
+    left = heights - base @ (fit_biweight(base, heights, ring)[0] @ heights)
     side = int(np.ceil(2 * reach / step)) + 1
     cells = np.floor((places + reach) / step).astype(int)
     flat = cells[:, 0] * side + cells[:, 1]
@@ -410,15 +414,3 @@ def _region(
     wide = ndimage.binary_dilation(region)
     cut = bool(region[[0, 1, -2, -1], :].any() or region[:, [0, 1, -2, -1]].any())
     return wide[cells[:, 0], cells[:, 1]] | (away < _CORE * peak.radius), cut
-
-
-def _robust_plane(base: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """Coefficients (3,) of a plane by Tukey's biweight."""
-    weight = np.ones(len(heights))
-    solved = np.zeros(base.shape[1])
-    for _ in range(6):
-        solved = np.linalg.lstsq(base * weight[:, None], heights * weight, rcond=None)[0]
-        left = heights - base @ solved
-        spread = max(MAD_TO_STD * float(np.median(np.abs(left - np.median(left)))), 1e-12)
-        weight = np.clip(1 - np.square(left / (4.685 * spread)), 0, None)
-    return solved

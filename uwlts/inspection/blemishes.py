@@ -10,7 +10,7 @@ through to every value: by each pattern that all points share, and by noise draw
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -19,24 +19,30 @@ from scipy import ndimage, sparse
 from scipy.spatial import KDTree
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import fit_biweight
+from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.blemish_search import BlemishSearch, Indication, UnrolledSurface
-from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR, FeatureKind, FeatureValue
-from uwlts.inspection.propagation import NormalErrors, plain_value
+from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR, FeatureKind, FeatureValue, plain_value
 
-_DRAWS, _TO_LEVEL, _SEED = 120, 48, 635
-"""Three are beyond either end of a 95 % interval; a standard deviation of the second number is right to 10 %."""
+_DRAWS = 120
+"""Draws of noise: three are beyond either end of a 95 % interval."""
+_TO_LEVEL = 48
+"""Draws for the noise of depths: their standard deviation is right to 10 %."""
+_SEED = 635
+"""Of the draws, so that the same cloud has the same values."""
 _EXPONENTS = 1, 2, 3
 """Of bells (1 - t^2)^p: from a paraboloid with a sharp edge to one that runs out slowly."""
-_BANDWIDTH, _POINTS = 0.35, 150
-"""Radius of the local quadratic in the blemish's, with which it lowers the depth of a bell by 0.3 %, or less where a
-smaller one holds so many points: with these the noise is a sixth of one point's."""
-_EDGE_SHARE, _EDGE_STD = 0.1, 3.0
-"""Depth of the contour: a tenth of the blemish's, as metal loss is boxed in pipe inspection, and above the noise."""
+_BANDWIDTH = 0.35
+"""Radius of the local quadratic, relative to the blemish's: it lowers the depth of a bell by 0.3 %."""
+_POINTS = 150
+"""Points in the local quadratic from which its radius is smaller: the noise is a sixth of one point's."""
+_EDGE_SHARE = 0.1
+"""Depth of the contour, relative to the blemish's, as metal loss is boxed in pipe inspection."""
+_EDGE_STD = 3.0
+"""Least depth of the contour in standard deviations of the depths."""
 _RING = 0.6
 """Width of the surroundings in the blemish's radius."""
 _FEWEST = 12
-_TUKEY = 4.685
 _NODES = [
     (np.sqrt(3.0) * np.array([a, b]), (2 / 3 if a == 0 else 1 / 6) * (2 / 3 if b == 0 else 1 / 6))
     for a in (-1, 0, 1)
@@ -68,7 +74,7 @@ def measure_blemish(
     surface: UnrolledSurface,
     search: BlemishSearch,
     indication: Indication,
-    errors: NormalErrors,
+    errors: PointErrors,
     *,
     diameter_mm: float,
     wall_mm: float | None = None,
@@ -83,7 +89,7 @@ def measure_blemish(
     # Single points that, were they independent, would scatter local means as these do.
     noise = indication.noise_mm * surface.std[field.near] / float(np.median(surface.std))
     rng, own = np.random.default_rng(_SEED), errors[field.near]
-    moves = [rng.standard_normal(len(noise)) * noise + own.drawn_of_images(rng) for _ in range(_DRAWS)]
+    moves = replace(own, single_mm=noise).drawn(_DRAWS, rng)
     inside = np.arange(len(noise)) < len(indication.points)
     scale = np.where(inside, field.scatter_over(heights, moves[:_TO_LEVEL], inside), 1.0)
     moves = [scale * each for each in moves]
@@ -104,11 +110,13 @@ def measure_blemish(
     resolved = field.figures(field.depths(heights, share=1 - field.footprint_std), edge, deepest) - seen
     resolved[0] += between
     random = np.sqrt(random**2 + bias**2 + resolved**2)
-    common = None
-    if own.patterns_mm is not None:
-        moved = np.array([field.figures(depths + field.depths(p), edge, deepest) - seen for p in own.patterns_mm])
-        moved[:, 0] += between
-        common = np.sqrt(np.sum(np.square(moved), axis=0))
+
+    def changed(pattern: np.ndarray) -> np.ndarray:
+        found = field.figures(depths + field.depths(pattern), edge, deepest) - seen
+        found[0] += between
+        return found
+
+    common = own.by_patterns(changed)
     length, width = plain[1], plain[2]
     kind = FeatureKind.PROTRUSION
     if sign < 0:
@@ -199,7 +207,6 @@ class _Field:
         middle = 0.5 * (low + high)
         places, heights = surface.places[near] - middle, surface.heights[near]
         ring = np.arange(len(near)) >= len(indication.points)
-        plane = _plane(places, heights, ring)
         dense = len(indication.points) / max(float(np.prod(high - low)), 1e-9)
         bandwidth = max(min(_BANDWIDTH * radius, float(np.sqrt(_POINTS / np.pi / dense))), search.smallest_mm)
         cell = float(np.max(high - low)) / _CELLS
@@ -216,6 +223,7 @@ class _Field:
             parts = [weight * _interpolation((places + node * size - grid[0]) / cell, shape) for node, weight in _NODES]
             seen = sparse.csr_array(sum(parts[1:], parts[0]))
         design = np.column_stack([np.ones(len(places)), places])
+        plane = fit_biweight(design, heights, ring)[0]
         known = surface.places[near], size, grid + middle, shape, cell
         return cls(near, *known, smooth, design, plane, seen, sharp, surface.footprint_std, stride, region)
 
@@ -320,20 +328,6 @@ def _crossing(profile: np.ndarray, edge: float, cell: float) -> tuple[float, flo
     body = float(np.trapezoid(np.maximum(profile[first : last + 1], 0), dx=cell))
     rims = sum(cell * end * 0.5 * (edge + float(profile[k])) for end, k in zip(ends, (first, last), strict=True))
     return length, body + rims
-
-
-def _plane(places: np.ndarray, heights: np.ndarray, ring: np.ndarray) -> np.ndarray:
-    """Rows (3, n) whose products with heights are the coefficients of the plane through the ring, outliers aside."""
-    design = np.column_stack([np.ones(len(places)), places])
-    weight = ring.astype(float)
-    rows = np.zeros((3, len(places)))
-    for _ in range(8):
-        normal = (design * weight[:, None]).T @ design
-        rows = np.linalg.pinv(normal, rcond=1e-10, hermitian=True) @ (design * weight[:, None]).T
-        left = heights - design @ (rows @ heights)
-        spread = max(MAD_TO_STD * float(np.median(np.abs(left[ring]))), 1e-12)
-        weight = ring * np.square(np.clip(1 - np.square(left / (_TUKEY * spread)), 0, None))
-    return rows
 
 
 def _interpolation(places: np.ndarray, shape: tuple[int, int]) -> sparse.csr_array:

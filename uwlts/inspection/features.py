@@ -5,6 +5,8 @@ from enum import StrEnum
 
 import numpy as np
 
+from uwlts.files.json_files import RecordFile
+from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 
 COVERAGE = 0.95
@@ -226,8 +228,8 @@ class Feature:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class Inspection:
+@dataclass(frozen=True, eq=False, repr=False)
+class Inspection(Brief, RecordFile):
     """What an inspection found in a cloud.
 
     Attributes
@@ -267,3 +269,43 @@ class Inspection:
         """The inspection as text: one line for each feature."""
         lines = [f"{each.name:16}{', '.join(value.text() for value in each.values)}" for each in self.features]
         return [*lines, *(f"note: {note}" for note in self.notes)]
+
+
+def plain_value(
+    kind: FeatureKind, name: str, value: float, random: float, systematic: float | None, *, least: float = -np.inf
+) -> FeatureValue:
+    """A value with a symmetric interval, cut at the least that it can be."""
+    half = COVERAGE_FACTOR * float(np.hypot(random, systematic or 0.0))
+    low, high = max(value - half, least), max(value + half, least)
+    unit = DEFINITIONS[kind][name].unit
+    common = None if systematic is None else float(systematic)
+    return FeatureValue(name, float(value), unit, float(random), common, float(low), float(high))
+
+
+def amplitude_value(
+    kind: FeatureKind, name: str, vector: np.ndarray, random: np.ndarray, systematic: np.ndarray | None, *, scale: float
+) -> FeatureValue:
+    """Length of a vector (2,) with covariances (2, 2), times a scale.
+
+    The length of a noisy vector is too large: its square by the trace of the covariance, which is taken off (Rice,
+    Bell System Technical Journal 24, 1945, section 3.10). The interval reaches down to zero where the vector is not
+    significant.
+    """
+    total = random if systematic is None else random + systematic
+    length = float(np.linalg.norm(vector))
+    corrected = float(np.sqrt(max(length**2 - float(np.trace(total)), 0.0)))
+    along = vector / length if length > 0 else np.array([1.0, 0.0])
+
+    def std(covariance: np.ndarray) -> float:
+        # Near zero the direction is chance.
+        near = float(np.linalg.eigvalsh(covariance)[-1])
+        far = float(along @ covariance @ along)
+        share = min(length**2 / max(float(np.trace(total)), 1e-300) / 9, 1.0)
+        return float(np.sqrt(max(share * far + (1 - share) * near, 0.0)))
+
+    by_noise, by_common = std(random), None if systematic is None else std(systematic)
+    half = COVERAGE_FACTOR * float(np.hypot(by_noise, by_common or 0.0))
+    ends = max(corrected - half, 0.0), max(length, corrected) + half
+    common = None if by_common is None else scale * by_common
+    unit = DEFINITIONS[kind][name].unit
+    return FeatureValue(name, scale * corrected, unit, scale * by_noise, common, scale * ends[0], scale * ends[1])

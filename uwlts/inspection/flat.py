@@ -6,8 +6,9 @@ has left to the last point on a face, and are known to half a point's spacing.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -19,16 +20,19 @@ from scipy.stats import norm
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.evaluation.step_faces import StepFace, label_step_faces
-from uwlts.fitting.least_squares import MAD_TO_STD, evenly_thinned, fit_robustly
+from uwlts.fitting.least_squares import evenly_thinned, fit_robustly, robust_std
 from uwlts.fitting.point_spacing import footprint_on
+from uwlts.fitting.propagation import PointErrors
 from uwlts.fitting.shapes import fit_plane
-from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, Inspection
-from uwlts.inspection.propagation import NormalErrors, normal_errors, plain_value
+from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, Inspection, plain_value
 from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import loaded_cloud
 
 _FEWEST = 200
-_PROPOSALS, _THINNED = 600, 3000
-"""Planes through three points tried for the largest face, and points on which they are judged."""
+_PROPOSALS = 600
+"""Planes through three points that are tried for the largest face."""
+_THINNED = 3000
+"""Points on which they are judged."""
 _NEAR_SHARE = 2e-3
 """Of the cloud's size: how near to a proposed plane a point has to be; flatter faces than that are refined after."""
 _OFF_FACE = 6.0
@@ -56,16 +60,28 @@ _FLAT_CELLS = 24
 """Across the face; the means of cells are its smoothed form."""
 _EDGE_LINES = 4
 """Lines next to an edge that do not count for the flatness: the camera's blur mixes in what lies beyond."""
-_DRAWS, _SEED = 48, 635
+_DRAWS = 48
+"""Draws of noise for the flatness: their standard deviation is right to 10 %."""
 
 _facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
 
 
-def inspect_step(cloud: PointCloud) -> Inspection:
+def inspect_step(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     """Measure the step between the two largest parallel faces of a cloud.
 
-    EvaluationError where there are no two such faces.
+    Parameters
+    ----------
+    cloud
+        As for `inspect_pipe`.
+
+    Raises
+    ------
+    CaptureError
+        The file cannot be read.
+    EvaluationError
+        There are no two such faces.
     """
+    cloud = loaded_cloud(cloud)
     _require_points(cloud)
     normal = _largest_plane(cloud.points_mm)[0]
     labels = label_step_faces(cloud.points_mm, height_mm=_height_between(cloud.points_mm @ normal))
@@ -78,7 +94,7 @@ def inspect_step(cloud: PointCloud) -> Inspection:
     row = np.concatenate([-lever @ base.rows, np.full(len(upper), 1 / len(upper))])
     distance = cloud.points_mm[used] @ base.axes[2] - base.point_mm @ base.axes[2]
     height = float(row @ distance)
-    errors = normal_errors(cloud, used, np.broadcast_to(base.axes[2], (len(used), 3)))
+    errors = PointErrors.along(cloud, used, np.broadcast_to(base.axes[2], (len(used), 3)))
     residuals = np.concatenate([base.residuals_mm, other.residuals_mm])
     turned = base.axes[:2] @ other.axes[:2].T
     slopes = np.hstack([-base.rows[1:], turned @ other.rows[1:]])
@@ -94,12 +110,28 @@ def inspect_step(cloud: PointCloud) -> Inspection:
     return _inspection("step", cloud, (feature,), [(lower, base), (upper, other)])
 
 
-def inspect_flange(cloud: PointCloud, *, datum: PointCloud | None = None) -> Inspection:
+def inspect_flange(
+    cloud: PointCloud | str | os.PathLike[str], *, datum: PointCloud | str | os.PathLike[str] | None = None
+) -> Inspection:
     """Measure a flange's face: flatness, holes, bolt circle, and its parallelism to the face of another cloud.
 
-    The ``datum`` is in the same frame. Of the holes the largest is the bore, those of like diameter are for bolts.
-    EvaluationError where the cloud has no frames and lines, or no face.
+    Of the holes the largest is the bore, those of like diameter are for bolts.
+
+    Parameters
+    ----------
+    cloud
+        As for `inspect_pipe`.
+    datum
+        Cloud of another face in the same frame, to which the flange's face is to be parallel, or its file.
+
+    Raises
+    ------
+    CaptureError
+        The file cannot be read.
+    EvaluationError
+        The cloud has no frames and lines, or no face.
     """
+    cloud, datum = loaded_cloud(cloud), None if datum is None else loaded_cloud(datum)
     _require_points(cloud)
     on_face = _largest_plane(cloud.points_mm)[1]
     face = _face_of(cloud, on_face)
@@ -143,11 +175,22 @@ def inspect_flange(cloud: PointCloud, *, datum: PointCloud | None = None) -> Ins
     return _inspection("flange", cloud, (whole, *features), [(used, face)], notes)
 
 
-def inspect_gap(cloud: PointCloud) -> Inspection:
+def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     """Measure the gap between two plates that the profiles cross: width, parallelism and flush.
 
-    EvaluationError where the cloud has no frames and lines, or no gap goes through it.
+    Parameters
+    ----------
+    cloud
+        As for `inspect_pipe`.
+
+    Raises
+    ------
+    CaptureError
+        The file cannot be read.
+    EvaluationError
+        The cloud has no frames and lines, or no gap goes through it.
     """
+    cloud = loaded_cloud(cloud)
     _require_points(cloud)
     # Both plates, which may be offset: everything on either side of the widest hole in the profiles.
     everything = np.arange(len(cloud))
@@ -266,7 +309,7 @@ def _largest_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for _ in range(_REFINED):
         fit = fit_robustly(_facing_plane, points[inside]).fit
         normal, distance = fit.normal, fit.distances_mm(points)
-        spread = MAD_TO_STD * float(np.median(np.abs(distance[inside])))
+        spread = robust_std(distance[inside])
         inside = np.abs(distance) < _OFF_FACE * max(spread, 1e-9)
     if np.count_nonzero(inside) < _FEWEST:
         raise EvaluationError(f"the largest flat face holds {np.count_nonzero(inside)} points; {_FEWEST} are needed")
@@ -351,19 +394,18 @@ def _flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> FeatureValue:
         return np.bincount(index[inner], left[inner], len(count))[full] / count[full]
 
     found = means(face.residuals_mm)
-    errors = normal_errors(cloud, used, np.broadcast_to(face.axes[2], (len(used), 3)))
-    rng, value, drawn = np.random.default_rng(_SEED), float(np.ptp(found)), []
-    noise = np.maximum(errors.single_mm, face.std_mm)
-    for _ in range(_DRAWS):
-        moves = rng.standard_normal(len(used)) * noise
-        moves += errors.drawn_of_images(rng)
-        drawn.append(float(np.ptp(found + means(moves))))
-    bias = max(float(np.mean(drawn)) - value, 0.0)
-    common = None
-    if errors.patterns_mm is not None:
-        common = float(np.sqrt(sum((np.ptp(found + means(p)) - value) ** 2 for p in errors.patterns_mm)))
+    errors = PointErrors.along(cloud, used, np.broadcast_to(face.axes[2], (len(used), 3)))
+    noisy = replace(errors, single_mm=np.maximum(errors.single_mm, face.std_mm))
+    value = float(np.ptp(found))
+
+    def changed(moves: np.ndarray) -> float:
+        return float(np.ptp(found + means(moves))) - value
+
+    drawn = [changed(moves) for moves in noisy.drawn(_DRAWS)]
+    bias, common = max(float(np.mean(drawn)), 0.0), errors.by_patterns(changed)
     random = float(np.hypot(np.std(drawn), bias))
-    return plain_value(FeatureKind.FLANGE, "flatness", max(value - bias, 0.0), random, common, least=0.0)
+    shared = None if common is None else float(common)
+    return plain_value(FeatureKind.FLANGE, "flatness", max(value - bias, 0.0), random, shared, least=0.0)
 
 
 def _away_from_edges(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
@@ -535,7 +577,7 @@ def _parallelism(cloud: PointCloud, face: _Face, used: np.ndarray, datum: PointC
     slopes = facing * face.axes[:2] @ other.axes[2]
     random, common = np.zeros((2, 2)), None
     for own, plane, chosen in ((cloud, face, used), (datum, other, on_datum)):
-        errors: NormalErrors = normal_errors(own, chosen, np.broadcast_to(plane.axes[2], (len(chosen), 3)))
+        errors: PointErrors = PointErrors.along(own, chosen, np.broadcast_to(plane.axes[2], (len(chosen), 3)))
         rows = (face.axes[:2] @ plane.axes[:2].T) @ plane.rows[1:]
         by_noise, by_common = errors.covariances(rows, plane.residuals_mm, _groups(own, chosen))
         random = random + by_noise
@@ -552,7 +594,7 @@ def _flush(cloud: PointCloud, face: _Face, plates: list[np.ndarray], middle: np.
     for sign, chosen in zip((-1.0, 1.0), plates, strict=True):
         local = (cloud.points_mm[chosen] - face.point_mm) @ face.axes.T
         near = np.abs(local[:, 2] - np.median(local[:, 2])) < _OFF_FACE * max(
-            MAD_TO_STD * float(np.median(np.abs(local[:, 2] - np.median(local[:, 2])))), 1e-9
+            robust_std(local[:, 2] - np.median(local[:, 2])), 1e-9
         )
         chosen, local = chosen[near], local[near]
         design = np.column_stack([np.ones(len(local)), local[:, :2] - middle])
@@ -562,6 +604,6 @@ def _flush(cloud: PointCloud, face: _Face, plates: list[np.ndarray], middle: np.
         residuals.append(local[:, 2] - design @ (rows @ local[:, 2]))
     both, weights = np.concatenate(used), np.concatenate(parts)[None]
     offset = float(weights[0] @ ((cloud.points_mm[both] - face.point_mm) @ face.axes[2]))
-    errors = normal_errors(cloud, both, np.broadcast_to(face.axes[2], (len(both), 3)))
+    errors = PointErrors.along(cloud, both, np.broadcast_to(face.axes[2], (len(both), 3)))
     random, common = errors.covariances(weights, np.concatenate(residuals), _groups(cloud, both))
     return _plain(FeatureKind.GAP, "flush", abs(offset), random, common, 0)

@@ -14,11 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import robust_std
 from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR
 
-_DRAWS, _SEED = 2000, 635
-"""Fifty are beyond a quantile of 97.5 %, which is right to a tenth of a standard deviation."""
+_DRAWS = 2000
+"""Draws of noise: fifty are beyond a quantile of 97.5 %, which is right to a tenth of a standard deviation."""
+_SEED = 635
+"""Of the draws, so that the same profiles have the same values."""
 _TO_NO_NOISE = 1 / (np.sqrt(2) - 1)
 """Noise once more adds this part of what the noise itself has added, where that is proportional to its deviation."""
 
@@ -45,7 +47,7 @@ def largest_mean(profiles: Sequence[np.ndarray], count: int, *, noise: float | N
     if not owns:
         return Largest(np.nan, np.nan, np.nan, tuple(weights))
     jumps = np.concatenate([np.diff(own) for own in owns])
-    seen_noise = MAD_TO_STD * float(np.median(np.abs(jumps))) / np.sqrt(2) if len(jumps) else 0.0
+    seen_noise = robust_std(jumps) / np.sqrt(2) if len(jumps) else 0.0
     std = seen_noise if noise is None else noise
     rng = np.random.default_rng(_SEED)
     means = [_means(own[None], count) for own in owns]

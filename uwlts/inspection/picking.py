@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.evaluation.figure_uncertainty import drawn_by_image, noise_mm
 from uwlts.evaluation.figures import FigureUncertainty
 from uwlts.fitting.least_squares import fit_robustly
+from uwlts.fitting.propagation import PointErrors, noise_mm
 from uwlts.fitting.shapes import CylinderFit, FlatFit, SphereFit, fit_cylinder, fit_plane, fit_sphere
 from uwlts.storage.cloud import PointCloud
 
@@ -21,7 +21,8 @@ _FITS: dict[Shape, Callable[[np.ndarray], SphereFit | FlatFit | CylinderFit]] = 
 }
 _MOST_POINTS = 20_000
 """More add nothing but time: what remains is common to all points."""
-_DRAWS, _SEED = 8, 635
+_DRAWS = 8
+"""Draws of noise: the standard deviation of so many is right to 27 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,16 +103,8 @@ def shape_near(cloud: PointCloud, place_mm: np.ndarray, radius_mm: float, shape:
             moved = _figures(fit(cloud.points_mm[used] + moves))
             return [moved[name] - figures[name] for name in names]
 
-        known = known[used]
-        by_pattern = [changed(pattern) for pattern in known.patterns_mm]
-        rng, along = np.random.default_rng(_SEED), noise_mm(known)
-        images, image = np.unique(cloud.frame[used], return_inverse=True)
-        by_image, drawn = known.by_image_mm(), []
-        for _ in range(_DRAWS):
-            together = drawn_by_image(rng, by_image, image, len(images))
-            drawn.append(changed(rng.standard_normal((len(used), 1)) * along + together))
-        systematic = np.sqrt(np.sum(np.square(by_pattern), axis=0))
-        random = np.std(drawn, axis=0, ddof=1)
+        random, systematic = PointErrors.of(known[used], cloud.frame[used]).propagate(changed, draws=_DRAWS)
+        assert systematic is not None
         stated = {
             name: FigureUncertainty(float(r), float(s)) for name, r, s in zip(names, random, systematic, strict=True)
         }

@@ -2,30 +2,33 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import robust_std
 from uwlts.fitting.point_spacing import footprint_on
+from uwlts.fitting.propagation import PointErrors
 from uwlts.inspection.blemish_search import BlemishSearch, Indication, UnrolledSurface, search_blemishes
 from uwlts.inspection.blemishes import Blemish, measure_blemish
 from uwlts.inspection.features import Feature, FeatureKind, Inspection
 from uwlts.inspection.pipe_form import LARGEST_OVALITY, MOST_OFF_SHARE, PipeForm, fit_pipe, pipe_features, refit_pipe
-from uwlts.inspection.propagation import normal_errors
 from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import loaded_cloud
 
-_OVERLAP, _SEARCHED = 0.6, 0.1
-"""Radians by which both sides of a pipe that is cut open overlap, unless as many without a point part them; and by
-which findings count beyond the cut. Farther beyond it points are surroundings alone: findings there have less of these
-than on the other side, where they are found, too."""
+_OVERLAP = 0.6
+"""Angle, rad, by which both sides of a pipe that is cut open overlap, unless as much without a point parts them."""
+_SEARCHED = 0.1
+"""Angle, rad, by which findings count beyond the cut. Farther beyond it points are surroundings alone: findings there
+have less of these than on the other side, where they are found, too."""
 _FEWEST = 500
 """Points from which a pipe's surface can be searched."""
 
 
 def inspect_pipe(
-    cloud: PointCloud,
+    cloud: PointCloud | str | os.PathLike[str],
     *,
     section_mm: float | None = None,
     wall_mm: float | None = None,
@@ -43,13 +46,13 @@ def inspect_pipe(
     Parameters
     ----------
     cloud
-        Cloud of the pipe's outside.
+        Cloud of the object, or its file (.ply, .h5, .copc.laz; of other programs .las, .e57, and text in mm).
     section_mm
-        Length of a section; up to twelve sections unless given.
+        Length of a section along the pipe (or a weld); up to twelve sections unless given.
     wall_mm
-        Thickness of the undamaged wall, for the wall that remains.
+        Thickness of the pipe's undamaged wall, for the wall that remains.
     false_alarm
-        Probability that anything is found on the whole pipe where nothing is.
+        Probability that anything is found on the whole of a pipe's surface where nothing is.
     largest_ovality
         Ovality over the diameter that the pipe may have where less than half of its circumference was seen: the
         tolerance of its specification, where it still holds.
@@ -66,6 +69,7 @@ def inspect_pipe(
     >>> found = uwlts.inspect_pipe("pipe.ply", wall_mm=9.5)
     >>> print("\\n".join(found.lines()))
     """
+    cloud = loaded_cloud(cloud)
     if wall_mm is not None and not 0 < wall_mm < np.inf:
         raise EvaluationError(f"wall_mm is {wall_mm:g}; expected a positive thickness in mm")
     if not 0 < false_alarm < 1:
@@ -146,9 +150,9 @@ def _joined(search: BlemishSearch, copied: np.ndarray, count: int) -> BlemishSea
 
 def _unrolled(cloud: PointCloud, form: PipeForm, chosen: np.ndarray, angle: np.ndarray) -> UnrolledSurface:
     """The surface of the chosen points (M,), unrolled by angles (M,), which may count from anywhere."""
-    errors = normal_errors(cloud, chosen, form.outwards[chosen])
+    errors = PointErrors.along(cloud, chosen, form.outwards[chosen])
     heights = form.distance_mm[chosen]
-    spread = max(MAD_TO_STD * float(np.median(np.abs(heights - np.median(heights)))), 1e-9)
+    spread = max(robust_std(heights - np.median(heights)), 1e-9)
     std = errors.single_mm if np.all(errors.single_mm > 0) else np.full(len(heights), spread)
     axis = np.broadcast_to(form.frame.axes[2], (len(chosen), 3))
     tangents = np.stack([axis, np.cross(axis, form.outwards[chosen])], axis=1)
@@ -160,7 +164,7 @@ def _blemish_features(
     cloud: PointCloud, form: PipeForm, chosen: np.ndarray, search: BlemishSearch, wall_mm: float | None
 ) -> tuple[list[Feature], list[str]]:
     """What was found, as features, and a note for each that became none."""
-    errors = normal_errors(cloud, chosen, form.outwards[chosen])
+    errors = PointErrors.along(cloud, chosen, form.outwards[chosen])
     flat = _unrolled(cloud, form, chosen, form.angle[chosen])
     measured: list[tuple[Blemish, float, float]] = []
     notes = [_left_out(cloud, chosen[[each.point]], each.height_mm, each.reason) for each in search.unresolved]

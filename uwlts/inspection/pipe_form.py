@@ -8,19 +8,20 @@ from itertools import pairwise
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import MAD_TO_STD, evenly_thinned, fit_robustly
+from uwlts.fitting.least_squares import evenly_thinned, fit_biweight, fit_robustly
+from uwlts.fitting.propagation import PointErrors
 from uwlts.fitting.shapes import CylinderFit, fit_cylinder
-from uwlts.inspection.features import Feature, FeatureKind, FeatureValue
-from uwlts.inspection.propagation import NormalErrors, amplitude_value, normal_errors, plain_value
+from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, amplitude_value, plain_value
 from uwlts.storage.cloud import PointCloud
 
 _TO_START = 6000
 """Points for the first cylinder; more add nothing to a start."""
 _MOST_POINTS = 150_000
 """Points for the form; with more what remains is common to all of them."""
-_ROUNDS, _STILL_MM = 12, 1e-6
-_TUKEY = 4.685
-"""Of Tukey's biweight, in standard deviations: 95 % efficient for normal noise."""
+_ROUNDS = 12
+"""Rounds of the axis at most; each divides its error by some ten."""
+_STILL_MM = 1e-6
+"""Move of the axis that ends the rounds."""
 _SECTORS = 72
 """Sectors of 5 deg, as of a pipe standard (`uwlts.evaluation.artefact_figures`)."""
 _LEAST_ARC = np.pi
@@ -30,8 +31,10 @@ LARGEST_OVALITY = 0.02
 specification is given. A choice: pipes bent in the yard or dented by handling are less round than new line pipe."""
 _WHOLE_ARC = np.radians(300.0)
 """Arc from which the third and fourth harmonics are fitted too, so that they do not pass for others."""
-_FEWEST_OF_SECTION, _LEAST_SHARE = 60, 0.8
-"""Points of a section, and the part of the whole pipe's arc (up to half of its circumference) that it shows."""
+_FEWEST_OF_SECTION = 60
+"""Points of a section."""
+_LEAST_SHARE = 0.8
+"""Part of the whole pipe's arc (up to half of its circumference) that a section shows."""
 _MOST_SECTIONS = 12
 MOST_OFF_SHARE = 0.06
 """Of the radius: the deepest blemish or ovality that still counts as the pipe's surface."""
@@ -142,7 +145,7 @@ def _fitted(cloud: PointCloud, fitted: np.ndarray, frame: PipeFrame, radius: flo
     points = cloud.points_mm[fitted]
     scale = max(0.5 * float(np.ptp(frame.places(points)[0])), 1e-9)
     arc, moved, off, terms = 0.0, np.inf, np.zeros(0), ()
-    coefficients, weight, design = np.zeros(0), np.zeros(0), np.zeros((0, 0))
+    coefficients, weight, design, rows = np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
     for number in range(_ROUNDS):
         along, angle, away = frame.places(points)
         off = away - radius
@@ -150,7 +153,8 @@ def _fitted(cloud: PointCloud, fitted: np.ndarray, frame: PipeFrame, radius: flo
         arc = _arc(angle[near])
         terms = _terms(arc)
         design = _design(along, angle, scale, terms)
-        coefficients, weight = _biweight(design, off, near)
+        rows, weight = fit_biweight(design, off, near)
+        coefficients = rows @ off
         known = dict(zip(terms, coefficients, strict=True))
         # Offset and tilt go into the axis, so that the distances stay linear in them.
         shift = np.array([known["cos"], known["sin"]])
@@ -168,28 +172,14 @@ def _fitted(cloud: PointCloud, fitted: np.ndarray, frame: PipeFrame, radius: flo
             f"the pipe's axis does not settle: after {_ROUNDS} rounds it still moves by {moved:.2g} mm, more than a "
             "mean of all points scatters. Leave out points beside the pipe"
         )
-    normal = (design * weight[:, None]).T @ design
-    weights = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ (design[counted] * weight[counted, None]).T
     # What moved into the axis is no part of the form any more.
     inside = np.array([term in ("1", "cos", "sin", "along cos", "along sin") for term in terms])
     coefficients = np.where(inside, 0.0, coefficients)
     along, angle, away = frame.places(cloud.points_mm)
     distance = away - radius - _design(along, angle, scale, terms) @ coefficients
     used = fitted[counted]
-    known = frame, radius, along, angle, distance, used, arc, terms, coefficients, weights, scale
+    known = frame, radius, along, angle, distance, used, arc, terms, coefficients, rows[:, counted], scale
     return PipeForm(*known, largest_ovality)
-
-
-def _biweight(design: np.ndarray, values: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (K,) by Tukey's biweight and the weights (N,); points that are not near have none."""
-    weight, coefficients = near.astype(float), np.zeros(design.shape[1])
-    for _ in range(_ROUNDS):
-        loaded = (design * weight[:, None]).T
-        coefficients = np.linalg.lstsq(loaded @ design, loaded @ values, rcond=1e-12)[0]
-        left = values - design @ coefficients
-        spread = max(MAD_TO_STD * float(np.median(np.abs(left[near]))), 1e-9)
-        weight = near * np.square(np.clip(1 - np.square(left / (_TUKEY * spread)), 0, None))
-    return coefficients, weight
 
 
 def pipe_features(
@@ -200,7 +190,7 @@ def pipe_features(
     Without a ``section_mm`` the length is divided into up to twelve sections of at least 60 points.
     """
     used = form.used
-    errors = normal_errors(cloud, used, form.outwards[used])
+    errors = PointErrors.along(cloud, used, form.outwards[used])
     whole = _values(form, errors)
     extent = np.array([2 * form.radius_mm, 2 * form.radius_mm, np.ptp(form.along_mm[used])])
     features = [Feature(FeatureKind.PIPE, "pipe", whole, form.frame.point_mm, form.frame.axes, extent, used)]
@@ -240,7 +230,7 @@ def pipe_features(
     return features, notes
 
 
-def _values(form: PipeForm, errors: NormalErrors) -> tuple[FeatureValue, ...]:
+def _values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValue, ...]:
     kind, used, coefficients, diameter = FeatureKind.PIPE, form.used, form.coefficients, 2 * form.radius_mm
     random, common = errors.covariances(form.weights, form.distance_mm[used], _groups(form, used))
     if not form.is_seen_round:
@@ -291,7 +281,7 @@ def _level(across: np.ndarray, stated: int) -> np.ndarray:
 
 def _section_values(
     form: PipeForm,
-    errors: NormalErrors,
+    errors: PointErrors,
     weights: np.ndarray,
     coefficients: np.ndarray,
     terms: tuple[str, ...],
@@ -317,7 +307,7 @@ def _section_values(
 
 
 def _diameter_of_arc(
-    form: PipeForm, errors: NormalErrors, inside: np.ndarray, weights: np.ndarray, off: float
+    form: PipeForm, errors: PointErrors, inside: np.ndarray, weights: np.ndarray, off: float
 ) -> FeatureValue:
     """Diameter of a section of which an arc was seen, whose middle is where the whole pipe's axis puts it.
 

@@ -8,27 +8,46 @@ so that the points' errors run through to every value: by each pattern that all 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage, sparse
 
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.figures import TOWARDS_SENSOR
-from uwlts.fitting.least_squares import MAD_TO_STD, evenly_thinned, fit_robustly, principal_axes
+from uwlts.fitting.least_squares import (
+    MAD_TO_STD,
+    evenly_thinned,
+    fit_biweight,
+    fit_robustly,
+    principal_axes,
+    robust_std,
+)
 from uwlts.fitting.point_spacing import footprint_on
+from uwlts.fitting.propagation import PointErrors
 from uwlts.fitting.shapes import fit_plane
-from uwlts.inspection.features import COVERAGE_FACTOR, DEFINITIONS, Feature, FeatureKind, FeatureValue, Inspection
+from uwlts.inspection.features import (
+    COVERAGE_FACTOR,
+    DEFINITIONS,
+    Feature,
+    FeatureKind,
+    FeatureValue,
+    Inspection,
+    plain_value,
+)
 from uwlts.inspection.noisy_extremes import Largest, largest_mean
-from uwlts.inspection.propagation import NormalErrors, normal_errors, plain_value
 from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud_files import loaded_cloud
 
 _FEWEST = 500
 _TO_START = 20_000
-_DRAWS, _SEED = 32, 635
+_DRAWS = 32
 """The standard deviation of so many is right to 13 %."""
-_TOGETHER_HIGH, _TOGETHER_DEEP = 3, 5
-"""Neighbouring sections of which the largest height and undercut are means: single ones would be the noise's."""
+_TOGETHER_HIGH = 3
+"""Neighbouring sections of which the largest height is the mean: that of a single one would be the noise's."""
+_TOGETHER_DEEP = 5
+"""Neighbouring sections of which the largest undercut is the mean."""
 _MOST_SECTIONS = 100
 _POINTS_IN_SECTION = 80
 _BANDWIDTH_SHARE = 0.04
@@ -54,23 +73,36 @@ _SIGNIFICANT = 4.0
 """Standard deviations of the plates' points that a bead must stand out."""
 _APART = 0.1
 """Of the width over all beads side by side: how far apart these are at half their height, at least."""
-_TUKEY = 4.685
 _NOTHING = 1e-9
 
 
-def inspect_weld(cloud: PointCloud, *, section_mm: float | None = None) -> Inspection:
+def inspect_weld(cloud: PointCloud | str | os.PathLike[str], *, section_mm: float | None = None) -> Inspection:
     """Measure the highest weld bead of a cloud: height, width, undercut, toe angles and misalignment.
 
     The plates on both sides are fitted robustly; the bead runs along the longest extent of what stands out of them.
-    Sections are ``section_mm`` long, or as short as their points allow. Toes are where the lines through the flanks,
-    from 10 to 50 % of the height, meet the plates. EvaluationError where no bead stands out.
+    Toes are where the lines through the flanks, from 10 to 50 % of the height, meet the plates.
+
+    Parameters
+    ----------
+    cloud
+        As for `inspect_pipe`.
+    section_mm
+        Length of a section along the weld; as short as its points allow unless given.
+
+    Raises
+    ------
+    CaptureError
+        The file cannot be read.
+    EvaluationError
+        No bead stands out, or the length is not positive.
     """
+    cloud = loaded_cloud(cloud)
     if section_mm is not None and not 0 < section_mm < np.inf:
         raise EvaluationError(f"section_mm is {section_mm:g}; expected a positive length in mm")
     if len(cloud) < _FEWEST:
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST} are needed for a weld")
     bead, notes = _bead_of(cloud, section_mm)
-    errors = normal_errors(cloud, bead.chosen, np.broadcast_to(bead.axes[2], (len(bead.chosen), 3)))
+    errors = PointErrors.along(cloud, bead.chosen, np.broadcast_to(bead.axes[2], (len(bead.chosen), 3)))
     values, extent, left_out = _values(bead, errors)
     feature = Feature(FeatureKind.WELD, "weld", values, bead.middle_mm, bead.axes, extent, bead.chosen[bead.on_bead])
     deviation = np.full(len(cloud), np.nan)
@@ -158,7 +190,7 @@ def _bead_of(cloud: PointCloud, section_mm: float | None) -> tuple[_Bead, list[s
     if min(map(np.count_nonzero, sides)) < _FEWEST_BESIDE:
         raise EvaluationError("the plate was not seen on both sides of the bead")
     design = np.column_stack([np.ones(len(along)), along, across])
-    rows = [_robust_rows(design, raw, side) for side in sides]
+    rows = [fit_biweight(design, raw, side)[0] for side in sides]
     # Between the toes the reference runs from one plate to the other.
     share = np.clip((across + half) / (2 * half), 0, 1)
     heights = raw - (1 - share) * (design @ (rows[0] @ raw)) - share * (design @ (rows[1] @ raw))
@@ -215,7 +247,7 @@ def _found(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarra
     """
     start = fit_robustly(lambda p: fit_plane(p, towards=TOWARDS_SENSOR), evenly_thinned(points, _TO_START))
     up, heights = start.fit.normal, start.fit.distances_mm(points)
-    noise = MAD_TO_STD * float(np.median(np.abs(heights - np.median(heights))))
+    noise = robust_std(heights - np.median(heights))
     top = float(np.quantile(heights, 0.995))
     if top < _SIGNIFICANT * noise:
         raise EvaluationError(
@@ -239,19 +271,6 @@ def _found(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarra
     half = _HALF_FROM_CROWN * 0.5 * float(high - low)
     ends = np.quantile((crown - middle) @ along, [0.005, 0.995])
     return axes, middle, half, ends, len(beads) - 1
-
-
-def _robust_rows(design: np.ndarray, heights: np.ndarray, side: np.ndarray) -> np.ndarray:
-    """Rows (3, n) whose products with heights are the coefficients of the plane of one side, outliers aside."""
-    weight = side.astype(float)
-    rows = np.zeros((3, len(heights)))
-    for _ in range(8):
-        normal = (design * weight[:, None]).T @ design
-        rows = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ (design * weight[:, None]).T
-        left = heights - design @ (rows @ heights)
-        spread = max(MAD_TO_STD * float(np.median(np.abs(left[side]))), 1e-12)
-        weight = side * np.square(np.clip(1 - np.square(left / (_TUKEY * spread)), 0, None))
-    return rows
 
 
 def _profile_rows(
@@ -320,7 +339,7 @@ class _Figures:
     grooves: tuple[np.ndarray, np.ndarray]
 
 
-def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...], np.ndarray, list[str]]:
+def _values(bead: _Bead, errors: PointErrors) -> tuple[tuple[FeatureValue, ...], np.ndarray, list[str]]:
     """Values, extent (3,), and notes on sections and values that are left out."""
     profiles = bead.profiles.of(bead.raw_mm)
     tops = _tops(bead, profiles)
@@ -341,13 +360,8 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
             notes.append(
                 f"the undercut {side} is not known in {lost} of {len(whole)} sections: too few lines were seen there"
             )
-    rng = np.random.default_rng(_SEED)
-    noise = np.maximum(bead.noise_mm, errors.single_mm)
-    noisy = []
-    for _ in range(_DRAWS):
-        moves = rng.standard_normal(len(noise)) * noise
-        moves += errors.drawn_of_images(rng)
-        noisy.append(_figures(bead, bead.raw_mm + moves, whole, toes))
+    scattered = replace(errors, single_mm=np.maximum(bead.noise_mm, errors.single_mm))
+    noisy = [_figures(bead, bead.raw_mm + moves, whole, toes) for moves in scattered.drawn(_DRAWS)]
     # Ripples make neighbouring crests differ, which is no noise; grooves have none.
     of_crest = float(np.median(np.std([each.crest for each in noisy], axis=0)))
     largest = {
@@ -379,10 +393,7 @@ def _values(bead: _Bead, errors: NormalErrors) -> tuple[tuple[FeatureValue, ...]
     resolved = np.nan_to_num(np.array(resolution) - seen)
     fixed = np.sqrt(bias**2 + np.sum(resolved**2, axis=0))
     plain = np.where(extremes, np.maximum(seen - bias, 0), seen)
-    common = None
-    if errors.patterns_mm is not None:
-        moved = [values_of(_figures(bead, bead.raw_mm + pattern, whole, toes)) - seen for pattern in errors.patterns_mm]
-        common = np.sqrt(np.nansum(np.square(moved), axis=0))
+    common = errors.by_patterns(lambda pattern: values_of(_figures(bead, bead.raw_mm + pattern, whole, toes)) - seen)
     values = []
     for k, (name, value) in enumerate(zip(_NAMES, plain, strict=True)):
         if not np.isfinite(value):

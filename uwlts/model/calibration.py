@@ -1,6 +1,7 @@
 """The calibrated sensor: everything reconstruction needs, stored as readable JSON with residuals and provenance."""
 
 from itertools import product
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -14,8 +15,12 @@ from pydantic import (
 )
 
 from uwlts.errors import problems_of
+from uwlts.files.json_files import write_model
+from uwlts.model.brief import Brief
 from uwlts.model.joint_estimate import JointEstimate, Origin
 from uwlts.model.sensor import Camera, Description, Distortion, Medium, Positive, Table, UnitVector, Vector, Window
+
+FORMAT, VERSION = "uwlts-calibration", 1
 
 _Rows = tuple[tuple[float, float, float, float], ...]
 
@@ -28,6 +33,13 @@ def is_rigid(matrices: np.ndarray, *, within: float) -> bool:
     square = np.allclose(rotation @ np.swapaxes(rotation, -1, -2), np.eye(3), atol=within)
     last = np.allclose(matrices[..., 3, :], (0, 0, 0, 1), atol=within)
     return square and last and bool((np.linalg.det(rotation) > 0).all())
+
+
+def rigid_transform(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Matrix (4, 4) of a rotation (3, 3) and a shift (3,)."""
+    result = np.eye(4)
+    result[:3, :3], result[:3, 3] = rotation, shift
+    return result
 
 
 def _rigid(matrix: _Rows) -> _Rows:
@@ -43,6 +55,12 @@ def _with_numbers(figures: Table) -> Table:
         if not isinstance(value := figures.get(name), int | float | None):
             raise ValueError(f"{name} is {value!r}; expected a number")
     return figures
+
+
+def _numbers_in(figures: object) -> dict[str, float]:
+    """The finite numbers among figures by their names; none where there are no figures."""
+    known = figures.items() if isinstance(figures, dict) else ()
+    return {name: value for name, value in known if isinstance(value, int | float) and np.isfinite(value)}
 
 
 def _with_origin(provenance: Table) -> Table:
@@ -157,13 +175,31 @@ class KnownStage(Description):
     direction: Vector
 
 
-class Calibration(Description):
+class CalibrationStd(Description):
+    """Standard uncertainties of the parameters of a calibration; None for those that were not estimated, or not alone.
+
+    A single focal length for square pixels gives both ``fx_px`` and ``fy_px``. ``distortion`` is by the names of the
+    coefficients.
+    """
+
+    fx_px: float | None = None
+    fy_px: float | None = None
+    cx_px: float | None = None
+    cy_px: float | None = None
+    distortion: dict[str, float] = {}
+    sheet_normal_deg: float | None = None
+    window_distance_mm: float | None = None
+
+
+class Calibration(Brief, Description):
     """A calibrated sensor.
 
     ``window`` is None where none stands in the light's way, or where its effect was left to focal length and
     distortion. Without a window the calibration holds in the kind of medium in which the target was seen,
-    ``medium_kind``; in water that is the approximation of a single viewpoint. ``camera_from_object`` is the 4x4 matrix
-    ``T_camera_object`` of the OCS: X normal to the sheet, Z along the laser's axis, Y along the stripe.
+    ``medium_kind``; in water that is the approximation of a single viewpoint. With a window it holds in all media, and
+    ``medium_kind`` is that of the target, or of a `uwlts.nominal` calibration that of the sheet.
+    ``camera_from_object`` is the 4x4 matrix ``T_camera_object`` of the OCS: X normal to the sheet, Z along the laser's
+    axis, Y along the stripe.
     ``stripe_along`` is as in the sensor description. ``media`` are those of the evidence: in just these the index
     found replaces the one that follows from the description. ``stages`` are those whose direction was found.
     ``residuals`` are named figures of each step, ``provenance`` what the calibration was made from. ``joint`` is the
@@ -210,9 +246,26 @@ class Calibration(Description):
         place = 1 + next((number for number, (key, _) in enumerate(figures) if key == "camera"), -1)
         return dict([*figures[:place], ("joint", self.joint.in_file()), *figures[place:]])
 
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the calibration as JSON, whole or not at all; OutputError if that fails."""
+        write_model(path, self, format=FORMAT, version=VERSION, overwrite=overwrite)
+
     def figures(self, step: str) -> Table:
         """Figures of a step among the residuals; none where there are none of it."""
         return self.residuals.get(step, {})
+
+    def std(self) -> CalibrationStd:
+        """Standard uncertainties of camera, sheet and window as far as the calibration states them."""
+        camera = _numbers_in(self.figures("camera").get("std"))
+        focal = camera.pop("f", None)
+        known: Table = {f"{name}_px": camera.pop(name, focal) for name in ("fx", "fy")}
+        known |= {f"{name}_px": camera.pop(name, None) for name in ("cx", "cy")}
+        others = {
+            "distortion": camera,
+            "sheet_normal_deg": _numbers_in(self.figures("sheet")).get("normal_std_deg"),
+            "window_distance_mm": _numbers_in(self.figures("window")).get("std_mm"),
+        }
+        return CalibrationStd.model_validate(known | others)
 
     def origin(self) -> Origin:
         """Evidence that the calibration was made from, by its provenance."""

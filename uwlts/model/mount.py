@@ -1,12 +1,17 @@
 """The mount of a laser profiler on a moving platform, as `uwlts.calibrate_mount` finds it and `mount.json` holds it."""
 
+from pathlib import Path
 from typing import Annotated, Literal, assert_never
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from uwlts.files.json_files import write_model
+from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import Description, NotNegative, Positive, Vector
+
+FORMAT, VERSION = "uwlts-mount", 1
 
 Rows = tuple[tuple[float, ...], ...]
 
@@ -96,7 +101,7 @@ class SensorShare(Description):
     covariance_apart: Rows
 
 
-class Mount(Description):
+class Mount(Brief, Description):
     """Transform from the sensor to the platform that carries it, with its uncertainty and the evidence.
 
     ``T_platform_sensor`` (4, 4) maps points of the sensor's frame (x and z of the profiles, y = z x x across the sheet)
@@ -145,6 +150,10 @@ class Mount(Description):
         if not np.all(np.delete(np.diag(covariance), (2, 5) if self.table else ()) > 0):
             raise ValueError("covariance must have positive variances")
         return self
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the mount as JSON, whole or not at all; OutputError if that fails."""
+        write_model(path, self, format=FORMAT, version=VERSION, overwrite=overwrite)
 
     def transform(self) -> np.ndarray:
         """``T_platform_sensor`` as an array (4, 4), mm."""

@@ -1,18 +1,23 @@
 """The polynomial reference method's calibration: two polynomials for each profile line, stored as JSON."""
 
+import json
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from uwlts.files.writing import written_aside
+from uwlts.model.brief import Brief
 from uwlts.model.calibration import Residuals
 from uwlts.model.sensor import Description, Medium, Positive, Table
 
+FORMAT, VERSION = "uwlts-polynomials", 1
 Pair = tuple[float, float]
 Rows = tuple[tuple[float, ...], ...]
 
 
-class PolynomialCalibration(Description):
+class PolynomialCalibration(Brief, Description):
     """A sensor calibrated by polynomials (thesis, section 4.7): stripe position to Z, and Z to Y, for each line.
 
     It holds in the medium and with the window it was made with, and only where its evidence reached. Both polynomials
@@ -64,6 +69,14 @@ class PolynomialCalibration(Description):
         if not known or not all(low <= a <= b <= high for a, b in known):
             raise ValueError("domains_px must name ranges that grow and lie within position_range_px")
         return self
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the calibration as JSON, whole or not at all; OutputError if that fails."""
+        # One key a line: indented, the thousands of coefficients would take a line each.
+        content = {"format": FORMAT, "version": VERSION} | self.model_dump(mode="json")
+        lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
+        with written_aside(path, overwrite=overwrite) as aside:
+            aside.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
 
     def figures(self, step: str) -> Table:
         """Figures of a step among the residuals; none where there are none of it."""

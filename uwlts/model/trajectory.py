@@ -2,21 +2,26 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from uwlts.errors import DescriptionError
+from uwlts.files.writing import written_aside
+from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
 
 _ROUNDED = 1e-6
 _LARGEST_DRIFT_PPM = 10_000.0
 """A hundred times the worst quartz: more is a mistaken unit."""
+COVARIANCE_COLUMNS = {f"cov_{i}{j}": (i, j) for i in range(6) for j in range(i, 6)}
+"""Names of a file's columns with the upper triangle of each covariance, and their places in it."""
 
 
-@dataclass(frozen=True, eq=False)
-class Trajectory:
+@dataclass(frozen=True, eq=False, repr=False)
+class Trajectory(Brief):
     """Poses of a platform at growing times.
 
     Between them positions follow a cubic spline and rotations one with continuous angular acceleration (SciPy's
@@ -60,6 +65,17 @@ class Trajectory:
         for name, values in known.items():
             values.flags.writeable = False
             object.__setattr__(self, name, values)
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the path as CSV of the format quaternion-xyzw, mm, with covariances; OutputError if that fails."""
+        turns = Rotation.from_matrix(self.poses[:, :3, :3]).as_quat()
+        table = np.column_stack([self.times_s, self.poses[:, :3, 3], turns])
+        names = ["time_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"]
+        if self.covariance is not None:
+            names += COVARIANCE_COLUMNS
+            table = np.column_stack([table, *(self.covariance[:, i, j] for i, j in COVARIANCE_COLUMNS.values())])
+        with written_aside(path, overwrite=overwrite) as aside:
+            np.savetxt(aside, table, fmt="%.12g", delimiter=",", header=",".join(names), comments="")
 
     @cached_property
     def _positions(self) -> CubicSpline:

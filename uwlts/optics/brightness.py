@@ -40,8 +40,9 @@ _REACH_MM = 2.0
 _LEAST_APART_MM = 0.05
 """Least standard deviation of the positions of images for their brightness to be compared: a third of a sheet."""
 
-# Neighbouring lines on either side for slopes of brightness and of the stripe; the share of them that must show it.
-_LINES, _BEND_LINES, _LEAST_SHARE = 12, 6, 0.2
+_LINES = 12  # neighbouring lines on either side for slopes of brightness
+_BEND_LINES = 6  # the same for slopes of the stripe, which bends
+_LEAST_SHARE = 0.2  # share of the neighbours that must show it
 
 _LEAST_ACROSS = 0.3
 """Least cosine between the stage's motion and the sheet's normal for which a scan shows what lies beside the sheet."""

@@ -16,14 +16,14 @@ _RAYS, _DEPTHS = 65, 9
 
 
 def nominal(sensor: str | Path | Sensor, *, medium: str) -> Calibration:
-    """Calibration of a sensor that is built exactly as described, for use in one of its media.
+    """Return the calibration that a sensor would have if it were built exactly as described.
 
     Parameters
     ----------
     sensor : str, Path or Sensor
-        Name of a shipped sensor, path of a description, or the description itself.
+        Name or path of a sensor description, or the description itself.
     medium : str
-        Name of one of the sensor's media, in which the laser's window may turn the sheet.
+        One of the sensor's media; the laser's window may turn the sheet in it.
 
     Raises
     ------
@@ -48,6 +48,8 @@ def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibra
         sensor_name=sensor.name,
         stripe_along=camera.stripe_along,
         wavelength_nm=sensor.laser.wavelength_nm,
+        # Without a window the described focal length holds no refraction: it is one in air.
+        medium_kind=medium.kind if medium is not None and camera.window.mounted else "air",
         camera=CameraModel.described(camera),
         window=WindowModel.described(camera.window, sensor.laser.wavelength_nm) if camera.window.mounted else None,
         sheet=_sheet(sensor, medium),

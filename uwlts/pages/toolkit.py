@@ -199,13 +199,15 @@ def new_figure(
     rows: int = 1,
     columns: int = 1,
     height_ratios: list[float] | None = None,
+    width_ratios: list[float] | None = None,
 ) -> tuple[Figure, list[Axes]]:
     """A matplotlib figure in the pages' style, and its axes row by row; sizes in inches."""
     import matplotlib
 
     figure = figure_of(width, height)
     with matplotlib.rc_context(_STYLE):
-        return figure, list(figure.subplots(rows, columns, squeeze=False, height_ratios=height_ratios).flat)
+        axes = figure.subplots(rows, columns, squeeze=False, height_ratios=height_ratios, width_ratios=width_ratios)
+        return figure, list(axes.flat)
 
 
 def legend_below(figure: Figure, *, columns: int = 4) -> None:

@@ -15,9 +15,10 @@ from uwlts.fitting.least_squares import MAD_TO_STD
 _LARGEST_S = 0.5
 """Latency that is looked for at most: that of slow drivers."""
 _MOST_BENT_PX = 2.0
+"""Largest change of the stripe's motion from one frame to the next, px. Beyond is an edge, unless the motion changes
+alike beside it."""
 _MOST_BENT = 0.5
-"""Largest change of the stripe's motion from one frame to the next, in px or as a share of the motion. Beyond is an
-edge, unless the motion changes alike beside it. (At a jump it changes by twice its mean, and next by the opposite.)"""
+"""The same as a share of the motion: at a jump it changes by twice its mean, and next by the opposite."""
 _FEWEST = 200
 """Pairs of stripe centres with relief from which the latency is estimated."""
 _GRAIN = 2.0

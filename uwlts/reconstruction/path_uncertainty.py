@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.runtime.compiled import compiled
-from uwlts.storage.cloud import PAIRS, PointUncertainty
+from uwlts.storage.cloud import PointUncertainty, turned_pairs
 
 _MOST_SHAPES = 12
 """Shapes along the path; what they leave counts as independent from image to image."""
@@ -121,11 +121,7 @@ def along_corrected_path(
     for start in range(0, len(image), _BLOCK):
         here = slice(start, start + _BLOCK)
         matrices = Rotation.from_rotvec(turns[here]).as_matrix()
-        full = np.empty((len(matrices), 3, 3))
-        for column, (i, j) in enumerate(PAIRS):
-            full[:, i, j] = full[:, j, i] = known.random_mm2[here, column]
-        full = matrices @ full @ matrices.transpose(0, 2, 1)
-        random[here] = np.stack([full[:, i, j] for i, j in PAIRS], axis=1)
+        random[here] = turned_pairs(known.random_mm2[here], matrices)
         position[here] = np.einsum("nij,nj->ni", matrices, known.position_mm[here])
         own[:, here] = np.einsum("nij,knj->kni", matrices, np.tensordot(mixing, known.patterns_mm[:, here], axes=1))
     patterns = moved_by_poses(shapes, image, levers_mm, after=own)

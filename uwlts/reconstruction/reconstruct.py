@@ -1,13 +1,12 @@
 """Reconstruction of captures: point clouds from the stripes of all laser images by a calibration of any kind."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from uwlts.errors import CalibrationError, DescriptionError
-from uwlts.model.any_calibration import AnyCalibration, calibration_digest, check_fits
+from uwlts.model.any_calibration import AnyCalibration, calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import Mount
 from uwlts.model.polynomial_calibration import PolynomialCalibration
@@ -15,15 +14,18 @@ from uwlts.model.sensor import Table
 from uwlts.model.stripe import CaptureStripes
 from uwlts.model.trajectory import Trajectory
 from uwlts.optics.brightness import LitSheet, footprint_std, sharp_lines, slopes_of_brightness
+from uwlts.optics.fitness import check_fits
 from uwlts.optics.triangulation import MeasuredPoints, reconstruct_by_polynomials, reconstruct_profile, stage_travel
 from uwlts.optics.window import RayStatus, require_index
 from uwlts.reconstruction.moving import carried, platform_ride, with_platform
 from uwlts.reconstruction.point_uncertainty import point_uncertainty
 from uwlts.runtime.compiled import compiled
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.calibration_file import loaded_calibration
 from uwlts.storage.capture import Capture, FrameTable, opened_capture, sensor_poses
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PointCloud
 from uwlts.storage.mount_files import read_mount
+from uwlts.storage.pose_files import PoseFormat, Unit, read_trajectory
 from uwlts.stripe import StripeSettings, find_stripes
 
 
@@ -32,40 +34,53 @@ def reconstruct(
     calibration: AnyCalibration | str | Path,
     *,
     mount: Mount | str | Path | None = None,
-    trajectory: Trajectory | None = None,
+    trajectory: Trajectory | str | Path | None = None,
+    pose_format: PoseFormat = "matrix",
+    pose_unit: Unit = "mm",
     clock_offset_s: float | None = None,
     clock_drift_ppm: float = 0.0,
     pose_correlation_s: float | None = None,
     stripe: StripeSettings = None,
     index: float | None = None,
     with_uncertainty: bool | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> PointCloud:
-    """Point cloud of a capture: finds the stripes of all laser images and turns them into points.
+    """Turn a capture into a point cloud: find the stripes of all laser images and triangulate them.
 
     Parameters
     ----------
     capture : Capture or path
+        Capture of a scan.
     calibration : Calibration, PolynomialCalibration or path
+        Calibration of the sensor, or one by polynomials.
     mount : Mount or path, optional
-        Where the sensor is on its platform. The poses of the capture's images are then the platform's. Where a capture
-        states a mount, that of the drawing, it is used unless this is given.
-    trajectory : Trajectory, optional
-        Path of the platform (of the sensor without a mount), in place of poses in the capture and of the stage.
+        Where the sensor is on its platform (uwlts mount), in place of what the capture states. Poses are the platform's
+        then, and points are given in the frame of the poses.
+    trajectory : Trajectory or path, optional
+        CSV file or ROS bag with times and poses of the platform (of the sensor without a mount), which replace poses in
+        the capture and the stage.
+    pose_format : str
+        Format of the trajectory: matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about
+        the moved axes), euler-zyx-deg (about the fixed axes) or another order, -rad for radians; tum; or of a ROS bag
+        ros, ros:/TOPIC, ros:PARENT>CHILD (frames).
+    pose_unit : {"mm", "m"}
+        Unit of the trajectory's positions.
     clock_offset_s : float, optional
-        What to add to the times of the images for those of the trajectory; by default as the mount says, or nothing.
+        What to add to the times of the images for those of the trajectory; as the mount says unless given.
     clock_drift_ppm : float, optional
-        By how many parts in a million the trajectory's clock runs faster than the camera's, from the first laser image.
+        By how many parts in a million the trajectory's clock runs faster than the camera's, from the first laser image
+        on.
     pose_correlation_s : float, optional
-        Time over which errors of poses stay alike: 0 where each pose errs by itself, infinity where all err together.
-        By default 0 for poses in the capture, and for a trajectory as the errors of a navigation filter that states
-        these covariances (`uwlts.reconstruction.moving`).
+        Time over which errors of poses stay alike: 0 if each pose errs by itself, inf if all err together. Unless given
+        it is 0 for poses in the capture; errors of a trajectory are those of a navigation filter of its covariances.
     stripe : StripeOptions or dict, optional
-        How stripes are found: all options, or settings in place of those in the sensor's table [stripe].
+        How stripes are found: all options, or settings such as half_window_px=32 threshold_sigmas=4, in place of those
+        in the sensor's table [stripe] (docs: StripeOptions).
     index : float, optional
         Refractive index of the medium relative to air, in place of the one that follows from the capture.
     with_uncertainty : bool, optional
-        Calculate the uncertainty of the points; by default with a joint calibration, which alone holds one.
+        Calculate the uncertainty of the points, by default with a joint calibration, which alone holds one. Files with
+        it are more than ten times as large.
     progress : callable, optional
         Called after each image with the number of images done and the number in all.
 
@@ -94,6 +109,8 @@ def reconstruct(
             stripes = find_stripes(scan, options=stripe, progress=progress)
             return reconstruct_stripes(scan, stripes, calibration, index=index, with_uncertainty=known)
         mount = read_mount(mount) if isinstance(mount, str | Path) else mount
+        if isinstance(trajectory, str | Path):
+            trajectory = read_trajectory(trajectory, pose_format=pose_format, unit=pose_unit)
         ride = platform_ride(
             scan, trajectory, mount=mount, clock_offset_s=clock_offset_s, clock_drift_ppm=clock_drift_ppm
         )
@@ -105,7 +122,7 @@ def reconstruct(
         )
         warnings = cloud.warnings
         if mount is None and scan.header.T_platform_sensor is not None:
-            warnings = [*warnings, "the mount is that of the drawing: calibrate it (uwlts mount) and give --mount"]
+            warnings = [*warnings, "the mount is that of the drawing: calibrate it (uwlts mount) and give `mount`"]
         own = cloud.uncertainty
         if own is not None:
             where = cloud.points_mm, cloud.frame, ride
@@ -168,7 +185,7 @@ def reconstruct_stripes(
     kept, known = stripes[good], None
     if with_uncertainty:
         if exact is None:
-            raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (--water or --joint)")
+            raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (`water` or `joint`)")
         where = kept.frame, kept.line, kept.centre_px
         moved = {"blur_px": blur[good], "beside_mm": beside[good], "mount_by": mount_by}
         known = point_uncertainty(capture, exact, *where, **moved, digest=digest)

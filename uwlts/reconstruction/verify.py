@@ -88,7 +88,17 @@ def verify(
 ) -> Verification:
     """Measure the artefact that a capture shows and compare it with its calibrated values.
 
-    ``limit_mm`` is the largest permissible error.
+    Each calibrated size must agree with its certificate within both uncertainties (E_n at most 1, ISO/IEC 17043) and,
+    with a limit, conform to it beyond doubt (ISO 14253-1).
+
+    Parameters
+    ----------
+    capture : Capture or path
+        Scan of an artefact with calibrated sizes.
+    calibration : Calibration, PolynomialCalibration or path
+        Calibration of the sensor; a joint one holds its uncertainty.
+    limit_mm : float, optional
+        Largest permissible error.
 
     Raises
     ------
@@ -101,11 +111,11 @@ def verify(
         The calibration does not fit the capture, there is no stripe, or a file cannot be read.
     """
     if limit_mm is not None and not limit_mm > 0:
-        raise RangeError(f"--limit is {limit_mm:g} mm; a permissible error is positive")
+        raise RangeError(f"`limit_mm` is {limit_mm:g}; a permissible error is positive")
     calibration = loaded_calibration(calibration)
     with opened_capture(capture) as scan:
         if calibration.joint is None and limit_mm is None:
-            advice = "give --limit, or calibrate jointly"
+            advice = "give `limit_mm`, or calibrate jointly"
             raise EvaluationError(f"the calibration holds no uncertainty to judge by: {advice}")
         if scan.header.artefact is None:
             raise EvaluationError(f"{scan.path.name} does not say what it shows: its header needs an artefact")

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from uwlts.errors import EvaluationError, SetupError
-from uwlts.fitting.patches import Patches, distances_between
-from uwlts.registration.joint_registration import JointRegistration
+from uwlts.fitting.patches import Patches
+from uwlts.registration.joint_registration import fit_pair
 from uwlts.registration.marker_spheres import MarkerSphere, movement_by_markers
 
 _TRIES = ((0.55, 2.0, 6.0), (0.55, 3.0, 5.0), (0.8, 2.0, 6.0), (0.8, 3.0, 5.0), (1.6, 3.0, 5.0))
@@ -25,7 +25,6 @@ _LEAST_SHARE = 0.6
 """Of the patches that lie near each other, those that agree within their noise: a wrong start leaves a few."""
 _LEAST_OVERLAP = 30
 """Patches on each other that make a pair; chance gives a few."""
-_REFINING_ROUNDS = 12
 _CLOSE = 5.0
 """Standard deviations within which patches lie on each other."""
 
@@ -109,20 +108,11 @@ def _refined(a: Patches, b: Patches, movement: np.ndarray) -> tuple[np.ndarray, 
     The number is 0 where many patches disagree, and where the shape leaves a direction open, as a pipe or a plane does:
     then any place along it would fit as well.
     """
-    poses = np.array([np.eye(4), movement])
-    joint = JointRegistration([b, a], [[], []], poses, start_std=None, sphere_mm=None)
-    reach = 4 * max(a.radius_mm, b.radius_mm)
-    for _ in range(_REFINING_ROUNDS):
-        pairs = joint.evidence(reach)
-        if not pairs:
-            return movement, 0.0
-        joint.move(joint.solved(list(pairs.values())).step)
-        reach = max(0.8 * reach, a.radius_mm)
-    if not (pairs := joint.evidence(reach)) or len(joint.solved(list(pairs.values())).open_directions):
+    if (fitted := fit_pair(a, b, movement)) is None:
         return movement, 0.0
-    found = distances_between(a, joint.poses[1], b, joint.poses[0], reach_mm=reach)
+    found = fitted[1]
     fits = np.abs(found.distance_mm) < _CLOSE * found.std_mm
-    return joint.poses[1], float(np.count_nonzero(fits)) if len(fits) and np.mean(fits) > _LEAST_SHARE else 0.0
+    return fitted[0], float(np.count_nonzero(fits)) if len(fits) and np.mean(fits) > _LEAST_SHARE else 0.0
 
 
 def _library() -> Any:

@@ -12,23 +12,31 @@ from dataclasses import dataclass, replace
 from itertools import combinations, pairwise, permutations
 
 import numpy as np
-from scipy.linalg import eigh
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.patches import PatchDistances, Patches, distances_between, scatter
+from uwlts.fitting.least_squares import biweight, noise_factor
+from uwlts.fitting.patches import (
+    LEAST_INFORMATION,
+    PatchDistances,
+    Patches,
+    distances_between,
+    information_of_slopes,
+    rigid_derivatives,
+    ways_of_moving,
+)
 from uwlts.registration.marker_spheres import MarkerSphere, common_markers
 
-_TUKEY = 4.685
-"""Of Tukey's biweight, in standard deviations: 95 % efficient for normal noise."""
-_FEWEST = 12
-"""Patches of an overlap; a movement has six parameters."""
-_NOISE = 5.0
-"""Times the information that the noise of normals alone would give: a direction with less is open."""
+FEWEST_OF_PAIR = 12
+"""Patches of an overlap that counts: two for each of the six parameters of a movement."""
 _OWN_PART = 1e-4
 """Variance of a pattern that no other scan has, of one: a hundredth of its errors, as temperature and load change."""
-_ROUNDING = 1e-9
-"""Of the information of the best determined direction: less is rounding."""
+NARROWER = 0.8
+"""Reach of a round relative to that of the round before."""
+_PAIR_REACH = 4.0
+"""Reach of the first round of a pair's own fit, in patch radii: a search is right to about one."""
+_PAIR_ROUNDS = 12
+"""Rounds of a pair's own fit: after seven the reach is one patch radius."""
 _SPHERE_REACH = 0.25
 """Of the diameter: how far the centres of one sphere lie apart in two scans, at most."""
 
@@ -114,29 +122,34 @@ class JointRegistration:
 
     def evidence(self, reach_mm: float) -> dict[tuple[int, int], PairEvidence]:
         """What all pairs of scans that overlap or share spheres say, about the present state."""
-        moved = [self._moved(number) for number in range(len(self.patches))]
-        found: dict[tuple[int, int], PatchDistances] = {}
-        others = [np.ones(len(each)) for each in moved]
-        for a, b in permutations(range(len(moved)), 2):
-            distances = distances_between(moved[a], self.poses[a], moved[b], self.poses[b], reach_mm=reach_mm)
-            if len(distances.source):
-                found[a, b] = distances
-                others[a][distances.source] += 1
+        found = self._distances(reach_mm)
+        others = [np.ones(len(each)) for each in self.patches]
+        for (a, _), distances in found.items():
+            others[a][distances.source] += 1
         centres = [self._centres(number) for number in range(len(self.markers))]
         common = common_markers(centres, _SPHERE_REACH * (self.sphere_mm or 0.0))
         pairs = {}
-        for a, b in combinations(range(len(moved)), 2):
+        for a, b in combinations(range(len(self.patches)), 2):
             ways = [
                 (source, target, found[source, target])
                 for source, target in ((a, b), (b, a))
                 if (source, target) in found
             ]
-            if sum(len(distances.source) for *_, distances in ways) < _FEWEST:
+            if sum(len(distances.source) for *_, distances in ways) < FEWEST_OF_PAIR:
                 ways = []
             shared = [(views[a], views[b], len(views)) for views in common if a in views and b in views]
             if ways or shared:
                 pairs[a, b] = self._pair(a, b, ways, others, shared)
         return pairs
+
+    def narrow_overlaps(self, reach_mm: float) -> tuple[tuple[int, int, int], ...]:
+        """Return the pairs of scans that overlap too little to count, with the number of patches."""
+        found = self._distances(reach_mm)
+        counts = {
+            (a, b): sum(len(found[way].source) for way in ((a, b), (b, a)) if way in found)
+            for a, b in combinations(range(len(self.patches)), 2)
+        }
+        return tuple((a, b, count) for (a, b), count in counts.items() if 0 < count < FEWEST_OF_PAIR)
 
     def solved(self, pairs: Sequence[PairEvidence]) -> Solved:
         """The least-squares step by the evidence of pairs and what is known beforehand."""
@@ -154,10 +167,8 @@ class JointRegistration:
         within = np.linalg.solve(beside, normal[count:, :count])
         reduced = normal[:count, :count] - normal[:count, count:] @ within
         reduced = (reduced + reduced.T) / 2
-        rounding = _ROUNDING / _NOISE * float(np.linalg.eigvalsh(reduced)[-1])
-        metric = spurious + max(rounding, 1e-300) * np.eye(count)
-        values, vectors = eigh(reduced, metric)
-        known = values > _NOISE
+        values, vectors, metric = ways_of_moving(reduced, spurious)
+        known = values > LEAST_INFORMATION
         ways, strengths = vectors[:, known], values[known]
         down = gradient[:count] - within.T @ gradient[count:]
         open_ways = np.linalg.qr(vectors[:, np.logical_not(known)])[0]
@@ -207,6 +218,15 @@ class JointRegistration:
                 "start, a larger reach, spheres, or search the start (search)"
             )
 
+    def _distances(self, reach_mm: float) -> dict[tuple[int, int], PatchDistances]:
+        """Distances of the patches of each scan from each other one that it overlaps."""
+        moved = [self._moved(number) for number in range(len(self.patches))]
+        found = {
+            (a, b): distances_between(moved[a], self.poses[a], moved[b], self.poses[b], reach_mm=reach_mm)
+            for a, b in permutations(range(len(moved)), 2)
+        }
+        return {pair: distances for pair, distances in found.items() if len(distances.source)}
+
     def _moved(self, number: int) -> Patches:
         patches, amounts = self.patches[number], self.patterns[number]
         return replace(patches, places_mm=patches.places_mm + np.tensordot(amounts, patches.patterns_mm, axes=1))
@@ -234,21 +254,20 @@ class JointRegistration:
         others: list[np.ndarray],
         spheres: list[tuple[MarkerSphere, MarkerSphere, int]],
     ) -> PairEvidence:
-        unknown, count = len(self.units), self.unknown_poses
+        unknown, count, middles = len(self.units), self.unknown_poses, self.middles_mm
         relative = np.concatenate([each.distance_mm / each.std_mm for *_, each in ways]) if ways else np.empty(0)
-        spread = scatter(relative)
+        spread = noise_factor(relative)
         blocks, residuals, weights, deviations = [], [], [], []
         spurious = np.zeros((count, count))
         for source, target, found in ways:
             std = found.std_mm * spread
-            u = np.clip(found.distance_mm / std / _TUKEY, -1, 1)
             # Both directions count by half, and K scans of one place have K (K - 1) / 2 pairs and K - 1 differences.
             each = 1 / (others[source][found.source] * self.patches[source].alike(len(found.source)))
-            weight = (1 - u * u) ** 2 / std**2 * each
+            weight = biweight(found.distance_mm / std) / std**2 * each
             block = np.zeros((len(weight), unknown))
             for number, rows, sign in ((source, found.source, 1.0), (target, found.target, -1.0)):
                 if len(columns := self.pose_columns[number]):
-                    block[:, columns] = sign * self._by_pose(number, found.places_mm, found.normals)
+                    block[:, columns] = sign * rigid_derivatives(found.places_mm, found.normals, middles[number])
                 turned = self.patches[number].patterns_mm[:, rows] @ self.poses[number, :3, :3].T
                 block[:, self.pattern_columns[number]] = sign * np.einsum("mqi,qi->qm", turned, found.normals)
             blocks.append(block)
@@ -263,7 +282,9 @@ class JointRegistration:
             block = np.zeros((3, unknown))
             for number, marker, sign in ((a, first, 1.0), (b, second, -1.0)):
                 if len(columns := self.pose_columns[number]):
-                    block[:, columns] = sign * self._by_pose(number, np.tile(marker.centre_mm, (3, 1)), root)
+                    block[:, columns] = sign * rigid_derivatives(
+                        np.tile(marker.centre_mm, (3, 1)), root, middles[number]
+                    )
                 block[:, self.pattern_columns[number]] = sign * root @ marker.patterns_mm.T
             blocks.append(block)
             residuals.append(off)
@@ -282,28 +303,43 @@ class JointRegistration:
             len(spheres),
         )
 
-    def _by_pose(self, number: int, places: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Motion (Q, 6) of places (Q, 3) along directions (Q, 3) by shift and turn of a scan."""
-        return np.hstack([directions, np.cross(places - self.middles_mm[number], directions)])
-
     def _spurious(self, source: int, target: int, found: PatchDistances, weight: np.ndarray) -> np.ndarray:
         """Information (P, P) that the noise of the normals alone would give."""
-        across = np.cross(found.normals, np.eye(3)[np.argmin(np.abs(found.normals), axis=1)])
-        across /= np.linalg.norm(across, axis=1, keepdims=True)
-        result = np.zeros((self.unknown_poses,) * 2)
-        for direction in (across, np.cross(found.normals, across)):
+        middles = self.middles_mm
+
+        def by_poses(directions: np.ndarray) -> np.ndarray:
             block = np.zeros((len(weight), self.unknown_poses))
             for number, sign in ((source, 1.0), (target, -1.0)):
                 if len(columns := self.pose_columns[number]):
-                    block[:, columns] = sign * self._by_pose(number, found.places_mm, direction)
-            result += block.T @ ((weight * found.slope_variance)[:, None] * block)
-        return result
+                    block[:, columns] = sign * rigid_derivatives(found.places_mm, directions, middles[number])
+            return block
+
+        return information_of_slopes(found.normals, weight * found.slope_variance, by_poses)
 
     def _from_start(self) -> np.ndarray:
         """Shifts and turns (P,) of the poses from the start."""
         turned = Rotation.from_matrix(self.poses[1:, :3, :3] @ self.start[1:, :3, :3].transpose(0, 2, 1)).as_rotvec()
         before = np.einsum("nij,nj->ni", self.start[1:, :3, :3], self.local_middles[1:]) + self.start[1:, :3, 3]
         return np.hstack([self.middles_mm[1:] - before, turned]).ravel()
+
+
+def fit_pair(source: Patches, target: Patches, start: np.ndarray) -> tuple[np.ndarray, PatchDistances] | None:
+    """Fit a pose (4, 4) that brings patches onto others, from a start; return it and the distances then.
+
+    None if they do not overlap, or if their shape leaves a direction open, as a pipe or a plane does: any place along
+    it would fit as well.
+    """
+    joint = JointRegistration([target, source], [[], []], np.array([np.eye(4), start]), start_std=None, sphere_mm=None)
+    reach = _PAIR_REACH * max(source.radius_mm, target.radius_mm)
+    for _ in range(_PAIR_ROUNDS):
+        if not (pairs := joint.evidence(reach)):
+            return None
+        joint.move(joint.solved(list(pairs.values())).step)
+        reach = max(NARROWER * reach, source.radius_mm)
+    pairs = joint.evidence(reach)
+    if not pairs or len(joint.solved(list(pairs.values())).open_directions):
+        return None
+    return joint.poses[1], distances_between(source, joint.poses[1], target, np.eye(4), reach_mm=reach)
 
 
 def _alike(patterns: Sequence[np.ndarray], shared: Sequence[dict[str, np.ndarray]]) -> np.ndarray:

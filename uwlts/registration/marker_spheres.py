@@ -12,11 +12,10 @@ from uwlts.evaluation.spheres import find_sphere
 from uwlts.fitting.shapes import fit_sphere
 from uwlts.storage.cloud import PointCloud
 
-_MOST = 12
-"""Spheres in one scan."""
 _AGREE = 0.05
-"""Of the diameter: distances between centres, before registration, agree within it."""
+"""Difference of distances between centres, relative to the diameter, within which they agree before registration."""
 _TRIPLES = 200
+"""Triples of spheres that are tried, spread evenly over all; all of up to six spheres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +28,10 @@ class MarkerSphere:
 
 
 def find_markers(cloud: PointCloud, diameter_mm: float) -> list[MarkerSphere]:
-    """Spheres of a diameter in a cloud."""
+    """Find all spheres of a diameter in a cloud."""
     usable, found = np.ones(len(cloud), bool), []
     rng = np.random.default_rng(0)
-    while len(found) < _MOST:
-        sphere = find_sphere(cloud.points_mm, diameter_mm / 2, usable=usable, rng=rng)
-        if sphere is None:
-            break
+    while (sphere := find_sphere(cloud.points_mm, diameter_mm / 2, usable=usable, rng=rng)) is not None:
         members = sphere.members[sphere.robust.inliers]
         usable[sphere.near] = False
         # Of a cap, centre and radius are known together only; the diameter is given.
@@ -74,7 +70,8 @@ def movement_by_markers(
         return None
     limit, best = _AGREE * diameter_mm, None
     sides_a, sides_b = (np.linalg.norm(x[:, None] - x[None], axis=2) for x in (a, b))
-    for i, j, k in list(permutations(range(len(a)), 3))[:_TRIPLES]:
+    triples = list(permutations(range(len(a)), 3))
+    for i, j, k in triples[:: -(-len(triples) // _TRIPLES)]:
         near = np.argwhere(np.abs(sides_b - sides_a[i, j]) < limit)
         for p, q in near[near[:, 0] != near[:, 1]]:
             last = np.flatnonzero(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from uwlts.registration.joint_registration import JointRegistration
-from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, NO_INDEX, PAIRS, PointCloud, PointUncertainty
+from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, NO_INDEX, PointCloud, PointUncertainty, turned_pairs
 
 _BLOCK = 50_000
 _LEFT_OUT = 1e-4
@@ -28,12 +28,7 @@ def merged_cloud(
         rotation = joint.poses[number, :3, :3]
         points.append(_corrected(scan, joint.patterns[number]) @ rotation.T + joint.poses[number, :3, 3])
         known = scan.uncertainty
-        matrices = np.zeros((len(scan), 3, 3))
-        if known is not None:
-            for column, (i, j) in enumerate(PAIRS):
-                matrices[:, i, j] = matrices[:, j, i] = known.random_mm2[:, column]
-        turned = rotation @ matrices @ rotation.T
-        random.append(np.stack([turned[:, i, j] for i, j in PAIRS], axis=1))
+        random.append(np.zeros((len(scan), 6)) if known is None else turned_pairs(known.random_mm2, rotation))
         position.append(np.zeros((len(scan), 3)) if known is None else known.position_mm @ rotation.T)
         frames.append(np.where(scan.frame == NO_INDEX, NO_INDEX, scan.frame + first))
         firsts.append(first)

@@ -10,7 +10,7 @@ surface.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,23 +18,29 @@ import numpy as np
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.patches import surface_patches
+from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import Table
 from uwlts.registration.coarse_registration import coarse_poses
-from uwlts.registration.joint_registration import JointRegistration, PairEvidence, Solved
+from uwlts.registration.joint_registration import FEWEST_OF_PAIR, NARROWER, JointRegistration, PairEvidence, Solved
 from uwlts.registration.marker_spheres import find_markers
 from uwlts.registration.merging import merged_cloud
-from uwlts.registration.open_movements import OpenMovement, open_movements
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.cloud import PointCloud
-from uwlts.storage.cloud_files import read_cloud
+from uwlts.storage.cloud_files import loaded_cloud
+from uwlts.storage.pose_files import PoseFormat, Unit, read_poses, write_poses
 
 _ROUNDS = 60
 _STILL_MM = 1e-5
 """A step that moves the usual point by less changes nothing that can be measured."""
 _REACH = 0.05
 """Of a scan's size: how far overlapping surfaces lie apart at the start, at most, unless that is given."""
-_NARROWER = 0.8
 _ROUNDED = 1e-6
+"""Largest error of a rotation's elements that is rounding of a file."""
+_PART = 0.1
+"""Part of a scan in an open direction, relative to the largest, below which it does not move in it."""
+_NO_TURN = 0.05
+"""Shift of the usual point by the turn of a movement, relative to the movement, below which it is a shift alone."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +72,26 @@ class Overlap:
 
 
 @dataclass(frozen=True, eq=False)
-class RegisteredScans:
+class OpenMovement:
+    """A movement of a scan that is open: a shift along a unit direction, or a turn about a line through a point.
+
+    ``point_mm`` is None for a shift; for a turn it is the point of the line that lies nearest to the scan's middle.
+    """
+
+    scan: int
+    direction: np.ndarray
+    point_mm: np.ndarray | None
+
+    def words(self) -> str:
+        """The movement in words, in the common frame."""
+        along = "({:.3f}, {:.3f}, {:.3f})".format(*(self.direction + 0.0))
+        if self.point_mm is None:
+            return f"shift along {along}"
+        return "turn about the line through ({:.1f}, {:.1f}, {:.1f}) mm along ".format(*self.point_mm) + along
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RegisteredScans(Brief):
     """Several scans in the frame of the first.
 
     Attributes
@@ -83,6 +108,8 @@ class RegisteredScans:
     pairs : tuple of PairFit
     overlaps : tuple of Overlap
         Where each pair overlaps, in the order of the pairs.
+    narrow_overlaps : tuple of (int, int, int)
+        Numbers of two scans, and of the patches of their overlap: too few to count.
     scale : float
         Patterns that were found, root mean square over all in units of what the calibration expects; NaN without.
     cloud : PointCloud
@@ -96,8 +123,9 @@ class RegisteredScans:
     open_movements: tuple[OpenMovement, ...]
     pairs: tuple[PairFit, ...]
     overlaps: tuple[Overlap, ...] = field(repr=False)
+    narrow_overlaps: tuple[tuple[int, int, int], ...]
     scale: float
-    cloud: PointCloud = field(repr=False)
+    cloud: PointCloud
 
     @property
     def std(self) -> np.ndarray:
@@ -128,9 +156,17 @@ class RegisteredScans:
                 }
                 for pair in self.pairs
             ],
+            "narrow_overlaps": [
+                {"scans": [self.names[first], self.names[second]], "patches": patches}
+                for first, second, patches in self.narrow_overlaps
+            ],
             "pattern_scale": self.scale if np.isfinite(self.scale) else None,
             "points": len(self.cloud),
         }
+
+    def save_poses(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the poses of the scans as CSV of the format matrix, mm; OutputError if that fails."""
+        write_poses(path, self.poses, overwrite=overwrite)
 
     def lines(self) -> list[str]:
         """The summary as text."""
@@ -145,6 +181,11 @@ class RegisteredScans:
                 f"  {first} - {second}: {pair.patches} patches, mm: mean {pair.mean_mm:+.4f}, rms {pair.rms_mm:.4f}"
                 f"{closure}{spheres}"
             )
+        lines += [
+            f"  {self.names[first]} - {self.names[second]}: left out, "
+            f"{patches} patches overlap, fewer than {FEWEST_OF_PAIR}"
+            for first, second, patches in self.narrow_overlaps
+        ]
         for name, std in list(zip(self.names, self.std, strict=True))[1:]:
             shift, turn = np.linalg.norm(std[:3]), np.degrees(np.linalg.norm(std[3:]))
             lines.append(f"  {name}: standard uncertainty {shift:.4f} mm, {turn:.5f} deg")
@@ -157,27 +198,34 @@ class RegisteredScans:
 def register(
     clouds: Sequence[PointCloud | str | os.PathLike[str]],
     *,
-    poses: np.ndarray | None = None,
+    poses: np.ndarray | str | os.PathLike[str] | None = None,
+    pose_format: PoseFormat = "matrix",
+    pose_unit: Unit = "mm",
     start_std_mm: float | None = None,
     start_std_deg: float | None = None,
     search: bool = False,
     sphere_mm: float | None = None,
     reach_mm: float | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> RegisteredScans:
-    """Bring scans that overlap into the frame of the first, and merge them.
+    """Bring scans that overlap into the frame of the first, and merge them into one cloud with its uncertainty.
 
     Parameters
     ----------
     clouds
         Two or more clouds or their files, in any order; every one overlaps another, not necessarily the first.
-    poses : (N, 4, 4), optional
-        Poses at the start, common frame from each scan's; the scans' frames are taken as one frame unless given.
-    start_std_mm, start_std_deg : float, optional
-        Standard uncertainty of the poses at the start, of each scan's shift and of its turn about its middle, by axis.
-        They count as evidence then, and decide what surfaces leave open.
+    poses : (N, 4, 4) or path, optional
+        Pose of every scan at the start, in the order of the clouds, common frame from each scan's: an array, or a CSV
+        file. The scans' frames are taken as one unless given.
+    pose_format, pose_unit
+        As for `reconstruct`.
+    start_std_mm : float, optional
+        Standard uncertainty of each scan's shift at the start along each axis. The start counts as evidence then, and
+        decides what surfaces leave open.
+    start_std_deg : float, optional
+        The same of its turn about its middle.
     search : bool
-        Search the start by the shape of the surfaces (KISS-Matcher), or by spheres; whatever the frames and poses are.
+        Search the start by the shape of the surfaces (KISS-Matcher), or by spheres, whatever the frames and poses are.
     sphere_mm : float, optional
         Diameter of spheres that stand in the scene: their centres tie scans together that do not see one surface.
     reach_mm : float, optional
@@ -197,10 +245,12 @@ def register(
     Examples
     --------
     >>> found = uwlts.register(["top.ply", "left.ply", "right.ply"])
-    >>> uwlts.write_cloud("pipe.ply", found.cloud)
+    >>> found.cloud.save("pipe.ply")
     """
     names = tuple(_name(each, number) for number, each in enumerate(clouds))
     scans = [_opened(each) for each in clouds]
+    if isinstance(poses, str | os.PathLike):
+        poses = read_poses(Path(poses), pose_format=pose_format, unit=pose_unit)[0]
     if len(scans) < 2:
         raise EvaluationError(f"found {len(scans)} cloud; two or more are needed for a registration")
     for name, length in (("sphere_mm", sphere_mm), ("reach_mm", reach_mm), ("start_std_mm", start_std_mm)):
@@ -238,7 +288,7 @@ def register(
             and np.abs(step[: joint.unknown_poses] / joint.units[: joint.unknown_poses]).max() < _STILL_MM
         ):
             break
-        reach = max(_NARROWER * reach, least)
+        reach = max(NARROWER * reach, least)
     progress(steps, steps)
     pairs = joint.evidence(reach)
     solved = joint.solved(list(pairs.values()))
@@ -251,9 +301,10 @@ def register(
         poses=joint.poses,
         covariance=covariance,
         middles_mm=joint.middles_mm,
-        open_movements=open_movements(solved.open_directions, joint.middles_mm, joint.sizes),
+        open_movements=_open_movements(solved.open_directions, joint.middles_mm, joint.sizes),
         pairs=tuple(_fit_of(joint, key, pairs, solved) for key in pairs),
         overlaps=tuple(_overlap(pair) for pair in pairs.values()),
+        narrow_overlaps=joint.narrow_overlaps(reach),
         scale=float(np.sqrt(np.mean(amounts**2))) if len(amounts) else np.nan,
         cloud=merged_cloud(scans, names, joint, solved.covariance),
     )
@@ -294,6 +345,37 @@ def _overlap(pair: PairEvidence) -> Overlap:
     return Overlap(pair.places_mm[counted], pair.residuals[: pair.patches][counted])
 
 
+def _open_movements(directions: np.ndarray, middles_mm: np.ndarray, sizes_mm: np.ndarray) -> tuple[OpenMovement, ...]:
+    """Movements of N scans, the first fixed, from open directions (K, 6 (N - 1)): shifts, then turns about middles."""
+    found = []
+    for number in range(1, len(middles_mm)):
+        twists = directions[:, 6 * (number - 1) : 6 * number] * np.repeat([1.0, sizes_mm[number]], 3)
+        if not len(twists):
+            continue
+        _, strengths, rows = np.linalg.svd(twists, full_matrices=False)
+        basis = rows[strengths > _PART]
+        if not len(basis):
+            continue
+        # Combinations without a turn first, each as a row of coefficients.
+        left, turns, _ = np.linalg.svd(basis[:, 3:], full_matrices=True)
+        turns = np.append(turns, np.zeros(len(basis) - len(turns)))
+        for coefficients, turn in zip(left.T[::-1], turns[::-1], strict=True):
+            shift, turned = (coefficients @ basis).reshape(2, 3)
+            turned = turned / sizes_mm[number]
+            if turn < _NO_TURN:
+                found.append(OpenMovement(number, _pointing(shift), None))
+            else:
+                nearest = middles_mm[number] + np.cross(turned, shift) / (turned @ turned)
+                found.append(OpenMovement(number, _pointing(turned), nearest))
+    return tuple(found)
+
+
+def _pointing(direction: np.ndarray) -> np.ndarray:
+    """The unit vector along a direction whose largest part is positive."""
+    unit = direction / np.linalg.norm(direction)
+    return unit * np.sign(unit[np.argmax(np.abs(unit))])
+
+
 def _closure(
     joint: JointRegistration, key: tuple[int, int], pairs: dict[tuple[int, int], PairEvidence], solved: Solved
 ) -> float | None:
@@ -326,7 +408,7 @@ def _size(cloud: PointCloud) -> float:
 
 
 def _opened(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
-    return cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
+    return loaded_cloud(cloud)
 
 
 def _name(cloud: PointCloud | str | os.PathLike[str], number: int) -> str:

@@ -14,7 +14,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import biweight, noise_factor
+from uwlts.fitting.patches import rigid_derivatives
+from uwlts.fitting.propagation import covariance_of_groups
 from uwlts.storage.cloud import PointUncertainty, images_along, variance_along
 
 _ROUNDS = 40
@@ -22,8 +24,6 @@ _MOST_POINTS = 50_000
 """More add nothing but time."""
 _OPEN_SHARE = 1e-3
 """Of the information of the best determined direction: a direction with less rests on the noise of the normals."""
-_TUKEY = 4.685
-"""Of Tukey's biweight, in standard deviations: 95 % efficient for normal noise."""
 _STILL_MM = 1e-5
 _LEAST_MM2 = 1e-8
 """A tenth of a micrometre, squared, so that no point weighs infinitely."""
@@ -233,7 +233,7 @@ def _size(points: np.ndarray, middle: np.ndarray) -> float:
 
 def _by_movement(points: np.ndarray, normals: np.ndarray, middle: np.ndarray, *, sized: bool = False) -> np.ndarray:
     """Derivatives (N, 6) of distances along normals by shift and turn, (N, 7) with the radius of the cloud's shape."""
-    by = np.hstack([normals, np.cross(points - middle, normals)])
+    by = rigid_derivatives(points, normals, middle)
     return np.hstack([by, np.ones((len(by), 1))]) if sized else by
 
 
@@ -271,10 +271,9 @@ def _estimate(
         counted = left
     else:
         relative = left / np.sqrt(variance)
-        spread = max(MAD_TO_STD * float(np.median(np.abs(relative))), 1.0)
-        u = np.clip(relative / (_TUKEY * spread), -1, 1)
-        weight, noise = (1 - u * u) ** 2 / variance, variance * spread**2
-        counted = left[np.abs(u) < 1]
+        spread = noise_factor(relative)
+        weight, noise = biweight(relative / spread) / variance, variance * spread**2
+        counted = left[weight > 0]
     values, vectors = np.linalg.eigh(scaled.T @ (weight[:, None] * scaled))
     known = values > open_share * values[-1]
     inverse = (vectors[:, known] / values[known]) @ vectors[:, known].T
@@ -301,20 +300,13 @@ class _Shared:
             return np.zeros((len(answer), len(answer)))
         image = np.arange(answer.shape[1]) if self._frame is None else self._frame
         parts = images_along(self._known, self._normals)
-        return np.sum([_grouped(answer * part, image) for part in parts], axis=0)
+        return np.sum([covariance_of_groups(answer * part, image) for part in parts], axis=0)
 
     def noise(self, answer: np.ndarray, index: np.ndarray) -> np.ndarray:
         """Covariance (K, K) of the answer by the noise of points that are used several times, by index (N,)."""
         if self._known is None:
             return np.zeros((len(answer), len(answer)))
-        return _grouped(answer * np.sqrt(variance_along(self._known.random_mm2, self._normals)), index)
-
-
-def _grouped(along: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Covariance (K, K) of sums of columns (K, N) that are one within each group and independent between groups."""
-    number = np.unique(group, return_inverse=True)[1].ravel()
-    together = np.stack([np.bincount(number, row) for row in along])
-    return together @ together.T
+        return covariance_of_groups(answer * np.sqrt(variance_along(self._known.random_mm2, self._normals)), index)
 
 
 def _words(direction: np.ndarray) -> str:

@@ -28,7 +28,7 @@ _MOST_PICTURES = 12
 _ARROWS_PX = 0.02  # length of the usual arrow, as a share of the image's width
 
 
-def write_camera_page(path: str | Path, camera: CameraCalibration, *, overwrite: bool = False) -> None:
+def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool = False) -> None:
     """Write the page of a camera's calibration; OutputError if that fails."""
     lens = camera.lens
     left_out = [each for each in camera.photographs if each.reason is not None]

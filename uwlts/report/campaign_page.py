@@ -11,8 +11,9 @@ from typing import Any
 from uwlts._version import __version__
 from uwlts.errors import OutputError, RangeError
 from uwlts.evaluation.evaluate import TruthComparisons
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import refuse_unsuitable, require_ending
+from uwlts.model.brief import Brief
 from uwlts.pages.numbers import fixed, is_number, small_length, unit_of, words_of
 from uwlts.pages.toolkit import (
     HTML,
@@ -48,8 +49,8 @@ _CAPTIONS = {
 }
 
 
-@dataclass(frozen=True)
-class Report:
+@dataclass(frozen=True, repr=False)
+class Report(Brief):
     """Report of a campaign: its page and summary, what it shows, and the published values beside the measured ones."""
 
     page: Path
@@ -62,8 +63,8 @@ class Report:
         return summary_table(self.campaign, self.reference)
 
 
-@keeps_inputs
-def write_report(
+@inputs_kept()
+def write_campaign(
     folder: str | Path,
     *,
     reference: str | Path | None = None,
@@ -72,7 +73,7 @@ def write_report(
     workers: int = 1,
     overwrite: bool = False,
 ) -> Report:
-    """Write the report of a campaign: one page with pictures, and a summary in numbers beside it.
+    """Gather a campaign's files into one page with pictures, and a summary in numbers beside it.
 
     Parameters
     ----------
@@ -80,7 +81,7 @@ def write_report(
         Folder with captures NAME.h5, coloured clouds NAME.ply (or .h5), evaluations NAME.evaluation.json and
         calibrations.
     reference : str or Path, optional
-        Published values to set beside the measured ones: "thesis", or the path of a TOML file.
+        Published values to set beside the measured ones: name (thesis) or path of a TOML file.
     out : str or Path, optional
         Page to write; FOLDER/report.html unless given. The summary goes beside it, to summary.json.
     pictures : str or Path, optional

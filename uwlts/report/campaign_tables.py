@@ -13,8 +13,9 @@ from rich.text import Text
 
 from uwlts.model.calibration import Calibration
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.pages.numbers import as_fine_as, entries_of, fixed, is_number, numbers_in, plain, unit_of, words_of
+from uwlts.pages.numbers import entries_of, fixed, is_number, plain, unit_of, words_of
 from uwlts.pages.toolkit import MISSING, ComparisonTable
+from uwlts.report.certificate import parameter_rows
 from uwlts.report.gather import CALIBRATION, GatheredCalibration, GatheredCampaign, GatheredMeasurement, Reference
 from uwlts.report.plot import SHORT_LIST
 
@@ -148,39 +149,20 @@ def _side_by_side(columns: list[tuple[str, dict[tuple[str, str], str]]]) -> Comp
 
 
 def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
-    camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
-    std = numbers_in(calibration.figures("camera").get("std"))
+    """Texts of the parameters, with their standard uncertainties where known, and of what follows from them."""
     table = {}
-    for words, value, names in (
-        ("focal length, x", camera.fx_px, ("fx", "f")),
-        ("focal length, y", camera.fy_px, ("fy", "f")),
-        ("principal point, x", camera.cx_px, ("cx",)),
-        ("principal point, y", camera.cy_px, ("cy",)),
-    ):
-        table[words, "px"] = _with_std(value, next((std[name] for name in names if name in std), None), 3)
-    for name, value in camera.distortion.used().items():
-        table[f"distortion {name}", ""] = _with_std(value, std.get(name), 6)
-    pose = calibration.object_transform()
-    table["stand-off: sheet on the camera's axis", "mm"] = fixed(pose[2, 3])
+    for row in parameter_rows(calibration):
+        value, std = row.texts()
+        table[row.words, row.unit] = value if std == MISSING else f"{value} ± {std}"
+    sheet, window = calibration.sheet, calibration.window
+    table["stand-off: sheet on the camera's axis", "mm"] = fixed(calibration.object_transform()[2, 3])
     table["angle between camera and sheet", "°"] = fixed(math.degrees(math.asin(min(1, abs(sheet.normal[2])))), 4)
     table["sheet's distance from the camera", "mm"] = fixed(sheet.offset_mm)
     if window is not None:
         table["refractions", ""] = str(window.refractions)
-        known = numbers_in(calibration.figures("window")).get("std_mm")
-        table["window distance d", "mm"] = _with_std(window.distance_mm, known, 3)
         cosine = float(window.normal[2] / np.linalg.norm(window.normal))
         table["window tilt", "°"] = fixed(math.degrees(math.acos(min(1, cosine))), 3)
-        if window.refractions == 2:
-            table["glass thickness", "mm"] = fixed(window.thickness_mm)
-            table["index of the glass", ""] = fixed(window.glass_index, 4)
     return table
-
-
-def _with_std(value: float, std: float | None, decimals: int) -> str:
-    """A value, and its standard deviation with two significant digits; both with the same decimals."""
-    if std is None or not std > 0:
-        return fixed(value, decimals)
-    return f"{as_fine_as(value, std, digits=2)} ± {as_fine_as(std, std, digits=2)}"
 
 
 def _figures(calibration: Calibration) -> Iterator[tuple[tuple[str, str], str]]:

@@ -21,7 +21,8 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit
 from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parameter_of
 from uwlts.model.sensor import Medium
-from uwlts.pages.numbers import numbers_in
+from uwlts.pages.numbers import as_fine_as, numbers_in
+from uwlts.pages.toolkit import MISSING
 from uwlts.report.certificate_volume import InUse, LengthUncertainty, in_use, index_key, length_uncertainties
 
 FORMAT = "uwlts-certificate"
@@ -55,7 +56,14 @@ def read_certificate(path: str | Path) -> dict[str, JsonValue]:
 
 
 def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
-    """Objections to a certificate and to its belonging to a calibration's file; none if both are as issued.
+    """Return objections to a certificate and to its belonging to a calibration's file; none if both are as issued.
+
+    Parameters
+    ----------
+    path : str or Path
+        Certificate (JSON) to verify.
+    calibration : str or Path
+        The calibration file that it is about.
 
     Raises
     ------
@@ -106,6 +114,12 @@ class ParameterRow(_Stored):
     value: float
     std: float | None
     std_before: float | None
+
+    def texts(self) -> tuple[str, str]:
+        """The value with as many decimals as two digits of its standard uncertainty have, and that."""
+        if self.std is None or not self.std > 0:
+            return f"{self.value:.6g}", MISSING
+        return as_fine_as(self.value, self.std, digits=2), as_fine_as(self.std, self.std, digits=2)
 
 
 class CalibratedMedium(_Stored):
@@ -240,16 +254,15 @@ def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
         rows = zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True)
         return tuple(_row(*row) for row in rows)
     camera, window = calibration.camera, calibration.window
-    std = numbers_in(calibration.figures("camera").get("std"))
-    values = (
-        {"f": camera.fx_px} if "f" in std or camera.fx_px == camera.fy_px else {"fx": camera.fx_px, "fy": camera.fy_px}
-    )
+    known = calibration.std()
+    std = {"f": known.fx_px, "fx": known.fx_px, "fy": known.fy_px, "cx": known.cx_px, "cy": known.cy_px}
+    std |= known.distortion
+    values = {"f": camera.fx_px} if camera.fx_px == camera.fy_px else {"fx": camera.fx_px, "fy": camera.fy_px}
     values |= {"cx": camera.cx_px, "cy": camera.cy_px}
     values |= {name: value for name, value in camera.distortion.model_dump().items() if value}
     rows = [_row(parameter_of(name), value, std.get(name)) for name, value in values.items()]
     if window is not None:
-        distance_std = numbers_in(calibration.figures("window")).get("std_mm")
-        rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, distance_std))
+        rows.append(_row(WindowParameter.DISTANCE, window.distance_mm, known.window_distance_mm))
         if window.refractions == 2:
             rows.append(_row(WindowParameter.THICKNESS, window.thickness_mm))
             rows.append(_row(WindowParameter.GLASS_INDEX, window.glass_index))

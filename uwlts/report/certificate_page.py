@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from uwlts.calibration.joint.observability import regions
 from uwlts.calibration.joint.stored_estimate import require_joint
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.model.calibration import Calibration
 from uwlts.model.joint_estimate import ImageFit, Origin
 from uwlts.model.parameter_keys import ParameterKey
@@ -43,7 +43,7 @@ from uwlts.storage.calibration_file import read_calibration
 _WORST_IMAGES = 5
 
 
-@keeps_inputs
+@inputs_kept()
 def write_certificate(
     calibration: str | Path, *, out: str | Path | None = None, before: str | Path | None = None, overwrite: bool = False
 ) -> tuple[Path, AnyCertificate]:
@@ -52,7 +52,7 @@ def write_certificate(
     Parameters
     ----------
     calibration : str or Path
-        Calibration file; only a joint calibration has uncertainties.
+        Calibration file; only a joint one has uncertainties.
     out : str or Path, optional
         Page to write; CALIBRATION.certificate.html unless given. The JSON goes beside it.
     before : str or Path, optional
@@ -143,17 +143,9 @@ def _parameters(rows: Sequence[ParameterRow], before: tuple[str, Calibration] | 
     shown = []
     for row in rows:
         known = MISSING if row.std_before is None else as_fine_as(row.std_before, row.std_before, digits=2)
-        shown.append((row.words, row.unit, *_with_std(row), known, *_with_std(other.pop(row.name, None))))
-    return shown + [(row.words, row.unit, MISSING, MISSING, MISSING, *_with_std(row)) for row in other.values()]
-
-
-def _with_std(row: ParameterRow | None) -> tuple[str, str]:
-    """A value with as many decimals as two digits of its uncertainty have, and that."""
-    if row is None:
-        return MISSING, MISSING
-    if row.std is None or not row.std > 0:
-        return f"{row.value:.6g}", MISSING
-    return as_fine_as(row.value, row.std, digits=2), as_fine_as(row.std, row.std, digits=2)
+        theirs = other.pop(row.name, None)
+        shown.append((row.words, row.unit, *row.texts(), known, *(theirs.texts() if theirs else (MISSING, MISSING))))
+    return shown + [(row.words, row.unit, MISSING, MISSING, MISSING, *row.texts()) for row in other.values()]
 
 
 def _length_rows(lengths: Sequence[LengthUncertainty]) -> list[tuple[float, list[tuple[str, str]]]]:

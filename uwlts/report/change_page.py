@@ -12,7 +12,7 @@ from uwlts.comparison.change import SurfaceChange
 from uwlts.files.json_files import json_text
 from uwlts.files.writing import require_ending, written_aside
 from uwlts.pages.toolkit import BLUE, INK, RED, new_figure, png_data_uri, render_page, svg_of, write_page
-from uwlts.report.plot import UNKNOWN
+from uwlts.report.plot import UNKNOWN, surface_limit_mm
 from uwlts.storage.cloud_files import PLY_COLOURS, write_ply_points
 from uwlts.storage.las_file import las_content
 
@@ -34,8 +34,6 @@ _COLUMNS = (
 )
 _MOST_ROWS = 20
 """Regions that the page lists and numbers; the file beside it has all."""
-_CLIPPED = 0.995
-"""Share of the places within the colours' range."""
 
 
 def write_change(
@@ -86,14 +84,9 @@ def _write_places(path: Path, change: SurfaceChange, *, overwrite: bool) -> None
         aside.write_bytes(content)
 
 
-def _limit_mm(change: SurfaceChange) -> float:
-    """Distance at which the colours end."""
-    return float(np.quantile(np.abs(change.distance_mm[change.compared]), _CLIPPED)) or 1.0
-
-
 def _colours(change: SurfaceChange) -> np.ndarray:
     """Red, green and blue (P, 3) uint8 of the places, as on the map; `UNKNOWN` where not compared."""
-    limit = _limit_mm(change) if change.compared.any() else 1.0
+    limit = surface_limit_mm(change.distance_mm[change.compared])
     colours = _COLOURS((np.nan_to_num(change.distance_mm) / limit + 1) / 2, bytes=True)[:, :3]
     for where, colour in ((~change.significant, _NOT_SIGNIFICANT), (~change.compared, UNKNOWN)):
         colours[where] = np.rint(255 * np.array(to_rgb(colour)))
@@ -120,7 +113,7 @@ def _map(change: SurfaceChange) -> str:
     """The places from above, across the two longest of their extents, coloured where the change is significant."""
     first, second = np.sort(np.argsort(np.ptp(change.points_mm, axis=0), kind="stable")[1:])
     shown, changed = change.compared, change.significant
-    limit = _limit_mm(change)
+    limit = surface_limit_mm(change.distance_mm[shown])
     figure, (axes,) = new_figure(9.0, 6.0)
     u, v = change.points_mm[:, first], change.points_mm[:, second]
     size = float(np.clip(_INK / len(u), 2, 60))
@@ -145,7 +138,7 @@ def _map(change: SurfaceChange) -> str:
 
 def _histogram(change: SurfaceChange) -> Markup:
     distance, level = change.distance_mm[change.compared], change.level_mm[change.compared]
-    limit = _limit_mm(change)
+    limit = surface_limit_mm(distance)
     figure, (axes,) = new_figure(9.0, 3.2)
     axes.hist(np.clip(distance, -limit, limit), bins=81, color=BLUE)
     for side in (-1, 1):

@@ -14,7 +14,7 @@ import numpy as np
 from uwlts._version import __version__
 from uwlts.errors import EvaluationError
 from uwlts.evaluation.evaluate import read_evaluation
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.json_files import json_text
 from uwlts.files.writing import refuse_unsuitable, sha256_of
 from uwlts.inspection.features import (
@@ -26,8 +26,7 @@ from uwlts.inspection.features import (
     FeatureValue,
     Inspection,
 )
-from uwlts.inspection.inspect import InspectionKind, inspect
-from uwlts.inspection.pipe_form import LARGEST_OVALITY
+from uwlts.inspection.inspect import InspectionKind, inspected
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.sensor import Table
 from uwlts.pages.numbers import as_fine_as
@@ -44,7 +43,7 @@ from uwlts.pages.toolkit import (
     write_page,
 )
 from uwlts.report.certificate import check_certificate
-from uwlts.report.plot import DEVIATIONS
+from uwlts.report.plot import DEVIATIONS, surface_limit_mm
 from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import read_cloud
@@ -59,8 +58,6 @@ _SMALLEST_MM = 0.002
 _MOST_PICTURES = 40
 FINDINGS = "findings"
 """Kind of the page, in the name of the JSON beside it."""
-_CLIPPED = 0.995
-"""Share of the points within the colours' range: the findings are drawn larger below."""
 _MOST_DRAWN = 60_000
 _AROUND = 1.2
 """Times a finding's size: how much is drawn around it."""
@@ -86,15 +83,7 @@ class _CheckedFigure:
     expanded_mm: float | None
 
 
-@dataclass(frozen=True)
-class _ArtefactCheck:
-    """An artefact in words, and its figures."""
-
-    artefact: str
-    figures: tuple[_CheckedFigure, ...]
-
-
-@keeps_inputs
+@inputs_kept()
 def write_findings(
     cloud: str | os.PathLike[str],
     kind: InspectionKind = "pipe",
@@ -106,19 +95,17 @@ def write_findings(
     calibration: str | Path | None = None,
     certificate: str | Path | None = None,
     verification: Sequence[str | Path] = (),
-    section_mm: float | None = None,
-    wall_mm: float | None = None,
-    false_alarm: float = 0.05,
-    largest_ovality: float = LARGEST_OVALITY,
-    datum: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
+    **options: Any,
 ) -> Inspection:
     """Inspect a cloud and write the report for the object's owner: a page, the same as JSON, and as PDF.
 
     Parameters
     ----------
-    cloud, kind, section_mm, wall_mm, false_alarm, largest_ovality, datum
-        As for `uwlts.inspect`.
+    cloud
+        File of the object's cloud.
+    kind
+        What the cloud shows.
     out
         Page to write; the JSON goes beside it, for pipe.html to pipe.findings.json.
     pdf
@@ -132,10 +119,12 @@ def write_findings(
     certificate
         Its certificate (JSON), whose seal is checked.
     verification
-        Evaluations (JSON of `uwlts.write_evaluation`) of artefacts that were measured by the same calibration; their
-        figures stand in the report.
+        Evaluations (JSON of uwlts evaluate) of artefacts that were measured by the same calibration; their figures
+        stand in the report.
     overwrite
         Replace existing files.
+    options
+        Those of the kind's inspection: `uwlts.inspect_pipe`, `uwlts.inspect_weld`, `uwlts.inspect_flange`.
 
     Raises
     ------
@@ -159,15 +148,7 @@ def write_findings(
     sources += [
         Source("verification", Path(each).name, sha256_of(each), "by the same calibration") for each in verification
     ]
-    found = inspect(
-        measured,
-        kind,
-        section_mm=section_mm,
-        wall_mm=wall_mm,
-        false_alarm=false_alarm,
-        largest_ovality=largest_ovality,
-        datum=datum,
-    )
+    found = inspected(measured, kind, **options)
     made = datetime.now(UTC).isoformat(timespec="seconds")
     text = _page(found, measured, sources, checks, title=title or f"Inspection of {path.name}", made=made)
     record: Table = {
@@ -176,7 +157,7 @@ def write_findings(
         "software": f"uwlts {__version__}",
         "sources": [vars(source) for source in sources],
         "verification": [
-            {"artefact": check.artefact, "figures": [vars(figure) for figure in check.figures]} for check in checks
+            {"artefact": artefact, "figures": [vars(each) for each in figures]} for artefact, figures in checks
         ],
         "inspection": found.record(),
     }
@@ -217,8 +198,8 @@ def _sources(
     return sources
 
 
-def _artefact_check(path: str | Path, cloud: PointCloud) -> _ArtefactCheck:
-    """Figures of an artefact that was measured by the calibration that the cloud names."""
+def _artefact_check(path: str | Path, cloud: PointCloud) -> tuple[str, list[_CheckedFigure]]:
+    """Name and figures of an artefact that was measured by the calibration that the cloud names."""
     record, named = read_evaluation(path), cloud.metadata.get("calibration")
     if record.artefact is None or record.evaluation is None:
         raise EvaluationError(f"{path} is the evaluation of no artefact: give those of spheres, a step or a plane")
@@ -233,12 +214,12 @@ def _artefact_check(path: str | Path, cloud: PointCloud) -> _ArtefactCheck:
         known, key = record.uncertainty.get(name), keys.get(name)
         calibrated = None if key is None or key.calibrated is None else key.calibrated.value_mm
         rows.append(_CheckedFigure(name, calibrated, measured, None if known is None else known.expanded_mm))
-    return _ArtefactCheck(f"{record.evaluation.kind}, {record.cloud}", tuple(rows))
+    return f"{record.evaluation.kind}, {record.cloud}", rows
 
 
-def _check_rows(check: _ArtefactCheck) -> list[tuple[str, ...]]:
+def _check_rows(figures: Sequence[_CheckedFigure]) -> list[tuple[str, ...]]:
     rows = []
-    for each in check.figures:
+    for each in figures:
         fine = each.expanded_mm or _SMALLEST_MM
         calibrated = MISSING if each.calibrated_mm is None else f"{each.calibrated_mm:g}"
         stated = MISSING if each.expanded_mm is None else as_fine_as(each.expanded_mm, fine, digits=2)
@@ -247,7 +228,13 @@ def _check_rows(check: _ArtefactCheck) -> list[tuple[str, ...]]:
 
 
 def _page(
-    found: Inspection, cloud: PointCloud, sources: list[Source], checks: list[_ArtefactCheck], *, title: str, made: str
+    found: Inspection,
+    cloud: PointCloud,
+    sources: list[Source],
+    checks: list[tuple[str, list[_CheckedFigure]]],
+    *,
+    title: str,
+    made: str,
 ) -> str:
     parts = [each for each in found.features if each.kind in _BLEMISHES]
     whole = [each for each in found.features if each.kind not in (*_BLEMISHES, FeatureKind.SECTION, FeatureKind.HOLE)]
@@ -269,7 +256,7 @@ def _page(
         left_out=len(parts) - len(drawn),
         notes=found.notes,
         sources=[(each.role, each.name, each.note, each.sha256) for each in sources],
-        checks=[(check.artefact, _check_rows(check)) for check in checks],
+        checks=[(artefact, _check_rows(figures)) for artefact, figures in checks],
         stated=cloud.uncertainty is not None,
         searched=found.kind == "pipe",
         coverage=f"{100 * COVERAGE:.0f} %",
@@ -335,12 +322,6 @@ def _tiles(whole: list[Feature], parts: list[Feature]) -> list[Tile]:
             if not value.name.startswith("axis"):
                 tiles.append(Tile(f"{each.name}: {value.name}", f"{_with_interval(value)} {value.unit}"))
     return tiles
-
-
-def surface_limit_mm(deviation_mm: np.ndarray) -> float:
-    """Deviation at which the colours of an inspected surface end, so that all but its largest findings differ."""
-    seen = deviation_mm[np.isfinite(deviation_mm)]
-    return (float(np.quantile(np.abs(seen), _CLIPPED)) if len(seen) else 0.0) or 1e-3
 
 
 def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:

@@ -1,25 +1,23 @@
-"""Files and sensors described for the terminal: what a file holds, and what a sensor's design formulas give."""
+"""Files and sensors described for the terminal: what a file holds."""
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from pydantic import JsonValue
+from scipy.spatial.transform import Rotation
 
 from uwlts.errors import CaptureError, DescriptionError
 from uwlts.evaluation.evaluate import FORMAT as EVALUATION_FORMAT, EvaluationRecord, TruthComparisons, read_evaluation
 from uwlts.files.json_files import read_json
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
+from uwlts.model.mount import BoardFound, Mount, RingFound, SphereFound, StepFound
 from uwlts.model.placement import check_design, view_of_sheet
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.model.sensor import Medium, Sensor
-from uwlts.optics import design as formulas
 from uwlts.pages.numbers import numbers_in
-from uwlts.report.mount_lines import mount_lines
 from uwlts.storage.calibration_file import (
     FORMAT as CALIBRATION_FORMAT,
     POLYNOMIALS_FORMAT as POLYNOMIAL_FORMAT,
@@ -33,88 +31,13 @@ from uwlts.storage.mount_files import FORMAT as MOUNT_FORMAT, read_mount
 from uwlts.storage.truth import Truth, TruthHeader, TruthStatus, read_truth
 
 
-class DesignRow(NamedTuple):
-    """A row of the design table."""
-
-    name: str
-    value: float
-    unit: str
-    source: str
-
-
-def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
-    """Resolution, line length, depth range and speckle limit of a sensor in one of its media by the design formulas.
-
-    Depths and ranges run along the camera's axis unless named otherwise.
-
-    Raises
-    ------
-    DescriptionError
-        The sensor or the medium is unknown, or the description cannot be read.
-    DesignError
-        As `uwlts.optics.design.nominal_setup`.
-    """
-    sensor = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
-    camera = sensor.camera
-    setup, leaning = formulas.nominal_setup(sensor, sensor.medium(medium))
-    window, tangent = setup.window, math.tan(setup.triangulation_angle_rad)
-    sides = {"width": camera.width_px, "height": camera.height_px}
-    along = sides.pop(camera.stripe_along)
-    (across,) = sides.values()
-    standoff, outer = float(formulas.depth_mm(setup, 0.0)), window.outer_mm
-    per_pixel = float(formulas.depth_per_pixel_mm(setup, 0.0))
-    by_factor = float(
-        formulas.depth_per_pixel_mm(replace(setup, window=formulas.thesis_factor(window.medium_index)), 0.0)
-    )
-    near, far = formulas.measuring_volume(setup, side_px=across)
-    near_line, line, far_line = formulas.line_length_mm(
-        setup, np.array([sensor.volume.near_mm + outer, standoff, sensor.volume.far_mm + outer]), side_px=along
-    )
-    apparent = float(window.reach_mm(standoff))
-    tilt = formulas.scheimpflug_angle_rad(
-        triangulation_angle_rad=math.atan(window.medium_index * tangent),
-        magnification=camera.focal_length_mm / apparent,
-    )
-    speckle = formulas.speckle_limit_um(
-        wavelength_nm=sensor.laser.wavelength_nm,
-        focal_length_mm=camera.focal_length_mm,
-        f_number=camera.f_number,
-        distance_mm=apparent,
-    )
-    glass = formulas.window_thickness_mm(
-        pressure_mpa=1.0, unsupported_diameter_mm=camera.window.aperture_diameter_mm, strength_mpa=60.0
-    )
-    needed = formulas.line_needed_mm(pipe_diameter_mm=300.0, passes=5)
-    snell = "with Snell's law"
-    return [
-        DesignRow("stand-off from the pupil", standoff, "mm", f"Eq. 2.8 {snell}"),
-        DesignRow("stand-off from the window", standoff - outer, "mm", f"Eq. 2.8 {snell}"),
-        DesignRow("sheet in view, nearest to the window", near - outer, "mm", f"Eq. 2.8 {snell}"),
-        DesignRow("sheet in view, farthest from the window", far - outer, "mm", f"Eq. 2.8 {snell}"),
-        DesignRow("depth in view", far - near, "mm", f"Eq. 2.8 {snell}"),
-        DesignRow("depth in view along the laser's axis", (far - near) * leaning, "mm", "over cos theta_t"),
-        DesignRow("depth per pixel at the stand-off", per_pixel, "mm/px", f"Eq. 2.9 {snell}"),
-        DesignRow("depth per pixel along the laser's axis", per_pixel * leaning, "mm/px", "over cos theta_t"),
-        DesignRow("depth per pixel by the thesis's factor n", by_factor, "mm/px", "Eq. 2.9 over n, section 3.1.2"),
-        DesignRow("line length at the volume's near end", float(near_line), "mm", f"Eq. 2.10, corrected, {snell}"),
-        DesignRow("line length at the stand-off", float(line), "mm", f"Eq. 2.10, corrected, {snell}"),
-        DesignRow("line length at the volume's far end", float(far_line), "mm", f"Eq. 2.10, corrected, {snell}"),
-        DesignRow("line needed for a 300 mm pipe in 5 passes", needed, "mm", "Figure 27"),
-        DesignRow("image plane to lens axis, sheet in focus", math.degrees(tilt), "deg", "Eq. 2.12, Scheimpflug"),
-        DesignRow("speckle limit across the camera's axis", speckle, "um", "Dorsch et al. 1994, contrast 0.71"),
-        DesignRow("speckle limit along the laser's axis", speckle * leaning / tangent, "um", "over sin theta_t"),
-        DesignRow("fused silica window for 1 MPa, clamped", glass, "mm", "Eq. 3.2, safety factor 4, 60 MPa"),
-    ]
-
-
-def table_lines(rows: list[DesignRow]) -> list[str]:
-    """The table as text."""
-    width = max(len(row.name) for row in rows)
-    return [f"{row.name:<{width}}  {row.value:>8.4g} {row.unit:<5}  {row.source}" for row in rows]
-
-
 def describe(path: str | Path) -> str:
-    """Text about a file, or about a sensor that ships with the package.
+    """Describe a file: a capture, cloud, calibration, mount, evaluation, or a sensor description (by name or path).
+
+    Parameters
+    ----------
+    path : str or Path
+        File, or name of a shipped sensor such as thesis.
 
     Raises
     ------
@@ -279,6 +202,61 @@ def _figure_lines(calibration: Calibration | PolynomialCalibration, **shown: tup
         if value is not None:
             lines.append(text.format(value))
     return lines
+
+
+def mount_lines(mount: Mount) -> list[str]:
+    """The transform with its 95 % intervals, the artefact, the scatter found, poses left out and the next pose."""
+    half = mount.coverage_factor * mount.std()
+    transform = mount.transform()
+    rotation = Rotation.from_matrix(transform[:3, :3])
+    used = [pose for pose in mount.poses if pose.reason is None]
+    lines = ["T_platform_sensor (x y z of the sensor -> platform, mm):"]
+    lines += ["  " + " ".join(f"{value:12.6f}" for value in row) for row in transform]
+    lines += [
+        f"  quaternion x y z w      {' '.join(f'{value:10.7f}' for value in rotation.as_quat())}",
+        f"  Euler angles ZYX deg    {' '.join(f'{value:10.4f}' for value in rotation.as_euler('ZYX', degrees=True))}",
+        f"translation, 95 % mm      {' '.join(f'+-{value:.3f}' for value in half[:3])}",
+        f"rotation, 95 % deg        {' '.join(f'+-{value:.4f}' for value in np.degrees(half[3:]))}",
+    ]
+    found = mount.artefact
+    if isinstance(found, BoardFound):
+        x, y, z = (row[3] for row in found.T_base_target[:3])
+        lines.append(f"target, mm                origin at {_vector((x, y, z))}")
+    elif isinstance(found, SphereFound):
+        known = "given" if found.radius_std_mm is None else f"+-{mount.coverage_factor * found.radius_std_mm:.3f}"
+        lines.append(f"sphere, mm                at {_vector(found.centre_mm)}, radius {found.radius_mm:.3f} ({known})")
+    elif isinstance(found, StepFound):
+        known = "given" if found.height_std_mm is None else f"+-{mount.coverage_factor * found.height_std_mm:.3f}"
+        place = f"normal {_vector(found.normal)}, distance {found.distance_mm:.3f} mm"
+        lines.append(f"step                      {place}, height {abs(found.height_mm):.3f} mm ({known})")
+    elif isinstance(found, RingFound):
+        known = "given" if found.radius_std_mm is None else f"+-{mount.coverage_factor * found.radius_std_mm:.3f}"
+        place = f"axis {_vector(found.axis)} through {_vector(found.centre_mm)}"
+        lines.append(f"ring, mm                  {place}, radius {found.radius_mm:.3f} ({known})")
+    else:
+        lines.append(f"plane                     normal {_vector(found.normal)}, distance {found.distance_mm:.3f} mm")
+    if mount.robot_scale is not None and mount.robot_scale_std is not None:
+        half_scale = mount.coverage_factor * mount.robot_scale_std
+        lines.append(f"robot's scale             {mount.robot_scale:.6f} +-{half_scale:.6f}")
+    if mount.time_offset_s is not None and mount.time_offset_std_s is not None:
+        half_time = mount.coverage_factor * mount.time_offset_std_s
+        lines.append(f"time offset, s            {mount.time_offset_s:.5f} +-{half_time:.5f}")
+    lines += [
+        f"scatter found, mm         points {mount.point_std_mm:.4f}, positions of the platform {mount.pose_std_mm:.4f}",
+        f"distances rms, mm         {mount.rms_mm:.4f}; of poses held out {mount.held_out_rms_mm:.4f}",
+        f"poses used                {len(used)} of {len(mount.poses)}",
+    ]
+    lines += [f"  left out {pose.name}: {pose.reason}" for pose in mount.poses if pose.reason is not None]
+    if (advised := mount.next_pose) is not None:
+        lines.append(
+            f"next pose                 {advised.words}: points known to {advised.after_mm:.4f} mm in place of "
+            f"{advised.before_mm:.4f} mm"
+        )
+    return lines
+
+
+def _vector(values: tuple[float, float, float]) -> str:
+    return f"({', '.join(f'{value:.3f}' for value in values)})"
 
 
 def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:

@@ -64,6 +64,8 @@ _BINS, _SHOWN_STD = 81, 4.0
 _INTERVALS, _LEAST_IN_INTERVAL = 120, 5
 # Residuals that differ by less than this share are drawn as dots: bars must start at zero, where all would look alike.
 _FLAT = 1.2
+# Share of a surface's places within the range of its colours.
+_SHOWN_SHARE = 0.995
 # Pixels shown beside a stripe; image lines and pixels beside it in the enlarged part.
 _AROUND_PX, _LINES_ENLARGED, _AROUND_ENLARGED_PX = 24, 44, 7
 
@@ -181,6 +183,12 @@ def colour_limit_mm(deviation_mm: np.ndarray) -> float:
     """Deviation at which the colours end: `LIMIT_STD` standard deviations, never quite zero."""
     finite = deviation_mm[np.isfinite(deviation_mm)].astype(np.float64)
     return max(LIMIT_STD * float(finite.std()), 1e-9) if len(finite) else 1e-9
+
+
+def surface_limit_mm(distance_mm: np.ndarray) -> float:
+    """Distance at which the colours of a surface end, so that all but a few of its places differ; never zero."""
+    known = distance_mm[np.isfinite(distance_mm)]
+    return (float(np.quantile(np.abs(known), _SHOWN_SHARE)) if len(known) else 0.0) or 1e-3
 
 
 def interactive_cloud(cloud: PointCloud) -> tuple[go.Figure, str]:

@@ -11,11 +11,10 @@ from uwlts._version import __version__
 from uwlts.files.json_files import json_text
 from uwlts.pages.toolkit import BLUE, COLOURS, RED, new_figure, png_data_uri, render_page, svg_of, write_page
 from uwlts.registration.register import RegisteredScans
+from uwlts.report.plot import surface_limit_mm
 
 _SHOWN = 30_000
 """Points of all scans in a picture: more cover each other."""
-_CLIPPED = 0.99
-"""Share of the distances within the colours' range."""
 _VIEWS = ((0, 1), (0, 2), (1, 2))
 
 
@@ -67,7 +66,7 @@ def _scans(registered: RegisteredScans) -> str:
 def _overlaps(registered: RegisteredScans) -> str:
     places = np.vstack([each.places_mm for each in registered.overlaps])
     distance = np.concatenate([each.distance_mm for each in registered.overlaps])
-    limit = float(np.quantile(np.abs(distance), _CLIPPED)) if len(distance) else 1.0
+    limit = surface_limit_mm(distance)
     every = slice(None, None, max(1, len(registered.cloud) // _SHOWN))
     beneath = registered.cloud.points_mm[every]
 
@@ -97,7 +96,7 @@ def _histograms(registered: RegisteredScans) -> Markup:
     figure, axes = new_figure(9.0, 2.0 * -(-count // columns), rows=-(-count // columns), columns=columns)
     for pair, overlap, ax in zip(registered.pairs, registered.overlaps, axes, strict=False):
         distance = overlap.distance_mm
-        limit = float(np.quantile(np.abs(distance), _CLIPPED)) if len(distance) else 1.0
+        limit = surface_limit_mm(distance)
         ax.hist(np.clip(distance, -limit, limit), bins=41, color=BLUE)
         ax.axvline(pair.mean_mm, color=RED, linewidth=1)
         first, second = (registered.names[number] for number in pair.scans)

@@ -1,7 +1,11 @@
-"""The shared library of Aravis, by which sensor and twin both speak to cameras."""
+"""The shared library of Aravis, by which sensor and twin both speak to cameras.
+
+`python -m uwlts.runtime.shared_library` prints the library in use. Exit status 0, or 1 if there is none.
+"""
 
 import ctypes
 import os
+import sys
 from functools import cache
 
 from uwlts.errors import SetupError
@@ -34,3 +38,10 @@ def load_aravis() -> ctypes.CDLL:
     if not hasattr(library, "arv_camera_new"):
         raise SetupError(f"{called}: it is not Aravis, it lacks arv_camera_new\n{HOW_TO_INSTALL}")
     return library
+
+
+if __name__ == "__main__":
+    try:
+        print(f"Aravis: {load_aravis()._name}")
+    except SetupError as error:
+        sys.exit(f"error: {error}")

@@ -27,7 +27,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, Literal, TypeVar, assert_never
 
 from uwlts.errors import Error, SetupError
-from uwlts.files.unfinished import remove_unfinished
+from uwlts.files.writing import remove_unfinished
 from uwlts.runtime.interrupts import interrupts_kept
 
 Item = TypeVar("Item")

@@ -1,16 +1,16 @@
 """Files of calibrations: JSON, written whole or not at all, and checked when they are read."""
 
-import json
 from pathlib import Path
-from typing import TypedDict, assert_never
+from typing import TypedDict
 
-from uwlts.files.json_files import model_in, read_json, read_model, write_model
-from uwlts.files.writing import written_aside
+from uwlts.files.json_files import model_in, read_json, read_model
 from uwlts.model.any_calibration import AnyCalibration
-from uwlts.model.calibration import Calibration
-from uwlts.model.polynomial_calibration import PolynomialCalibration
-
-FORMAT, POLYNOMIALS_FORMAT, VERSION = "uwlts-calibration", "uwlts-polynomials", 1
+from uwlts.model.calibration import FORMAT, VERSION, Calibration
+from uwlts.model.polynomial_calibration import (
+    FORMAT as POLYNOMIALS_FORMAT,
+    VERSION as POLYNOMIALS_VERSION,
+    PolynomialCalibration,
+)
 
 
 class _Known(TypedDict):
@@ -22,22 +22,11 @@ class _Known(TypedDict):
 
 
 _CALIBRATION: _Known = {"format": FORMAT, "version": VERSION, "called": "calibration"}
-_POLYNOMIALS: _Known = {"format": POLYNOMIALS_FORMAT, "version": VERSION, "called": "polynomial calibration"}
-
-
-def write_calibration(path: str | Path, calibration: AnyCalibration, *, overwrite: bool = False) -> None:
-    """Write a calibration of any kind as JSON, completely or not at all; OutputError if that fails."""
-    match calibration:
-        case Calibration():
-            write_model(path, calibration, format=FORMAT, version=VERSION, overwrite=overwrite)
-        case PolynomialCalibration():
-            # One key a line: indented, the thousands of coefficients would take a line each.
-            content = {"format": POLYNOMIALS_FORMAT, "version": VERSION} | calibration.model_dump(mode="json")
-            lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
-            with written_aside(path, overwrite=overwrite) as aside:
-                aside.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
-        case _:
-            assert_never(calibration)
+_POLYNOMIALS: _Known = {
+    "format": POLYNOMIALS_FORMAT,
+    "version": POLYNOMIALS_VERSION,
+    "called": "polynomial calibration",
+}
 
 
 def read_calibration(path: str | Path) -> Calibration:

@@ -35,14 +35,8 @@ from uwlts.model.calibration import is_rigid
 from uwlts.model.joint_estimate import CaptureSource
 from uwlts.model.sensor import Camera, CaptureHeader, Table
 from uwlts.model.stripe import ROWS, Stripe, StripeStatus
-from uwlts.storage.hdf5_file import (
-    UnfinishedFile,
-    find_dataset,
-    has_writer,
-    read_label,
-    read_plan,
-    require_small_chunks,
-)
+from uwlts.storage.hdf5_file import DAMAGE, find_dataset, read_label, read_plan, require_small_chunks
+from uwlts.storage.unfinished_hdf5 import UnfinishedFile, has_writer
 
 FORMAT = "uwlts-capture"
 VERSION = 2
@@ -52,8 +46,6 @@ PER_FRAME = {"stage_mm": (), "pose": (4, 4), "laser_on": (), "exposure_ms": (), 
 COVARIANCE = "pose_covariance"
 MORE = {"has_image": bool, "encoder": float, "speed_mm_per_s": float}
 """Columns of version 2."""
-# What h5py raises on a damaged file depends on where the damage is.
-_DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
 POSE_ROUNDED = 1e-4
 """By how much a pose's elements may be off a rotation, as tables give them with four decimals or more."""
 
@@ -215,12 +207,12 @@ class Capture(AbstractContextManager["Capture"]):
         try:
             unfinished = not self.finished or has_writer(self.path)
             self.file = UnfinishedFile(self.path) if unfinished else h5py.File(self.path, "r")
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise CaptureError(f"{self.path} is not a capture, or is truncated: {_what_is_wrong(error)}") from error
         try:
             self.header = read_label(self.file, CaptureHeader, path=self.path, format=FORMAT, version=VERSION)
             self._read_frames(unfinished=unfinished)
-        except _DAMAGE as error:
+        except DAMAGE as error:
             self.file.close()
             raise CaptureError(f"{self.path} is damaged: {error}") from error
         except BaseException:
@@ -310,6 +302,10 @@ class Capture(AbstractContextManager["Capture"]):
             )
         return dataset
 
+    def __repr__(self) -> str:
+        """Name of the file, and numbers of images."""
+        return f"Capture: {self.path.name}, {len(self)} images, {int(self.laser_on.sum())} with the laser on"
+
     def __len__(self) -> int:
         return self._count
 
@@ -330,7 +326,7 @@ class Capture(AbstractContextManager["Capture"]):
             if self.has_image[index]:
                 return self._images[index]
             rows = self._lines[index]
-        except _DAMAGE as error:
+        except DAMAGE as error:
             raise CaptureError(f"frame {index} of {self.path} cannot be read: the file is damaged ({error})") from error
         return self._stripe(rows, index)
 
@@ -379,20 +375,6 @@ class Capture(AbstractContextManager["Capture"]):
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def open_capture(path: str | Path) -> Capture:
-    """Open a capture file (HDF5) for reading; CaptureError as from `Capture`.
-
-    Per-frame values are read at once, images when they are asked for: ``capture[12]`` is a `Frame`. A recording that is
-    still being written can be opened by its name ``NAME.part``; it has the frames that were complete then.
-
-    Examples
-    --------
-    >>> with uwlts.open_capture("spheres.h5") as capture:
-    ...     images = [frame.image for frame in capture if frame.laser_on]
-    """
-    return Capture(path)
 
 
 @contextmanager

@@ -12,10 +12,9 @@ import hdf5plugin
 import numpy as np
 
 from uwlts.errors import CaptureError, ImageError, OutputError
-from uwlts.files.command_files import note_made, refuse_input
+from uwlts.files.inputs import note_made, refuse_input
 from uwlts.files.json_files import differences
-from uwlts.files.one_writer import one_writer
-from uwlts.files.writing import refuse_unsuitable
+from uwlts.files.writing import one_writer, refuse_unsuitable
 from uwlts.model.calibration import is_rigid
 from uwlts.model.sensor import CaptureHeader, Table
 from uwlts.model.stripe import ROWS, Stripe, rows_of
@@ -77,7 +76,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 refuse_input(self._part)
             if self._part.exists() and not (resume or overwrite):
                 raise OutputError(
-                    f"{self._part} is left from an interrupted run; give --resume to go on or --overwrite"
+                    f"{self._part} is left from an interrupted run; give `resume` to go on or `overwrite`"
                 )
             with self._left_over() if resume and self._part.exists() else nullcontext(()) as unfinished:
                 self._begin(unfinished)
@@ -92,7 +91,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
         try:
             unfinished = Capture(self._part)
         except CaptureError as error:
-            raise CaptureError(f"cannot resume: {error}; give --overwrite to start afresh") from error
+            raise CaptureError(f"cannot resume: {error}; give `overwrite` to start afresh") from error
         held = unfinished.header, unfinished.dtype, unfinished.plan()
         there = _recording_table(*held, lines=unfinished.holds_lines, moving=unfinished.moving)
         kinds = {"lines": bool(self._lines), "moving": self._moving}
@@ -101,7 +100,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
             unfinished.close()
             raise CaptureError(
                 f"{self._part} belongs to another recording: {others}. Go on with the plan of that one, give "
-                "another name, or --overwrite to start afresh"
+                "another name, or `overwrite` to start afresh"
             )
         return unfinished
 
@@ -270,6 +269,7 @@ class CaptureWriter(AbstractContextManager["CaptureWriter"]):
                 if self._plan is not None:
                     forget_plan(self._part)
                 _cut_to_used(self._part)
+                refuse_input(self.path)
                 os.replace(self._part, self.path)
                 note_made(self.path)
 

@@ -1,14 +1,16 @@
 """A measured point cloud: points, what is known of each, and its uncertainty. `cloud_files` reads and writes it."""
 
 import json
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from uwlts.errors import CaptureError
 from uwlts.files.reading import require_plain
+from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -78,12 +80,11 @@ class PointUncertainty:
 
     def covariance_mm2(self) -> np.ndarray:
         """Covariance (N, 3, 3) of the coordinates of each point, of all kinds together."""
-        order = [PAIRS.index((min(i, j), max(i, j))) for i in range(3) for j in range(3)]
         result = np.empty((len(self.random_mm2), 3, 3), self.random_mm2.dtype)
         for start in range(0, len(result), _BLOCK):
             some = self[start : start + _BLOCK]
             pairs = _pairs_of(some.by_image_mm()) + (some.random_mm2 + some.systematic_mm2())
-            result[start : start + _BLOCK] = pairs[:, order].reshape(-1, 3, 3)
+            result[start : start + _BLOCK] = matrices_of(pairs)
         return result
 
     def std_mm(self) -> np.ndarray:
@@ -97,6 +98,17 @@ def _pairs_of(parts_mm: np.ndarray) -> np.ndarray:
     return np.stack([np.einsum("mn,mn->n", axes[i], axes[j]) for i, j in PAIRS], axis=1)
 
 
+def matrices_of(pairs: np.ndarray) -> np.ndarray:
+    """Return the symmetric matrices (N, 3, 3) of six numbers each (N, 6), in the order of `PAIRS`."""
+    return pairs[:, [PAIRS.index((min(i, j), max(i, j))) for i in range(3) for j in range(3)]].reshape(-1, 3, 3)
+
+
+def turned_pairs(pairs: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return covariances (N, 6), in the order of `PAIRS`, after rotations (3, 3) or (N, 3, 3)."""
+    matrices = rotations @ matrices_of(pairs) @ np.swapaxes(rotations, -1, -2)
+    return np.stack([matrices[:, i, j] for i, j in PAIRS], axis=1)
+
+
 def images_along(known: PointUncertainty, normals: np.ndarray) -> np.ndarray:
     """Motions (1 + K, N) along normals (N, 3) for one standard deviation of each part that an image's points share."""
     return np.einsum("kni,ni->kn", known.by_image_mm(), normals)
@@ -108,8 +120,8 @@ def variance_along(pairs: np.ndarray, directions: np.ndarray) -> np.ndarray:
     return np.einsum("ni,in->n", pairs, np.stack(parts))
 
 
-@dataclass(frozen=True, eq=False)
-class PointCloud:
+@dataclass(frozen=True, eq=False, repr=False)
+class PointCloud(Brief):
     """Points in the object coordinate system (OCS) and what is known of each.
 
     OCS: X normal to the laser sheet (the direction of the scan), Y along the stripe, Z parallel to the laser's axis,
@@ -156,6 +168,8 @@ class PointCloud:
     lines_by_status: dict[str, int] = field(default_factory=dict)
     rays_by_status: dict[str, int] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    writer: ClassVar[Callable[..., None]]
+    """How clouds are written: `uwlts.storage.cloud_files`, which knows the formats, sets it."""
 
     def __post_init__(self) -> None:
         for name, kind in KINDS.items():
@@ -185,6 +199,13 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.points_mm)
 
+    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write the cloud in the format that the ending names; errors as `uwlts.storage.cloud_files.write_cloud`.
+
+        .ply, .h5, .xyz (text), .laz, .las, .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers).
+        """
+        self.writer(path, self, overwrite=overwrite)
+
     def selected(self, selection: slice | np.ndarray) -> "PointCloud":
         """The cloud of a selection of the points, by a slice, indices or a mask."""
         known, deviation = self.uncertainty, self.deviation_mm
@@ -200,6 +221,27 @@ class PointCloud:
     def covariance_mm2(self) -> np.ndarray | None:
         """Covariance (N, 3, 3) of the coordinates of each point, mm2, of all kinds together; None where not known."""
         return None if self.uncertainty is None else self.uncertainty.covariance_mm2()
+
+
+def cloud_of(
+    points_mm: np.ndarray,
+    *,
+    intensity: np.ndarray | None = None,
+    frame: np.ndarray | None = None,
+    line: np.ndarray | None = None,
+    deviation_mm: np.ndarray | None = None,
+    time_s: np.ndarray | None = None,
+) -> PointCloud:
+    """A cloud of another program, whose intensity, frame or line may be unknown; CaptureError as from `PointCloud`."""
+    unknown = np.full(len(points_mm), NO_INDEX)
+    return PointCloud(
+        points_mm,
+        np.full(len(points_mm), np.nan) if intensity is None else intensity,
+        unknown if frame is None else frame,
+        unknown if line is None else line,
+        deviation_mm=deviation_mm,
+        time_s=time_s,
+    )
 
 
 def joined(parts: Sequence[PointCloud]) -> PointCloud:

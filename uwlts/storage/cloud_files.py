@@ -4,6 +4,7 @@ programs."""
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -26,7 +27,7 @@ from uwlts.storage.foreign_clouds import (
     require_libraries,
     write_foreign,
 )
-from uwlts.storage.hdf5_file import find_dataset, format_of, read_array, read_label, write_label
+from uwlts.storage.hdf5_file import DAMAGE, find_dataset, format_of, read_array, read_label, write_label
 
 FORMAT = "uwlts-cloud"
 VERSION = 1
@@ -112,6 +113,9 @@ def write_cloud(
     write_ply_points(path, columns, comments=_comments(_with_shared(cloud)), overwrite=overwrite)
 
 
+PointCloud.writer = staticmethod(write_cloud)
+
+
 def write_ply_points(
     path: Path, columns: Mapping[str, np.ndarray], *, comments: Sequence[str] = (), overwrite: bool
 ) -> None:
@@ -154,17 +158,23 @@ def read_cloud(path: str | os.PathLike[str]) -> PointCloud:
     return read_thinned_cloud(path)[0]
 
 
+def loaded_cloud(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
+    """The cloud itself, or the one in a file; CaptureError as from `read_cloud`."""
+    return cloud if isinstance(cloud, PointCloud) else read_cloud(cloud)
+
+
 def read_thinned_cloud(path: str | os.PathLike[str], at_most: int | None = None) -> tuple[PointCloud, int]:
     """Every n-th point of a cloud's file, ``at_most`` so many, and the number of points in the file; see `read_cloud`.
 
     Of HDF5 and binary PLY only these are held in memory. Of COPC the upper levels are read, an even sample.
     """
-    if is_copc(path):
-        return _read_copc(path, None, at_most)
-    if _is_foreign(path):
-        whole = _read_foreign(Path(path))
-        return whole.selected(_every(len(whole), at_most)), len(whole)
-    return _read_rows(Path(path), lambda count: _every(count, at_most))
+    with _naming(path):
+        if is_copc(path):
+            return read_copc(path, at_most=at_most)
+        if _is_foreign(path):
+            whole = read_foreign(Path(path))
+            return whole.selected(_every(len(whole), at_most)), len(whole)
+        return _read_rows(Path(path), lambda count: _every(count, at_most))
 
 
 def read_region(
@@ -178,7 +188,8 @@ def read_region(
     if low.shape != (3,) or high.shape != (3,) or not (np.isfinite([low, high]).all() and (low < high).all()):
         raise CaptureError(f"a region goes from x, y, z to larger x, y, z; found {low.tolist()} to {high.tolist()} mm")
     if is_copc(path):
-        return _read_copc(path, (low, high), at_most)[0]
+        with _naming(path):
+            return read_copc(path, box_mm=(low, high), at_most=at_most)[0]
     found = [
         part.selected(np.flatnonzero(np.all((part.points_mm >= low) & (part.points_mm <= high), axis=1)))
         for part in cloud_parts(path)
@@ -198,38 +209,23 @@ def cloud_parts(path: str | os.PathLike[str], most: int = POINTS_OF_PART) -> Ite
         return
     start, total = 0, 1
     while start < total:
-        part, total = _read_rows(Path(path), lambda _, start=start: slice(start, start + most))
+        with _naming(path):
+            part, total = _read_rows(Path(path), lambda _, start=start: slice(start, start + most))
         yield part
         start += most
-
-
-def _read_copc(
-    path: str | os.PathLike[str], box: tuple[np.ndarray, np.ndarray] | None, at_most: int | None
-) -> tuple[PointCloud, int]:
-    found = read_copc(path, box_mm=box, at_most=at_most)
-    unknown = np.full(len(found.points_mm), NO_INDEX)
-    frame, line = (unknown if each is None else each for each in (found.frame, found.line))
-    return PointCloud(found.points_mm, found.intensity, frame, line, found.deviation_mm), found.total
 
 
 def _is_foreign(path: str | os.PathLike[str]) -> bool:
     return Path(path).suffix.lower() in FOREIGN_FORMATS
 
 
-def _read_foreign(path: Path) -> PointCloud:
-    found = read_foreign(path)
-    none, unknown = np.full(len(found.points_mm), np.nan), np.full(len(found.points_mm), NO_INDEX)
+@contextmanager
+def _naming(path: str | os.PathLike[str]) -> Iterator[None]:
+    """A context whose CaptureErrors name the file."""
     try:
-        return PointCloud(
-            found.points_mm,
-            none if found.intensity is None else found.intensity,
-            unknown if found.frame is None else found.frame,
-            unknown if found.line is None else found.line,
-            deviation_mm=found.deviation_mm,
-            time_s=found.time_s,
-        )
+        yield
     except CaptureError as error:
-        raise CaptureError(f"{path}: {error}") from error
+        raise CaptureError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
 
 
 def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
@@ -238,10 +234,7 @@ def _read_rows(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
         with opened(path, called="cloud") as file:
             if not file.read(4).startswith(b"ply"):
                 raise CaptureError(f"{path} ends with none of {', '.join(CLOUD_ENDINGS)}, the formats of clouds")
-    try:
-        return _read_hdf5(path, rows) if _in_hdf5(path) else _read_ply(path, rows)
-    except CaptureError as error:
-        raise CaptureError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+    return _read_hdf5(path, rows) if _in_hdf5(path) else _read_ply(path, rows)
 
 
 def _every(count: int, at_most: int | None) -> slice:
@@ -454,7 +447,7 @@ def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
             selection: dict[str, tuple[slice, ...]] = dict.fromkeys((*KINDS, *names), (chosen,))
             selection["patterns_mm"] = selection["poses_mm"] = (slice(None), chosen)
             found = {name: read_array(file, name, path=path, selection=selection[name]) for name in selection}
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+    except DAMAGE as error:
         raise CaptureError(f"{path} is not a complete HDF5 file of a cloud: {error}") from error
     arrays = {name: values for name, values in found.items() if values is not None}
     # Whole numbers may not be cut, nor fractions become whole.

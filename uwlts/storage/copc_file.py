@@ -11,13 +11,15 @@ import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any
 
 import numpy as np
 
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import opened
 from uwlts.files.writing import written_aside
+from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.storage.cloud import PointCloud, cloud_of
 from uwlts.storage.las_file import INTENSITY_LIMITS, LAZ_STEP_M, brief, las_middle, library
 
 SUFFIX = ".copc.laz"
@@ -28,38 +30,10 @@ _DEEPEST = 7
 _MOST_LEVELS = 16
 _FIELDS: dict[str, type] = {"amplitude": np.float32, "frame": np.int32, "line": np.int32, "deviation_mm": np.float32}
 
-Progress = Callable[[int, int], None]
-
 
 def is_copc(path: str | os.PathLike[str]) -> bool:
     """Whether a file's name ends with ``.copc.laz``."""
     return Path(path).name.lower().endswith(SUFFIX)
-
-
-class CloudPart(Protocol):
-    """Points (N, 3) and columns (N,) of a cloud, as in `uwlts.storage.cloud.PointCloud`."""
-
-    @property
-    def points_mm(self) -> np.ndarray: ...
-    @property
-    def intensity(self) -> np.ndarray: ...
-    @property
-    def frame(self) -> np.ndarray: ...
-    @property
-    def line(self) -> np.ndarray: ...
-    @property
-    def deviation_mm(self) -> np.ndarray | None: ...
-
-
-class CopcPoints(NamedTuple):
-    """Points (N, 3) in mm and columns (N,) of a file, None where it has no such field, and its number of points."""
-
-    points_mm: np.ndarray
-    intensity: np.ndarray
-    frame: np.ndarray | None
-    line: np.ndarray | None
-    deviation_mm: np.ndarray | None
-    total: int
 
 
 @dataclass(eq=False)
@@ -95,10 +69,10 @@ class _Sorter:
 
 def write_copc(
     path: str | os.PathLike[str],
-    parts: Callable[[], Iterable[CloudPart]],
+    parts: Callable[[], Iterable[PointCloud]],
     *,
     overwrite: bool = False,
-    progress: Progress = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> int:
     """Write the parts of a cloud as COPC, whole or not at all; returns the number of points.
 
@@ -182,7 +156,7 @@ def _writer(copc: Any, header: Any, aside: Path, *, low: Any, high: Any, centre:
     return copc.FileWriter(str(aside), settings)
 
 
-def _table(part: CloudPart, kind: np.dtype, middle: np.ndarray) -> np.ndarray:
+def _table(part: PointCloud, kind: np.dtype, middle: np.ndarray) -> np.ndarray:
     table = np.zeros(len(part.points_mm), kind)
     for name, values in zip("XYZ", (1e-3 * part.points_mm - middle).T / LAZ_STEP_M, strict=True):
         table[name] = np.rint(values)
@@ -197,8 +171,8 @@ def _table(part: CloudPart, kind: np.dtype, middle: np.ndarray) -> np.ndarray:
 
 def read_copc(
     path: str | os.PathLike[str], *, box_mm: tuple[np.ndarray, np.ndarray] | None = None, at_most: int | None = None
-) -> CopcPoints:
-    """The points of a COPC file within a box.
+) -> tuple[PointCloud, int]:
+    """The points of a COPC file within a box, and the number of points in the file.
 
     With ``at_most`` only as many levels are read as hold about so many points in the box, at least the first, and an
     even sample of these is taken if they are more. Fields of other programs' files that are missing are left out.
@@ -215,15 +189,10 @@ def read_copc(
     except (OSError, RuntimeError, ValueError, KeyError, laspy.errors.LaspyException) as error:
         raise CaptureError(f"{path} is not a complete COPC file: {brief(error)}") from error
     columns = {name: np.asarray(found[name]) for name in found.point_format.dimension_names if name in _FIELDS}
-    deviation = columns.get("deviation_mm")
-    return CopcPoints(
-        1e3 * np.column_stack([found.x, found.y, found.z]),
-        np.asarray(columns.get("amplitude", found["intensity"]), np.float32),
-        columns.get("frame"),
-        columns.get("line"),
-        None if deviation is None or np.isnan(deviation).all() else deviation,
-        total,
-    )
+    intensity = columns.pop("amplitude", found["intensity"])
+    if np.isnan(columns.get("deviation_mm", np.nan)).all():
+        columns.pop("deviation_mm", None)
+    return cloud_of(1e3 * np.column_stack([found.x, found.y, found.z]), intensity=intensity, **columns), total
 
 
 def _queried(reader: Any, box: Any, at_most: int | None) -> Any:

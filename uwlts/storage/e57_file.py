@@ -5,11 +5,13 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from uwlts.errors import CaptureError, OutputError
+from uwlts.files.reading import require_regular_file
+from uwlts.storage.cloud import PointCloud, cloud_of
 from uwlts.storage.las_file import brief, library
 
 PREFIX, EXTENSION = "uwlts", "urn:uwlts:point-fields"
@@ -20,14 +22,6 @@ COLOURS = "colorRed", "colorGreen", "colorBlue"
 _LIMITS: tuple[tuple[str, Callable[[np.ndarray], Any]], ...] = (("Minimum", np.min), ("Maximum", np.max))
 _PLACES = ("cartesianInvalidState", "sphericalInvalidState")
 """Fields of points that have no place."""
-
-
-class E57Points(NamedTuple):
-    """Points (N, 3) in mm, and columns (N,), None where a scan of the file has no such field."""
-
-    points_mm: np.ndarray
-    intensity: np.ndarray | None
-    time_s: np.ndarray | None
 
 
 def write_e57(
@@ -113,12 +107,13 @@ def _limits(named: Sequence[tuple[str, np.ndarray]], kind: type[int] | type[floa
     return {f"{label}{end}": kind(of(values)) for label, values in named for end, of in _LIMITS}
 
 
-def read_e57(path: Path) -> E57Points:
+def read_e57(path: Path) -> PointCloud:
     """All points of a file, each scan at its pose; times by the scanner's clock.
 
     CaptureError where the file is damaged or has no scans; SetupError where pye57 is not installed.
     """
     pye57 = library("pye57", "E57")
+    require_regular_file(path, called="cloud")
     try:
         with pye57.E57(str(path)) as file:
             scans = [
@@ -133,10 +128,10 @@ def read_e57(path: Path) -> E57Points:
     points = 1e3 * np.concatenate([np.column_stack([scan[f"cartesian{axis}"] for axis in "XYZ"]) for scan in scans])
     lit = all("intensity" in scan for scan in scans)
     timed = all(scan["time_s"] is not None for scan in scans)
-    return E57Points(
+    return cloud_of(
         points,
-        np.concatenate([scan["intensity"] for scan in scans]) if lit else None,
-        np.concatenate([scan["time_s"] for scan in scans]) if timed else None,
+        intensity=np.concatenate([scan["intensity"] for scan in scans]) if lit else None,
+        time_s=np.concatenate([scan["time_s"] for scan in scans]) if timed else None,
     )
 
 

@@ -4,7 +4,6 @@ import csv
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -13,9 +12,10 @@ import numpy as np
 import tomli_w
 
 from uwlts.errors import CaptureError, OutputError
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import require_possible_name
 from uwlts.model.stripe import rows_of
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import (
@@ -36,31 +36,33 @@ from uwlts.stripe import Stripe
 HEADER, TABLE = "header.json", "frames.csv"
 _COLUMNS = ("file", "light", "stage_mm", "exposure_ms", "time_s")
 
+Corner = tuple[float, float, float]
 
-@keeps_inputs
+
+@inputs_kept()
 def export(
     file: str | Path,
     out: str | Path,
     *,
     images: Literal["png", "tiff"] = "png",
-    region_mm: tuple[Sequence[float], Sequence[float]] | None = None,
+    region_mm: tuple[Corner, Corner] | None = None,
     at_most: int | None = None,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> int:
-    """Write a capture as a folder of images that `import_images` reads back, or a cloud in another format.
+    """Write a capture as a folder of images that uwlts import reads back, or a cloud in another format.
 
     Parameters
     ----------
     file : str or Path
-        Capture (.h5) or cloud (.ply, .h5 or .copc.laz).
+        Capture (.h5) or cloud (.ply, .h5, .copc.laz; of other programs .xyz, .las, .e57).
     out : str or Path
         New folder for a capture; for a cloud a file whose ending names the format: .ply, .h5, .xyz (text), .laz,
-        .las, .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz, which is written a part at a time.
+        .las, .e57, .mcap (ROS 2), .foxglove.mcap, or .copc.laz (an octree for viewers, written a part at a time).
     images : {"png", "tiff"}
         Format of a capture's images; both keep all bits.
     region_mm : pair of (3,), optional
-        Only the points in the box from the first to the second corner.
+        Only the points in a box: x y z of one corner, x y z of the other.
     at_most : int, optional
         Only an even sample of about so many points.
     overwrite : bool
@@ -117,7 +119,7 @@ def export_capture(
     folder: Path,
     *,
     image_format: Literal["png", "tiff"] = "png",
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> None:
     """Write a capture's frames as images of its own depth, without loss, into a new folder; whole or not at all.
 

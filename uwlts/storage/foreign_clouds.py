@@ -1,21 +1,16 @@
-"""Clouds for and of other programs and scanners: text, LAS, E57; LAZ, COPC and MCAP are written only here.
+"""Clouds for and of other programs and scanners: text, LAS, E57; LAZ, COPC and MCAP are written only here."""
 
-LAZ is read as COPC only: the decompressor ends the process on some damaged files.
-"""
-
-import struct
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
 from uwlts.errors import CaptureError, DescriptionError, OutputError
-from uwlts.files.reading import opened
 from uwlts.files.writing import written_aside
-from uwlts.storage.cloud import PointCloud
+from uwlts.storage.cloud import PointCloud, cloud_of
 from uwlts.storage.copc_file import is_copc, write_copc
 from uwlts.storage.e57_file import COLOURS, read_e57, write_e57
-from uwlts.storage.las_file import brief, las_content, library
+from uwlts.storage.las_file import las_content, library, read_las
 from uwlts.storage.mcap_clouds import covariance_columns, mcap_of
 from uwlts.storage.pose_files import read_columns
 
@@ -24,39 +19,23 @@ TEXT_FORMATS = (".xyz", ".txt", ".csv", ".asc")
 FOREIGN_FORMATS = (*TEXT_FORMATS, ".las", ".e57")
 WRITTEN_FORMATS = (".xyz", ".laz", ".e57", ".las", ".mcap")
 
-_LAS_START, _LAS_RECORD = 104, 54
-"""Bytes of a LAS header up to its number of variable length records, and fewest bytes of such a record."""
 
-
-class ForeignPoints(NamedTuple):
-    """Points (N, 3) in mm and columns (N,) of a file, None where it has no such field."""
-
-    points_mm: np.ndarray
-    intensity: np.ndarray | None = None
-    frame: np.ndarray | None = None
-    line: np.ndarray | None = None
-    deviation_mm: np.ndarray | None = None
-    time_s: np.ndarray | None = None
-
-
-def read_foreign(path: Path) -> ForeignPoints:
+def read_foreign(path: Path) -> PointCloud:
     """All points of a file whose suffix is one of `FOREIGN_FORMATS`: text in mm; LAS and E57 in m, as they prescribe.
 
     Scans of an E57 file are taken together, each at its pose. Raises CaptureError where the file is damaged or foreign,
     SetupError where the library of its format is not installed.
     """
-    with opened(path, called="cloud") as file:
-        start = file.read(_LAS_START)
-    suffix = path.suffix.lower()
-    if suffix in TEXT_FORMATS:
-        return _read_text(path)
-    if suffix == ".las":
-        return _read_las(path, start)
-    found = read_e57(path)
-    return ForeignPoints(found.points_mm, found.intensity, time_s=found.time_s)
+    match path.suffix.lower():
+        case ".las":
+            return read_las(path)
+        case ".e57":
+            return read_e57(path)
+        case _:
+            return _read_text(path)
 
 
-def _read_text(path: Path) -> ForeignPoints:
+def _read_text(path: Path) -> PointCloud:
     try:
         columns = read_columns(path, {}, named=False)
     except DescriptionError as error:
@@ -71,46 +50,7 @@ def _read_text(path: Path) -> ForeignPoints:
     points = np.column_stack(axes)
     seen = np.isfinite(points).all(axis=1)
     intensity = columns.get("intensity")
-    return ForeignPoints(points[seen], None if intensity is None else intensity[seen])
-
-
-def _read_las(path: Path, start: bytes) -> ForeignPoints:
-    laspy = library("laspy", "LAS")
-    try:
-        # The library reads as many records before the points as the header declares, however many.
-        points_begin, records = struct.unpack("<II", start[96:_LAS_START])
-        if records * _LAS_RECORD > points_begin:
-            raise ValueError(f"{records} records do not fit before its points")
-        with laspy.open(path, read_evlrs=False) as reader:
-            header = reader.header
-            needed = header.offset_to_point_data + header.point_count * header.point_format.size
-            if header.are_points_compressed or needed > path.stat().st_size:
-                raise ValueError("its points are compressed, or fewer than its header declares")
-            found = reader.read_points(header.point_count)
-        points = 1e3 * np.column_stack([found.x, found.y, found.z])
-        names = set(found.point_format.dimension_names)
-        column = {name: np.asarray(found[name]) for name in names & {"frame", "line", "deviation_mm", "gps_time"}}
-        intensity = np.asarray(found["amplitude" if "amplitude" in names else "intensity"], np.float32)
-    except (
-        OSError,
-        RuntimeError,
-        ValueError,
-        KeyError,
-        MemoryError,
-        struct.error,
-        laspy.errors.LaspyException,
-    ) as error:
-        raise CaptureError(f"{path} is not a complete LAS file: {brief(error)}") from error
-    times = column.get("gps_time")
-    return ForeignPoints(
-        points,
-        intensity,
-        column.get("frame"),
-        column.get("line"),
-        column.get("deviation_mm"),
-        # Programs leave it 0 where they know no times.
-        None if times is None or not times.any() else times,
-    )
+    return cloud_of(points[seen], intensity=None if intensity is None else intensity[seen])
 
 
 def write_foreign(path: Path, cloud: PointCloud, *, overwrite: bool, colours: np.ndarray | None = None) -> None:

@@ -1,18 +1,15 @@
-"""Label of the program's HDF5 files, and reading of HDF5 files that are still being written.
+"""Label and arrays of the program's HDF5 files.
 
 The label is the attributes ``format``, ``version`` and ``header`` (JSON). They are stored as text of fixed length,
 which lies under HDF5's checksums. Text of variable length would not: where it is damaged, HDF5 may search for its end
 for ever.
 """
 
-import io
 import json
 import math
-import os
-from contextlib import ExitStack
 from pathlib import Path
 from types import EllipsisType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import h5py
 import numpy as np
@@ -22,10 +19,10 @@ from uwlts.files.reading import MOST_JSON_BYTES, is_regular_file, parsed_json
 from uwlts.model.library import validated
 from uwlts.model.sensor import Description, Table
 
-if TYPE_CHECKING:
-    from typing_extensions import Buffer
-
 AnyHeader = TypeVar("AnyHeader", bound=Description)
+
+DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError)
+"""What h5py raises on a damaged file, depending on where the damage is."""
 
 _FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32, 32000, 32001, 32015}
 """Of a dataset's stored pieces: those of the program, LZF and Zstandard, with which files may be packed again."""
@@ -102,7 +99,7 @@ def format_of(path: str | Path) -> str | None:
         # Unlocked, as it may be a recording that goes on.
         with h5py.File(path, "r", locking=False) as file:
             return _text(file, "format")
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError):
+    except DAMAGE:
         return None
 
 
@@ -170,89 +167,3 @@ def require_small_chunks(dataset: h5py.Dataset, name: str, *, path: str | Path) 
     piece = 0 if dataset.chunks is None else math.prod(dataset.chunks) * dataset.dtype.itemsize
     if piece > max(_LARGEST_CHUNK, 2 * dataset.nbytes):
         raise CaptureError(f"{path} is damaged: '{name}' is stored in pieces of {piece:,} bytes")
-
-
-_SIGNATURE_AND_VERSION = b"\x89HDF\r\n\x1a\n\x03"
-# Superblock version 3 with 8-byte offsets (HDF5 File Format Specification 3.0, II.A): where its entries begin.
-_FLAGS, _END_OF_FILE, _ROOT, _CHECKSUM, _SIZE = 11, 28, 36, 44, 48
-_ROOM = 2**28
-"""Bytes by which a file may grow while it is read."""
-
-
-def has_writer(path: str | Path) -> bool:
-    """Whether the file says that a writer has it open, or had when it was killed."""
-    with open(path, "rb") as file:
-        start = file.read(_SIZE)
-    return len(start) == _SIZE and start.startswith(_SIGNATURE_AND_VERSION) and start[_FLAGS] != 0
-
-
-class UnfinishedFile(h5py.File):
-    """The file of a writer that was killed, or is still at work, as it was last flushed; errors as of ``h5py.File``.
-
-    HDF5's single-writer-multiple-reader mode hangs on a damaged file: it tries a hundred times and doubles the pause
-    each time. What keeps the file from being opened like any other are two entries of its superblock, the mark of the
-    writer and the end of the used space. HDF5 is shown them as in a closed file; the file itself is not changed.
-    """
-
-    def __init__(self, path: str | Path):
-        with ExitStack() as opened:
-            self._view = opened.enter_context(_AsIfClosed(path))
-            super().__init__(self._view, "r")
-            opened.pop_all()
-
-    def close(self) -> None:
-        """Close the file."""
-        super().close()
-        self._view.close()
-
-
-class _AsIfClosed(io.FileIO):
-    """The file with the superblock it would have if its writer had closed it, and room for what is still written."""
-
-    def __init__(self, path: str | Path):
-        super().__init__(path, "r")
-        start = self.read(_SIZE)
-        self._end = os.fstat(self.fileno()).st_size + _ROOM
-        settled = start[:_FLAGS] + b"\0" + start[_FLAGS + 1 : _END_OF_FILE] + self._end.to_bytes(8, "little")
-        settled += start[_ROOT:_CHECKSUM]
-        # A superblock that is damaged stays so.
-        intact = lookup3(start[:_CHECKSUM]).to_bytes(4, "little") == start[_CHECKSUM:]
-        self._start = settled + lookup3(settled).to_bytes(4, "little") if intact else start
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Go to a place; the file ends where the settled superblock says."""
-        return super().seek(offset + self._end) if whence == os.SEEK_END else super().seek(offset, whence)
-
-    def readinto(self, buffer: "Buffer", /) -> int:
-        """Read as any file, with the settled superblock in place of the stored one and zeros where nothing is yet."""
-        place, position = memoryview(buffer).cast("B"), self.tell()
-        count = super().readinto(place)
-        place[count:] = bytes(len(place) - count)
-        settled = self._start[position : position + len(place)]
-        place[: len(settled)] = settled
-        return len(place)
-
-
-def lookup3(data: bytes) -> int:
-    """Checksum of HDF5's metadata: ``hashlittle`` of Bob Jenkins' lookup3.c (2006, public domain), started with 0."""
-
-    def turned(value: int, bits: int) -> int:
-        return ((value << bits) | (value >> (32 - bits))) & 0xFFFFFFFF
-
-    a = b = c = (0xDEADBEEF + len(data)) & 0xFFFFFFFF
-    blocks = max(0, -(-len(data) // 12))
-    words = data.ljust(12 * blocks, b"\0")
-    for block in range(blocks):
-        x, y, z = (int.from_bytes(words[12 * block + k : 12 * block + k + 4], "little") for k in (0, 4, 8))
-        a, b, c = (a + x) & 0xFFFFFFFF, (b + y) & 0xFFFFFFFF, (c + z) & 0xFFFFFFFF
-        if block < blocks - 1:
-            for bits in (4, 6, 8, 16, 19, 4):
-                a = ((a - c) & 0xFFFFFFFF) ^ turned(c, bits)
-                c = (c + b) & 0xFFFFFFFF
-                a, b, c = b, c, a
-        else:
-            for bits in (14, 11, 25, 16, 4, 14, 24):
-                c = ((c ^ b) - turned(b, bits)) & 0xFFFFFFFF
-                a, b, c = b, c, a
-    # The last of the seven steps handed c on as b.
-    return b

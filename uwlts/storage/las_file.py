@@ -1,19 +1,30 @@
-"""LAS and LAZ as other programs read them: points in m, in steps of 0.1 um, with fields of any name."""
+"""LAS and LAZ as other programs read them: points in m, in steps of 0.1 um, with fields of any name.
 
-from importlib import import_module
+LAZ is read as COPC only: the decompressor ends the process on some damaged files.
+"""
+
+import struct
 from io import BytesIO
+from pathlib import Path
 from types import ModuleType
 from typing import Literal
 
 import numpy as np
 
-from uwlts.errors import OutputError, SetupError
+from uwlts.errors import CaptureError, OutputError
+from uwlts.files.reading import opened
+from uwlts.runtime.optional_library import optional_library
+from uwlts.storage.cloud import PointCloud, cloud_of
 
 LAZ_STEP_M = 1e-7
 """Coordinates in LAZ are whole multiples of it from the middle of the cloud: 0.1 um, over 214 m to either side."""
 
 _REACH_M = LAZ_STEP_M * (2**31 - 1)
 INTENSITY_LIMITS = 0, 2**16 - 1
+_START = 104
+"""Bytes of a LAS header up to its number of variable length records (LAS 1.4, 2.4)."""
+_RECORD = 54
+"""Fewest bytes of such a record: its header (LAS 1.4, 2.5)."""
 
 
 def las_content(
@@ -63,15 +74,44 @@ def las_middle(low_m: np.ndarray, high_m: np.ndarray) -> np.ndarray:
     return middle
 
 
-def library(name: Literal["laspy", "lazrs", "copclib", "pye57"], format: str) -> ModuleType:
-    """An optional library by its name; SetupError where it is not installed."""
+def read_las(path: Path) -> PointCloud:
+    """All points of a LAS file; CaptureError if it is damaged or compressed, SetupError without laspy."""
+    laspy = library("laspy", "LAS")
+    with opened(path, called="cloud") as file:
+        start = file.read(_START)
     try:
-        return import_module(name)
-    except ImportError as error:
-        raise SetupError(
-            f"{format} needs the library {name}, which is not installed: pip install 'uwlts[clouds]', or write "
-            "PLY or XYZ"
-        ) from error
+        # The library reads as many records before the points as the header declares, however many.
+        points_begin, records = struct.unpack("<II", start[96:_START])
+        if records * _RECORD > points_begin:
+            raise ValueError(f"{records} records do not fit before its points")
+        with laspy.open(path, read_evlrs=False) as reader:
+            header = reader.header
+            needed = header.offset_to_point_data + header.point_count * header.point_format.size
+            if header.are_points_compressed or needed > path.stat().st_size:
+                raise ValueError("its points are compressed, or fewer than its header declares")
+            found = reader.read_points(header.point_count)
+        points = 1e3 * np.column_stack([found.x, found.y, found.z])
+        names = set(found.point_format.dimension_names)
+        column = {name: np.asarray(found[name]) for name in names & {"frame", "line", "deviation_mm", "gps_time"}}
+        intensity = np.asarray(found["amplitude" if "amplitude" in names else "intensity"], np.float32)
+    except (
+        OSError,
+        RuntimeError,
+        ValueError,
+        KeyError,
+        MemoryError,
+        struct.error,
+        laspy.errors.LaspyException,
+    ) as error:
+        raise CaptureError(f"{path} is not a complete LAS file: {brief(error)}") from error
+    times = column.pop("gps_time", None)
+    # Programs leave it 0 where they know no times.
+    return cloud_of(points, intensity=intensity, time_s=None if times is None or not times.any() else times, **column)
+
+
+def library(name: Literal["laspy", "lazrs", "copclib", "pye57"], format: str) -> ModuleType:
+    """A library for clouds by its name; SetupError if it is not installed."""
+    return optional_library(name, needed_by=format, extra="clouds", instead=", or write PLY or XYZ")
 
 
 def brief(error: BaseException) -> str:

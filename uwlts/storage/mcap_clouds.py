@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from io import BytesIO
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from uwlts.errors import OutputError, SetupError
+from uwlts.errors import OutputError
+from uwlts.runtime.optional_library import optional_library
 from uwlts.storage.cloud import PAIRS, PointCloud
 
 TOPIC, FRAME_ID = "/points", "base"
@@ -68,12 +70,8 @@ def _moments(cloud: PointCloud) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def _ros2(cloud: PointCloud) -> bytes:
-    try:
-        from mcap.writer import Writer
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise _missing(error) from error
-    store: Any = get_typestore(Stores.ROS2_HUMBLE)
+    mcap, typesys = _library("mcap.writer"), _library("rosbags.typesys")
+    store: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     point_cloud2, field = store.types[_POINT_CLOUD2], store.types["sensor_msgs/msg/PointField"]
     header, stamp = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
     kinds = {"<f4": field.FLOAT32, "<f8": field.FLOAT64, "<i4": field.INT32}
@@ -83,7 +81,7 @@ def _ros2(cloud: PointCloud) -> bytes:
         for name, (kind, offset) in _layout(table).items()
     ]
     content = BytesIO()
-    writer = Writer(content)
+    writer = mcap.Writer(content)
     writer.start(profile="ros2", library="uwlts")
     text = store.generate_msgdef(_POINT_CLOUD2, ros_version=2)[0]
     schema = writer.register_schema(name=_POINT_CLOUD2, encoding="ros2msg", data=text.encode())
@@ -107,11 +105,7 @@ def _ros2(cloud: PointCloud) -> bytes:
 
 
 def _foxglove(cloud: PointCloud) -> bytes:
-    try:
-        import foxglove
-        from foxglove import channels, messages
-    except ImportError as error:
-        raise _missing(error) from error
+    foxglove, channels, messages = (_library(f"foxglove{part}") for part in ("", ".channels", ".messages"))
     kind_of = messages.PackedElementFieldNumericType
     kinds = {"<f4": kind_of.Float32, "<f8": kind_of.Float64, "<i4": kind_of.Int32}
     table = _table(cloud)
@@ -143,5 +137,5 @@ def _layout(table: np.ndarray) -> dict[str, tuple[np.dtype, int]]:
     return {name: (entry[0], entry[1]) for name, entry in (table.dtype.fields or {}).items()}
 
 
-def _missing(error: ImportError) -> SetupError:
-    return SetupError(f"MCAP needs the library {error.name}, which is not installed: pip install 'uwlts[ros]'")
+def _library(module: str) -> ModuleType:
+    return optional_library(module, needed_by="MCAP", extra="ros")

@@ -12,6 +12,7 @@ from plyfile import PlyData, PlyElement
 
 from uwlts.errors import OutputError
 from uwlts.files.writing import written_aside
+from uwlts.model.brief import Brief
 from uwlts.model.sensor import Table
 
 MESH_FORMATS = (".stl", ".ply", ".glb")
@@ -20,8 +21,8 @@ _FARTHEST_SINGLE_MM = 16_000.0
 """Numbers of 32 bits have steps of a micrometre there."""
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceMesh:
+@dataclass(frozen=True, eq=False, repr=False)
+class SurfaceMesh(Brief):
     """Triangles with the uncertainty of their vertices.
 
     Attributes
@@ -72,32 +73,34 @@ class SurfaceMesh:
             f"points without a surface  {100 * self.left_out:.2f} %",
         ]
 
+    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write the mesh in the format that the path's suffix names, whole or not at all.
 
-def write_mesh(path: str | os.PathLike[str], mesh: SurfaceMesh, *, overwrite: bool = False) -> None:
-    """Write a mesh in the format that the path's suffix names, whole or not at all.
+        - ``.ply``: binary, mm. Vertices have x, y, z (double), nx, ny, nz, and the standard uncertainty along the
+          normal: uncertainty, and its parts uncertainty_noise and uncertainty_shared (float, mm).
+        - ``.glb``: glTF 2.0, in m about the origin of the mesh's node, with normals and the attribute _uncertainty
+          (mm).
+        - ``.stl``: binary, mm, triangles alone.
 
-    - ``.ply``: binary, mm. Vertices have x, y, z (double), nx, ny, nz, and the standard uncertainty along the normal:
-      uncertainty, and its parts uncertainty_noise and uncertainty_shared (float, mm).
-    - ``.glb``: glTF 2.0, in m about the origin of the mesh's node, with normals and the attribute _uncertainty (mm).
-    - ``.stl``: binary, mm, triangles alone.
-
-    Raises
-    ------
-    OutputError
-        The suffix is another one, the file exists and ``overwrite`` is not set, the mesh lies too far from the origin
-        for STL, or the file cannot be written.
-    """
-    path = Path(path)
-    match path.suffix.lower():
-        case ".ply":
-            with written_aside(path, overwrite=overwrite) as aside:
-                _ply(mesh).write(str(aside))
-        case ".stl" | ".glb":
-            content = _stl(mesh) if path.suffix.lower() == ".stl" else _glb(mesh)
-            with written_aside(path, overwrite=overwrite) as aside:
-                aside.write_bytes(content)
-        case _:
-            raise OutputError(f"{path} ends with none of {', '.join(MESH_FORMATS)}, which name the format of a mesh")
+        Raises
+        ------
+        OutputError
+            The suffix is another one, the file exists and ``overwrite`` is not set, the mesh lies too far from the
+            origin for STL, or the file cannot be written.
+        """
+        path = Path(path)
+        match path.suffix.lower():
+            case ".ply":
+                with written_aside(path, overwrite=overwrite) as aside:
+                    _ply(self).write(str(aside))
+            case ".stl" | ".glb":
+                content = _stl(self) if path.suffix.lower() == ".stl" else _glb(self)
+                with written_aside(path, overwrite=overwrite) as aside:
+                    aside.write_bytes(content)
+            case _:
+                raise OutputError(
+                    f"{path} ends with none of {', '.join(MESH_FORMATS)}, which name the format of a mesh"
+                )
 
 
 def _ply(mesh: SurfaceMesh) -> PlyData:

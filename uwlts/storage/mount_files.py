@@ -1,6 +1,6 @@
 """Files of a mount's calibration: profiles of any maker's scanner, and `mount.json`."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
@@ -8,10 +8,10 @@ from typing import Literal, get_args
 import numpy as np
 
 from uwlts.errors import DescriptionError
-from uwlts.files.json_files import read_model, write_model
+from uwlts.files.json_files import read_model
 from uwlts.files.writing import sha256_of
 from uwlts.model.library import read_table, validated
-from uwlts.model.mount import Mount
+from uwlts.model.mount import FORMAT, VERSION, Mount
 from uwlts.model.sensor import Description, Positive
 from uwlts.storage.cloud_files import is_cloud, read_cloud
 from uwlts.storage.import_.matching import natural_key
@@ -26,19 +26,6 @@ from uwlts.storage.pose_files import (
     read_columns,
     scaled,
 )
-
-FORMAT, VERSION = "uwlts-mount", 1
-
-_OFTEN_MEANT = (
-    "quaternion-xyzw",
-    "quaternion-wxyz",
-    "euler-ZYX-deg",
-    "euler-zyx-deg",
-    "euler-XYZ-deg",
-    "euler-xyz-deg",
-)
-_OFTEN_MEANT += ("euler-ZYZ-deg", "rotvec-deg", "rotvec-rad", "euler-ZYX-rad", "euler-xyz-rad", "euler-XYZ-rad")
-
 
 Artefact = Literal["sphere", "plane", "step", "ring"]
 _SIZES: dict[Artefact, str] = {"sphere": "radius", "step": "height", "ring": "radius"}
@@ -83,27 +70,12 @@ class MountEvidence:
     time: bool = False
     profile_times_s: np.ndarray | None = None
     pose_times_s: np.ndarray | None = None
-    pose_format: str = "matrix"
-    rows: np.ndarray | None = None
     digests: dict[str, str] = field(default_factory=dict)
 
     @property
     def size(self) -> str:
         """Name of the artefact's size."""
         return _SIZES.get(self.artefact, "size")
-
-    def other_readings(self) -> Iterator[tuple[str, np.ndarray]]:
-        """The same numbers as poses of other formats, by which they are often meant."""
-        if self.rows is None:
-            return
-        for name in _OFTEN_MEANT:
-            if name != self.pose_format and self.rows.shape[1] == (7 if name.startswith("quaternion") else 6):
-                try:
-                    matrices = matrices_of(self.rows, name, Path())
-                except DescriptionError:
-                    continue
-                matrices[:, :3, 3] = self.poses[:, :3, 3]
-                yield name, matrices
 
 
 def read_mount_evidence(
@@ -125,7 +97,6 @@ def read_mount_evidence(
     """Profiles and poses from arrays or files, checked; DescriptionError where they do not go together."""
     digests: dict[str, str] = {}
     names: list[str] | None = None
-    rows: np.ndarray | None = None
     if isinstance(profiles, str | Path) and Path(profiles).suffix == ".toml":
         path = Path(profiles)
         if poses is not None:
@@ -182,8 +153,6 @@ def read_mount_evidence(
         time=time,
         profile_times_s=profile_times_s,
         pose_times_s=pose_times_s,
-        pose_format=pose_format,
-        rows=rows,
         digests=digests,
     )
 
@@ -283,11 +252,6 @@ def _points_of(columns: dict[str, np.ndarray], path: Path) -> np.ndarray:
             f"{path} has the columns {', '.join(columns)}; expected x and z, and y where there is one"
         )
     return np.column_stack([columns[name] for name in ("x", "y", "z") if name in columns])
-
-
-def write_mount(path: str | Path, mount: Mount, *, overwrite: bool = False) -> None:
-    """Write a mount as JSON, completely or not at all; OutputError if that fails."""
-    write_model(path, mount, format=FORMAT, version=VERSION, overwrite=overwrite)
 
 
 def read_mount(path: str | Path) -> Mount:

@@ -14,7 +14,7 @@ from uwlts.errors import DescriptionError
 from uwlts.files.reading import read_bytes
 from uwlts.files.writing import sha256_of, written_aside
 from uwlts.model.calibration import is_rigid
-from uwlts.model.trajectory import Trajectory
+from uwlts.model.trajectory import COVARIANCE_COLUMNS, Trajectory
 from uwlts.storage.ros_bags import read_bag_poses
 
 Unit = Literal["mm", "m"]
@@ -151,33 +151,18 @@ def write_poses(path: str | Path, poses: np.ndarray, *, overwrite: bool = False)
         aside.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
-_COVARIANCE = {f"cov_{i}{j}": (i, j) for i in range(6) for j in range(i, 6)}
-
-
 def _covariances(columns: dict[str, np.ndarray], path: Path, mm_per_unit: float) -> np.ndarray | None:
     """Covariances (N, 6, 6), mm and rad, taken out of the columns of a file; None where it has none."""
-    found = {name: columns.pop(name) for name in [*columns] if name in _COVARIANCE}
+    found = {name: columns.pop(name) for name in [*columns] if name in COVARIANCE_COLUMNS}
     if not found:
         return None
-    if missing := sorted(_COVARIANCE.keys() - found.keys()):
+    if missing := sorted(COVARIANCE_COLUMNS.keys() - found.keys()):
         raise DescriptionError(f"{path} has columns of covariances, but not {', '.join(missing)}")
     units = np.array([mm_per_unit] * 3 + [1.0] * 3)
     covariances = np.empty((len(next(iter(found.values()))), 6, 6))
-    for name, (i, j) in _COVARIANCE.items():
+    for name, (i, j) in COVARIANCE_COLUMNS.items():
         covariances[:, i, j] = covariances[:, j, i] = found[name] * units[i] * units[j]
     return covariances
-
-
-def write_trajectory(path: str | Path, trajectory: Trajectory, *, overwrite: bool = False) -> None:
-    """Write a trajectory as CSV for `read_trajectory` in the format quaternion-xyzw, mm; OutputError if that fails."""
-    turns = Rotation.from_matrix(trajectory.poses[:, :3, :3]).as_quat()
-    table = np.column_stack([trajectory.times_s, trajectory.poses[:, :3, 3], turns])
-    names = ["time_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"]
-    if trajectory.covariance is not None:
-        names += _COVARIANCE
-        table = np.column_stack([table, *(trajectory.covariance[:, i, j] for i, j in _COVARIANCE.values())])
-    with written_aside(path, overwrite=overwrite) as aside:
-        np.savetxt(aside, table, fmt="%.12g", delimiter=",", header=",".join(names), comments="")
 
 
 def trajectory_path(capture: str | Path) -> Path:
@@ -199,7 +184,7 @@ def pose_rows(path: Path, digests: dict[str, str]) -> tuple[np.ndarray, np.ndarr
 
 
 def _rows_of(columns: dict[str, np.ndarray], path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    columns = {name: values for name, values in columns.items() if name not in _COVARIANCE}
+    columns = {name: values for name, values in columns.items() if name not in COVARIANCE_COLUMNS}
     times = columns.pop("time_s", None)
     columns.pop("pose", None)
     rows = np.column_stack(list(columns.values())) if columns else np.empty((0, 0))

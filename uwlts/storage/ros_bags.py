@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from uwlts.errors import DescriptionError, SetupError
+from uwlts.errors import DescriptionError
 from uwlts.files.reading import require_regular_file
+from uwlts.runtime.optional_library import optional_library
 
 _POSES = {
     "nav_msgs/msg/Odometry": lambda message: message.pose.pose,
@@ -43,7 +43,9 @@ def read_bag_poses(path: Path, wanted: str = "") -> tuple[np.ndarray, np.ndarray
     SetupError
         The library for bags is not installed.
     """
-    highlevel, typesys = _rosbags()
+    highlevel, typesys = (
+        optional_library(f"rosbags.{part}", needed_by="a ROS bag", extra="ros") for part in ("highlevel", "typesys")
+    )
     if not path.is_dir():
         require_regular_file(path, error=DescriptionError, called="bag")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
@@ -105,13 +107,3 @@ def _row(stamp: Any, pose: Any) -> tuple[float, ...]:
     """Time and pose of a message; a pose has a position and an orientation, a transform translation and rotation."""
     place, turn = (pose.position, pose.orientation) if hasattr(pose, "position") else (pose.translation, pose.rotation)
     return stamp.sec + 1e-9 * stamp.nanosec, place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w
-
-
-def _rosbags() -> tuple[ModuleType, ModuleType]:
-    try:
-        from rosbags import highlevel, typesys
-    except ImportError as error:
-        raise SetupError(
-            "ROS bags need the library rosbags, which is not installed: pip install 'uwlts[ros]'"
-        ) from error
-    return highlevel, typesys

@@ -10,8 +10,9 @@ import numpy as np
 from uwlts.errors import CaptureError
 from uwlts.files.reading import require_regular_file
 from uwlts.files.writing import written_aside
+from uwlts.model.brief import Brief
 from uwlts.model.sensor import Description, Medium, Sensor, Table
-from uwlts.storage.hdf5_file import read_array, read_label, write_label
+from uwlts.storage.hdf5_file import DAMAGE, read_array, read_label, write_label
 
 FORMAT = "uwlts-truth"
 VERSION = 1
@@ -34,8 +35,8 @@ class TruthHeader(Description):
     scene: Table
 
 
-@dataclass(frozen=True)
-class Truth:
+@dataclass(frozen=True, repr=False)
+class Truth(Brief):
     """True stripe of every profile line of every frame; F frames, L lines.
 
     ``centre_px (F, L)`` is the image coordinate across the stripe where the line's centre sees the middle of the
@@ -79,7 +80,7 @@ def read_truth(path: str | Path) -> tuple[TruthHeader, Truth]:
             header = read_label(file, TruthHeader, path=path, format=FORMAT, version=VERSION)
             pose = _array(file, _POSE, path, dimensions=3) if _POSE in file else None
             truth = Truth(**{name: _array(file, name, path) for name in _DIMENSIONS}, pose=pose)
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+    except DAMAGE as error:
         raise CaptureError(f"{path} is not a truth file, or is damaged: {error}") from error
     lines = truth.status.shape
     shapes = {name: getattr(truth, name).shape for name in _DIMENSIONS if name != "depth_mm"}

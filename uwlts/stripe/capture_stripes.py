@@ -1,6 +1,6 @@
 """The stripes of all laser images of a capture, and why images show none."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Literal
 
 import cv2
@@ -8,6 +8,7 @@ import numpy as np
 
 from uwlts.errors import CaptureError, ImageError
 from uwlts.model.stripe import CaptureStripes, StripeStatus
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.stripe.exposures import BracketImages, fused_images
 from uwlts.stripe.extract import direct_stripe_in, extract_stripe
 from uwlts.stripe.options import StripeOptions, StripeSettings
@@ -27,10 +28,7 @@ seen on a fifth of as many, at its steep places."""
 
 
 def find_stripes(
-    capture: BracketImages,
-    *,
-    options: StripeSettings = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    capture: BracketImages, *, options: StripeSettings = None, progress: ProgressListener = unheard
 ) -> CaptureStripes:
     """Find the stripe in all laser images of a recording, such as an opened `uwlts.storage.capture.Capture`.
 

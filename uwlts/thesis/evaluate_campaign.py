@@ -18,6 +18,7 @@ from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_by_polynomials
 from uwlts.reconstruction.reconstruct import reconstruct
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import work_through
 from uwlts.storage.capture import Capture
 from uwlts.thesis.campaign_folder import CampaignFolder, ScanFile, up_to_date
@@ -45,7 +46,6 @@ class _Known(BaseModel):
 
 
 _SHOWN_LINES = {"one end": 0.05, "middle": 0.5, "other end": 0.95}
-Progress = Callable[[str, int, int], None]
 
 
 def evaluate_campaign(
@@ -54,7 +54,7 @@ def evaluate_campaign(
     trials: int = TRIALS,
     workers: int | None = None,
     overwrite: bool = False,
-    progress: Progress = lambda stage, done, total: None,
+    progress: ProgressListener = unheard,
 ) -> CampaignResults:
     """Results of a campaign, kept in its file results.json; read from there if no recording is newer.
 
@@ -75,7 +75,7 @@ def evaluate_campaign(
         scans = _sphere_scans(folder, _by_rays(calibrations(folder)[PROPOSED, "water"]))
         intervals = _monte_carlo(folder, scans, trials, workers, progress)
         return kept.model_copy(update={"monte_carlo": intervals, "trials": trials}).keep(path)
-    calibrated = calibrations(folder, progress=partial(progress, "calibrations"))
+    calibrated = calibrations(folder, progress=partial(progress, stage="calibrations"))
     measurements = _measured(folder, calibrated, workers, progress)
     proposed, two = (_by_rays(calibrated[method, "water"]) for method in (PROPOSED, TWO))
     scans = _sphere_scans(folder, proposed)
@@ -102,7 +102,10 @@ def _by_rays(calibration: AnyCalibration) -> Calibration:
 
 
 def _measured(
-    folder: CampaignFolder, calibrated: dict[tuple[str, str], AnyCalibration], workers: int | None, progress: Progress
+    folder: CampaignFolder,
+    calibrated: dict[tuple[str, str], AnyCalibration],
+    workers: int | None,
+    progress: ProgressListener,
 ) -> list[Measurement]:
     """All scans, several at a time."""
     clouds = folder.path / "clouds"
@@ -112,7 +115,7 @@ def _measured(
         partial(_measure, calibrated, clouds),
         scans,
         workers=workers,
-        on_message=lambda _: progress("measurements", next(numbers), len(scans)),
+        on_message=lambda _: progress(next(numbers), len(scans), "measurements"),
     )
     return list(chain.from_iterable(found))
 
@@ -167,7 +170,7 @@ def _budget(
 
 
 def _monte_carlo(
-    folder: CampaignFolder, scans: list[SphereScan], trials: int, workers: int | None, progress: Progress
+    folder: CampaignFolder, scans: list[SphereScan], trials: int, workers: int | None, progress: ProgressListener
 ) -> list[SpacingInterval]:
     """Intervals of every scan of spheres."""
     if trials == 0 or not scans:
@@ -184,7 +187,7 @@ def _monte_carlo(
         knowledge = _Known.model_validate(campaign).imperfections
     except ValidationError as error:
         raise CaptureError(f"{plan} does not hold the campaign's imperfections: {problems_of(error)}") from error
-    shown = partial(progress, "Monte Carlo")
+    shown = partial(progress, stage="Monte Carlo")
     return [
         SpacingInterval(each.placement, each.observed_mm, each.std_mm(), each.interval_mm(), each.contains_truth())
         for each in propagate(

@@ -6,7 +6,7 @@ Judged are the other half, and all scans in air.
 """
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -32,8 +32,8 @@ from uwlts.model.calibration import Calibration
 from uwlts.optics.design import nominal_setup, speckle_limit_um
 from uwlts.pages.toolkit import COLOURS, legend_below, new_figure, render_page, svg_of
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import Send, work_through
-from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.truth import read_truth, truth_path
 from uwlts.stripe import find_stripes
@@ -58,7 +58,6 @@ _BESIDE = 0.16  # of the distance between two campaigns, from method to method
 SPACING, DIAMETERS = "SSE", ("diameter error sphere 1", "diameter error sphere 2")
 SHIFTS = ("mean error X", "mean error Y", "mean error Z")
 """Of all points of a scan."""
-Progress = Callable[[int, int], None]
 
 
 def joint_calibration(folder: CampaignFolder, method: JointMethod) -> tuple[Calibration, float]:
@@ -80,7 +79,7 @@ def joint_calibration(folder: CampaignFolder, method: JointMethod) -> tuple[Cali
     start = time.perf_counter()
     calibration = solve_jointly(gathered, options=options).calibration
     taken_s = time.perf_counter() - start
-    write_calibration(folder.path / "calibrations" / f"{method.replace('_', '-')}.json", calibration, overwrite=True)
+    calibration.save(folder.path / "calibrations" / f"{method.replace('_', '-')}.json", overwrite=True)
     return calibration, taken_s
 
 
@@ -94,7 +93,7 @@ def compare_campaigns(
     *,
     workers: int | None = None,
     again: bool = False,
-    progress: Progress = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> list[JointResults]:
     """Errors of all judged scans of spheres and planes by all calibrations, with the joint ones' uncertainties.
 

@@ -6,7 +6,7 @@ from them by more than a tolerance, 40 % unless set; it is no plain mean. "Every
 read as five pixels, the size of the filter. Which lines show a stripe is decided as for all methods.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +25,8 @@ from uwlts.model.artefacts import parse_artefact
 from uwlts.model.calibration import Calibration
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.reconstruction.reconstruct import reconstruct_stripes
-from uwlts.storage.calibration_file import load_calibration, write_calibration
+from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.storage.calibration_file import load_calibration
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import write_cloud
@@ -40,7 +41,7 @@ METHODS = {"air": (PROPOSED, POLYNOMIALS, FORGOTTEN), "water": (PROPOSED, TWO, P
 
 
 def calibrations(
-    folder: CampaignFolder, *, progress: Callable[[int, int], None] = lambda done, total: None
+    folder: CampaignFolder, *, progress: ProgressListener = unheard
 ) -> dict[tuple[str, str], AnyCalibration]:
     """Calibrations by method and medium; those made since the recordings are read from the folder ``calibrations``.
 
@@ -67,7 +68,7 @@ def calibrations(
         progress(number, len(made))
         path = place / f"{method.replace(' ', '-')}-{medium}.json"
         if not path.is_file() or path.stat().st_mtime_ns < newest:
-            write_calibration(path, make(), overwrite=True)
+            make().save(path, overwrite=True)
         found[method, medium] = load_calibration(path)
     progress(len(made), len(made))
     # In air nothing but camera and sheet is used of a calibration.

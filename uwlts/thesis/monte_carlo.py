@@ -18,6 +18,7 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.errors import CalibrationError, EvaluationError, RangeError
 from uwlts.model.sensor import Medium
 from uwlts.optics.camera import project
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import work_through
 from uwlts.thesis.sphere_spacing import SphereScan, spacing_error
 
@@ -64,7 +65,7 @@ def propagate(
     trials: int,
     seed: int = 0,
     workers: int | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> list[Propagated]:
     """Propagate what is known of the inputs to the sphere spacing of every scan.
 

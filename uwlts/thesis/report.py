@@ -4,7 +4,7 @@ import csv
 import io
 import json
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -30,6 +30,7 @@ from uwlts.pages.toolkit import (
 )
 from uwlts.report import plot
 from uwlts.report.pictures import stripe_picture, stripe_view
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture
 from uwlts.storage.cloud_files import read_cloud
 from uwlts.thesis.campaign_folder import campaign_folders
@@ -70,7 +71,7 @@ def evaluate_thesis(
     joint: bool = False,
     again: bool = False,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> ThesisReport:
     """Evaluate campaigns as the thesis does, by all its methods, and set its tables beside the results.
 
@@ -119,13 +120,7 @@ def evaluate_thesis(
         summary = write_joint_comparison(folder, compared, overwrite=overwrite)
         return ThesisReport(files, "\n".join(summary_lines(summary)))
     results = [
-        evaluate_campaign(
-            campaign,
-            trials=trials,
-            workers=workers,
-            overwrite=again,
-            progress=lambda stage, done, total: progress(done, total),
-        )
+        evaluate_campaign(campaign, trials=trials, workers=workers, overwrite=again, progress=progress)
         for campaign in campaigns
     ]
     return ThesisReport(files, markdown(write_comparison(folder, results, tables, overwrite=overwrite), results))

@@ -22,7 +22,7 @@ from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes
 from uwlts.thesis.campaign_folder import STEP_PLACES, CampaignFolder
 from uwlts.thesis.results import WindowChoice, WindowProfile
-from uwlts.thesis.uncertainty_budget import UncertaintySource, combine, thermal_expansion_mm
+from uwlts.thesis.uncertainty_budget import UNIFORM, UncertaintySource, combine
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +139,7 @@ TEMPERATURE_HALF_WIDTH_C = 5.0
 _EXPANSION_PER_K = 22.2e-6
 """Of the standard: the thesis's 0.011 mm for 5 K over 99.18 mm, as aluminium expands."""
 _STANDARD_EXPANDED_MM = 0.004
+"""Of its calibration, k = 2 (thesis, Table 9)."""
 _SUBPIXEL = 0.1
 """The thesis takes a tenth of a pixel as the effective resolution."""
 
@@ -161,23 +162,17 @@ def spacing_budget(
     changes = [[spacing_error(calibration, scan, medium_index=index) for scan in scans] for index in (warm, cold)]
     half_widths = {
         "index": float(np.mean(np.abs(np.diff(changes, axis=0)))) / 2,
-        "expansion": thermal_expansion_mm(
-            length_mm=scans[0].spacing_mm, alpha_per_k=_EXPANSION_PER_K, temperature_change_k=TEMPERATURE_HALF_WIDTH_C
-        ),
+        "expansion": scans[0].spacing_mm * _EXPANSION_PER_K * TEMPERATURE_HALF_WIDTH_C,
         "resolution": _SUBPIXEL * mm_per_px(calibration, scans[0].medium_index) / 2,
     }
     scatter, correction = float(np.std(errors, ddof=1)), float(np.mean(np.abs(errors)))
+    certain = {name: UNIFORM * half for name, half in half_widths.items()} | {"standard": _STANDARD_EXPANDED_MM / 2}
+    freedom = {"degrees_of_freedom": len(errors) - 1, "correction": correction}
     budget = combine(
         [
-            *(
-                UncertaintySource(name=name, half_width=half, distribution="uniform")
-                for name, half in half_widths.items()
-            ),
-            UncertaintySource(name="standard", half_width=_STANDARD_EXPANDED_MM, coverage_factor=2.0),
-            UncertaintySource(
-                name="SSE", half_width=scatter, degrees_of_freedom=len(errors) - 1, correction=correction
-            ),
-            UncertaintySource(name="PE", half_width=deviation_mm),
+            *(UncertaintySource(name=name, standard_uncertainty=std) for name, std in certain.items()),
+            UncertaintySource(name="SSE", standard_uncertainty=scatter, **freedom),
+            UncertaintySource(name="PE", standard_uncertainty=deviation_mm),
         ]
     )
     return {source.name: source.standard_uncertainty for source in budget.sources} | {

@@ -232,7 +232,7 @@ def test_damaged_files_are_named(folder, tmp_path):
 @pytest.mark.slow
 def test_ctrl_c_leaves_complete_shards_only(tmp_path):
     out = tmp_path / "set"
-    line = [sys.executable, "-m", "twin.cli", "dataset", "stripe-clean", "--scenes", "40", "--out", str(out)]
+    line = [sys.executable, "-m", "twin", "dataset", "stripe-clean", "--scenes", "40", "--out", str(out)]
     process = subprocess.Popen([*line, "--workers", "2"], stderr=subprocess.PIPE, text=True)
     until = time.monotonic() + 120
     while not list(out.glob(".*.tar")) and time.monotonic() < until:
@@ -284,7 +284,7 @@ def test_shards_that_another_run_holds_are_left_to_it_and_then_waited_for(folder
     held = sorted(made)[-1]
     # Another machine's run that takes a shard, and dies before it is written.
     program = (
-        "import sys, time, pathlib\nfrom uwlts.files.one_writer import one_writer\n"
+        "import sys, time, pathlib\nfrom uwlts.files.writing import one_writer\n"
         "with one_writer(pathlib.Path(sys.argv[1])):\n"
         "    print('held', flush=True)\n"
         "    while len(list(pathlib.Path(sys.argv[1]).parent.glob('*.tar'))) < int(sys.argv[2]):\n"

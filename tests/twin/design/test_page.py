@@ -9,12 +9,23 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
+from matplotlib.tri import LinearTriInterpolator
 
 from twin.design.choice import Judged, pareto
 from twin.design.designs import Design, EvaluatedDesign, Marked, built, described, judged, row_of
 from twin.design.figures_of_merit import FIGURES, figures_of
 from twin.design.parameters import parameters_of
-from twin.design.report.charts import bars, curves, map_of, parallel_chart, pareto_chart, sample, trade_off
+from twin.design.report.charts import (
+    bars,
+    contours,
+    curves,
+    map_places,
+    mesh_between,
+    parallel_chart,
+    pareto_chart,
+    sample,
+    trade_off,
+)
 from twin.design.report.drawing import views_of
 from twin.design.report.study_page import page_text
 from twin.design.report.study_tables import (
@@ -297,49 +308,46 @@ def test_numbers_in_words():
 # --- charts -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_grid_is_shown_as_it_is(swept):
+def test_a_map_is_linear_between_designs_that_work(swept):
     study, _, columns = swept
-    found = map_of(Judged(study, columns), *study.variables, ["sigma_z_rms_mm", "line_mm"])
-    assert found.values["line_mm"].shape == (6, 5)
-    checked = 0
-    for place in range(len(columns["design"])):
-        row = row_of(columns, place).table()
-        k = int(np.argmin(abs(found.x - row["laser.baseline_mm"])))
-        i = int(np.argmin(abs(found.y - row["laser.triangulation_angle_deg"])))
-        if row["failure"]:
-            assert math.isnan(found.values["line_mm"][i, k]) and found.reasons[i, k] == row["failure"]
-        else:
-            assert found.values["line_mm"][i, k] == row["line_mm"]
-            assert (found.reasons[i, k] != "") == (row["line_mm"] < 160.0)
-        checked += 1
-    assert checked == 30
-    assert any("line length in the middle is" in text and "at least 160" in text for text in found.reasons.ravel())
+    judged_designs = Judged(study, columns)
+    places = map_places(judged_designs, *study.variables)
+    assert places.tolist() == list(range(30))
+    mesh = mesh_between(judged_designs, places, *study.variables)
+    # A grid of 5 x 6 has 4 x 5 cells of two triangles each; those at a design that fails are left out.
+    assert len(mesh.triangles) == 40
+    fails = columns["failure"] != ""
+    assert mesh.mask.tolist() == fails[mesh.triangles].any(axis=1).tolist() and 0 < mesh.mask.sum() < 40
+    linear = columns["laser.baseline_mm"] + 2 * columns["laser.triangulation_angle_deg"]
+    inside = mesh.triangles[~mesh.mask][0]
+    x, y = mesh.x[inside].mean(), mesh.y[inside].mean()
+    # Rounding of numbers of some hundred.
+    assert float(LinearTriInterpolator(mesh, linear)(x, y)) == pytest.approx(x + 2 * y, rel=1e-9)
 
 
-def test_scattered_designs_are_interpolated():
-    study = small()
-    _, columns = scattered(study, 400)
-    # A figure that is linear in both variables comes back as it was.
-    columns["sigma_z_rms_mm"] = np.where(
-        columns["failure"] == "", columns["laser.baseline_mm"] + 2 * columns["laser.triangulation_angle_deg"], np.nan
-    )
-    found = map_of(Judged(study, columns), *study.variables, ["sigma_z_rms_mm", "line_mm"])
-    expected = found.x[None, :] + 2 * found.y[:, None]
-    known = np.isfinite(found.values["sigma_z_rms_mm"])
-    assert known.mean() > 0.5
-    assert found.values["sigma_z_rms_mm"][known] == pytest.approx(expected[known], rel=1e-9)
-    assert found.smooth and found.dots
+def test_a_map_draws_bounds_designs_and_failures(swept):
+    study, _, columns = swept
+    figure, caption = contours(Judged(study, columns), [], *study.variables)
+    panel = next(axes for axes in figure.axes if axes.get_title() == "line length in the middle (mm)")
+    dots, crosses = (next(line for line in panel.lines if line.get_marker() == kind) for kind in (".", "x"))
+    assert len(dots.get_xdata()) == (columns["failure"] == "").sum() > 5
+    assert len(crosses.get_xdata()) == (columns["failure"] != "").sum() > 0
+    assert "line length in the middle at least 160" in panel.get_legend_handles_labels()[1][0]
+    assert "Grey: a constraint is missed." in caption and "Crosses" in caption
+    assert panel.get_xlabel() == "laser baseline (mm)"
 
 
 def test_what_else_varies_is_shown_at_its_best(swept):
     study, _, _ = swept
     wider = small(choices={"lens": {"f/4": {"camera.f_number": 4.0}, "f/8": {"camera.f_number": 8.0}}})
     _, columns = grid(wider)
-    found = map_of(Judged(wider, columns), *study.variables, ["sigma_z_rms_mm", "line_mm"])
-    sigma = np.where(columns["violation"] == 0, columns["sigma_z_rms_mm"], np.inf).reshape(5, 6, 2).min(axis=2).T
-    assert np.isfinite(sigma).sum() > 5
-    assert found.values["sigma_z_rms_mm"][np.isfinite(sigma)] == pytest.approx(sigma[np.isfinite(sigma)])
-    assert found.caption.startswith("Lens also vary")
+    found = Judged(wider, columns)
+    places = map_places(found, *study.variables)
+    sigma = np.where(columns["violation"] == 0, columns["sigma_z_rms_mm"], np.inf).reshape(30, 2).min(axis=1)
+    assert np.isfinite(sigma).sum() > 5 and len(places) == 30
+    shown = places[columns["violation"][places] == 0]
+    assert sorted(columns["sigma_z_rms_mm"][shown]) == sorted(sigma[np.isfinite(sigma)])
+    assert contours(found, [], *study.variables)[1].startswith("Lens also vary")
 
 
 def test_the_front_in_the_chart_is_that_of_the_designs_that_meet_the_constraints(swept):
@@ -352,7 +360,7 @@ def test_the_front_in_the_chart_is_that_of_the_designs_that_meet_the_constraints
     values = np.column_stack([columns["sigma_z_rms_mm"], -columns["line_mm"]])[meets]
     expected = values[front_by_definition(values.tolist())]
     assert sorted(front.x) == rounded(np.sort(expected[:, 0]))
-    assert [note.text for note in figure.layout.annotations] == ["<b>base</b>"]
+    assert [trace.text for trace in figure.data if not trace.name] == [("<b>base</b>",)]
 
 
 def test_parallel_axes_hold_choices_by_name():
@@ -505,8 +513,7 @@ def test_labels_are_escaped():
     for tag in ("<script>", "<b>bold", "<u>", "<hr>", "<marks>", "<i>lens"):
         assert tag not in before.split("<body>")[1]
     assert "<b>bold</b>" in page.text() and "no <marks>" in page.text()
-    notes = [note["text"] for note in page.figures[0]["layout"]["annotations"]]
-    assert "<b>&lt;u&gt;me&lt;/u&gt;</b>" in notes
+    assert ["<b>&lt;u&gt;me&lt;/u&gt;</b>"] in [trace.get("text") for trace in page.figures[0]["data"]]
 
 
 def failing(study: Study) -> dict[str, np.ndarray]:

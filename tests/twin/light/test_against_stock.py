@@ -17,7 +17,7 @@ from scipy import stats
 
 from tests.stock_mitsuba import blocks, fog, opened_from_its_origin, per_radiance, stock_irradiance
 from tests.virtual_sensors import altered, camera_axes, laser_origin, plate, scene_of, sensor_at
-from twin.light.longer_ways import WALK_CELL_PX
+from twin.light.multiple_scattering import WALK_CELL_PX
 from twin.light.renderer import Renderer
 from twin.options import ALL
 from twin.scene.description import Scene

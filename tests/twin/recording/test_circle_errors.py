@@ -11,7 +11,8 @@ from tests.virtual_sensors import altered, camera_axes, scene_of, sensor_at
 from twin.light.renderer import Renderer
 from twin.options import NONE, Options
 from twin.recording.frame_truth import depth_map
-from twin.recording.studio import Studio, record_scene, with_window
+from twin.recording.record_scene import record_scene
+from twin.recording.studio import Studio, with_window
 from twin.scene.description import CirclePlate, Scene
 from twin.scene.finish import printed_shifts
 from twin.scene.motion import Motion, Shot

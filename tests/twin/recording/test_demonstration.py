@@ -1,15 +1,14 @@
 """The demonstration stops where a command fails. That it runs to its end is seen by everyone who runs it."""
 
-import subprocess
-
 import pytest
 
 from twin.recording.demonstration import demo
+from uwlts.errors import CommandFailed
 
 
 def test_a_command_that_fails_ends_the_demo_and_says_why(tmp_path, capfd):
     (tmp_path / "plan.json").mkdir()
-    with pytest.raises(subprocess.CalledProcessError) as failed:
+    with pytest.raises(CommandFailed) as failed:
         demo(tmp_path)
     printed, complaints = capfd.readouterr()
     assert failed.value.returncode == 2

@@ -8,8 +8,8 @@ import trimesh
 from pydantic import ValidationError
 
 from twin.scene.forms import Cable, Flange, OvergrownPipe, Rope, Seabed
+from twin.scene.forms.cables_and_ropes import rope_radius
 from twin.scene.forms.flange import flange_face
-from twin.scene.forms.lines import rope_radius
 from twin.scene.forms.overgrown_pipe import overgrown_radius
 from twin.scene.forms.seabed import seabed_height
 from twin.scene.placed import FreeForm

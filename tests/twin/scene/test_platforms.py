@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twin.scene.navigation import Navigation, Sea, drift_of, waves_of
+from twin.scene.guide_and_table import LinearGuide, RotaryTable
 from twin.scene.placed import Pose
-from twin.scene.platforms import IdealPath, LinearGuide, Robot, RotaryTable, Vehicle
+from twin.scene.platforms import IdealPath
+from twin.scene.robot import Robot
+from twin.scene.vehicle import Navigation, Sea, Vehicle, drift_of, waves_of
 from uwlts.errors import DescriptionError
 from uwlts.model.trajectory import Trajectory
-from uwlts.storage.pose_files import read_trajectory, write_trajectory
+from uwlts.storage.pose_files import read_trajectory
 
 ALONG = ({"position_mm": (0.0, 0.0, 0.0)}, {"position_mm": (300.0, 0.0, 0.0)})
 MOUNT = Pose(position_mm=(30.0, -20.0, 80.0), rotation_deg=(10.0, 20.0, 30.0))
@@ -200,7 +202,7 @@ def test_a_vehicle_shakes_and_reports_a_path_that_drifts(tmp_path):
     # 2 pi 25 Hz 0.2 mm is 31 mm/s at the middle of an oscillation, beside the 100 mm/s of the path.
     velocities = np.array([course.twist(shot, exposure_s=0.002)[0] for shot in course.shots])
     assert 10 < np.ptp(velocities[:, 1]) < 63
-    write_trajectory(tmp_path / "a.csv", Trajectory(*course.report))
+    Trajectory(*course.report).save(tmp_path / "a.csv")
     read = read_trajectory(tmp_path / "a.csv", pose_format="quaternion-xyzw")
     np.testing.assert_allclose(read.poses, course.report[1], atol=1e-7)
     np.testing.assert_allclose(read.covariance, course.report[2], rtol=1e-9, atol=1e-12)

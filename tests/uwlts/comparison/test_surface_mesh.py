@@ -147,7 +147,7 @@ def test_a_pipe_of_three_scans_is_one_surface():
 def test_files_hold_the_mesh(tmp_path, monkeypatch):
     rng = np.random.default_rng(6)
     monkeypatch.chdir(tmp_path)
-    uwlts.write_cloud("scan.ply", scan(rng, lambda x, y: 0.02 * x * y, half=6.0))
+    scan(rng, lambda x, y: 0.02 * x * y, half=6.0).save("scan.ply")
     for name in ("mesh.ply", "mesh.stl", "mesh.glb"):
         app(["mesh", "scan.ply", "--out", name, "--towards", "0", "0", "-1"], result_action="return_value")
     table = PlyData.read("mesh.ply")

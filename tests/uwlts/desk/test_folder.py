@@ -9,7 +9,6 @@ import pytest
 from uwlts.desk.desk_files import file_in, interrupted, kind_of, listed, new_in
 from uwlts.errors import DescriptionError
 from uwlts.optics.nominal import nominal
-from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import write_cloud
 
@@ -63,7 +62,7 @@ def test_known_files_are_listed_the_latest_first(folder):
 def test_labels_tell_what_names_do_not(folder):
     none = np.full(2, -1)
     write_cloud(folder / "wall.h5", PointCloud(np.zeros((2, 3)), np.ones(2), none, none, metadata={}))
-    write_calibration(folder / "polished.json", nominal("thesis", medium="air"))
+    nominal("thesis", medium="air").save(folder / "polished.json")
     for name, text in (
         ("damaged", "{"),
         ("other", '{"format": "mine"}'),

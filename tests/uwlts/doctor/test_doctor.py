@@ -27,7 +27,7 @@ NOBODY = 65534
 
 
 def doctor(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess:
-    command = [sys.executable, "-m", "uwlts.cli", "doctor", *arguments]
+    command = [sys.executable, "-m", "uwlts", "doctor", *arguments]
     return subprocess.run(command, cwd=folder, env=os.environ | environment, capture_output=True, text=True, timeout=60)
 
 
@@ -111,7 +111,8 @@ def test_the_requirements_are_the_projects_own():
 
 def test_an_installed_package_lists_its_requirements_without_a_checkout(tmp_path):
     face = [ROOT / "uwlts" / name for name in ("__init__.py", "__init__.pyi", "_version.py", "errors.py")]
-    for source in [*face, *(ROOT / "uwlts" / "doctor").glob("*.py")]:
+    progress = [ROOT / "uwlts" / "runtime" / name for name in ("__init__.py", "progress.py")]
+    for source in [*face, *progress, *(ROOT / "uwlts" / "doctor").glob("*.py")]:
         copy = tmp_path / source.relative_to(ROOT)
         copy.parent.mkdir(parents=True, exist_ok=True)
         copy.write_bytes(source.read_bytes())
@@ -160,7 +161,7 @@ def test_a_libllvm_that_is_none_is_a_warning_with_the_command_that_gets_one(tmp_
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "libLLVM.so"))
     (finding,) = examine_renderer()
     assert finding.status == "warning" and str(tmp_path) in finding.found
-    assert finding.advice.endswith("-m twin.backend.llvm --install")
+    assert finding.advice.endswith("-m twin.backend.llvm")
 
 
 # The machine

@@ -21,6 +21,7 @@ from uwlts.errors import EvaluationError
 from uwlts.inspection.blemish_search import UnrolledSurface, search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
 from uwlts.inspection.flat import _circle
+from uwlts.inspection.inspect import inspected
 from uwlts.inspection.pipe_form import fit_pipe, pipe_features
 from uwlts.inspection.weld import _toes_and_slopes
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty
@@ -190,7 +191,7 @@ def test_pits_are_found_and_measured():
 
     rng = np.random.default_rng(5)
     cloud = pipe_scan(rng, half_arc=0.5, along=(-24, 24, 0.5), around_mm=0.3, radius=radius, correlated=True)
-    found = uwlts.inspect(cloud, wall_mm=9.0)
+    found = uwlts.inspect_pipe(cloud, wall_mm=9.0)
     assert any("deg of the circumference" in note for note in found.notes)
     assert not any("no uncertainty" in note for note in found.notes)
     blemishes = found.of(FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
@@ -226,7 +227,7 @@ def test_a_pit_where_a_whole_pipe_is_cut_open_is_found_once():
         return RADIUS_MM + sum(bell(x, RADIUS_MM * each, (0.0, 0.0), 20.0, 1.0) for each in away)
 
     cloud = pipe_scan(np.random.default_rng(13), radius=radius, along=(-30, 30.5, 1.5), around_mm=1.5)
-    pits = uwlts.inspect(cloud).of(FeatureKind.PIT)
+    pits = uwlts.inspect_pipe(cloud).of(FeatureKind.PIT)
     angles = np.sort([np.arctan2(pit.place_mm[1], -pit.place_mm[2]) for pit in pits])
     assert len(pits) == 8
     assert np.diff(angles) == pytest.approx(np.full(7, np.pi / 4), abs=0.02)
@@ -243,7 +244,7 @@ def test_depths_are_within_their_intervals():
         return RADIUS_MM + sum(bell(x, RADIUS_MM * angle, at, 5.0, 1.0) for at in places)
 
     cloud = pipe_scan(np.random.default_rng(6), half_arc=0.2, along=(-25, 25, 0.5), around_mm=0.25, radius=radius)
-    pits = uwlts.inspect(cloud).of(FeatureKind.PIT)
+    pits = uwlts.inspect_pipe(cloud).of(FeatureKind.PIT)
     assert len(pits) == len(places)
     assert np.count_nonzero([pit["depth"].low <= 1.0 <= pit["depth"].high for pit in pits]) >= 27
     # What all points share is common to a pit and its surroundings.
@@ -266,7 +267,7 @@ def test_what_the_footprint_of_points_smooths_is_put_back():
     known = replace(cloud, metadata={FOOTPRINT: list(sizes), FOOTPRINT_STD: 0.2})
     means = []
     for each in (cloud, known):
-        pits = uwlts.inspect(each).of(FeatureKind.PIT)
+        pits = uwlts.inspect_pipe(each).of(FeatureKind.PIT)
         assert len(pits) == len(places)
         means.append(np.mean([pit["depth"].value for pit in pits]))
     inside = [pit["depth"].low <= 0.5 <= pit["depth"].high for pit in pits]
@@ -300,7 +301,7 @@ def within(feature, truth):
 
 def test_a_step_is_measured():
     cloud = flat_scan(np.random.default_rng(7), lambda x, y: np.where(y > 10, 12.34, 0.0) + 0.01 * x, everywhere)
-    step = uwlts.inspect(cloud, "step").features[0]
+    step = uwlts.inspect_step(cloud).features[0]
     # The height is across the faces, which lean by 0.01.
     within(step, {"height": 12.34 * np.cos(np.arctan(0.01))})
     assert step["height"].uncertainty < 0.02 and step["parallelism"].low < 0.01
@@ -318,7 +319,7 @@ def test_a_flange_is_measured():
     rng = np.random.default_rng(8)
     cloud = flat_scan(rng, lambda x, y: 0.1 * np.square(x / 55), face, along=(-60, 60, 0.5))
     datum = flat_scan(rng, lambda x, y: 30 + 0.005 * x, everywhere)
-    found = uwlts.inspect(cloud, "flange", datum=datum)
+    found = uwlts.inspect_flange(cloud, datum=datum)
     flange = found.features[0]
     within(flange, {"bore": 36.0, "bolt circle": 76.0, "parallelism": np.degrees(np.arctan(0.005))})
     holes = found.of(FeatureKind.HOLE)
@@ -329,7 +330,7 @@ def test_a_flange_is_measured():
     # A parabola over the face; its outermost cells average over a twenty-fourth of it.
     assert flange["flatness"].value == pytest.approx(0.1, abs=0.015)
     plain = flat_scan(rng, lambda x, y: 0 * x, face, along=(-60, 60, 0.5))
-    assert uwlts.inspect(plain, "flange").features[0]["flatness"].value < 0.02
+    assert uwlts.inspect_flange(plain).features[0]["flatness"].value < 0.02
 
 
 def test_a_gap_is_measured():
@@ -337,7 +338,7 @@ def test_a_gap_is_measured():
         return np.abs(y - 0.02 * x) > 1.5 + 0.004 * x
 
     cloud = flat_scan(np.random.default_rng(9), lambda x, y: np.where(y > 0, 0.3, 0.0), apart)
-    gap = uwlts.inspect(cloud, "gap").features[0]
+    gap = uwlts.inspect_gap(cloud).features[0]
     # Square to the middle line, which leans by 0.02.
     within(gap, {"width": 3.0 * np.cos(0.02), "parallelism": np.degrees(0.008), "flush": 0.3})
     assert gap["width"].random < 0.03 and gap["width"].uncertainty < 0.2
@@ -355,7 +356,7 @@ def test_blur_beyond_an_edge_shows_in_the_brightness():
     )
     stripes = replace(cloud, intensity=100 * brightness(cloud.points_mm[:, 1]))
     known = replace(stripes, metadata={FOOTPRINT: [0.15, blur], FOOTPRINT_STD: 0.2})
-    narrow, right = (uwlts.inspect(each, "gap").features[0]["width"].value for each in (stripes, known))
+    narrow, right = (uwlts.inspect_gap(each).features[0]["width"].value for each in (stripes, known))
     # Half of a line's spacing of 0.12 mm on either side is all that is known without.
     assert narrow < 2.93 and right == pytest.approx(3.0, abs=0.03)
 
@@ -374,7 +375,7 @@ def test_a_weld_is_measured(undercut, offset):
         return weld_height(x, y, undercut=undercut, offset=offset)
 
     cloud = flat_scan(np.random.default_rng(10), height, everywhere, along=(-15, 15, 1.0), across=(-40, 40, 400))
-    weld = uwlts.inspect(cloud, "weld").features[0]
+    weld = uwlts.inspect_weld(cloud).features[0]
     within(weld, {"height": 2.0, "misalignment": offset})
     if undercut:
         within(weld, dict.fromkeys(("undercut left", "undercut right", "largest undercut"), undercut))
@@ -398,7 +399,7 @@ def test_a_weld_of_many_even_profiles_is_measured_and_what_is_left_out_is_named(
         return weld_height(x, y, undercut=0.0, offset=0.0) * (np.abs(x - 20) > 3) + second
 
     cloud = flat_scan(np.random.default_rng(17), height, everywhere, along=(-30, 30, 0.3), across=(-40, 40, 500))
-    found = uwlts.inspect(cloud, "weld")
+    found = uwlts.inspect_weld(cloud)
     within(found.features[0], {"height": 2.0})
     assert found.features[0].extent_mm[0] > 55
     assert any(note.startswith("1 more of what stands out") for note in found.notes)
@@ -416,7 +417,7 @@ def test_holes_that_are_not_measured_are_named():
         return inside & ((np.abs(x - 48) > 4) | (np.abs(y + 8) > 1.5))
 
     cloud = flat_scan(np.random.default_rng(18), lambda x, y: 0 * x, face, along=(-60, 60, 0.5))
-    flange = uwlts.inspect(cloud, "flange")
+    flange = uwlts.inspect_flange(cloud)
     assert len(flange.of(FeatureKind.HOLE)) == 5
     left_out = [note for note in flange.notes if "is not listed" in note]
     assert any("its diameter is" in note for note in left_out), flange.notes
@@ -425,7 +426,7 @@ def test_holes_that_are_not_measured_are_named():
     def gapped(x, y):
         return (np.abs(y) > 1.5) & ((np.abs(y - 30) > 1) | (x > 0))
 
-    gap = uwlts.inspect(flat_scan(np.random.default_rng(19), lambda x, y: 0 * x, gapped), "gap")
+    gap = uwlts.inspect_gap(flat_scan(np.random.default_rng(19), lambda x, y: 0 * x, gapped))
     within(gap.features[0], {"width": 3.0})
     assert sum("profiles cross it, fewer than the gap" in note for note in gap.notes) == 1
 
@@ -447,7 +448,7 @@ def test_clouds_without_covariance_say_so(tmp_path, monkeypatch, capsys):
     rng = np.random.default_rng(11)
     options = {"half_arc": 0.3, "along": (-12, 12, 0.5), "around_mm": 0.4, "stated": False}
     cloud = pipe_scan(rng, radius=lambda x, a: RADIUS_MM + bell(x, RADIUS_MM * a, (0, 0), 6.0, 0.6), **options)
-    uwlts.write_cloud(tmp_path / "pipe.ply", cloud)
+    cloud.save(tmp_path / "pipe.ply")
     monkeypatch.chdir(tmp_path)
     app(
         ["inspect", "pipe.ply", "--wall-mm", "9", "--out", "pipe.json", "--coloured", "c.ply"],
@@ -459,7 +460,7 @@ def test_clouds_without_covariance_say_so(tmp_path, monkeypatch, capsys):
     assert pit["values"]["depth"]["systematic"] is None and pit["values"]["depth"]["random"] > 0
     assert pit["values"]["depth"]["source"].startswith("ASME B31G")
     assert "pit 1" in capsys.readouterr().out
-    deviation = uwlts.read_cloud("c.ply").deviation_mm
+    deviation = uwlts.read("c.ply").deviation_mm
     # As on the page: blue in the pit, red where the surface stands out, and most of it pale.
     red, _, blue, _ = np.asarray(trimesh.load("c.ply").colors, int).T
     assert (blue > red)[deviation < -0.1].all() and (blue <= red)[deviation > 0.01].all()
@@ -485,17 +486,17 @@ def test_wrong_input_is_refused():
     rng = np.random.default_rng(12)
     cloud = flat_scan(rng, lambda x, y: 0 * x, everywhere, along=(-5, 5, 1.0), across=(-20, 20, 100))
     for words, options in (
-        ("a weld has no wall_mm", {"kind": "weld", "wall_mm": 9.0}),
-        ("a pipe has no datum", {"datum": cloud}),
-        ("a step has no section_mm", {"kind": "step", "section_mm": 1.0}),
+        ("a weld has no `wall_mm`", {"kind": "weld", "wall_mm": 9.0}),
+        ("a pipe has no `datum`", {"datum": cloud}),
+        ("a step has no `section_mm`", {"kind": "step", "section_mm": 1.0}),
         ("wall_mm is -1", {"wall_mm": -1.0}),
         ("false_alarm is 2", {"false_alarm": 2.0}),
         ("no bead stands out", {"kind": "weld"}),
         ("no gap goes through", {"kind": "gap"}),
     ):
         with pytest.raises(EvaluationError, match=words):
-            uwlts.inspect(cloud, **options)
+            inspected(cloud, **({"kind": "pipe"} | options))
     few = PointCloud(cloud.points_mm[:50], cloud.intensity[:50], cloud.frame[:50], cloud.line[:50])
     for kind in ("pipe", "weld", "step", "flange", "gap"):
         with pytest.raises(EvaluationError, match="at least"):
-            uwlts.inspect(few, kind)
+            inspected(few, kind)

@@ -14,7 +14,7 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.errors import CalibrationError, CaptureError
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Medium
-from uwlts.storage.calibration_file import read_calibration, write_calibration
+from uwlts.storage.calibration_file import read_calibration
 
 WATER = Medium(kind="fresh", temperature_c=25.0)
 
@@ -32,7 +32,7 @@ def calibrated(described):
 @pytest.fixture(scope="module")
 def written(thesis, tmp_path_factory):
     path = tmp_path_factory.mktemp("joint") / "calibration.json"
-    write_calibration(path, calibrated(thesis))
+    calibrated(thesis).save(path)
     return path
 
 

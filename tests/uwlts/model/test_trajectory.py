@@ -64,7 +64,7 @@ def test_tum_files_hold_seconds_metres_and_quaternions(tmp_path):
     for row in np.column_stack([times, poses[:, :3, 3] / 1000, quaternions]):
         lines.append(" ".join(f"{value:.9f}" for value in row))
     (tmp_path / "path.txt").write_text("\n".join(lines))
-    found = uwlts.read_trajectory(tmp_path / "path.txt", pose_format="tum")
+    found = uwlts.read(tmp_path / "path.txt", pose_format="tum")
     np.testing.assert_allclose(found.times_s, times, atol=1e-6)
     np.testing.assert_allclose(found.poses, poses, atol=1e-5)
 
@@ -80,4 +80,4 @@ def test_tum_files_hold_seconds_metres_and_quaternions(tmp_path):
 def test_other_files_are_refused(tmp_path, text, pose_format, message):
     (tmp_path / "path.csv").write_text(text)
     with pytest.raises(uwlts.Error, match=message):
-        uwlts.read_trajectory(tmp_path / "path.csv", pose_format=pose_format)
+        uwlts.read(tmp_path / "path.csv", pose_format=pose_format)

@@ -31,7 +31,7 @@ from uwlts.optics.design import (
     thesis_factor,
     window_thickness_mm,
 )
-from uwlts.report.inventory import design, table_lines
+from uwlts.optics.design_table import design, table_lines
 
 ANGLE = math.radians(35)
 AIR = Triangulation(baseline_mm=265, triangulation_angle_rad=ANGLE, focal_length_mm=12.5, pixel_size_mm=0.0053)

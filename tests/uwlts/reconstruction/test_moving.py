@@ -9,7 +9,7 @@ from tests.uwlts.mount_views import MOUNT, MOUNT_STD, known_mount
 from tests.uwlts.reconstruction.test_reconstruct import CALIBRATION, FRESH, HEIGHT, WIDTH, small_sensor, stripe_image
 from uwlts.evaluation.figure_uncertainty import shift_std_mm
 from uwlts.reconstruction.moving import Ride, with_platform
-from uwlts.storage.capture import CaptureHeader
+from uwlts.storage.capture import CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointUncertainty
 
@@ -42,7 +42,7 @@ def record(path, *, stage=False, poses=False, mount=None):
             at = STEP_MM * number
             image = stripe_image(number) if number != 3 else np.zeros((HEIGHT, WIDTH), np.uint8)
             pose = platform_at(at) if poses else None
-            frame = uwlts.Frame(image, at if stage else 0.0, number != 3, 1.0, float(number), pose)
+            frame = Frame(image, at if stage else 0.0, number != 3, 1.0, float(number), pose)
             writer.append(frame)
     return path
 
@@ -56,7 +56,7 @@ def expected(tmp_path):
 
 def test_poses_in_the_capture_are_the_platform_s_with_a_mount(tmp_path, expected):
     path = record(tmp_path / "posed.h5", poses=True)
-    uwlts.write_mount(tmp_path / "mount.json", known_mount(MOUNT))
+    known_mount(MOUNT).save(tmp_path / "mount.json")
     cloud = uwlts.reconstruct(path, CALIBRATION, mount=tmp_path / "mount.json")
     np.testing.assert_allclose(cloud.points_mm, expected, atol=1e-8)
 

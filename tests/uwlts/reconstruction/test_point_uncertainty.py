@@ -7,14 +7,15 @@ import pytest
 
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import MEDIUM, Noise, gathered, target_series
-from uwlts.calibration.joint.earlier_estimate import Prior
+from uwlts.calibration.joint.parameters import Prior
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
 from uwlts.calibration.joint.stored_estimate import stored_estimate
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.evaluation.artefact_figures import evaluate_cloud
-from uwlts.evaluation.figure_uncertainty import MovedSpheres, figure_uncertainties, noise_mm, shift_std_mm
+from uwlts.evaluation.figure_uncertainty import MovedSpheres, figure_uncertainties, shift_std_mm
+from uwlts.fitting.propagation import noise_mm
 from uwlts.fitting.shapes import fit_sphere
 from uwlts.model.artefacts import PlaneStandard, SphereStandard
 from uwlts.model.calibration import KnownMedium, KnownStage

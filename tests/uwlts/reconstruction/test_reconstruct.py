@@ -15,13 +15,13 @@ from uwlts.calibration.sequential.sequential_calibration import (
     solve,
 )
 from uwlts.errors import CalibrationError, CaptureError, RangeError
-from uwlts.model.any_calibration import check_fits
 from uwlts.model.library import load_sensor
 from uwlts.model.sensor import Medium
+from uwlts.optics.fitness import check_fits
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_profile
 from uwlts.reconstruction.reconstruct import reconstruct, reconstruct_stripes
-from uwlts.storage.calibration_file import read_calibration, write_calibration
+from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, FrameTable
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import StripeOptions, find_stripes
@@ -154,10 +154,13 @@ def single_viewpoint(medium):
         (single_viewpoint(FRESH), SEA, "the calibration is for fresh only"),
         (single_viewpoint(SEA), SEA, None),
         (single_viewpoint(AIR), AIR, None),
-        (single_viewpoint(AIR), FRESH, r"the calibration is for air only: .*--step"),
+        (single_viewpoint(AIR), FRESH, r"the calibration is for air only: .*`step`"),
         (CALIBRATION, AIR, None),
         (CALIBRATION, FRESH, None),
         (CALIBRATION, SEA, None),
+        # With a window it holds in all media, whichever it is a nominal one of.
+        (nominal_calibration(small_sensor(), FRESH), AIR, None),
+        (nominal_calibration(small_sensor(), FRESH), SEA, None),
     ],
 )
 def test_a_calibration_without_a_window_holds_in_its_own_medium(tmp_path, calibration, medium, refusal):
@@ -239,7 +242,7 @@ def test_the_medium_of_the_targets_images_is_kept(tmp_path):
     for medium_kind in ("fresh", "air"):
         solved = solve(replace(evidence, medium_kind=medium_kind), options=CalibrationOptions()).calibration
         assert (solved.medium_kind, solved.window) == (medium_kind, None)
-        write_calibration(tmp_path / f"{medium_kind}.json", solved)
+        solved.save(tmp_path / f"{medium_kind}.json")
         assert read_calibration(tmp_path / f"{medium_kind}.json").medium_kind == medium_kind
 
 

@@ -14,7 +14,9 @@ from uwlts.errors import EvaluationError
 from uwlts.evaluation.artefact_figures import evaluate_pipe
 from uwlts.fitting.patches import distances_between, surface_patches
 from uwlts.model.artefacts import PipeStandard
+from uwlts.registration.joint_registration import FEWEST_OF_PAIR, JointRegistration
 from uwlts.storage.cloud import PointCloud
+from uwlts.storage.pose_files import read_poses, write_poses
 
 SEED = 11
 PIPE = PipeStandard(diameter_mm=2 * RADIUS_MM)
@@ -62,6 +64,19 @@ def test_a_pipe_with_pits_is_closed(pits):
     errors = pose_errors(found.poses, true, found.middles_mm)
     assert np.abs(errors[:, :3]).max() < 0.1 and np.degrees(np.abs(errors[:, 3:]).max()) < 0.05
     assert max(pair.closure_mm for pair in found.pairs) < 0.1
+
+
+def test_overlaps_of_few_patches_are_named_and_do_not_count():
+    rng, patches = np.random.default_rng(SEED), []
+    # The third strip overlaps the first by 1 mm, half the radius of a patch, and the second by 52 mm.
+    for start in (0.0, 47.0, 99.0):
+        points = np.column_stack([rng.uniform(start, start + 100, 2500), rng.uniform(0, 5, 2500), np.zeros(2500)])
+        patches.append(surface_patches(points + [0, 0, 300] + 0.02 * rng.standard_normal(points.shape), None))
+    start = np.tile(np.eye(4), (3, 1, 1))
+    joint = JointRegistration(patches, [[], [], []], start, start_std=None, sphere_mm=None)
+    ((first, third, count),) = joint.narrow_overlaps(1.0)
+    assert (first, third) == (0, 2) and 0 < count < FEWEST_OF_PAIR
+    assert set(joint.evidence(1.0)) == {(0, 1), (1, 2)}
 
 
 def test_a_registration_that_does_not_settle_is_an_error(monkeypatch):
@@ -219,14 +234,14 @@ def test_the_command_writes_cloud_poses_and_page(tmp_path, monkeypatch):
     scans, _, wrong = views(np.random.default_rng(SEED), count=5, radius=oval)
     monkeypatch.chdir(tmp_path)
     for number in range(2):
-        uwlts.write_cloud(f"view-{number}.ply", scans[number])
-    uwlts.write_poses("start.csv", wrong[:2])
+        scans[number].save(f"view-{number}.ply")
+    write_poses("start.csv", wrong[:2])
     words = ["register", "view-0.ply", "view-1.ply", "--poses", "start.csv", "--out", "pipe.h5"]
     app([*words, "--page", "pipe.html", "--poses-out", "found.csv"], result_action="return_value")
-    merged, record = uwlts.read_cloud("pipe.h5"), json.loads((tmp_path / "pipe.registration.json").read_text())
+    merged, record = uwlts.read("pipe.h5"), json.loads((tmp_path / "pipe.registration.json").read_text())
     assert len(merged) == len(scans[0]) + len(scans[1]) and merged.uncertainty is not None
     assert [each["name"] for each in merged.metadata["scans"]] == ["view-0", "view-1"]
-    poses, _ = uwlts.read_poses("found.csv")
+    poses, _ = read_poses("found.csv")
     np.testing.assert_allclose(poses, [each["transform"] for each in record["scans"]], atol=1e-11)
     page = (tmp_path / "pipe.html").read_text()
     assert "shift along (1.000" in page and "Not determined" in page

@@ -34,7 +34,7 @@ from uwlts.report.certificate_volume import (
     uncertainty_maps,
     without_rigid_motion,
 )
-from uwlts.storage.calibration_file import read_calibration, write_calibration
+from uwlts.storage.calibration_file import read_calibration
 
 BUILT = built_sensor()
 ISSUED = "2026-01-02T03:04:05+00:00"
@@ -48,7 +48,7 @@ def path(thesis, tmp_path_factory):
     options = CalibrationOptions(poses="stage", correct_circles=False)
     calibration = solve_jointly(gathered(thesis, [series]), options=options).calibration
     path = tmp_path_factory.mktemp("certificate") / "calibration.json"
-    write_calibration(path, calibration)
+    calibration.save(path)
     return path
 
 
@@ -257,7 +257,7 @@ def test_the_page_holds_everything_and_asks_nothing_of_the_network(calibration, 
 
 def test_without_a_joint_estimate_it_says_that_nothing_is_known(thesis, tmp_path):
     path = tmp_path / "nominal.json"
-    write_calibration(path, nominal_calibration(thesis))
+    nominal_calibration(thesis).save(path)
     known = read_calibration(path)
     content = certificate_of(known, path, issued=ISSUED)
     assert content.remark == NOT_JOINT

@@ -35,9 +35,9 @@ def folder(tmp_path_factory):
     metadata = {"capture": "pipe.h5", "sensor": "thesis", "calibration": "0" * 64}
     cloud = PointCloud(points, np.ones(len(x)), frame, np.zeros(len(x), int), uncertainty=known, metadata=metadata)
     folder = tmp_path_factory.mktemp("pipe")
-    uwlts.write_cloud(folder / "pipe.ply", cloud)
+    cloud.save(folder / "pipe.ply")
     evaluation = uwlts.evaluate(_ball(rng, calibration="0" * 64), SphereStandard(diameters_mm=(50.0,)))
-    uwlts.write_evaluation(folder / "ball.evaluation.json", evaluation)
+    evaluation.save(folder / "ball.evaluation.json")
     return folder
 
 
@@ -80,21 +80,23 @@ def test_page_json_and_pdf_say_the_same(folder, chromium, monkeypatch):
 
 
 def test_foreign_calibrations_and_missing_browsers_are_refused(folder, tmp_path, monkeypatch):
-    uwlts.write_calibration(tmp_path / "other.json", uwlts.nominal("thesis", medium="water"))
+    uwlts.nominal("thesis", medium="water").save(tmp_path / "other.json")
     with pytest.raises(EvaluationError, match="another calibration"):
-        uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", calibration=tmp_path / "other.json")
+        uwlts.report.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", calibration=tmp_path / "other.json")
     with pytest.raises(EvaluationError, match="give that, too"):
-        uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", certificate=tmp_path / "other.json")
+        uwlts.report.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", certificate=tmp_path / "other.json")
     foreign = uwlts.evaluate(
         _ball(np.random.default_rng(1), calibration="1" * 64), SphereStandard(diameters_mm=(50.0,))
     )
-    uwlts.write_evaluation(tmp_path / "foreign.json", foreign)
+    foreign.save(tmp_path / "foreign.json")
     with pytest.raises(EvaluationError, match="by another calibration"):
-        uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", verification=[tmp_path / "foreign.json"])
+        uwlts.report.write_findings(
+            folder / "pipe.ply", out=tmp_path / "a.html", verification=[tmp_path / "foreign.json"]
+        )
     with pytest.raises(OutputError, match="give a name like a.html"):
-        uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.json")
+        uwlts.report.write_findings(folder / "pipe.ply", out=tmp_path / "a.json")
     monkeypatch.delenv("CHROMIUM", raising=False)
     monkeypatch.setattr(pdf, "shutil", SimpleNamespace(which=lambda name: None))
     with pytest.raises(SetupError, match="needs Chromium"):
-        uwlts.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", pdf=True)
+        uwlts.report.write_findings(folder / "pipe.ply", out=tmp_path / "a.html", pdf=True)
     assert {path.name for path in tmp_path.iterdir()} == {"other.json", "foreign.json"}

@@ -15,7 +15,7 @@ from matplotlib.colors import to_hex
 from rich.console import Console
 
 from uwlts.errors import CaptureError, DescriptionError, OutputError
-from uwlts.evaluation.evaluate import StoredUncertainty, evaluate, write_evaluation
+from uwlts.evaluation.evaluate import StoredUncertainty, evaluate
 from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
@@ -29,7 +29,6 @@ from uwlts.report.campaign_tables import print_table, summary_table
 from uwlts.report.gather import gather_campaign, load_reference
 from uwlts.report.pictures import StripeView, draw_pictures, stripe_picture, write_pictures
 from uwlts.report.summary_file import summary, write_summary
-from uwlts.storage.calibration_file import write_calibration
 from uwlts.storage.capture import CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud import PointCloud
@@ -113,7 +112,7 @@ def cloud_of(points: np.ndarray, capture: str, artefact: dict, calibration: Cali
 def write_measurement(folder, name, points, artefact, calibration, *, truth=None, cloud_name=None):
     cloud = cloud_of(points, f"{name}.h5", artefact, calibration)
     evaluation = evaluate(cloud, artefact, truth, source=f"{name}.ply")
-    write_evaluation(folder / f"{name}.evaluation.json", evaluation)
+    evaluation.save(folder / f"{name}.evaluation.json")
     write_cloud(folder / f"{cloud_name or name}.ply", evaluation.cloud)
     return cloud
 
@@ -148,8 +147,8 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("campaign")
     main = calibration_at(47.35, **RESIDUALS)
     other = calibration_at(45.0, refractions=1)
-    write_calibration(folder / "calibration.json", main)
-    write_calibration(folder / "calibration-one-refraction.json", other)
+    main.save(folder / "calibration.json")
+    other.save(folder / "calibration-one-refraction.json")
     for name, spacing, calibration in (
         ("spheres-near", 99.21, main),
         ("spheres-far", 99.17, main),
@@ -533,7 +532,7 @@ def test_text_from_files_is_escaped(folder, tmp_path):
     calibration = calibration_at(47.35, **RESIDUALS).model_copy(
         update={"sensor_name": evil, "provenance": {"source": evil, "warnings": [evil]}}
     )
-    write_calibration(campaign_folder / "calibration<b>.json", calibration)
+    calibration.save(campaign_folder / "calibration<b>.json")
     name = "<img src=x onerror=alert(3)>"
     write_capture(campaign_folder / f"{name}.h5", name=evil)
     write_measurement(campaign_folder, name, two_spheres(99.2), SPHERES, calibration)

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
+import uwlts
 from uwlts.errors import CaptureError, Error, OutputError
 from uwlts.model.calibration import Calibration
 from uwlts.model.library import load_sensor
 from uwlts.optics.nominal import nominal_calibration
-from uwlts.storage.calibration_file import read_calibration, write_calibration
+from uwlts.storage.calibration_file import read_calibration
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +25,7 @@ def calibration() -> Calibration:
 
 @pytest.fixture
 def path(tmp_path: Path, calibration: Calibration) -> Path:
-    write_calibration(tmp_path / "calibration.json", calibration)
+    calibration.save(tmp_path / "calibration.json")
     return tmp_path / "calibration.json"
 
 
@@ -57,7 +58,7 @@ def test_everything_comes_back_exactly(path: Path, calibration: Calibration):
 
 def test_calibration_for_air_only(tmp_path: Path, calibration: Calibration):
     dry = calibration.model_copy(update={"window": None})
-    write_calibration(tmp_path / "dry.json", dry)
+    dry.save(tmp_path / "dry.json")
     assert read_calibration(tmp_path / "dry.json") == dry
 
 
@@ -65,16 +66,16 @@ def test_existing_file_is_only_replaced_on_demand(path: Path, calibration: Calib
     before = path.read_bytes()
     other = calibration.model_copy(update={"sensor_name": "other"})
     with pytest.raises(OutputError, match="exists already"):
-        write_calibration(path, other)
+        other.save(path)
     assert path.read_bytes() == before
-    write_calibration(path, other, overwrite=True)
+    other.save(path, overwrite=True)
     assert read_calibration(path).sensor_name == "other"
     assert list(path.parent.iterdir()) == [path]
 
 
 def test_folder_must_exist(tmp_path: Path, calibration: Calibration):
     with pytest.raises(OutputError, match="missing does not exist"):
-        write_calibration(tmp_path / "missing" / "a.json", calibration)
+        calibration.save(tmp_path / "missing" / "a.json")
 
 
 @pytest.mark.parametrize(
@@ -174,7 +175,7 @@ def test_missing_keys_are_named(path: Path):
 @given(data=st.data())
 def test_random_damage_gives_only_known_errors(tmp_path: Path, calibration: Calibration, data):
     path = tmp_path / "a.json"
-    write_calibration(path, calibration, overwrite=True)
+    calibration.save(path, overwrite=True)
     content = bytearray(path.read_bytes())
     place = data.draw(st.integers(0, len(content) - 1))
     new = data.draw(st.binary(min_size=1, max_size=6) | st.sampled_from([b"NaN", b"null", b"[]", b"-", b"1e999", b"{"]))
@@ -187,3 +188,16 @@ def test_random_damage_gives_only_known_errors(tmp_path: Path, calibration: Cali
     else:
         assert np.isfinite(found.object_transform()).all()
         assert np.isfinite(found.camera.matrix()).all()
+
+
+def test_uncertainties_of_a_sequential_calibration_have_names():
+    residuals = {
+        "camera": {"std": {"f": 1.5, "cx": 0.25, "k1": 0.001}},
+        "sheet": {"normal_std_deg": 0.02},
+        "window": {"std_mm": 0.125},
+    }
+    known = uwlts.nominal("thesis", medium="water").model_copy(update={"residuals": residuals}).std()
+    assert (known.fx_px, known.fy_px, known.cx_px, known.cy_px) == (1.5, 1.5, 0.25, None)
+    assert known.distortion == {"k1": 0.001}
+    assert (known.sheet_normal_deg, known.window_distance_mm) == (0.02, 0.125)
+    assert uwlts.nominal("thesis", medium="water").std().fx_px is None

@@ -22,7 +22,8 @@ from uwlts.model.sensor import Sensor
 from uwlts.storage import capture_writer
 from uwlts.storage.capture import Capture, CaptureHeader, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.hdf5_file import has_writer, lookup3, read_label, write_label
+from uwlts.storage.hdf5_file import read_label, write_label
+from uwlts.storage.unfinished_hdf5 import has_writer, lookup3
 
 ROOT = Path(__file__).resolve().parents[3]
 HEIGHT, WIDTH = 20, 24
@@ -256,7 +257,7 @@ def test_places_that_cannot_hold_a_capture(tmp_path: Path):
 def test_left_over_part_needs_a_decision(tmp_path: Path):
     path = tmp_path / "a.h5"
     part = interrupted(path, 3)
-    with pytest.raises(OutputError, match=r"--resume .*--overwrite"):
+    with pytest.raises(OutputError, match=r"`resume` .*`overwrite`"):
         CaptureWriter(path, a_header(), dtype=np.uint8)
     with Capture(part) as capture:
         assert not capture.finished
@@ -301,7 +302,7 @@ def test_part_of_another_recording_is_refused(tmp_path: Path):
             CaptureWriter(path, header, dtype=dtype, resume=True)
     assert part.read_bytes() == before
     part.write_bytes(b"something else")
-    with pytest.raises(CaptureError, match=r"cannot resume: .*--overwrite"):
+    with pytest.raises(CaptureError, match=r"cannot resume: .*`overwrite`"):
         CaptureWriter(path, a_header(), dtype=np.uint8, resume=True)
     assert sorted(tmp_path.iterdir()) == [part]
 

@@ -38,9 +38,9 @@ def sorted_rows(cloud):
 
 
 def test_all_points_come_back(cloud, small_nodes, tmp_path):
-    uwlts.write_cloud(tmp_path / "pipe.ply", cloud)
+    cloud.save(tmp_path / "pipe.ply")
     assert uwlts.export(tmp_path / "pipe.ply", tmp_path / "pipe.copc.laz") == len(cloud)
-    back = uwlts.read_cloud(tmp_path / "pipe.copc.laz")
+    back = uwlts.read(tmp_path / "pipe.copc.laz")
     # Steps of 1e-4 mm; the amplitude and the deviation are stored as they are.
     np.testing.assert_allclose(sorted_rows(back), sorted_rows(cloud), atol=0.51e-4)
     with laspy.CopcReader.open(tmp_path / "pipe.copc.laz") as reader:
@@ -55,7 +55,7 @@ def test_all_points_come_back(cloud, small_nodes, tmp_path):
 
 
 def test_a_region_and_a_level_are_read_alone(cloud, small_nodes, tmp_path):
-    uwlts.write_cloud(tmp_path / "pipe.ply", cloud)
+    cloud.save(tmp_path / "pipe.ply")
     uwlts.export(tmp_path / "pipe.ply", tmp_path / "pipe.copc.laz")
     low, high = np.array([100.0, -20.0, 430.0]), np.array([150.0, 30.0, 520.0])
     inside = ((cloud.points_mm >= low) & (cloud.points_mm <= high)).all(axis=1)
@@ -75,21 +75,21 @@ def test_a_region_and_a_level_are_read_alone(cloud, small_nodes, tmp_path):
 
 def test_the_command_cuts_out_a_region(cloud, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    uwlts.write_cloud("pipe.h5", cloud)
+    cloud.save("pipe.h5")
     words = ["export", "pipe.h5", "--out", "pipe.copc.laz"]
     app(words, result_action="return_value")
     with pytest.raises(OutputError, match="exists already"):
         uwlts.export("pipe.h5", "pipe.copc.laz")
     box = ["--region-mm", "0", "-100", "0", "40", "100", "1000"]
     app(["export", "pipe.copc.laz", "--out", "end.ply", *box, "--at-most", "500"], result_action="return_value")
-    assert 100 < len(uwlts.read_cloud("end.ply")) <= 500
+    assert 100 < len(uwlts.read("end.ply")) <= 500
     with pytest.raises(CaptureError, match="is no cloud"):
         uwlts.export(tmp_path / "scan.h5", tmp_path / "part.ply", at_most=5)
 
 
 def test_parts_are_the_whole(cloud, tmp_path):
     for name in ("pipe.ply", "pipe.h5"):
-        uwlts.write_cloud(tmp_path / name, cloud)
+        cloud.save(tmp_path / name)
         parts = list(cloud_parts(tmp_path / name, 50_000))
         assert [len(part) for part in parts] == [50_000, 50_000, 20_000]
         np.testing.assert_array_equal(np.concatenate([part.points_mm for part in parts]), cloud.points_mm)
@@ -98,8 +98,8 @@ def test_parts_are_the_whole(cloud, tmp_path):
 def test_damaged_and_empty_clouds_are_refused(cloud, tmp_path):
     (tmp_path / "text.copc.laz").write_text("no cloud")
     with pytest.raises(CaptureError, match=r"text.copc.laz is not a complete COPC file"):
-        uwlts.read_cloud(tmp_path / "text.copc.laz")
-    uwlts.write_cloud(tmp_path / "empty.ply", cloud.selected(slice(0, 0)))
+        uwlts.read(tmp_path / "text.copc.laz")
+    cloud.selected(slice(0, 0)).save(tmp_path / "empty.ply")
     with pytest.raises(OutputError, match="no points"):
         uwlts.export(tmp_path / "empty.ply", tmp_path / "empty.copc.laz")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.ply", "text.copc.laz"]

@@ -15,8 +15,7 @@ from uwlts.storage.capture import Capture, part_path
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import SUFFIXES
 from uwlts.storage.import_ import import_images
-from uwlts.storage.import_.channels import one_channel
-from uwlts.storage.import_.images import grey_values
+from uwlts.storage.import_.grey_values import grey_values, one_channel
 from uwlts.storage.import_.matching import natural_key, read_rows
 from uwlts.stripe import extract_stripe
 

@@ -143,7 +143,7 @@ def test_e57_gives_its_times_back(cloud, tmp_path):
     for number, times in enumerate((cloud.time_s, cloud.time_s - 1.7e9 - 0.3, None)):
         path = tmp_path / f"{number}.e57"
         write_cloud(path, replace(cloud, time_s=times))
-        again = uwlts.read_cloud(path)
+        again = uwlts.read(path)
         np.testing.assert_allclose(again.points_mm, cloud.points_mm, atol=2e-5)
         assert (again.time_s is None) == (times is None)
         if times is not None:
@@ -154,16 +154,16 @@ def test_e57_gives_its_times_back(cloud, tmp_path):
 def test_e57_times_that_are_marked_invalid_are_not_known(cloud, tmp_path):
     columns = {"isTimeStampInvalid": (np.arange(len(cloud)) % 7 == 0).astype(np.uint8)}
     write_e57(tmp_path / "a.e57", cloud.points_mm, columns, to=tmp_path / "a.e57", time_s=cloud.time_s)
-    assert uwlts.read_cloud(tmp_path / "a.e57").time_s is None
+    assert uwlts.read(tmp_path / "a.e57").time_s is None
     columns = {"cartesianInvalidState": columns["isTimeStampInvalid"]}
     write_e57(tmp_path / "b.e57", cloud.points_mm, columns, to=tmp_path / "b.e57", time_s=cloud.time_s)
     placed = np.arange(len(cloud)) % 7 > 0
-    np.testing.assert_array_equal(uwlts.read_cloud(tmp_path / "b.e57").time_s, cloud.time_s[placed])
+    np.testing.assert_array_equal(uwlts.read(tmp_path / "b.e57").time_s, cloud.time_s[placed])
 
 
 def test_ply_has_time_image_and_covariance(cloud, tmp_path):
-    uwlts.write_cloud(tmp_path / "a.ply", cloud)
-    again = uwlts.read_cloud(tmp_path / "a.ply")
+    cloud.save(tmp_path / "a.ply")
+    again = uwlts.read(tmp_path / "a.ply")
     np.testing.assert_array_equal(again.time_s, cloud.time_s)
     np.testing.assert_array_equal(again.frame, cloud.frame)
     np.testing.assert_allclose(again.covariance_mm2, cloud.covariance_mm2, rtol=1e-6)

@@ -71,10 +71,10 @@ def assert_path(found):
 @pytest.mark.parametrize("kind", ["nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"])
 def test_poses_of_a_topic(tmp_path, storage, kind):
     path = write_ros2(tmp_path / "bag", {"/odom": kind}, storage)
-    assert_path(uwlts.read_trajectory(path, pose_format="ros"))
-    assert_path(uwlts.read_trajectory(path, pose_format="ros:/odom"))
+    assert_path(uwlts.read(path, pose_format="ros"))
+    assert_path(uwlts.read(path, pose_format="ros:/odom"))
     (file,) = (each for each in path.iterdir() if each.suffix in (".mcap", ".db3"))
-    assert_path(uwlts.read_trajectory(file, pose_format="ros"))
+    assert_path(uwlts.read(file, pose_format="ros"))
 
 
 def test_poses_of_a_ros_1_bag(tmp_path):
@@ -83,16 +83,16 @@ def test_poses_of_a_ros_1_bag(tmp_path):
         connection = bag.add_connection("/pose", kind, typestore=types)
         for time, message in zip(TIMES, messages(types, kind), strict=True):
             bag.write(connection, int(time * 1e9), types.serialize_ros1(message, kind))
-    assert_path(uwlts.read_trajectory(tmp_path / "path.bag", pose_format="ros"))
+    assert_path(uwlts.read(tmp_path / "path.bag", pose_format="ros"))
 
 
 def test_transforms_of_a_pair_of_frames(tmp_path):
     path = write_ros2(tmp_path / "bag", {"/tf": "tf2_msgs/msg/TFMessage"})
-    assert_path(uwlts.read_trajectory(path, pose_format="ros:map>base"))
+    assert_path(uwlts.read(path, pose_format="ros:map>base"))
     with pytest.raises(DescriptionError, match=r"transforms map>base, map>camera; found 12 of ''"):
-        uwlts.read_trajectory(path, pose_format="ros")
+        uwlts.read(path, pose_format="ros")
     with pytest.raises(DescriptionError, match=r"transforms map>base, map>camera; found 0 of 'odom>base'"):
-        uwlts.read_trajectory(path, pose_format="ros:odom>base")
+        uwlts.read(path, pose_format="ros:odom>base")
 
 
 def test_what_is_not_there_is_named(tmp_path):
@@ -100,7 +100,7 @@ def test_what_is_not_there_is_named(tmp_path):
     path = write_ros2(tmp_path / "bag", {"/dvl": kind, "/usbl": kind})
     for pose_format in ("ros", "ros:/odom"):
         with pytest.raises(DescriptionError, match=r"/dvl \(PoseStamped\), /usbl \(PoseStamped\)"):
-            uwlts.read_trajectory(path, pose_format=pose_format)
+            uwlts.read(path, pose_format=pose_format)
 
 
 @pytest.mark.parametrize("name", ["path.mcap", "path.bag", "path.db3", "path.txt"])
@@ -108,11 +108,11 @@ def test_other_files_are_refused(tmp_path, name):
     (tmp_path / name).write_bytes(b"no bag" * 100)
     for path in (tmp_path / name, tmp_path / "absent" / name, tmp_path):
         with pytest.raises(DescriptionError, match="bag"):
-            uwlts.read_trajectory(path, pose_format="ros")
+            uwlts.read(path, pose_format="ros")
 
 
 def test_without_the_library_the_extra_is_named(tmp_path, monkeypatch):
     path = write_ros2(tmp_path / "bag", {"/odom": "geometry_msgs/msg/PoseStamped"})
     monkeypatch.setitem(sys.modules, "rosbags", None)
     with pytest.raises(SetupError, match=r"uwlts\[ros\]"):
-        uwlts.read_trajectory(path, pose_format="ros")
+        uwlts.read(path, pose_format="ros")

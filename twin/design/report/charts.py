@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from html import escape
 
@@ -13,11 +13,10 @@ import matplotlib
 import numpy as np
 import plotly.graph_objects as go
 from matplotlib.axes import Axes
-from matplotlib.colors import LogNorm, Normalize, to_rgba
+from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import Delaunay, KDTree, QhullError
+from matplotlib.tri import Triangulation
 
 from twin.design.choice import Judged, pareto
 from twin.design.designs import Marked
@@ -25,19 +24,22 @@ from twin.design.figures_of_merit import CLASS_NAMES
 from twin.design.report import study_tables as tables
 from twin.design.study import Variable
 from twin.design.verification import Agreement
-from uwlts.pages.toolkit import BLUE, COLOURS, FAINT, INK, legend_below, new_figure
+from uwlts.pages.toolkit import BLUE, COLOURS, FAINT, INK, RED, legend_below, new_figure
 
 Static = tuple[Figure, str]
 Interactive = tuple[go.Figure, str]
 """A figure for a page, and its caption."""
 
-RED, GREEN, PALE = "#c22f2f", "#2e8b57", "#c3cad2"
+_FRONT = COLOURS[2]
+"""Colour of the Pareto front."""
+_PALE = "#c3cad2"
+"""Colour of bars of designs that miss a constraint."""
 _LIMITS = ("#d9480f", "#862e9c", "#0b7285", "#e67700", "#364fc7")
 """Colours of the lines on which constraints are just met."""
 _SYMBOLS = (("diamond", "D"), ("circle", "o"), ("star", "*"), ("square", "s"), ("cross", "P"))
 """Symbols of marked designs, of plotly and of matplotlib."""
-_AWAY = (-26, 26, -54, 54, -82, 82)
-"""Distances of labels from marked designs in px; the designs in turn."""
+_TEXT_PLACES = ("top right", "bottom right", "top left", "bottom left")
+"""Places of labels beside marked designs, in turn."""
 _SHOWN = (
     "sigma_z_rms_mm",
     "sigma_z_mm",
@@ -52,20 +54,36 @@ _SHOWN = (
     "speckle_limit_mm",
 )
 """Figures shown besides objectives and constraints, the most informative first."""
-_MOST_PANELS, _PANEL_COLUMNS, _PANEL_INCHES, _BAR_INCHES = 9, 3, (4.0, 3.1), 0.17
-MOST_POINTS, MOST_LINES = 20_000, 5_000
-_MOST_DOTS, _MOST_OF_CURVE, _MOST_BARS, _MOST_DIMENSIONS = 2000, 500, 40, 12
-"""More designs, points of a curve, bars and axes would hide each other."""
-_FEW, _IN_SVG = 300, 2500
-"""More points are drawn smaller; more than the second number with WebGL, which does not slow the page down."""
+_MOST_PANELS = 9
+_PANEL_COLUMNS = 3
+_PANEL_INCHES = (4.0, 3.1)
+_BAR_INCHES = 0.17
+# More points and lines make a page slow; more dots, points of a curve, bars and axes would hide each other.
+MOST_POINTS = 20_000
+MOST_LINES = 5_000
+_MOST_DOTS = 2000
+_MOST_OF_CURVE = 500
+_MOST_BARS = 40
+_MOST_DIMENSIONS = 12
+_FEW = 300
+"""More points are drawn smaller."""
+_IN_SVG = 2500
+"""More points are drawn with WebGL, which does not slow the page down."""
 _LAYOUT = {"template": "none", "font": {"color": INK}, "paper_bgcolor": "white"}
 _WIDE_RANGE = 30.0
 """A figure whose largest value is so many times the least gets a logarithmic axis."""
 _DASHED = "Dashed: bounds."
 _INTERVALS = 100
-_MOST_STEPS, _NODES = 100, 60
-_PER_CELL, _CELLS = 8, (4, 40)
-_LEVELS, _WIDE, _MARGIN = 12, 15.0, 0.02
+"""Places along a curve of which each shows its best design, where more is free than is drawn."""
+_CELLS = 40
+"""The same for maps, along each side."""
+_FLAT = 1e-6
+"""Designs whose places lie on a line but for this share of the ranges span no area."""
+_LEVELS = 12
+_WIDE = 15.0
+"""A figure whose best values differ by this factor gets logarithmic colours."""
+_MARGIN = 0.02
+"""Share of the ranges beside them."""
 _BESIDE = 1e-4
 """Part of a bound by which its line is drawn on the side that misses it: a figure in steps may equal the bound."""
 
@@ -165,7 +183,7 @@ def bars(judged: Judged) -> Static:
     labels = [_combination(judged, list(judged.study.free()), place) for place in places]
     figure, panels = _panels(shown_figures(judged), height=max(_PANEL_INCHES[1], _BAR_INCHES * len(places)))
     for number, (axes, name) in enumerate(panels):
-        axes.barh(range(len(places)), judged.figure(name)[places], color=np.where(judged.feasible[places], BLUE, PALE))
+        axes.barh(range(len(places)), judged.figure(name)[places], color=np.where(judged.feasible[places], BLUE, _PALE))
         # Long names stand at the left only.
         axes.set_yticks(range(len(places)), labels if number % _PANEL_COLUMNS == 0 else [""] * len(places))
         axes.invert_yaxis()
@@ -186,152 +204,93 @@ def share_of(variable: Variable, values: np.ndarray) -> np.ndarray:
 # --- maps over two variables ------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Map:
-    """Figures over two variables: values (ny, nx) by name at x (nx,) and y (ny,), NaN where no design works.
-
-    ``reasons`` (ny, nx) says where and why designs there do not do, "" where they do or nothing is known. ``smooth``
-    says whether neighbours are of one kind, so that contours make sense, ``dots`` whether designs are shown as well.
-    """
-
-    x: np.ndarray
-    y: np.ndarray
-    values: dict[str, np.ndarray]
-    reasons: np.ndarray
-    smooth: bool
-    dots: bool
-    caption: str
+def map_places(judged: Judged, x: str, y: str) -> np.ndarray:
+    """Designs (N,) to show over two variables: all of them, or the best one of every place where more is free."""
+    if len(judged.study.free()) == 2:
+        return np.arange(len(judged))
+    cells = [np.rint(_CELLS * share_of(judged.study.variables[name], judged.columns[name])) for name in (x, y)]
+    order = np.concatenate([judged.best_first, np.flatnonzero(~judged.works)])
+    return order[np.unique(np.stack(cells)[:, order], axis=1, return_index=True)[1]]
 
 
-def map_of(judged: Judged, x: str, y: str, figures: Sequence[str]) -> Map | None:
-    """The map of figures over two variables; None where the designs span no area. A grid shows its designs, others are
-    interpolated linearly. Where more is free, every cell shows its best design."""
-    names, free = (x, y), judged.study.free()
-    variables = [judged.study.variables[name] for name in names]
-    columns = [np.asarray(judged.columns[name], dtype=float) for name in names]
-    axes, caption = [np.unique(column) for column in columns], ""
-    scattered = len(axes[0]) * len(axes[1]) > 2 * len(judged)
-    if alone := scattered and len(free) == 2:
-        shares = [share_of(variable, column) for variable, column in zip(variables, columns, strict=True)]
-        found = _interpolated(judged, np.column_stack(shares), figures)
-        if found is None:
-            return None
-        values, failures = found
-        axes = [np.array([variable.at(share) for share in np.linspace(0, 1, _NODES)]) for variable in variables]
-        caption = f"Interpolated linearly between {int(judged.works.sum()):,} designs (dots); white: too far from any."
-    else:
-        cells = int(np.clip(math.sqrt(len(judged) / _PER_CELL), *_CELLS)) if scattered else _MOST_STEPS
-        for k, variable in enumerate(variables):
-            if scattered or len(axes[k]) > cells:
-                axes[k] = np.array([variable.at((cell + 0.5) / cells) for cell in range(cells)])
-        # Every design belongs to the cell of the axes' nearest values.
-        i, j = (np.searchsorted((a[1:] + a[:-1]) / 2, column) for a, column in zip(axes, columns, strict=True))
-        best = np.full((len(axes[1]), len(axes[0])), -1)
-        # Of several designs the last one written stays: failed ones first, then from the worst to the best.
-        order = np.concatenate([np.flatnonzero(~judged.works), judged.best_first[::-1]])
-        best[j[order], i[order]] = order
-        works = (best >= 0) & judged.works[best]
-        values = {name: np.where(works, judged.figure(name)[best], np.nan) for name in figures}
-        failures = np.where(best >= 0, np.array(judged.failures, dtype=object)[best], "")
-        if others := [tables.words_of(name) for name in free if name not in names]:
-            caption = (
-                f"{tables.listed(others).capitalize()} also vary: each place shows the design there that misses the "
-                f"constraints least and then has the best {tables.words_of(judged.study.objectives[0].figure)}."
-            )
-    reasons, bounded = failures.astype(object), [name for name in judged.study.constraints if name in values]
-    for place in map(tuple, np.argwhere(reasons == "")):
-        row = {name: float(values[name][place]) for name in bounded}
-        reasons[place] = "; ".join(text for text, _ in tables.misses(judged.study, row).values())
-    return Map(axes[0], axes[1], values, reasons, smooth=alone or not scattered, dots=scattered, caption=caption)
-
-
-def _interpolated(
-    judged: Judged, places: np.ndarray, figures: Sequence[str]
-) -> tuple[dict[str, np.ndarray], np.ndarray] | None:
-    """Figures between designs at ``places`` (N, 2), shares of the ranges, and reasons why the nearest one fails."""
-    shares = np.linspace(0, 1, _NODES)
-    nodes = np.stack(np.meshgrid(shares, shares), axis=-1)
-    try:
-        mesh = Delaunay(places[judged.works])
-    except (QhullError, ValueError):
+def mesh_between(judged: Judged, places: np.ndarray, x: str, y: str) -> Triangulation | None:
+    """Triangles between designs over two variables, none at a design that cannot work; None where they span no area."""
+    shares = np.column_stack([share_of(judged.study.variables[name], judged.columns[name][places]) for name in (x, y)])
+    if np.linalg.matrix_rank(shares - shares.mean(axis=0), tol=_FLAT) < 2:
         return None
-    known = np.column_stack([judged.figure(name)[judged.works] for name in figures])
-    found = LinearNDInterpolator(mesh, known)(nodes)
-    # A node belongs to its nearest design: near one that fails nothing is known.
-    nearest = KDTree(places).query(nodes)[1]
-    found[~judged.works[nearest]] = np.nan
-    if not np.isfinite(found[..., 0]).any():
-        return None
-    return dict(zip(figures, np.moveaxis(found, -1, 0), strict=True)), np.array(judged.failures, dtype=object)[nearest]
+    triangles = Triangulation(shares[:, 0], shares[:, 1]).triangles
+    at_x, at_y = (np.asarray(judged.columns[name][places], dtype=float) for name in (x, y))
+    return Triangulation(at_x, at_y, triangles, mask=~judged.works[places][triangles].all(axis=1))
 
 
 @_plain_text
 def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static | None:
     """The figures over two variables beside each other; None where the designs span no area."""
-    figures = shown_figures(judged)
-    found = map_of(judged, x, y, figures)
-    if found is None:
+    study, places = judged.study, map_places(judged, x, y)
+    mesh = mesh_between(judged, places, x, y)
+    if mesh is None or mesh.mask is None or mesh.mask.all():
         return None
-    figure, panels = _panels(figures)
-    variables = [judged.study.variables[name] for name in (x, y)]
-    dots = np.flatnonzero(sample(judged.works, np.zeros(len(judged), bool), _MOST_DOTS)) if found.dots else []
-    missed, grey = found.reasons != "", np.zeros((*found.reasons.shape, 4))
-    works = np.isfinite(np.stack(list(found.values.values()))).any(axis=0)
-    grey[missed & works], grey[missed & ~works] = to_rgba("#e4e7eb", 0.72), to_rgba("#969ea8")
-    # Lines on which constraints are just met.
-    limits = []
-    for (name, sign, bound), colour in zip(judged.study.bounds(), _LIMITS * 10, strict=False):
-        values, level = found.values.get(name, np.empty(0)), bound + sign * _BESIDE * (abs(bound) or 1.0)
-        crossed = min(values.shape) > 1 and (values < level).any() and (values > level).any()
-        if crossed and len(judged.study.free()) == 2:
-            limits.append((values, level, colour, tables.bound_text(name, sign, bound)))
+    works = judged.works[places]
+
+    def over(name: str) -> np.ndarray:
+        return np.where(works, judged.figure(name)[places], np.nan)
+
+    # By how much each bound is missed, in parts of it; a figure in steps may equal the bound.
+    missed = [(sign * (over(name) - bound) / (abs(bound) or 1.0) - _BESIDE) for name, sign, bound in study.bounds()]
+    limits = list(zip(missed, itertools.cycle(_LIMITS), (tables.bound_text(*each) for each in study.bounds())))
+    fails = np.max(missed, axis=0, initial=-1.0)
+    figure, panels = _panels(shown_figures(judged))
     for number, (axes, name) in enumerate(panels):
-        _fill(axes, found, name)
-        if missed.any():
-            axes.pcolormesh(found.x, found.y, grey, shading="nearest", rasterized=True, linewidth=0, antialiased=False)
-        for values, level, colour, label in limits:
-            axes.contour(found.x, found.y, values, levels=[level], colors=colour, linestyles="--")
-            axes.plot([], [], color=colour, linestyle="--", label=label)
-        if len(dots):
-            at = [judged.columns[free][dots] for free in (x, y)]
-            axes.plot(*at, ".", color=INK, markersize=1.0, alpha=0.5, rasterized=True)
+        _fill(axes, mesh, over(name), good=fails <= 0)
+        if (fails[works] > 0).any():
+            outside = np.where(works, fails, 0.0)
+            axes.tricontourf(mesh, outside, levels=[0.0, 1.01 * outside.max()], colors="#e4e7eb", alpha=0.72)
+        for values, colour, label in limits if len(study.free()) == 2 else ():
+            if values[works].min() < 0 < values[works].max():
+                axes.tricontour(mesh, np.where(works, values, 0.0), levels=[0.0], colors=colour, linestyles="--")
+                axes.plot([], [], color=colour, linestyle="--", label=label)
+        for chosen, style, size in ((works, ".", 1.5), (~works, "x", 3.0)):
+            shown = np.flatnonzero(sample(chosen, np.zeros(len(places), bool), _MOST_DOTS))
+            axes.plot(mesh.x[shown], mesh.y[shown], style, color=INK, markersize=size, alpha=0.5, rasterized=True)
         _mark(axes, marked, x, y)
         axes.grid(visible=False)
+        variables = [study.variables[name] for name in (x, y)]
         axes.set(xlabel=tables.label_of(x), ylabel="" if number % _PANEL_COLUMNS else tables.label_of(y))
         axes.set(xscale=variables[0].scale, yscale=variables[1].scale)
         # Designs on the border of the range are seen wholly.
         xlim, ylim = ((float(v.at(-_MARGIN)), float(v.at(1 + _MARGIN))) for v in variables)
         axes.set(xlim=xlim, ylim=ylim)
     legend_below(figure)
-    ends = {name: variable.ends() for name, variable in zip((x, y), variables, strict=True)}
+    others = [tables.words_of(name) for name in study.free() if name not in (x, y)]
+    ends = {name: study.variables[name].ends() for name in (x, y)}
     outside = [m.label for m in marked if not all(a <= m.design.number_of(n) <= b for n, (a, b) in ends.items())]
     parts = (
-        found.caption,
-        "Light grey: a constraint is missed; dark grey: designs cannot work; the table of reasons says why."
-        if missed.any()
+        f"{tables.listed(others).capitalize()} also vary: each place shows the design there that misses the "
+        f"constraints least and then has the best {tables.words_of(study.objectives[0].figure)}."
+        if others
         else "",
+        "Linear between the designs (dots).",
+        "Grey: a constraint is missed." if (fails[works] > 0).any() else "",
+        "Crosses: designs cannot work; the table of reasons says why." if not works.all() else "",
         f"Outside the ranges: {tables.listed(outside)}." if outside else "",
     )
     return figure, " ".join(filter(None, parts))
 
 
-def _fill(axes: Axes, found: Map, name: str) -> None:
-    """Draw a figure as filled contours, or as cells where neighbours differ in kind; wide ranges in their logarithm."""
-    values = found.values[name]
-    good = values[(found.reasons == "") & np.isfinite(values)]
-    known = values[np.isfinite(values)]
-    if not len(known):
+def _fill(axes: Axes, mesh: Triangulation, values: np.ndarray, *, good: np.ndarray) -> None:
+    """Draw a figure as filled contours, wide ranges in their logarithm."""
+    known = np.isfinite(values)
+    mesh = Triangulation(mesh.x, mesh.y, mesh.triangles, mask=~known[mesh.triangles].all(axis=1))
+    if mesh.mask is None or mesh.mask.all():
         return
     # Few extreme values must not take all the colours.
-    low, high = float(np.quantile(known, 0.02)), float(np.quantile(good if len(good) > 10 else known, 0.98))
+    best = values[good & known]
+    low, high = np.quantile(values[known], 0.02), np.quantile(best if len(best) > 10 else values[known], 0.98)
     high = max(high, low + 1e-12 + 1e-9 * abs(low))
     log = low > 0 and high > _WIDE * low
     norm = LogNorm(low, high) if log else Normalize(low, high)
-    if found.smooth and min(values.shape) > 1:
-        steps = np.geomspace(low, high, _LEVELS + 1) if log else MaxNLocator(_LEVELS).tick_values(low, high)
-        drawn = axes.contourf(found.x, found.y, values, levels=steps, norm=norm, extend="both")
-    else:
-        drawn = axes.pcolormesh(found.x, found.y, values, norm=norm, shading="nearest", rasterized=True)
+    steps = np.geomspace(low, high, _LEVELS + 1) if log else MaxNLocator(_LEVELS).tick_values(low, high)
+    drawn = axes.tricontourf(mesh, np.where(known, values, low), levels=steps, norm=norm, extend="both")
     ticks = np.geomspace(low, high, 5).tolist() if log else None
     bar = axes.figure.colorbar(drawn, ax=axes, ticks=ticks)
     if ticks:
@@ -416,8 +375,8 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
         **at(order),
         name=f"Pareto front ({len(order):,} of the designs)",
         mode="lines+markers",
-        line={"color": GREEN, "width": 2},
-        marker={"size": 6, "color": GREEN},
+        line={"color": _FRONT, "width": 2},
+        marker={"size": 6, "color": _FRONT},
         text=[
             "<br>".join(
                 [f"design {judged.columns['design'][place]}"]
@@ -428,12 +387,13 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
         hovertemplate="%{text}<extra></extra>",
     )
     axis = {"gridcolor": FAINT, "linecolor": INK, "ticks": "outside", "zeroline": False, "automargin": True}
-    ends, axes = [], []
-    for name, label, distance in zip((x, y), labels, (10, 12), strict=True):
+    axes = []
+    for name, label in zip((x, y), labels, strict=True):
         numbers = np.append(judged.figure(name)[known], [one.design.number_of(name) for one in marked])
-        ends.append((float(np.nanmin(numbers)), float(np.nanmax(numbers))))
-        log = {"type": "log", "dtick": "D2"} if 0 < ends[-1][0] * _WIDE_RANGE < ends[-1][1] else {}
-        axes.append(axis | {"title": {"text": label, "standoff": distance}} | log)
+        wide = 0 < np.nanmin(numbers) * _WIDE_RANGE < np.nanmax(numbers)
+        axes.append(
+            axis | {"title": {"text": label, "standoff": 12}} | ({"type": "log", "dtick": "D2"} if wide else {})
+        )
     figure.update_layout(
         _LAYOUT,
         height=520,
@@ -447,8 +407,21 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
         separators=". ",
         plot_bgcolor="white",
     )
-    logs = ["type" in axis for axis in axes]
-    _add_marked(figure, marked, (x, y), logs, middle=sum(map(math.log10, ends[0]) if logs[0] else ends[0]) / 2)
+    for number, one in enumerate(marked):
+        place, colour = [one.design.number_of(name) for name in (x, y)], RED if one is marked[-1] else INK
+        if all(map(math.isfinite, place)):
+            figure.add_scatter(
+                x=tables.rounded(place[:1]),
+                y=tables.rounded(place[1:]),
+                mode="markers+text",
+                showlegend=False,
+                cliponaxis=False,
+                text=[f"<b>{_escaped(one.label)}</b>"],
+                textposition=_TEXT_PLACES[number % len(_TEXT_PLACES)],
+                textfont={"color": colour, "size": 12.5},
+                marker={"symbol": _SYMBOLS[number % len(_SYMBOLS)][0], "size": 13, "color": colour},
+                hovertemplate=f"%{{text}}<br>{labels[0]}: %{{x}}<br>{labels[1]}: %{{y}}<extra></extra>",
+            )
     better = " and ".join(
         f"{'less' if sign > 0 else 'more'} {tables.words_of(name)}" for name, sign in ((x, x_sign), (y, y_sign))
     )
@@ -456,41 +429,6 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
     none = "" if judged.feasible.any() else " None meets all constraints: the front is that of all that work."
     more = " Further objectives are left out here." if len(judged.study.objectives) > 2 else ""
     return figure, f"Better is {better}: nothing beats the designs on the green line in both.{more}{none}{thin}"
-
-
-def _add_marked(
-    figure: go.Figure, marked: Sequence[Marked], names: tuple[str, str], logs: Sequence[bool], *, middle: float
-) -> None:
-    """Add marked designs with their labels, which stand towards the ``middle`` of the x axis."""
-    for number, one in enumerate(marked):
-        colour, size = (RED, 15) if one is marked[-1] else (INK, 11)
-        at, label = [one.design.number_of(name) for name in names], _escaped(one.label)
-        if not all(map(math.isfinite, at)):
-            continue
-        places = [math.log10(value) if log else value for value, log in zip(at, logs, strict=True)]
-        left = places[0] > middle
-        marker = {"symbol": _SYMBOLS[number % len(_SYMBOLS)][0], "size": size}
-        figure.add_scatter(
-            x=tables.rounded(at[:1]),
-            y=tables.rounded(at[1:]),
-            mode="markers",
-            showlegend=False,
-            name=label,
-            marker=marker | {"color": colour, "line": {"color": "white", "width": 1.5}},
-            hovertemplate=f"<b>{label}</b><br>{_escaped(tables.label_of(names[0]))}: %{{x}}<br>%{{y}}<extra></extra>",
-        )
-        figure.add_annotation(
-            {"x": places[0], "y": places[1], "ax": -30 if left else 30, "ay": _AWAY[number % len(_AWAY)]},
-            text=f"<b>{label}</b>",
-            xanchor="right" if left else "left",
-            arrowcolor=colour,
-            arrowwidth=1.2,
-            arrowhead=0,
-            standoff=7,
-            bgcolor="rgba(255,255,255,0.88)",
-            borderpad=2,
-            font={"color": colour, "size": 12.5},
-        )
 
 
 def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:

@@ -13,7 +13,6 @@ from itertools import pairwise
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike
 
 from twin.design.figures_of_merit import depths_in_view, field_of
 from twin.design.geometry import Lens, WindowGeometry, directions_of, traced
@@ -22,16 +21,23 @@ from twin.design.report.study_tables import number_text
 from uwlts.errors import DesignError
 from uwlts.model.placement import LaserPose, laser_pose
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
-from uwlts.pages.toolkit import INK, SOFT, new_figure
+from uwlts.pages.toolkit import BLUE, INK, RED, SOFT, new_figure
 
 _BEYOND = 1.06
 """Rays and sheet are drawn so much farther than the volume's far end."""
-_DEPTHS, _PLACES = 201, 21
-"""Points at which the part of the volume is sought that camera and laser reach: depths, and places along the stripe."""
+_DEPTHS = 201
+"""Depths at which the part of the volume is sought that camera and laser reach."""
+_PLACES = 21
+"""The same along the stripe."""
 _BORDER = 41
 """Pixels along each side of the image."""
-_HOUSING_MM, _WALL_MM, _BARE_FRONT_MM, _BARE_HALF_MM = 42.0, 5.0, 12.0, 15.0
-"""The description does not contain the housing: its depth, its wall, and its size where there is no window."""
+# The description does not contain the housing: these only hint at where it is.
+_HOUSING_MM = 42.0
+_WALL_MM = 5.0
+_BARE_FRONT_MM = 12.0
+"""Distance of the front from the pupil where there is no window."""
+_BARE_HALF_MM = 15.0
+"""Half the width of the front there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,173 +256,124 @@ def _border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
 
 # --- the drawing ------------------------------------------------------------------------------------------------------
 
-_RED, _BLUE, _GLASS, _BEHIND, _THIN = "#c22f2f", "#3573b1", "#12a3a8", "#98a3af", "#b9c2cc"
-_WIDTH, _HEIGHT, _PX_PER_INCH = 720.0, 700.0, 96.0
-"""Most room in px for both views together, without labels: what the page's width and a screen's height leave."""
-_LEFT, _BETWEEN, _RIGHT, _TOP, _BOTTOM = 108.0, 102.0, 150.0, 64.0, 44.0
-"""Room in px for the dimensions and labels around the views."""
-_FITS = 1.7
-"""A design behind the chosen one is drawn if the picture need not grow more than this for it."""
-_LETTER_PX = 6.7
-"""Mean width of a letter."""
+_GLASS = "#12a3a8"
+_BEHIND = "#98a3af"
+_THIN = "#b9c2cc"
+_HOUSING = "#aab4c0"
+_VOLUME = "#f1ecd9"
+_VOLUME_END = "#bda96b"
+_INCHES = (11.5, 7.0)
+_MARGIN = 0.1
+"""Room for dimensions around a view, as a share of its larger side."""
+_LABELS = 0.35
+"""Room for labels at the right, as a share of the width."""
+_ARC = 0.4
+"""Radius of the arc at the triangulation angle, as a share of the way from the window to the sheet's crossing."""
 
 
-def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | None = None) -> tuple[Figure, bool]:
-    """Draw a design's views beside each other at one scale, another design dashed behind them where it fits. The
-    figure, and whether the other design is drawn."""
-    for view, behind in zip((side, front), other or (), strict=False):
-        if (_box(view, behind)[1] > _FITS * _box(view)[1].max()).any():
-            other = None
-    behind_side, behind_front = other or (None, None)
-    low, size = _box(side, behind_side)
-    front_low, front_size = _box(front, behind_front)
-    tall = max(size[1], front_size[1])
-    px = 1 / min(_WIDTH / (size[0] + front_size[0]), _HEIGHT / tall)
-    width = size[0] + front_size[0] + (_LEFT + _BETWEEN + _RIGHT) * px
-    height = tall + (_TOP + _BOTTOM) * px
-    figure, (axes,) = new_figure(width / px / _PX_PER_INCH, height / px / _PX_PER_INCH)
-    left, top = low - (_LEFT * px, _TOP * px)
-    axes.set(xlim=(left, left + width), ylim=(top + height, top), aspect="equal")
-    axes.axis("off")
-    _draw_side(_Pen(axes, px, np.zeros(2)), side, behind_side, low, low + size)
-    shift = np.array([low[0] + size[0] + _BETWEEN * px, low[1]]) - front_low
-    _draw_front(_Pen(axes, px, shift), front, behind_front, right=float(front_low[0] + front_size[0]))
-    return figure, other is not None
-
-
-def _box(*views: SideView | FrontView | None) -> tuple[np.ndarray, np.ndarray]:
-    """Least coordinates and size of all points of views."""
-    points = np.concatenate([points for view in views if view is not None for points in view.outlines()])
-    points = points[np.isfinite(points).all(axis=1)]
-    return points.min(axis=0), np.maximum(np.ptp(points, axis=0), 1e-6)
-
-
-@dataclass(frozen=True, eq=False)
-class _Pen:
-    """Draws on axes with points (2,) in mm moved by ``shift``; ``px`` is the size of a pixel in mm."""
-
-    axes: Axes
-    px: float
-    shift: np.ndarray
-
-    def line(self, points: ArrayLike, color: str, linewidth: float, style: str = "-") -> None:
-        """A line through points (N, 2)."""
-        self.axes.plot(*(np.asarray(points) + self.shift).T, style, color=color, linewidth=linewidth, markersize=4.5)
-
-    def area(self, points: np.ndarray, color: str, alpha: float, edge: str = "none") -> None:
-        """A filled outline (N, 2), nothing if a point is not finite."""
-        if len(points) and np.isfinite(points).all():
-            self.axes.fill(*(points + self.shift).T, facecolor=color, edgecolor=edge, alpha=alpha, linewidth=0.8)
-
-    def text(self, at: ArrayLike, words: str, *, turned: float = 0.0, ha: str = "left", halo: bool = False) -> None:
-        """Words beside or about a point."""
-        x, y = np.asarray(at) + self.shift
-        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8} if halo else None
-        self.axes.text(x, y, words, rotation=turned, ha=ha, va="center", rotation_mode="anchor", bbox=box)
-
-    def behind(self, view: SideView | FrontView | None) -> None:
-        """Another design."""
-        for line in view.outlines() if view else ():
-            self.line(line, _BEHIND, 0.8, "--")
-
-    def module(self, module: Module, name: str) -> None:
-        """Housing, window, and name at the housing's back."""
-        self.area(module.housing, "#e6eaef", 0.6, edge="#aab4c0")
-        self.area(module.window, _GLASS, 0.4, edge=_GLASS)
-        back = module.housing[:2].mean(axis=0)
-        ahead = module.housing[2:4].mean(axis=0) - back
-        place = back + 10 * self.px * ahead / max(np.hypot(*ahead), 1e-9)
-        self.text(place, name, turned=90 - math.degrees(math.atan2(ahead[1], ahead[0])), ha="center")
-
-    def dimension(self, a: tuple[float, float], b: tuple[float, float], words: str = "") -> None:
-        """A dimension with its words along it, or beside its end where it is too short for them."""
-        px, vertical = self.px, a[0] == b[0]
-        self.line([a, b], INK, 0.8)
-        for x, y in (a, b):
-            self.line([(x - 4 * px, y + 4 * px), (x + 4 * px, y - 4 * px)], INK, 1.0)
-        if math.dist(a, b) > (_LETTER_PX * len(words) + 6) * px:
-            place = np.mean([a, b], axis=0) - ((9 * px, 0.0) if vertical else (0.0, 9 * px))
-            self.text(place, words, turned=90.0 * vertical, ha="center", halo=vertical)
+def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | None = None) -> Figure:
+    """Draw a design's views beside each other, to scale; another design is dashed behind them where it fits in."""
+    boxes = [_box(view) for view in (side, front)]
+    widths = [float(np.ptp(box[:, 0])) for box in boxes]
+    figure, panels = new_figure(*_INCHES, columns=2, width_ratios=widths)
+    for axes, view, behind, box in zip(panels, (side, front), other or (None, None), boxes, strict=True):
+        for line in behind.outlines() if behind else ():
+            axes.plot(*line.T, "--", color=_BEHIND, linewidth=0.8)
+        axes.set(xlim=box[:, 0], ylim=box[::-1, 1], aspect="equal")
+        axes.grid(visible=False)
+        if isinstance(view, SideView):
+            _draw_side(axes, view)
         else:
-            place = (a[0] + 6 * px, (a[1] + b[1]) / 2) if vertical else (max(a[0], b[0]) + 8 * px, a[1])
-            self.text(place, words, halo=vertical)
+            _draw_front(axes, view)
+    return figure
 
 
-def _draw_side(pen: _Pen, view: SideView, other: SideView | None, low: np.ndarray, high: np.ndarray) -> None:
-    """Draw the side view into the box from ``low`` to ``high``."""
-    px, outer, cross = pen.px, view.outer_mm, float(view.crossing[1])
-    near, far = view.volume[:, 1].tolist()
-    left, right = low[0] - 4 * px, high[0] + 4 * px
-    pen.area(np.array([(left, near), (right, near), (right, far), (left, far)]), "#f1ecd9", 1.0)
-    pen.behind(other)
-    pen.area(np.concatenate([view.edges[0], view.edges[1][::-1]]), _BLUE, 0.1)
+def _box(view: SideView | FrontView) -> np.ndarray:
+    """Least and largest coordinates (2, 2) of a view with a margin, and with room for labels at the right."""
+    points = np.concatenate(view.outlines())
+    points = points[np.isfinite(points).all(axis=1)]
+    margin = _MARGIN * np.ptp(points, axis=0).max()
+    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+    return np.stack([low, high + (_LABELS * (high - low)[0], 0.0)])
+
+
+def _labels_at(axes: Axes) -> float:
+    """Where the room for labels begins."""
+    left, right = axes.get_xlim()
+    return left + (right - left) / (1 + _LABELS)
+
+
+def _fill(axes: Axes, points: np.ndarray, colour: str, alpha: float, edge: str = "none") -> None:
+    """A filled outline (N, 2), nothing if a point is not finite."""
+    if len(points) and np.isfinite(points).all():
+        axes.fill(*points.T, facecolor=colour, edgecolor=edge, alpha=alpha, linewidth=0.8)
+
+
+def _draw_module(axes: Axes, module: Module, name: str) -> None:
+    _fill(axes, module.housing, _HOUSING, 0.3, edge=_HOUSING)
+    _fill(axes, module.window, _GLASS, 0.4, edge=_GLASS)
+    axes.annotate(name, module.housing[:2].mean(axis=0), xytext=(0, 6), textcoords="offset points", ha="center")
+
+
+def _dimension(axes: Axes, start: tuple[float, float], end: tuple[float, float], words: str) -> None:
+    """A dimension line between two places, with words beside its middle."""
+    arrow = {"arrowstyle": "<->", "color": INK, "linewidth": 0.8, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", start, end, arrowprops=arrow)
+    turned, aside = (90, (-7, 0)) if start[0] == end[0] else (0, (0, 7))
+    style = {"textcoords": "offset points", "ha": "center", "va": "center", "rotation": turned}
+    axes.annotate(words, np.mean([start, end], axis=0), xytext=aside, **style)
+
+
+def _draw_side(axes: Axes, view: SideView) -> None:
+    cross, outer, (near, far) = float(view.crossing[1]), view.outer_mm, view.volume[:, 1].tolist()
+    left, top = axes.get_xlim()[0], axes.get_ylim()[1]
+    axes.axhspan(near, far, color=_VOLUME, zorder=0)
     for depth, name in ((near, "near"), (far, "far")):
-        pen.line([(left, depth), (right, depth)], "#bda96b", 0.8)
-        pen.text((high[0] + 8 * px, depth), name)
-    pen.module(view.camera, "camera")
-    pen.module(view.laser, "laser")
-    pen.line([(0, 0), (0, _BEYOND * far)], SOFT, 0.8, "-.")
+        axes.axhline(depth, color=_VOLUME_END, linewidth=0.8, zorder=0)
+        axes.text(_labels_at(axes), depth, f"{name} {number_text(depth - outer)} mm", va="bottom")
+    _fill(axes, np.concatenate([view.edges[0], view.edges[1][::-1]]), BLUE, 0.1)
+    _draw_module(axes, view.camera, "camera")
+    _draw_module(axes, view.laser, "laser")
+    axes.axvline(0.0, color=SOFT, linewidth=0.8, linestyle="-.", zorder=1)
     for edge in view.edges:
-        pen.line(edge, _BLUE, 0.9)
-    pen.line(view.sheet, _RED, 1.0)
-    pen.line(view.volume, _RED, 1.8, ":")
+        axes.plot(*edge.T, color=BLUE, linewidth=0.9)
+    axes.plot(*view.sheet.T, color=RED, linewidth=1.0)
+    axes.plot(*view.volume.T, ":", color=RED, linewidth=1.8)
     if view.in_view is not None:
-        pen.line(view.in_view, _RED, 3.4)
-    pen.line([(-view.pupil_mm / 2, 0), (view.pupil_mm / 2, 0)], INK, 2.6)
-    pen.line([view.laser.origin, view.crossing], INK, 0.0, "o")
+        axes.plot(*view.in_view.T, color=RED, linewidth=3.4)
+    axes.plot([-view.pupil_mm / 2, view.pupil_mm / 2], [0, 0], color=INK, linewidth=2.6)
+    axes.plot(*np.stack([view.laser.origin, view.crossing], axis=1), "o", color=INK, markersize=4.5)
     # An arc between the camera's axis and the sheet, above their crossing.
-    radius = min(74.0 * px, 0.6 * (cross - outer))
-    towards = math.copysign(1.0, float(view.sheet[0, 0] - view.sheet[-1, 0]))
-
-    def on_arc(angles: np.ndarray | float, r: float) -> np.ndarray:
-        return view.crossing + r * np.stack([towards * np.sin(angles), -np.cos(angles)], axis=-1)
-
-    pen.line(on_arc(np.linspace(0, view.angle_rad, 60), radius), INK, 0.8)
+    angles = np.linspace(0, math.copysign(view.angle_rad, float(view.sheet[0, 0] - view.sheet[-1, 0])), 60)
+    arc = view.crossing + _ARC * (cross - outer) * np.stack([np.sin(angles), -np.cos(angles)], axis=1)
+    axes.plot(*arc.T, color=INK, linewidth=0.8)
     words = f"{number_text(math.degrees(view.angle_rad), 3)}°"
-    if 2 * math.sin(view.angle_rad / 2) * (radius - 16 * px) < 40 * px:
-        pen.text(on_arc(view.angle_rad, radius + 8 * px), words, ha="left" if towards > 0 else "right", halo=True)
-    else:
-        pen.text(on_arc(view.angle_rad / 2, radius - 16 * px), words, ha="center", halo=True)
-
-    chain, whole = low[0] - 26 * px, low[0] - 70 * px
-    for depth in (outer, cross):
-        pen.line([(whole, depth), (0, depth)], _THIN, 0.6)
-    pen.dimension((chain, outer), (chain, near), f"near {number_text(near - outer)}")
-    pen.dimension((chain, near), (chain, far), f"volume {number_text(far - near)}")
-    pen.dimension((whole, outer), (whole, cross), f"stand-off {number_text(cross - outer)}")
-    shown, top = float(view.laser.origin[0]), low[1] - 40 * px
-    for x, y in ((0.0, 0.0), view.laser.origin):
-        pen.line([(x, top), (x, y)], _THIN, 0.6)
+    axes.annotate(words, arc[30], xytext=(0, 8), textcoords="offset points", ha="center")
+    shown = float(view.laser.origin[0])
     words = f"baseline {number_text(view.baseline_mm)} mm"
     if abs(view.baseline_mm - shown) > 1e-3 * view.baseline_mm:
         # The baseline does not run square to the sheet.
         words = f"{number_text(shown)} mm of the {words}"
-    pen.dimension((0.0, top), (shown, top), words)
-    # A bar of a round length of about a fifth of the picture.
-    wanted = 0.2 * (high[0] - low[0])
-    decade = 10.0 ** math.floor(math.log10(wanted))
-    length = max(step * decade for step in (1, 2, 5) if step * decade <= wanted)
-    bottom = pen.axes.get_ylim()[0] - 16 * px
-    pen.dimension((low[0], bottom), (low[0] + length, bottom))
-    pen.text((low[0] + length + 8 * px, bottom), f"{number_text(length)} mm")
+    _dimension(axes, (0.0, 0.75 * top), (shown, 0.75 * top), words)
+    _dimension(axes, (0.8 * left, outer), (0.8 * left, cross), f"stand-off {number_text(cross - outer)} mm")
+    for depth in (outer, cross):
+        axes.plot([0.8 * left, 0.0], [depth, depth], color=_THIN, linewidth=0.6)
+    axes.set(title="along the sheet", xlabel="across the stripe / mm", ylabel="depth from the pupil / mm")
 
 
-def _draw_front(pen: _Pen, view: FrontView, other: FrontView | None, *, right: float) -> None:
-    """Draw the front view, with its labels right of ``right``."""
-    px = pen.px
-    pen.behind(other)
-    pen.area(np.concatenate([view.fan[0], view.fan[1][::-1]]), _RED, 0.06)
-    pen.area(view.region, _RED, 0.18)
-    pen.module(view.laser, "laser")
+def _draw_front(axes: Axes, view: FrontView) -> None:
+    right, end = _labels_at(axes), max(edge[-1, 1] for edge in view.fan)
+    _fill(axes, np.concatenate([view.fan[0], view.fan[1][::-1]]), RED, 0.06)
+    _fill(axes, view.region, RED, 0.18)
+    _draw_module(axes, view.laser, "laser")
     for edge in view.fan:
-        pen.line(edge, _RED, 0.9)
-    end = max(edge[-1, 1] for edge in view.fan)
+        axes.plot(*edge.T, color=RED, linewidth=0.9)
     for border in view.borders:
-        pen.line(np.where((border[:, 1:] <= end) & (border[:, :1] <= right + 8 * px), border, np.nan), _BLUE, 0.9)
-    pen.line([view.laser.origin], INK, 0.0, "o")
+        axes.plot(*np.where(border[:, 1:] <= end, border, np.nan).T, color=BLUE, linewidth=0.9)
+    axes.plot(*view.laser.origin, "o", color=INK, markersize=4.5)
     for word, line in zip(("near", "middle", "far"), view.lines, strict=True):
         if np.isfinite(line).all():
-            pen.line(line, _RED, 2.8)
-            x, y = line.max(axis=0)
-            pen.line([(x, y), (right + 8 * px, y)], _THIN, 0.6)
-            pen.text((right + 12 * px, y), f"{word} {number_text(float(np.ptp(line[:, 0])))} mm")
+            axes.plot(*line.T, color=RED, linewidth=2.8)
+            axes.plot([line[:, 0].max(), right], line[:, 1].max() * np.ones(2), color=_THIN, linewidth=0.6)
+            axes.text(right, line[0, 1], f" {word} {number_text(float(np.ptp(line[:, 0])))} mm", va="center")
+    axes.set(title="onto the sheet", xlabel="along the stripe / mm", ylabel="along the laser's axis / mm")

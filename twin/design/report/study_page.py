@@ -19,10 +19,10 @@ from uwlts.pages.toolkit import FigureCollector, render_page, svg_of
 _BEST = 20
 """Designs in the table of the best."""
 _DRAWN = (
-    "Lengths in mm, both views at one scale. Left: along the sheet; the camera's view in blue, the sheet in red, thick "
-    "where the camera sees it within the measuring volume (tinted). Right: onto the sheet; the laser's fan, the "
-    "image's border in blue, and the line's length. Windows and rays are to scale, the housings only hint at where "
-    "they are."
+    "Lengths in mm; near, far and stand-off from the window. Left: along the sheet; the camera's view in blue, the "
+    "sheet in red, thick where the camera sees it within the measuring volume (tinted). Right: onto the sheet; the "
+    "laser's fan, the image's border in blue, and the line's lengths. Windows and rays are to scale, the housings only "
+    "hint at where they are."
 )
 
 
@@ -90,8 +90,7 @@ def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Markup | None, str
     if base is not chosen:
         with suppress(Error):
             other = drawing.views_of(base.sensor, study.medium_of(base.sensor))
-    figure, with_other = drawing.draw(*views, other)
-    return svg_of(figure), _DRAWN + (f" Dashed grey behind: {base.label}." if with_other else "")
+    return svg_of(drawing.draw(*views, other)), _DRAWN + (f" Dashed grey behind: {base.label}." if other else "")
 
 
 def _over_what_is_free(judged: Judged, marked: Sequence[Marked]) -> tuple[str, tuple[Markup, str] | None]:

@@ -3,9 +3,9 @@
 A new one is a module with its description, its formula and its triangles, and an entry of `AnyForm`.
 """
 
+from twin.scene.forms.cables_and_ropes import Cable, Rope
 from twin.scene.forms.flange import Flange
 from twin.scene.forms.head import Head
-from twin.scene.forms.lines import Cable, Rope
 from twin.scene.forms.overgrown_pipe import OvergrownPipe
 from twin.scene.forms.pitted_pipe import PittedPipe
 from twin.scene.forms.seabed import Seabed

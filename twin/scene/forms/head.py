@@ -36,8 +36,12 @@ _FEATURES = np.array(
         (0.000, -0.290, 0.045, 0.032, 0.035),  # chin
     ]
 )
-_ROWS, _COLUMNS, _FINER_IN_FRONT = 900, 640, 0.45
-"""Facets of a head: rows from crown to neck, columns round it, and how much finer than even these are on the face."""
+_ROWS = 900
+"""Rows of facets from crown to neck."""
+_COLUMNS = 640
+"""Facets round the head."""
+_FINER_IN_FRONT = 0.45
+"""How much finer than even these are on the face."""
 
 
 class Head(FreeForm):

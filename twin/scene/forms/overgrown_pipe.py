@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.scene.forms.triangles import require_few, step_of, tube, waves
+from twin.scene.forms.triangles import finer_in_front, require_few, step_of, tube, waves
 from twin.scene.placed import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
@@ -13,8 +13,10 @@ _SAG_MM = 0.04
 """Largest distance of the facets from the surface; growth itself is not known as well."""
 _GROWN_DEG = 60.0
 """Barnacles lie within this angle of the side that faces the sensor."""
-_SHORTEST, _LONGEST = 0.5, 2.0
-"""Wavelengths of the layer's waves over its ``patch_mm``."""
+_SHORTEST = 0.5
+"""Shortest wavelength of the layer's waves over its ``patch_mm``."""
+_LONGEST = 2.0
+"""The longest one."""
 
 
 class OvergrownPipe(FreeForm):
@@ -59,9 +61,7 @@ class OvergrownPipe(FreeForm):
         step = step_of(_SAG_MM, 1 / radius + wavy + shell)
         plain = step_of(_SAG_MM, 1 / radius + wavy)
         reach = np.radians(_GROWN_DEG) + 0.5 * self.barnacle_diameter_mm / (self.diameter_mm / 2)
-        front = np.linspace(-reach, reach, int(np.ceil(2 * reach * radius / step)) + 1)
-        back = np.linspace(reach, 2 * np.pi - reach, int(np.ceil(2 * (np.pi - reach) * radius / plain)) + 1)
-        around = np.concatenate([front, back[1:-1]])
+        around = finer_in_front(reach, radius, step=step, plain=plain)
         rings = int(np.ceil(self.length_mm / step)) + 1
         require_few(rings * len(around), step_mm=step, advice="make its barnacles wider or lower, or the pipe smaller")
         x = np.linspace(-0.5, 0.5, rings) * self.length_mm

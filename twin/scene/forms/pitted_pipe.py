@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.scene.forms.triangles import require_few, step_of, tube
+from twin.scene.forms.triangles import finer_in_front, require_few, step_of, tube
 from twin.scene.placed import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
@@ -56,9 +56,7 @@ class PittedPipe(FreeForm):
         step = step_of(_PIT_SAG_MM, 1 / radius + 8 * self.pit_depth_mm / (0.5 * self.pit_diameter_mm) ** 2)
         plain = step_of(_PIT_SAG_MM, 1 / radius)
         reach = np.radians(_PITTED_DEG) + 0.5 * self.pit_diameter_mm / radius if self.pits else 0.0
-        front = np.linspace(-reach, reach, int(np.ceil(2 * reach * radius / step)) + 1)
-        back = np.linspace(reach, 2 * np.pi - reach, int(np.ceil(2 * (np.pi - reach) * radius / plain)) + 1)
-        around = np.concatenate([front, back[1:-1]])
+        around = finer_in_front(reach, radius, step=step, plain=plain)
         rings = int(np.ceil(self.length_mm / (step if self.pits else self.length_mm))) + 1
         advice = "make its pits wider or flatter, or the pipe smaller"
         require_few(rings * len(around), step_mm=step, advice=advice)

@@ -11,8 +11,10 @@ from uwlts.model.sensor import NotNegative, Positive
 
 _SAG_MM = 0.02
 """Largest distance of the sediment's facets from the surface; that of the stones' facets is twice as large."""
-_SHORTEST, _LONGEST = 0.2, 1.0
-"""Wavelengths of the roughness over the ripples' pitch."""
+_SHORTEST = 0.2
+"""Shortest wavelength of the roughness over the ripples' pitch."""
+_LONGEST = 1.0
+"""The longest one."""
 
 
 class Seabed(FreeForm):

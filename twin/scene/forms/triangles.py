@@ -37,6 +37,13 @@ def tube(x: np.ndarray, around: np.ndarray, radius: np.ndarray) -> tuple[np.ndar
     return np.stack(places, axis=-1).reshape(-1, 3), faces
 
 
+def finer_in_front(reach: float, radius: float, *, step: float, plain: float) -> np.ndarray:
+    """Angles (M,) from -z towards y round a tube: steps of ``step`` mm within ``reach`` of -z, of ``plain`` behind."""
+    front = np.linspace(-reach, reach, int(np.ceil(2 * reach * radius / step)) + 1)
+    back = np.linspace(reach, 2 * np.pi - reach, int(np.ceil(2 * (np.pi - reach) * radius / plain)) + 1)
+    return np.concatenate([front, back[1:-1]])
+
+
 def grid_faces(shape: tuple[int, int]) -> np.ndarray:
     """Triangles (F, 3) between the vertices of a grid (rows, columns), numbered row by row."""
     corner = np.arange(shape[0] * shape[1]).reshape(shape)

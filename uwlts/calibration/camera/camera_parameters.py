@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from uwlts.errors import DescriptionError
 from uwlts.model.calibration import CameraModel
 from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.sensor import Camera, Distortion
@@ -26,9 +27,9 @@ class CameraOptions:
     def __post_init__(self) -> None:
         unknown = set(self.distortion) - set(DISTORTION)
         if unknown or len(set(self.distortion)) < len(self.distortion):
-            raise ValueError(f"distortion takes each of {', '.join(DISTORTION)} once, not {self.distortion}")
+            raise DescriptionError(f"distortion takes each of {', '.join(DISTORTION)} once, not {self.distortion}")
         if self.soft_limit_px is not None and not self.soft_limit_px > 0:
-            raise ValueError(f"soft_limit_px must be positive, not {self.soft_limit_px}")
+            raise DescriptionError(f"soft_limit_px must be positive, not {self.soft_limit_px}")
 
     def described(self, camera: Camera) -> "CameraOptions":
         """These options, with the pixels' described shape where it is not estimated."""

@@ -17,10 +17,11 @@ import numpy as np
 from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
-from uwlts.errors import CalibrationError
+from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.fitting.least_squares import MAD_TO_STD
 from uwlts.model.calibration import CameraModel
 from uwlts.model.sensor import Uncertainty
+from uwlts.runtime.progress import ProgressListener, unheard
 
 BESIDES = (("p1", "p2"), ("k3",), ("p1", "p2", "k3"))
 """Coefficients that lenses are tried with besides k1 and k2."""
@@ -32,16 +33,26 @@ _RATIONAL = tuple((*_USUAL, *names) for names in RATIONAL_BESIDES)
 _FOLDS = 5
 _WORSE = 1.0  # standard errors of the mean difference of squares; below, a model counts as good as the best
 _LEAST_GAIN = 0.01  # of the mean square; less is of no use, however certain
-_SOFT, _OUTLIER = 2.0, 5.0  # robust standard deviations from where a point counts less, and not at all
+_SOFT = 2.0  # robust standard deviations from where a point counts less
+_OUTLIER = 5.0  # robust standard deviations from where a point does not count
 _LARGEST_REJECTED = 0.3  # of an image's points; more are another board, or another pose
 _LEAST_SCATTER_PX = 1e-6  # of points; drawn ones may have none
 _MOVED = 3.0  # standard uncertainties by which one image may move a parameter
 HALVES_APART = 4.0
 """Standard uncertainties that a parameter from one half of the images may differ from that by the other."""
-_FEWEST_IMAGES, _LARGEST_LEFT_OUT = 5, 0.2
+_FEWEST_IMAGES = 5  # that are left: of fewer the influence of one says little
+_LARGEST_LEFT_OUT = 0.2  # share of the images: where more move a parameter, it is not clear which are right
 
-Distortion = Literal["auto"] | tuple[str, ...]
+Coefficient = Literal["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]
+Distortion = Literal["auto"] | tuple[Coefficient, ...]
 Pixels = Literal["auto", "square", "free"]
+
+
+def require_coefficients(distortion: Distortion) -> None:
+    """Raise DescriptionError unless distortion is auto alone, or each coefficient at most once."""
+    if distortion != "auto" and (not set(distortion) <= set(DISTORTION) or len(set(distortion)) < len(distortion)):
+        given = distortion if isinstance(distortion, str) else " ".join(distortion)
+        raise DescriptionError(f"`distortion` {given}: expected auto alone, or each of {', '.join(DISTORTION)} once")
 
 
 @dataclass(frozen=True)
@@ -162,7 +173,7 @@ def calibrate_lens(
     approaching: bool = True,
     choice: LensChoice = LensChoice(),
     circle_diameter_mm: float | None = None,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> LensCalibration:
     """Calibrate a lens from images of a flat target.
 

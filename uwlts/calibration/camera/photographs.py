@@ -1,19 +1,28 @@
 """A camera calibrated from a folder of photographs of a target, without a laser."""
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from uwlts.calibration.camera.lens import Distortion, LensCalibration, LensChoice, Pixels, calibrate_lens
+from uwlts.calibration.camera.lens import (
+    Distortion,
+    LensCalibration,
+    LensChoice,
+    Pixels,
+    calibrate_lens,
+    require_coefficients,
+)
 from uwlts.calibration.camera.target_images import TargetImage
 from uwlts.errors import CalibrationError, DescriptionError, ImageError, TargetError
 from uwlts.files.reading import is_regular_file
 from uwlts.files.writing import written_aside
+from uwlts.model.brief import Brief
 from uwlts.model.library import read_table
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.image_file import read_image
 from uwlts.storage.import_ import DESCRIPTION_NAME, checked_channel, image_files, one_channel
 from uwlts.targets import Target, parse_target
@@ -40,8 +49,8 @@ class Photograph:
         return float(np.sqrt(np.mean(np.sum(self.misses_px**2, axis=1))))
 
 
-@dataclass(frozen=True, eq=False)
-class CameraCalibration:
+@dataclass(frozen=True, eq=False, repr=False)
+class CameraCalibration(Brief):
     """A camera calibrated from photographs.
 
     Attributes
@@ -58,6 +67,39 @@ class CameraCalibration:
     photographs: list[Photograph]
     warnings: list[str]
 
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the camera as YAML in the form of ROS CameraInfo, which `uwlts import` reads as ``intrinsics``.
+
+        OutputError if the file exists and ``overwrite`` is not given, or it cannot be written.
+        """
+        lens, model = self.lens, self.lens.solution.model
+
+        def matrix(rows: list[list[float]]) -> dict[str, object]:
+            return {"rows": len(rows), "cols": len(rows[0]), "data": [float(value) for row in rows for value in row]}
+
+        known = model.distortion
+        projection = np.column_stack([model.matrix(), np.zeros(3)]).tolist()
+        content = {
+            "image_width": model.width_px,
+            "image_height": model.height_px,
+            "camera_name": self.folder.resolve().name,
+            "camera_matrix": matrix(model.matrix().tolist()),
+            "distortion_model": "rational_polynomial" if known.is_rational() else "plumb_bob",
+            "distortion_coefficients": matrix([list(known.used().values())]),
+            "rectification_matrix": matrix(np.eye(3).tolist()),
+            "projection_matrix": matrix(projection),
+            "estimated": {
+                "parameters": list(lens.solution.parameters),
+                "standard_uncertainties": [float(value) for value in lens.std().values()],
+                "covariance": lens.covariance.tolist(),
+                "rms_px": lens.solution.rms_px(),
+                "images": [each.name for each in self.photographs if each.reason is None],
+                "left_out": {each.name: each.reason for each in self.photographs if each.reason is not None},
+            },
+        }
+        with written_aside(path, overwrite=overwrite) as aside:
+            aside.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+
 
 def calibrate_camera(
     folder: str | Path,
@@ -66,26 +108,26 @@ def calibrate_camera(
     channel: str | None = None,
     distortion: Distortion = "auto",
     pixels: Pixels = "auto",
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: ProgressListener = unheard,
 ) -> CameraCalibration:
-    """Calibrate a camera from photographs of a target, held differently in each.
+    """Calibrate a camera alone, from photographs of a target that is held differently in each.
 
     Parameters
     ----------
     folder : str or Path
-        PNG, TIFF, BMP or JPEG images, in it or in folders below it. Those that do not show the target are named with
-        the reason.
+        Folder of PNG, TIFF, BMP or JPEG images, in it or in folders below it. Those that do not show the target are
+        named with the reason.
     target : str or Path, optional
-        TOML file of the target's description, or with a table [target]; target.toml or import.toml in the folder
-        unless given.
+        Description of the target (TOML), perhaps in a table [target]; target.toml or import.toml in the folder unless
+        given.
     channel : str, optional
         Channel of colour images, or a formula of channels; their luminance unless given.
     distortion : "auto" or tuple of str
-        Coefficients among k1 to k6, p1 and p2 to estimate; auto: those that predict images left out best.
+        Distortion coefficients to estimate; auto: those that predict images left out best.
     pixels : {"auto", "square", "free"}
-        Whether one focal length or two are estimated.
+        Whether pixels are square or free to be not; auto: as distortion.
     progress : callable, optional
-        Called with the name of the stage, the number of images or models done, and the number in all.
+        Called with the number of images or models done, the number in all, and the name of the stage.
 
     Returns
     -------
@@ -101,9 +143,9 @@ def calibrate_camera(
     CalibrationError
         The target is found in fewer than four images, or these do not determine a camera.
     """
+    require_coefficients(distortion)
     folder = Path(folder)
     described = _described_target(folder, target)
-    report = progress or (lambda stage, done, total: None)
     names = image_files(folder)
     try:
         wanted = checked_channel(channel or "grey")
@@ -119,7 +161,7 @@ def calibrate_camera(
             seen[number] = (raw.shape[1], raw.shape[0]), TargetImage(view.points_mm, view.pixels)
         except (ImageError, TargetError, CalibrationError) as error:
             reasons[name] = str(error).replace(f"{folder / name}", "it").removeprefix(f"{name} ")
-        report("target", number + 1, len(names))
+        progress(number + 1, len(names), "target")
     # An image of another camera is the odd one out.
     size = Counter(own for own, _ in seen.values()).most_common(1)[0][0] if seen else (0, 0)
     for number, ((width, height), _) in list(seen.items()):
@@ -140,7 +182,7 @@ def calibrate_camera(
         height_px=size[1],
         choice=LensChoice(distortion, pixels),
         circle_diameter_mm=described.circle_diameter_mm,
-        progress=lambda done, total: report("lens", done, total),
+        progress=partial(progress, stage="lens"),
     )
     for place, image, misses, moved in zip(lens.used, lens.images, lens.solution.residuals_px, lens.moved, strict=True):
         number = places[place]
@@ -170,37 +212,3 @@ def _described_target(folder: Path, path: str | Path | None) -> Target:
     if not isinstance(inner, dict):
         raise DescriptionError(f"{there}: target is {inner!r}; expected a table")
     return parse_target(inner)
-
-
-def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool = False) -> None:
-    """Write a camera as YAML in the form of ROS CameraInfo, which `uwlts import` reads as ``intrinsics``.
-
-    Raises OutputError: the file exists and ``overwrite`` is not given, or cannot be written.
-    """
-    lens, model = camera.lens, camera.lens.solution.model
-
-    def matrix(rows: list[list[float]]) -> dict[str, object]:
-        return {"rows": len(rows), "cols": len(rows[0]), "data": [float(value) for row in rows for value in row]}
-
-    known = model.distortion
-    projection = np.column_stack([model.matrix(), np.zeros(3)]).tolist()
-    content = {
-        "image_width": model.width_px,
-        "image_height": model.height_px,
-        "camera_name": camera.folder.resolve().name,
-        "camera_matrix": matrix(model.matrix().tolist()),
-        "distortion_model": "rational_polynomial" if known.is_rational() else "plumb_bob",
-        "distortion_coefficients": matrix([list(known.used().values())]),
-        "rectification_matrix": matrix(np.eye(3).tolist()),
-        "projection_matrix": matrix(projection),
-        "estimated": {
-            "parameters": list(lens.solution.parameters),
-            "standard_uncertainties": [float(value) for value in lens.std().values()],
-            "covariance": lens.covariance.tolist(),
-            "rms_px": lens.solution.rms_px(),
-            "images": [each.name for each in camera.photographs if each.reason is None],
-            "left_out": {each.name: each.reason for each in camera.photographs if each.reason is not None},
-        },
-    }
-    with written_aside(path, overwrite=overwrite) as aside:
-        aside.write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")

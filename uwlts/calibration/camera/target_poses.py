@@ -8,6 +8,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from pydantic import JsonValue
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
 from uwlts.calibration.camera.target_images import Placement, TargetImage, observe, placements, pose_values
@@ -180,6 +181,26 @@ class CameraSolution:
     def largest_bias_px(self) -> float | None:
         """Longest offset taken out, over all circles."""
         return None if self.bias_px is None else float(np.max(np.linalg.norm(np.vstack(self.bias_px), axis=1)))
+
+    def figures(self) -> dict[str, JsonValue]:
+        """Residuals, standard deviations and covariance as files hold them; None for what is missing."""
+        direction, tilt, tilt_std = self.stage_direction, self.stage_tilt_rad, self.stage_tilt_std_rad
+        return {
+            "images": len(self.residuals_px),
+            "points": sum(map(len, self.residuals_px)),
+            "rms_px": self.rms_px(),
+            "sigma_px": self.sigma_px,
+            "image_rms_px": self.image_rms_px().tolist(),
+            "std": {**self.std()},
+            "parameters": list(self.parameters),
+            "covariance": self.covariance.tolist(),
+            "stage_direction": None if direction is None else direction.tolist(),
+            "stage_tilt_deg": None if tilt is None else float(np.degrees(tilt)),
+            "stage_tilt_std_deg": None if tilt_std is None else float(np.degrees(tilt_std)),
+            "largest_circle_bias_px": self.largest_bias_px(),
+            "rounds": self.rounds,
+            "stopped": self.stopped,
+        }
 
 
 def solve_camera(
@@ -380,3 +401,45 @@ def stage_direction(target_poses: np.ndarray, stage_mm: np.ndarray) -> np.ndarra
     velocity = -(moved @ target_poses[:, :3, 3]) / (moved @ moved)
     speed = float(np.linalg.norm(velocity))
     return velocity / speed if abs(speed - 1) < 0.05 else None  # scales of stage and target agree better than that
+
+
+_LEAST_TURN = np.radians(20)
+"""Angle between a direction and its description from which images may be turned: descriptions are rough."""
+_MUCH_CLOSER = 1 / 3
+"""Share of that angle below which a direction lies where turned images would put it."""
+_TURNS = {
+    "turned by 180 deg": np.array([-1.0, -1.0, 1.0]),
+    "mirrored top to bottom": np.array([1.0, -1.0, 1.0]),
+    "mirrored left to right": np.array([-1.0, 1.0, 1.0]),
+}
+
+
+def turned_like(found: np.ndarray, described: np.ndarray, *, either_way: bool = False) -> str:
+    """How images are turned that explain a unit direction (3,) against the one described, in words; empty if none do.
+
+    Camera frame. ``either_way`` is for normals, of which the opposite is the same plane's.
+    """
+
+    def angle(other: np.ndarray) -> float:
+        cosine = float(found @ other)
+        return float(np.arccos(np.clip(abs(cosine) if either_way else cosine, -1.0, 1.0)))
+
+    off = angle(described)
+    if off < _LEAST_TURN:
+        return ""
+    return " or ".join(how for how, flip in _TURNS.items() if angle(flip * described) < _MUCH_CLOSER * off)
+
+
+def refuse_turned_travel(found: np.ndarray | None, described: np.ndarray) -> None:
+    """Refuse a stage that moves the sensor (3,) as in turned images, against its described direction (3,).
+
+    A board that looks the same in a mirror shows nothing of that itself. Both in the camera frame; None where poses do
+    not follow a stage. Raises CalibrationError.
+    """
+    described = described / np.linalg.norm(described)
+    if found is not None and (how := turned_like(found, described)):
+        raise CalibrationError(
+            f"by the target's poses the stage moves the sensor along {np.round(found, 2).tolist()} (camera: right, "
+            f"down, ahead), by stage_direction along {np.round(described, 2).tolist()}, as it is where the images are "
+            f"{how}: turn the images back, or correct stage_direction"
+        )

@@ -12,15 +12,15 @@ from uwlts.calibration.camera.target_images import Placement, TargetImage, obser
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
 from uwlts.calibration.sequential.sheet_fit import fit_sheet, points_on_target
 from uwlts.errors import CalibrationError, RangeError
-from uwlts.model.calibration import CameraModel
+from uwlts.model.calibration import CameraModel, rigid_transform
 from uwlts.model.parameter_keys import LensParameter
 from uwlts.model.placement import laser_pose
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics.camera import directions, project
 from uwlts.targets import Target, TargetView
 
-# A residual this many times that of the others, and this much beyond what noise alone may do, contradicts them.
-_CONTRADICTION, _ALLOWANCE_PX = 3.0, 0.1
+_CONTRADICTION = 3.0  # times the residual of the other images from which one contradicts them
+_ALLOWANCE_PX = 0.1  # what noise alone may add to that
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +64,7 @@ def pose_of(view: TargetView, camera: CameraModel) -> np.ndarray:
     found, rotation, translation = cv2.solvePnP(view.points_mm, view.pixels, camera.matrix(), camera.coefficients())
     if not found or not np.isfinite(translation).all():
         raise CalibrationError("no pose of the target explains its image: is it the described target?")
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(rotation)[0], translation[:, 0]
-    return pose
+    return rigid_transform(cv2.Rodrigues(rotation)[0], translation[:, 0])
 
 
 def judge_residual(before: CameraSolution | None, after: CameraSolution) -> tuple[str, ...]:
@@ -161,7 +159,8 @@ def tilts_rad(pose: np.ndarray) -> tuple[float, float]:
 
 
 TILT_RAD = np.radians(25.0)  # easily reached by hand, and printed circles stay detectable
-_PLACES, _DEPTHS = (0.2, 0.5, 0.8), (0.1, 0.5, 0.9)  # shares of the image and of the working range, inside both
+_PLACES = (0.2, 0.5, 0.8)  # shares of the image's sides, inside it
+_DEPTHS = (0.1, 0.5, 0.9)  # shares of the working range, inside it
 _MARGIN_PX = 10.0  # of the image, in which circles would be cut
 _SAMPLE = 100  # points of a candidate that stand for all: more repeat what these say
 
@@ -214,10 +213,9 @@ def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) 
     for depth, x, y, tilt in product(_DEPTHS, _PLACES, _PLACES, tilts):
         distance = nearest + depth * (farthest - nearest)
         ray = directions(camera, np.array([[x * camera.width_px, y * camera.height_px]]))[0]
-        pose = np.eye(4)
-        pose[:3, :3] = cv2.Rodrigues(tilt)[0] @ spin
-        pose[:3, 3] = ray / ray[2] * distance - pose[:3, :3] @ middle
-        rotation = cv2.Rodrigues(pose[:3, :3])[0]
+        turn = cv2.Rodrigues(tilt)[0] @ spin
+        pose = rigid_transform(turn, ray / ray[2] * distance - turn @ middle)
+        rotation = cv2.Rodrigues(turn)[0]
         pixels = cv2.projectPoints(points, rotation, pose[:3, 3], camera.matrix(), camera.coefficients())[0][:, 0]
         ahead = points @ pose[2, :3] + pose[2, 3] > 0
         inside = ahead & np.all((pixels > _MARGIN_PX) & (pixels < largest), axis=1)
@@ -228,8 +226,8 @@ def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) 
     return found
 
 
-# How well points are usually found, used until residuals are known. Sharp circles do better, in reality too.
-_USUAL_SIGMA_PX, _LEAST_SIGMA_PX = 0.1, 0.02
+_USUAL_SIGMA_PX = 0.1  # how well points are usually found, used until residuals are known
+_LEAST_SIGMA_PX = 0.02  # how well points are found at best: sharp circles are, in reality too
 # What is known of a described lens before anything is seen, as standard deviations: shares of f and of the image's
 # side, and plain coefficients.
 _FOCAL: tuple[LensParameter, ...] = (LensParameter.F, LensParameter.FX, LensParameter.FY)
@@ -241,12 +239,13 @@ _PRIOR = dict.fromkeys((*_FOCAL, *_CENTRE), 0.05) | {
     LensParameter.P2: 0.02,
     LensParameter.K3: 10.0,
 }
-# A fully uncovered image counts as a factor of 55 in a standard deviation, a side never tilted as one of 1.6.
-_COVERAGE_WEIGHT, _SPREAD_WEIGHT = 4.0, 0.5
+_COVERAGE_WEIGHT = 4.0  # logarithm of the factor in a standard deviation, 55, as which a fully uncovered image counts
+_SPREAD_WEIGHT = 0.5  # the same, 1.6, for a side of the target that was never tilted
 _SIDES = ("right side", "left side", "lower side", "upper side")
 _BEYOND = 0.05  # decides between poses once everything wanted is reached
-# What a hand can keep: closer to the advised pose nothing is said.
-_SAME_TILT_RAD, _SAME_PLACE, _SAME_DISTANCE = np.radians(9.0), 0.15, 0.1
+_SAME_TILT_RAD = np.radians(9.0)  # tilt against the advised pose that a hand can keep: below, nothing is said
+_SAME_PLACE = 0.15  # the same of the target's middle, as a share of the image's sides
+_SAME_DISTANCE = 0.1  # the same of the distance, as a share of it
 
 
 @dataclass(frozen=True)
@@ -311,11 +310,6 @@ class State:
         """As expected with one more image that shows the target at a pose ``T_camera_target`` (4, 4)."""
         information = information_of(view.points_mm, view.pixels, pose, self.camera, self.setting)
         return self.with_image(pose, view.pixels, information)
-
-    @property
-    def enough(self) -> bool:
-        """Whether everything wanted is reached."""
-        return not missing(self)
 
 
 @dataclass(frozen=True, eq=False)

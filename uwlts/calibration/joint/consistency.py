@@ -7,8 +7,7 @@ from typing import assert_never
 import numpy as np
 from scipy.stats import chi2
 
-from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence
-from uwlts.calibration.joint.noise import outliers
+from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence, outliers
 from uwlts.calibration.joint.residuals import SHIFT, TARGET, Residuals, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
 from uwlts.fitting.least_squares import MAD_TO_STD
@@ -56,7 +55,7 @@ def format_deviation(key: ParameterKey, value: float, known: float, std: float, 
                 "standard uncertainties off): check the target's spacing and the stage's scale"
             )
         case MediumIndex():
-            check = "the medium and the step's height in the captures, or --index"
+            check = "the medium and the step's height in the captures, or `index`"
         case StepHeight():
             check = "which standard it is"
             if value > known:
@@ -73,25 +72,36 @@ def format_deviation(key: ParameterKey, value: float, known: float, std: float, 
     )
 
 
-_LARGEST_TARGET_PX, _LARGEST_STRIPE_PX = 0.5, 1.0
-"""Scatter beyond which target points or stripes were misdetected or contradict each other, whatever the image."""
-_FEWEST_VALUES = 20  # a median of fewer is no scatter
-_OVER_OTHERS, _OVER_OTHERS_PX = 3.0, 0.15  # sharpness and light differ from image to image, but not so much
-_OVER_NOISE = 2.5  # fine structure underestimates noise that neighbours share, by up to two
-_WAVES_DOUBTFUL, _WAVES_WRONG = 8.0, 20.0
-"""Lines that err together; the filter that finds the stripe, and speckle, join two to four."""
-_OUTLIER_SHARE = 0.2  # outliers are few; more are another structure in the images
-_DOUBTFUL, _WRONG = 4.0, 6.0
-"""Standard uncertainties from what was known before. Design values are rough, so small deviations are only doubts."""
-_LEAST_GAIN, _MUCH_GAINED, _FEWEST_GAINED = 0.02, 0.5, 6
-"""Information gained over the prior, as a share of its standard uncertainty: the least that is distinguished from
-rounding, the least that makes a parameter count for Birge's ratio, and how many parameters that ratio needs."""
+_LARGEST_TARGET_PX = 0.5
+"""Scatter beyond which target points were misdetected or contradict each other, whatever the image."""
+_LARGEST_STRIPE_PX = 1.0  # the same for stripes
+_FEWEST_VALUES = 20  # residuals of an image: a median of fewer is no scatter
+_OVER_OTHERS = 3.0  # times the scatter of other images: sharpness and light differ from image to image, but not so much
+_OVER_OTHERS_PX = 0.15  # the same in px, where the others hardly scatter; the larger of both counts
+_OVER_NOISE = 2.5
+"""Times the noise by an image's fine structure, which is up to twice too small where neighbours share it."""
+_WAVES_DOUBTFUL = 8.0
+"""Lines that err together from which there is a doubt: the filter that finds the stripe, and speckle, join 2 to 4."""
+_WAVES_WRONG = 20.0  # lines that err together from which the model lacks something
+_OUTLIER_SHARE = 0.2  # share of outliers: they are few, more are another structure in the images
+_DOUBTFUL = 4.0
+"""Standard uncertainties from what was known before, beyond which lies one normal error in 16,000: a doubt."""
+_WRONG = 6.0
+"""The same beyond which it is a contradiction: design values are rough, so that smaller deviations are only doubts."""
+_LEAST_GAIN = 0.02  # information gained, as a share of the prior's standard uncertainty, that rounding does not make
+_MUCH_GAINED = 0.5  # the same from which a parameter counts for Birge's ratio
+_FALSE_ALARM = 1e-3  # probability that Birge's ratio takes what is known for less certain where it is as stated
+_FEWEST_GAINED = 6  # parameters that Birge's ratio needs: by six it is known to 30 %
 _ROUGH_SIZE = 2e-3  # share by which sizes that are stated without an uncertainty are usually off
 _ALIKE = 3.0  # standard uncertainties within which sizes are off by the same share
-_FOCAL_DOUBTFUL, _FOCAL_WRONG = 0.08, 0.2
-"""Shares of the focal length; a lens's name rounds it, and focusing near lengthens it."""
-_POSITIONS_WRONG, _FEWEST_POSITIONS = 3.0, 4  # the rms of four positions exceeds three sigma once in a million
-_MOST_NAMED, _MOST_SAID = 4, 6  # for a message that can be read
+_FOCAL_DOUBTFUL = 0.08
+"""Share of the focal length that is a doubt: a lens's name rounds it, and focusing near lengthens it."""
+_FOCAL_WRONG = 0.2  # the same that is a contradiction
+_POSITIONS_WRONG = 3.0
+"""Rms of the stage's positions over their stated uncertainty: that of four exceeds it once in a million."""
+_FEWEST_POSITIONS = 4
+_MOST_NAMED = 4  # findings of a kind that a message names
+_MOST_SAID = 6  # findings in a message that can be read
 
 
 @dataclass(frozen=True)
@@ -159,7 +169,7 @@ def findings(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) 
         for residuals in parts
         if len(residuals.values) >= _FEWEST_VALUES
     ]
-    known = [*_of_priors(result), *_of_stage(result, evidence, sensor)]
+    known = [*((each.wrong(), each.words()) for each in deviations(result)), *_of_stage(result, evidence, sensor)]
     lens = [*_of_lens(result, sensor)]
     earlier = [] if any(wrong for wrong, _ in known + lens) else [*_of_earlier(result)]
     unfit, noisy = _of_images(images)
@@ -217,7 +227,7 @@ def understated(result: Estimate) -> float:
             if gain > _MUCH_GAINED and not isinstance(each.key, TargetParameter)
         ]
     )
-    if len(squares) < _FEWEST_GAINED or squares.sum() < chi2.ppf(0.999, len(squares)):
+    if len(squares) < _FEWEST_GAINED or squares.sum() < chi2.isf(_FALSE_ALARM, len(squares)):
         return 1.0
     return float(np.sqrt(squares.mean()))
 
@@ -278,7 +288,7 @@ class SizeDeviation:
         return (
             f"{self.scan}: {self.quantity.words} found {found}, described as {described} ({self.off_mm:+.3f} mm or "
             f"{self.sigmas():.1f} standard uncertainties off): most likely it is described wrongly, check the artefact"
-            + (", or give --unknown-sizes" if self.known() else "; it was estimated")
+            + (", or give `unknown_sizes`" if self.known() else "; it was estimated")
         )
 
 
@@ -314,11 +324,6 @@ def wrong_sizes(deviations: Sequence[SizeDeviation], *, least: float = _WRONG) -
     if len(known) > 1 and np.all(np.abs(share - common) < _ALIKE * std):
         words.append(f"all known sizes are off by the same {100 * common:+.2f} %: check the target's spacings as well")
     return words
-
-
-def _of_priors(result: Estimate) -> _Found:
-    for each in deviations(result):
-        yield each.wrong(), each.words()
 
 
 def _of_earlier(result: Estimate) -> _Found:

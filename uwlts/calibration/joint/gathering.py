@@ -8,16 +8,8 @@ from pydantic import JsonValue
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.target_images import Placement, placements
-from uwlts.calibration.capture_evidence import (
-    AirEvidence,
-    Progress,
-    StepEvidence,
-    air_evidence,
-    no_stripe_in,
-    step_evidence,
-)
-from uwlts.calibration.joint.derivatives import SHEET
-from uwlts.calibration.joint.earlier_estimate import Prior, ViewMedium, window_values
+from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence, air_evidence, no_stripe_in, step_evidence
+from uwlts.calibration.joint.parameters import SHEET, Prior, ViewMedium, window_values
 from uwlts.calibration.joint.residuals import BENDS, SHIFT, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, common_sensor, sources_of
@@ -34,10 +26,12 @@ from uwlts.model.parameter_keys import (
 )
 from uwlts.model.sensor import Medium, Sensor, Uncertainty
 from uwlts.optics.brightness import sharp_lines, slopes_of_brightness
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeSettings, find_stripes
 
-_FEWEST_KEPT, _MOST_LEFT_OUT = 3, 0.3  # images; where more contradict the rest, it is not clear which are right
+_FEWEST_KEPT = 3  # images that are left where some contradict the others
+_MOST_LEFT_OUT = 0.3  # share of the images: where more contradict the rest, it is not clear which are right
 Scanned = SphereStandard | PlaneStandard | PipeStandard
 
 
@@ -145,7 +139,7 @@ def gather_jointly(
     scans: Sequence[Capture] = (),
     *,
     options: CalibrationOptions,
-    progress: Progress | None = None,
+    progress: ProgressListener = unheard,
 ) -> Gathered:
     """Find the target, the stripes on it and those on steps and scanned surfaces in all images.
 

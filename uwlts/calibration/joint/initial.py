@@ -8,12 +8,10 @@ import cv2
 import numpy as np
 
 from uwlts.calibration.camera.camera_parameters import DISTORTION, Intrinsics
-from uwlts.calibration.camera.image_turns import refuse_turned_travel
 from uwlts.calibration.camera.target_images import Placement
-from uwlts.calibration.camera.target_poses import placement_pose, solve_camera, stage_direction
-from uwlts.calibration.joint.derivatives import DescribedSheet
-from uwlts.calibration.joint.earlier_estimate import Parameters, Prior, ViewMedium
+from uwlts.calibration.camera.target_poses import placement_pose, refuse_turned_travel, solve_camera, stage_direction
 from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series, added_tangential
+from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.residuals import StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import (
     LEAST_SHARE,
@@ -42,12 +40,12 @@ from uwlts.optics.camera import directions
 from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.optics.window import trace_window
 
-_LARGEST_MISFIT_PX, _LARGEST_MISFIT = 1.5, 1e-3
-"""Pixels, or a share of the focal length: what the stage's errors leave in the images that a start is found from."""
-# As robust as a median can be; what is left out here is judged again with the final sheet.
+_LARGEST_MISFIT_PX = 1.5  # median miss of the images that a start is found from: what the stage's errors leave in them
+_LARGEST_MISFIT = 1e-3  # the same as a share of the focal length, for images of many pixels; the larger of both counts
 _LARGEST_REJECTED = 0.45
-_MOST_POINTS = 2000  # more points of a scan add little: neighbours err together
-_FEWEST_POINTS = 100  # of an image, before thinning
+"""Share of the stripe points beside the start's sheet: as robust as a median can be, as all are judged again."""
+_MOST_POINTS = 2000  # points of a scan: more add little, as neighbours err together
+_FEWEST_POINTS = 100  # points of an image of a scan, before thinning: with fewer it shows the rim of a body
 _STEEPEST = 0.3
 """Slope of the brightness, per mm of the stage, beyond which the place that the light comes from is uncertain."""
 

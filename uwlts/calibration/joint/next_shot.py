@@ -7,9 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.camera.target_images import Placement, pose_values
-from uwlts.calibration.joint.earlier_estimate import Prior, ViewMedium
-from uwlts.calibration.joint.estimate import Evidence
-from uwlts.calibration.joint.noise import Noise, with_common_error
+from uwlts.calibration.joint.estimate import Evidence, Noise, with_common_error
 from uwlts.calibration.joint.observability import (
     estimate_in,
     format_weaknesses,
@@ -18,20 +16,28 @@ from uwlts.calibration.joint.observability import (
     regions,
     weaknesses,
 )
+from uwlts.calibration.joint.parameters import Prior, ViewMedium
 from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Spheres, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, with_independent
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.sheet import sheet_surface
 from uwlts.targets import Target, parse_target
 
-_FEWEST_POINTS, _FEWEST_LINES = 20, 20  # an image with less determines its own pose poorly
-_SAMPLES = 400  # of a curve; more than the image of one needs for a point on each of its lines to be interpolated
-# A step standard and spheres as the thesis used them, in size; more images of a sphere say nothing new.
-STEP_MM, _STEP_HALF_MM, _STEP_REACH_MM = 20.0, 30.0, 70.0
-SPHERES, SPHERE_MM, _SPHERES_APART_MM, _SPHERE_IMAGES = 2, 30.0, 60.0, 29
+_FEWEST_POINTS = 20  # target points in view: an image with fewer determines its own pose poorly
+_FEWEST_LINES = 20  # profile lines on a surface in view
+_SAMPLES = 400  # points of a curve: more than its image needs for a point on each of its lines to be interpolated
+STEP_MM = 20.0
+"""Height of the step standard, as the thesis's."""
+_STEP_HALF_MM = 30.0  # half the length of its upper face along the stripe
+_STEP_REACH_MM = 70.0  # how far its lower faces reach from the middle
+SPHERES = 2
+SPHERE_MM = 30.0
+"""Diameter of the spheres, as the thesis's."""
+_SPHERES_APART_MM = 60.0  # spacing of their centres, which leaves a diameter between them
+_SPHERE_IMAGES = 29  # images of a scan of them, some 1 mm apart: more say nothing new
 _ON_SPHERES_PX = 0.01
 """Standard uncertainty of stripe centres on matt spheres by blur, for a stripe with a full width of 4 px."""
 
@@ -149,11 +155,9 @@ def _targets(
 
 def _pose(calibration: Calibration, target: Target, depth_mm: float, turns: tuple[float, float]) -> np.ndarray:
     """``T_camera_target`` (4, 4) with the target's middle on the OCS's axis, turned from being square to that axis."""
-    frame, pose = calibration.object_transform(), np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("XY", _TILT_DEG * np.array(turns), degrees=True).as_matrix() @ frame[:3, :3]
-    middle = np.append(target.extent_mm.mean(axis=0), 0.0)
-    pose[:3, 3] = frame[:3, 3] + depth_mm * frame[:3, 2] - pose[:3, :3] @ middle
-    return pose
+    frame, middle = calibration.object_transform(), np.append(target.extent_mm.mean(axis=0), 0.0)
+    turn = Rotation.from_euler("XY", _TILT_DEG * np.array(turns), degrees=True).as_matrix() @ frame[:3, :3]
+    return rigid_transform(turn, frame[:3, 3] + depth_mm * frame[:3, 2] - turn @ middle)
 
 
 def _target_shot(known: StoredEstimate, target: Target, pose: np.ndarray) -> _Shot | None:

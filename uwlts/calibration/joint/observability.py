@@ -5,14 +5,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uwlts.calibration.joint.earlier_estimate import ViewMedium
+from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, found_estimate, require_joint
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration
 from uwlts.model.parameter_keys import ParameterInFile, ParameterKey
 from uwlts.model.sensor import Medium
 
-_ROWS, _COLUMNS = 7, 9  # of a mesh: 1953 lengths, between ends in all parts of a region
+_ROWS = 7  # depths of a mesh, which with its columns has 1953 lengths, between ends in all parts of a region
+_COLUMNS = 9  # places along the stripe of a mesh
 _INSET = 0.02  # share of the depth left out at either end, where an outline may come to a point
 _LEAST_MM = 1.0  # extent of a region over which lengths mean something
 

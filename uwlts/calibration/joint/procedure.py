@@ -9,7 +9,6 @@ from pydantic import JsonValue
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import BESIDES, RATIONAL_BESIDES
-from uwlts.calibration.capture_evidence import Progress
 from uwlts.calibration.joint.consistency import (
     Findings,
     deviations,
@@ -18,10 +17,10 @@ from uwlts.calibration.joint.consistency import (
     understated,
     wrong_sizes,
 )
-from uwlts.calibration.joint.earlier_estimate import Parameters
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
 from uwlts.calibration.joint.initial import line_start, series_start, step_profiles, surface_scans
+from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.residuals import BENDS, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import Plane, SurfaceScanEvidence
 from uwlts.calibration.joint.stored_estimate import calibration_of
@@ -30,6 +29,7 @@ from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownStage, WindowModel
 from uwlts.model.parameter_keys import LensParameter, TargetParameter
 from uwlts.model.sensor import Sensor
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture
 
 _ROUNDS_LEFT_OUT = 3
@@ -145,7 +145,7 @@ def calibrate_jointly(
     scans: Sequence[Capture] = (),
     *,
     options: CalibrationOptions | None = None,
-    progress: Progress | None = None,
+    progress: ProgressListener = unheard,
 ) -> JointResult:
     """Calibrate a sensor from all captures at once.
 
@@ -294,7 +294,7 @@ class _Attempt:
         said = (
             f"the target's spacings are {' and '.join(f'{1e6 * value:+.0f}' for value in found)} µm/m off along rows "
             "and columns, or pixels are of another shape than described: both are estimated. Placements of the target "
-            "turned by 90° against each other tell which, and so does --pixels square or free"
+            "turned by 90° against each other tell which, and so does `pixels` square or free"
         )
         return None if freed is None else replace(freed, said=(*freed.said, said))
 

@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 from pydantic import JsonValue
 
-from uwlts.calibration.capture_evidence import Progress
-from uwlts.calibration.joint.derivatives import SHEET
-from uwlts.calibration.joint.earlier_estimate import EarlierEstimate, ViewMedium
 from uwlts.calibration.joint.estimate import Estimate, Evidence
 from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
 from uwlts.calibration.joint.initial import line_start, step_profiles
 from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
+from uwlts.calibration.joint.parameters import SHEET, EarlierEstimate, ViewMedium
 from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.joint.stored_estimate import (
     StoredEstimate,
@@ -26,12 +24,15 @@ from uwlts.calibration.joint.stored_estimate import (
 )
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, sources_of
 from uwlts.errors import CalibrationError, RangeError
-from uwlts.model.any_calibration import calibration_digest, check_fits
+from uwlts.model.any_calibration import calibration_digest
+from uwlts.model.brief import Brief
 from uwlts.model.calibration import Calibration, KnownStage
 from uwlts.model.joint_estimate import CoveredRegion, JointEstimate, Origin
 from uwlts.model.parameter_keys import MediumIndex
 from uwlts.model.sensor import Medium
+from uwlts.optics.fitness import check_fits
 from uwlts.optics.window import require_index
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, opened_captures
 from uwlts.stripe import StripeSettings
@@ -190,8 +191,8 @@ _ANY_INDEX = 0.02  # standard uncertainty of the index of a liquid of which noth
 _CONTRADICTED = 4.0  # standard uncertainties by which steps contradict an index
 
 
-@dataclass(frozen=True, eq=False)
-class Refreshed:
+@dataclass(frozen=True, eq=False, repr=False)
+class Refreshed(Brief):
     """A calibration for new water besides the old, and what that changed, one entry for each new water."""
 
     calibration: Calibration
@@ -206,25 +207,29 @@ def refresh(
     index: float | None = None,
     index_std: float | None = None,
     stripe: StripeSettings = None,
-    progress: Progress | None = None,
+    progress: ProgressListener = unheard,
 ) -> Refreshed:
-    """Estimate all parameters again from a joint calibration and images of a step in new water.
+    """Adapt a joint calibration to new water, or water of another temperature, by images of a step in it.
+
+    All that the calibration found, correlations included, is what is known before; the new water's index is estimated
+    too. The images of the calibration are not needed.
 
     Parameters
     ----------
     calibration : Calibration or path
-        All that it found, correlations included, is what is known before.
+        Joint calibration of the sensor.
     step : sequence of Capture or path
-        A step standard in water of another day. The index of that is a parameter of its own, even where water that is
+        Captures of the step standard in the new water. Its index is a parameter of its own, even where water that is
         described alike was calibrated in.
     index : float, optional
         Refractive index of the new water as far as it is known, in place of the one that follows from the captures.
     index_std : float, optional
-        Standard uncertainty of that index, in place of what follows from the sensor's description.
+        Standard uncertainty of that index, in place of what follows from the sensor's description; 0.001 if hardly
+        anything is known of the water.
     stripe : StripeOptions or dict, optional
-        How stripes are found: all options, or settings in place of those in the sensor's table [stripe].
+        As for `reconstruct`.
     progress : callable, optional
-        Called with the name of the stage, the number of images done, and the number in all.
+        Called with the number of images done, the number in all, and the name of the stage.
 
     Raises
     ------
@@ -306,8 +311,8 @@ def _other_water(problem: JointProblem, earlier: EarlierEstimate) -> str:
                 f"uncertainties from the {known.mean:.5f} +- {known.std:.2g} described"
             )
     advice = (
-        ": check the step's height and the water's temperature and salinity in the captures, or give with --index and "
-        "--index-std what is known of it; if they are right, the sensor has changed: calibrate again"
+        ": check the step's height and the water's temperature and salinity in the captures, or give with `index` and "
+        "`index_std` what is known of it; if they are right, the sensor has changed: calibrate again"
     )
     return "; ".join(words) + advice if words else ""
 
@@ -317,7 +322,7 @@ def _earlier(calibration: Calibration) -> StoredEstimate:
     if calibration.window is None:
         raise CalibrationError(
             "the calibration has no window, through which new water would be seen: calibrate with images taken in "
-            "water (--water, or --joint --step)"
+            "water (`water`, or `joint` and `step`)"
         )
     return known
 

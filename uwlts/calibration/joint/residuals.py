@@ -11,7 +11,8 @@ import numpy as np
 
 from uwlts.calibration.camera.target_images import Placement
 from uwlts.calibration.camera.target_poses import centre_offsets
-from uwlts.calibration.joint.earlier_estimate import Parameters, SheetPoints, ViewMedium
+from uwlts.calibration.joint.parameters import Parameters, SheetPoints, ViewMedium
+from uwlts.model.calibration import rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight, TargetParameter
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.line_table import LineTable, sum_series
@@ -244,10 +245,7 @@ class TargetEvidence(StripeEvidence):
     def pose(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, image: int) -> np.ndarray:
         """``T_camera_target`` (4, 4) of one of the images."""
         pose = _Poses(self, parameters, global_values, local, np.array([image]))
-        result = np.eye(4)
-        result[:3, :3] = pose.rotation
-        result[:3, 3] = pose.shift - pose.rotation @ (pose.direction * pose.travel)
-        return result
+        return rigid_transform(pose.rotation, pose.shift - pose.rotation @ (pose.direction * pose.travel))
 
     def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
         if not self.staged:

@@ -6,7 +6,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from uwlts.calibration.joint.earlier_estimate import Parameters
+from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.residuals import Distances, Residuals, StripeEvidence
 from uwlts.model.parameter_keys import StageParameter
 from uwlts.model.sensor import Uncertainty

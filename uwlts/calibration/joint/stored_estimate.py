@@ -9,10 +9,8 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.camera.camera_parameters import DISTORTION, CameraOptions, Intrinsics
-from uwlts.calibration.joint.derivatives import DescribedSheet
-from uwlts.calibration.joint.earlier_estimate import Parameters, Prior, ViewMedium, window_values
-from uwlts.calibration.joint.estimate import Estimate, Evidence
-from uwlts.calibration.joint.noise import outliers
+from uwlts.calibration.joint.estimate import Estimate, Evidence, outliers
+from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium, window_values
 from uwlts.calibration.joint.residuals import TARGET, SeenSheet
 from uwlts.calibration.sequential.sheet_fit import object_frame
 from uwlts.errors import CalibrationError
@@ -204,7 +202,7 @@ def covariance_root(covariance: np.ndarray) -> np.ndarray:
 def require_joint(calibration: Calibration) -> JointEstimate:
     """The joint estimate of a calibration; CalibrationError where it holds none."""
     if calibration.joint is None:
-        raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (--water or --joint)")
+        raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (`water` or `joint`)")
     return calibration.joint
 
 

@@ -1,7 +1,8 @@
 """Comparison of models of the sensor: each is calibrated and scored, and the simplest that is as good is found."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -9,9 +10,8 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.polynomial import legendre
 
-from uwlts.calibration.capture_evidence import Progress as Searched
+from uwlts.calibration.joint.estimate import outlier_limit
 from uwlts.calibration.joint.gathering import Gathered, Series, gather_jointly
-from uwlts.calibration.joint.noise import outlier_limit
 from uwlts.calibration.joint.procedure import JointProblem, joint_problem
 from uwlts.calibration.joint.residuals import STRIPE, TARGET, TargetEvidence
 from uwlts.calibration.model_comparison.held_out import (
@@ -28,14 +28,15 @@ from uwlts.calibration.polynomial.polynomial_calibration_fit import fit_line_pol
 from uwlts.calibration.polynomial.polynomial_evidence import common_header, object_coordinates, stripes_on_plate
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError, DescriptionError
+from uwlts.model.brief import Brief
 from uwlts.optics.window import require_index
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import Send, work_through
 from uwlts.storage.capture import Capture, CaptureHeader, opened_captures
 from uwlts.stripe import StripeSettings
 
 Level = TypeVar("Level")
 
-Progress = Callable[[int, int], None]
 _Captures = Sequence[Capture | str | Path]
 
 
@@ -263,9 +264,7 @@ Found = dict[Candidate, dict[str, Prediction] | str]
 """For each model its predictions by the way of holding out, or why there are none."""
 
 
-def choose(
-    problem: JointProblem, *, workers: int | None = None, progress: Progress = lambda done, total: None
-) -> Choice:
+def choose(problem: JointProblem, *, workers: int | None = None, progress: ProgressListener = unheard) -> Choice:
     """Compare models on the evidence of a joint problem: the usual one, what differs by one thing, and the simplest.
 
     Raises CalibrationError: there are too few images, or the usual model cannot be calibrated without those held out.
@@ -329,8 +328,8 @@ def choice_of(found: Found, ways: dict[str, frozenset[Image]], in_medium: frozen
     return Choice(judged, ways, predictions, tallies, {where: len(held) for where, held in wet.items()}, wet_tallies)
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(Brief):
     """Misses of models in images held out, with the sensor and the captures.
 
     ``polynomials`` is None without a target in a medium on the stage; ``why_none`` is why they have no score.
@@ -353,24 +352,31 @@ def compare_models(
     index: float | None = None,
     stripe: StripeSettings = None,
     workers: int | None = None,
-    progress: Searched = lambda stage, done, total: None,
+    progress: ProgressListener = unheard,
 ) -> Comparison:
     """Compare models of the sensor by how well each predicts images that its calibration has not seen.
 
+    One refraction or two, window tilted or not, sheet with bow or turned by the laser's window or not, distortion:
+    each model is calibrated without every fourth image, and without the nearest and the farthest ones.
+
     Parameters
     ----------
-    air, water, step : sequence of Capture or path
-        A target in air, the same in the medium of use, and a step standard in the medium of use.
+    air : sequence of Capture or path
+        Captures of the target in air, as for uwlts calibrate.
+    water : sequence of Capture or path
+        The same in the medium of use.
+    step : sequence of Capture or path
+        Captures of the step standard in the medium of use.
     poses : {"stage", "free"}
         stage: one pose of the target for each capture, moved by the stage. free: every image has a pose of its own.
     index : float, optional
         Refractive index of the medium relative to air, in place of the one that follows from the captures.
     stripe : StripeOptions or dict, optional
-        How stripes are found: all options, or settings in place of those in the sensor's table [stripe].
+        As for `reconstruct`.
     workers : int, optional
         Models calibrated at a time; as many as there are processors unless given.
     progress : callable, optional
-        Called with the name of the stage, the number of images or models done, and the number in all.
+        Called with the number of images or models done, the number in all, and the name of the stage.
 
     Raises
     ------
@@ -389,12 +395,12 @@ def compare_models(
     if workers is not None and workers < 1:
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
     if not (air or water):
-        raise DescriptionError("nothing to compare models by: give --air or --water with captures of a target")
+        raise DescriptionError("nothing to compare models by: give `air` or `water` with captures of a target")
     options = CalibrationOptions(poses=poses, medium_index=index, stripe=stripe)
     with opened_captures([*air, *water]) as targets, opened_captures(step) as steps:
         gathered = gather_jointly(targets, steps, options=options, progress=progress)
         problem = joint_problem(gathered, options=options)
-        choice = choose(problem, workers=workers, progress=lambda done, total: progress("models", done, total))
+        choice = choose(problem, workers=workers, progress=partial(progress, stage="models"))
         score, why_none = _polynomials(gathered, problem, choice, targets, free=poses == "free")
         captures = [capture.path.name for capture in [*targets, *steps]]
     return Comparison(gathered.sensor.name, captures, choice, score, why_none, problem.warnings)

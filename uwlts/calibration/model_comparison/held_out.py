@@ -11,9 +11,8 @@ from scipy.stats import chi2
 from uwlts.calibration.camera.camera_parameters import Intrinsics
 from uwlts.calibration.camera.target_images import pose_values
 from uwlts.calibration.joint.consistency import much_left_out
-from uwlts.calibration.joint.earlier_estimate import Parameters, ViewMedium
-from uwlts.calibration.joint.estimate import Estimate, Evidence
-from uwlts.calibration.joint.noise import outlier_limit
+from uwlts.calibration.joint.estimate import Estimate, Evidence, outlier_limit
+from uwlts.calibration.joint.parameters import Parameters, ViewMedium
 from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.joint.residuals import STEP, TARGET, Residuals, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
@@ -119,7 +118,8 @@ Image = tuple[int, int]
 
 _EVERY = 4  # of the images inside one in so many is held out: enough remain, enough are judged
 _OUTER = 1 / 6  # of the depth, at either end
-_FEWEST_KEPT, FEWEST_HELD = 4, 4  # images; fewer give neither a calibration nor a standard error
+_FEWEST_KEPT = 4  # images to calibrate from
+FEWEST_HELD = 4  # images to predict: fewer give no standard error
 
 
 def splits(problem: JointProblem) -> dict[str, frozenset[Image]]:
@@ -191,7 +191,8 @@ def of_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence
     return some.with_stripes(np.isin(evidence.image, wanted))
 
 
-_ROUNDS, _SETTLED_PX = 20, 1e-4  # steps of the pose, far below the noise of a centre
+_ROUNDS = 20  # of steps of the pose; a few settle
+_SETTLED_PX = 1e-4  # of a step, far below the noise of a centre
 _CHOOSING_ROUNDS = 10  # of which so many choose what is near enough to count
 _BY_CHANCE = 0.0027  # probability of three standard deviations or more
 

@@ -11,19 +11,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from uwlts.calibration.mount.profiles import (
-    ProfileArc,
-    ProfileLine,
-    find_arc,
-    find_face,
-    find_line,
-    find_step,
-    find_walls,
-)
+from uwlts.calibration.mount.profiles import Seen, find_arc, find_face, find_line, find_step, find_walls
 from uwlts.model.mount import PlaneFound, RingFound, SphereFound, StepFound
 from uwlts.storage.mount_files import Artefact
-
-Seen = ProfileArc | ProfileLine
 
 _FEWEST_WALLS = 5
 """Profiles with a ring's wall: for its place and radius, three unknowns, with some over."""

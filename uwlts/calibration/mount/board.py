@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, stored_estimate
 from uwlts.calibration.mount.estimate import (
-    FALSE_ALARM,
     LARGEST_ROUGH,
+    GroupedEvidence,
     RestrictedEstimate,
     settle_agreeing,
     solved_step,
@@ -26,10 +26,10 @@ from uwlts.calibration.mount.next_pose import OPEN_RAD, missing_turns, require_d
 from uwlts.calibration.mount.sensor import mount_covariance
 from uwlts.errors import CalibrationError, DescriptionError, TargetError
 from uwlts.files.writing import sha256_of
-from uwlts.model.any_calibration import check_fits
-from uwlts.model.calibration import Calibration, WindowModel
+from uwlts.model.calibration import Calibration, WindowModel, rigid_transform
 from uwlts.model.mount import BoardFound, Mount, MountPose
 from uwlts.optics.camera import directions, project_through_window
+from uwlts.optics.fitness import check_fits
 from uwlts.optics.window import trace_window
 from uwlts.storage.capture import Capture
 from uwlts.storage.mount_files import SENSOR_AXES, SensorAxis, require_table
@@ -48,16 +48,12 @@ _TRIPLES = 100
 """With a third of the images wrong, three right ones are missed by all of them once in 10^15 times."""
 _BOUNDS = np.array([(1.0, 100.0), (1e-4, 1e3), (1e-7, 1.0)])
 """Of the scatter: factor of the images' errors, which are at least those of their points, mm, and rad."""
-_LEAST = ((0, 1e-3), (3, 1e-6))
-"""First component of shift and turn, and the least scatter that counts, mm and rad."""
+_LEAST_MM = 1e-3  # scatter of shifts that a search starts from at least; no platform is better
+_LEAST_RAD = 1e-6  # the same of turns
 
 
 def mount_by_board(
-    captures: Sequence[Capture],
-    calibration: Calibration,
-    poses: np.ndarray | None = None,
-    *,
-    axis: SensorAxis | None = None,
+    capture: Capture, calibration: Calibration, poses: np.ndarray | None = None, *, axis: SensorAxis | None = None
 ) -> Mount:
     """``T_platform_sensor`` from images of a target at an unknown fixed place, the sensor's calibration held fixed.
 
@@ -71,25 +67,25 @@ def mount_by_board(
 
     Parameters
     ----------
-    captures
-        Images with the laser off show the target that the captures describe.
+    capture
+        Images with the laser off show the target that it describes.
     calibration
         Of the sensor.
     poses
-        ``T_base_platform`` (P, 4, 4) of the images with the laser off, in their order, in place of the captures' own.
+        ``T_base_platform`` (P, 4, 4) of the images with the laser off, in their order, in place of the capture's own.
     axis
         The platform is a rotary table that turns the target, as for `uwlts.calibrate_mount`.
 
     Raises
     ------
     DescriptionError
-        A capture does not describe its target, or images have no pose.
+        The capture does not describe its target, or images have no pose.
     CalibrationError
         Too few images show the target, or the poses do not determine the mount or contradict the images.
     """
-    header = captures[0].header
+    header = capture.header
     known = None if calibration.joint is None else stored_estimate(calibration, header.sensor, header.medium)
-    target, images, reasons = board_images(captures, calibration, known, poses)
+    target, images, reasons = board_images(capture, calibration, known, poses)
     middle = target.points_mm.mean(axis=0)
     rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in images])
     if axis is not None:
@@ -148,7 +144,7 @@ def mount_by_board(
         sensor=share,
         poses=tuple(rows),
         weaknesses=tuple(weak),
-        inputs={capture.path.name: sha256_of(capture.path) for capture in captures},
+        inputs={capture.path.name: sha256_of(capture.path)},
     )
 
 
@@ -176,41 +172,35 @@ class BoardImage:
 
 
 def board_images(
-    captures: Sequence[Capture], calibration: Calibration, known: StoredEstimate | None, poses: np.ndarray | None
+    capture: Capture, calibration: Calibration, known: StoredEstimate | None, poses: np.ndarray | None
 ) -> tuple[Target, list[BoardImage], dict[str, str]]:
     """The target, its pose in every image that shows it, and why others do not."""
+    header = capture.header
+    check_fits(header, calibration, source=capture.path.name)
+    if header.target is None:
+        raise DescriptionError(f"{capture.path.name} does not describe its target")
+    target, index = parse_target(header.target), calibration.index_of(header.medium)
+    window = calibration.window if header.sensor.camera.window.mounted else None
+    numbers = np.flatnonzero(~capture.laser_on)
+    taken, at = len(numbers), capture.pose[numbers] if poses is None else poses
+    if len(at) != taken:
+        raise DescriptionError(f"there are {len(at)} poses for {taken} images with the laser off: expected one each")
     images: list[BoardImage] = []
     reasons: dict[str, str] = {}
-    targets, taken = [], 0
-    for capture in captures:
-        check_fits(capture.header, calibration, source=capture.path.name)
-        if capture.header.target is None:
-            raise DescriptionError(f"{capture.path.name} does not describe its target")
-        targets.append(parse_target(capture.header.target))
-        if targets[-1] != targets[0]:
-            raise DescriptionError("the captures show different targets: calibrate with one target, at one place")
-        index = calibration.index_of(capture.header.medium)
-        window = calibration.window if capture.header.sensor.camera.window.mounted else None
-        for frame, image in capture.frames(laser_on=False):
-            name = f"{capture.path.stem}, frame {frame}"
-            pose = capture.pose[frame] if poses is None else poses[taken] if taken < len(poses) else None
-            taken += 1
-            if pose is None:
-                continue
-            if not np.isfinite(pose).all():
-                raise DescriptionError(f"{name} has no pose of the platform: give a table of poses, or import them")
-            try:
-                images.append(posed_board(name, image, targets[0], calibration, known, window, index, pose))
-            except (TargetError, CalibrationError) as error:
-                reasons[name] = f"no target: {error}"
-    if poses is not None and taken != len(poses):
-        raise DescriptionError(f"there are {len(poses)} poses for {taken} images with the laser off: expected one each")
+    for (frame, image), pose in zip(capture.frames(laser_on=False), at, strict=True):
+        name = f"{capture.path.stem}, frame {frame}"
+        if not np.isfinite(pose).all():
+            raise DescriptionError(f"{name} has no pose of the platform: give a table of poses, or import them")
+        try:
+            images.append(posed_board(name, image, target, calibration, known, window, index, pose))
+        except (TargetError, CalibrationError) as error:
+            reasons[name] = f"no target: {error}"
     if len(images) < FEWEST_IMAGES:
         why = next(iter(reasons.values()), "there are no images with the laser off")
         raise CalibrationError(
             f"{len(images)} of {taken} images show the target; at least {FEWEST_IMAGES} are needed ({why})"
         )
-    return targets[0], images, reasons
+    return target, images, reasons
 
 
 def posed_board(
@@ -289,12 +279,6 @@ def differences(values: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step
     return np.stack(columns, axis=1)
 
 
-def rigid_transform(rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = rotation, shift
-    return result
-
-
 def moved_about(pose: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
     """A pose (4, 4) after a shift (3,) of the place of a point ``middle`` and a turn (3,) about it."""
     rotation = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
@@ -307,11 +291,11 @@ _State = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
-class BoardEvidence:
+class BoardEvidence(GroupedEvidence[_State]):
     """Images of a target, ``T_camera_sensor`` and the target's middle (3,) in its own frame.
 
-    The parameters are steps of mount and target; on a rotary table (``table``) shift of the mount along its z axis and
-    turn about it change nothing, and are none.
+    The values are steps of mount and target, the components of the scatter a factor of the images' errors, and position
+    (mm) and turn (rad) of the platform.
     """
 
     images: Sequence[BoardImage]
@@ -319,15 +303,9 @@ class BoardEvidence:
     middle: np.ndarray
     table: bool = False
 
-    @cached_property
-    def free(self) -> np.ndarray:
-        """Steps (12, size) of mount and target by the parameters."""
-        return np.delete(np.eye(12), (2, 5), axis=1) if self.table else np.eye(12)
-
     @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return self.free.shape[1]
+    def values(self) -> int:
+        return 12
 
     @cached_property
     def _platforms(self) -> np.ndarray:
@@ -337,21 +315,14 @@ class BoardEvidence:
     def _sensor_from_target(self) -> np.ndarray:
         return np.linalg.inv(self.camera_from_sensor) @ np.array([image.camera_from_target for image in self.images])
 
-    @cached_property
-    def _covariances(self) -> np.ndarray:
-        return np.array([image.covariance for image in self.images])
-
     @property
     def groups(self) -> int:
-        """Number of images."""
         return len(self.images)
 
     def selected(self, kept: np.ndarray) -> Self:
-        """Evidence of some of the images: a mask, or their numbers."""
         return replace(self, images=[self.images[k] for k in np.arange(len(self.images))[kept]])
 
     def bounds(self) -> np.ndarray:
-        """Bounds (3, 2) of the scatter: factor of the images' errors, position (mm) and turn (rad) of the platform."""
         return _BOUNDS
 
     def start(self) -> _State:
@@ -386,7 +357,6 @@ class BoardEvidence:
         return np.hstack([shift, Rotation.from_matrix(own[:, :3, :3] @ common[:3, :3].T).as_rotvec()])
 
     def covariance(self, state: _State) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        """Function that returns covariances (K, 6, 6) of the residuals and their derivatives by logs of the scatter."""
         both, middle = self._by_images(state[0]), state[1][:3] @ np.append(self.middle, 1.0)
         # A turn of the platform moves what is far from its origin.
         lever = np.tile(np.eye(6, 3, -3), (len(both), 1, 1))
@@ -403,12 +373,7 @@ class BoardEvidence:
 
         return covariances
 
-    def repeated(self, state: _State) -> tuple[int, float]:
-        """None: the scatter of an image's points is part of its covariance."""
-        return 0, 0.0
-
     def pose_directions(self, state: _State) -> list[np.ndarray]:
-        """All six directions of each image."""
         return [np.eye(6)] * len(self.images)
 
     def _by_images(self, mount: np.ndarray) -> np.ndarray:
@@ -423,7 +388,6 @@ class BoardEvidence:
         return self._by_images(state[0]) @ np.array([image.by_sensor for image in self.images])
 
     def jacobian(self, state: _State, step: np.ndarray | None = None) -> np.ndarray:
-        """Derivatives (K, 6, size) by the parameters."""
         at = np.zeros(12) if step is None else self.free @ step
 
         def residuals(every: np.ndarray) -> np.ndarray:
@@ -432,7 +396,6 @@ class BoardEvidence:
         return differences(residuals, at, np.tile(POSE_STEPS, 2)).reshape(-1, 6, 12) @ self.free
 
     def stepped(self, state: _State, step: np.ndarray) -> _State:
-        """The state after a step (size,) of the parameters."""
         return self._moved(state, self.free @ step)
 
     def _moved(self, state: _State, step: np.ndarray) -> _State:
@@ -465,7 +428,8 @@ def agreeing_images(evidence: BoardEvidence) -> tuple[RestrictedEstimate[_State]
     triples = [evidence.selected(rng.choice(count, 3, replace=False)).start() for _ in range(_TRIPLES)]
     state = min([evidence.start(), *triples], key=evidence.typical_miss)
     left = evidence.residuals(state)
-    spread = [max(float(np.median(np.linalg.norm(left[:, k : k + 3], axis=1))), least) for k, least in _LEAST]
+    sizes = np.median(np.linalg.norm(left.reshape(count, 2, 3), axis=2), axis=0)
+    spread = np.maximum(sizes, (_LEAST_MM, _LEAST_RAD))
     rough = np.tile(np.diag(np.repeat(spread, 3) ** 2), (count, 1, 1))
     state = evidence.stepped(state, solved_step(evidence, state, rough, loss="cauchy"))
     sizes = (np.abs(evidence.residuals(state)) / np.repeat(spread, 3)).max(axis=1)
@@ -480,7 +444,7 @@ def agreeing_images(evidence: BoardEvidence) -> tuple[RestrictedEstimate[_State]
             )
 
     starts = [(each, np.array([1.0, *spread])) for each in (state, evidence.selected(near).start())]
-    found, among = settle_agreeing(evidence.selected(near), starts, false_alarm=FALSE_ALARM, require=require)
+    found, among = settle_agreeing(evidence.selected(near), starts, require=require)
     kept = np.zeros(count, dtype=bool)
     kept[near[among]] = True
     return found, kept

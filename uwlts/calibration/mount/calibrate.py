@@ -1,6 +1,7 @@
 """Calibration of the mount of a laser profiler on a moving platform, from its profiles of an unknown fixed artefact."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,21 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import SHAPES
 from uwlts.calibration.mount.board import mount_by_board
-from uwlts.calibration.mount.estimate import (
-    FALSE_ALARM,
-    LARGEST_ROUGH,
-    NotSettled,
-    RestrictedEstimate,
-    settle,
-    settle_agreeing,
-)
+from uwlts.calibration.mount.estimate import LARGEST_ROUGH, NotSettled, RestrictedEstimate, settle, settle_agreeing
 from uwlts.calibration.mount.next_pose import next_pose, require_determined, weaknesses
-from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter
+from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, in_sheet, in_space
 from uwlts.calibration.mount.profiles import LEAST_POINTS
 from uwlts.calibration.mount.sensor import CapturedProfiles, mount_covariance, profiles_of
 from uwlts.calibration.mount.start import NoFit, require_surfaces, start
 from uwlts.errors import CalibrationError, DescriptionError
-from uwlts.model.calibration import Calibration
+from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.mount import Mount, MountPose
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.calibration_file import loaded_calibration
@@ -35,9 +29,10 @@ _MOST_POINTS = 100_000
 """Points of all profiles together; more take time and hardly lower the uncertainty, as poses err too."""
 _NO_FIT = 0.1
 """Share of a sphere's radius by which platforms do not err; a wrong format of the poses gives more."""
-_OTHER_SIZE, _SURE = 0.03, 5.0
-"""Share of the given size by which profiles show another one for sure, as profilers' scales err by less, and standard
-uncertainties, beyond which lies one normal error in a million."""
+_OTHER_SIZE = 0.03
+"""Share of the given size by which profiles show another one for sure, as profilers' scales err by less."""
+_SURE = 5.0
+"""Standard uncertainties of the same, beyond which lies one normal error in a million; the larger of both counts."""
 
 
 def calibrate_mount(
@@ -57,7 +52,11 @@ def calibrate_mount(
     profile_times_s: np.ndarray | None = None,
     pose_times_s: np.ndarray | None = None,
 ) -> Mount:
-    """Find ``T_platform_sensor`` of any laser profiler from profiles of an artefact at an unknown fixed place.
+    """Calibrate the mount of a laser profiler on a robot or stage, from its profiles of a sphere, plane, step or ring.
+
+    Or that of a calibrated sensor, from a capture of one of them or of a target; or the axis of a rotary table. The
+    result is ``T_platform_sensor`` with its uncertainty, the poses that were left out, what the motions determine
+    badly, and the pose to add next.
 
     The platform's poses ``T_base_platform`` are known, as a robot's flange's. The artefact's place and the mount are
     estimated together by least squares of the distances of all points from the artefact, weighted by the noise of the
@@ -68,29 +67,39 @@ def calibrate_mount(
     Parameters
     ----------
     profiles
-        One array for each pose: (N, 2) with x along the profile and z, or (N, 3) with x, y, z in the sensor's frame, in
-        the order along the profile, mm, NaN where nothing was seen. Or a file or folder: a description (.toml) of
-        everything, a folder of CSV files, or one CSV file with a column ``pose``, or a cloud of `uwlts.reconstruct`
-        whose frames are the poses. Or, with a ``calibration``, a capture: of a target that its images with the laser
-        off show, else of an artefact that its laser images show.
+        Folder with one CSV file (columns x and z) for each pose, one CSV file with a column pose, a cloud whose frames
+        are the poses, or a description of everything (.toml; docs/how-to/calibrate-a-mount.md). With a calibration, a
+        capture of the artefact, or of a target that images with the laser off show. Or one array for each pose: (N, 2)
+        with x along the profile and z, or (N, 3) with x, y, z in the sensor's frame, in the order along the profile,
+        mm, NaN where nothing was seen.
     poses
-        ``T_base_platform`` (P, 4, 4), mm, or a CSV file with one pose a line; not needed for a capture that holds them.
-    artefact, radius_mm, height_mm
-        What is seen: a sphere, a plane, a step (two parallel faces), or a ring (a face, and a cylindrical wall square
-        to it). The radius of the sphere or of the ring's wall, or the height of the step, where it is known.
+        CSV file with the pose of the platform in the base frame for each profile, or image of the target; or
+        ``T_base_platform`` (P, 4, 4), mm. Those of the capture unless given.
+    artefact
+        What the profiles show: a sphere, a plane, a step (two parallel faces), or a ring (a face, and a cylindrical
+        wall square to it).
+    radius_mm
+        Radius of the sphere, or of the ring's wall; estimated unless given.
+    height_mm
+        Height of the step; estimated unless given.
     calibration
-        Of the sensor that took the capture, held fixed; what a joint estimate leaves open becomes part of the mount's
-        covariance. A target's images go to `uwlts.calibration.mount.board`.
-    pose_format, profile_unit, pose_unit
-        How files are to be read; see `uwlts.storage.pose_files.read_poses`.
+        Calibration of the sensor that took the capture, held fixed; what a joint estimate leaves open becomes part of
+        the mount's covariance.
+    pose_format
+        matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about the moved axes),
+        euler-zyx-deg (about the fixed axes) or another order, -rad for radians; angle-deg of a rotary table.
+    profile_unit
+        Unit of the profiles.
+    pose_unit
+        Unit of the positions.
     axis
-        The platform is a rotary table whose axis is not known, and which turns the sphere or target: the direction of
-        the sensor's frame that is nearest to the axis about which its angles turn counter-clockwise. The mount then
-        leads to a frame whose z axis is the table's (`uwlts.storage.pose_files.read_poses`, format ``angle-deg``).
+        The sphere or target stands on a rotary table whose axis is not known: direction in the sensor's frame nearest
+        to the axis about which angles turn it counter-clockwise. The mount then leads to a frame whose z axis is the
+        table's.
     scale
-        Estimate by which factor the robot's lengths are too short.
+        Estimate the robot's scale too.
     time
-        Estimate the offset to add to the times of the profiles; both have times then.
+        Estimate the offset to add to the profiles' times (columns time_s; the poses are a trajectory).
     profile_times_s, pose_times_s
         Times (P,) of the profiles and (M,) of the poses, which are then a trajectory of any number M of poses
         (`uwlts.Trajectory`).
@@ -121,7 +130,7 @@ def calibrate_mount(
             if capture.header.target is not None and not capture.laser_on.all():
                 if radius_mm is not None or height_mm is not None or scale or time:
                     raise DescriptionError("the capture shows a target: give no radius, height, scale or time")
-                return mount_by_board([capture], known, table, axis=axis)
+                return mount_by_board(capture, known, table, axis=axis)
             profiles = profiles_of(capture, known, table, times)
     captured = None
     if isinstance(profiles, CapturedProfiles):
@@ -149,27 +158,19 @@ def calibrate_mount(
 
 
 def _advice(evidence: MountEvidence) -> str:
-    """What makes the profiles fit, of the usual mistakes, in words."""
-    inverse = "the poses are T_platform_base: give their inverses"
-    mistakes = [(replace(evidence, poses=np.linalg.inv(evidence.poses)), inverse)]
+    """Name the usual mistakes; of them another size of the artefact is tried."""
     if evidence.size_mm is not None:
-        mistakes.append((replace(evidence, size_mm=None), f"the {evidence.artefact} has another {evidence.size}"))
-    for name, poses in evidence.other_readings():
-        mistakes.append((replace(evidence, poses=poses), f"the poses are {name}, not {evidence.pose_format}"))
-    for changed, words in mistakes:
-        try:
-            found = _Calibration(changed).result()
-        except CalibrationError:
-            continue
-        used = sum(pose.reason is None for pose in found.poses)
-        if 2 * used > len(found.poses):
-            where = ""
-            if changed.size_mm is None and evidence.size_mm is not None:
-                where = f", {found.size_mm():.3f} mm"
-            return f"They do fit, with {found.rms_mm:.3g} mm rms, if {words}{where}"
+        with suppress(CalibrationError):
+            found = _Calibration(replace(evidence, size_mm=None)).result()
+            if 2 * sum(pose.reason is None for pose in found.poses) > len(found.poses):
+                return (
+                    f"They do fit, with {found.rms_mm:.3g} mm rms, if the {evidence.artefact} has another "
+                    f"{evidence.size}, {found.size_mm():.3f} mm"
+                )
     return (
-        "Are the poses T_base_platform, is their format right, are the units right, and do profiles and poses come in "
-        "the same order?"
+        "Are the poses T_base_platform rather than their inverses T_platform_base? Is their format right (Euler angles "
+        "about moved axes, such as ZYX, or fixed ones, such as xyz; the place of w in a quaternion)? Are the units "
+        "right, and do profiles and poses come in the same order?"
     )
 
 
@@ -183,9 +184,10 @@ class _Calibration:
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
         self.rows = [_thinned(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
-        self.profiles = [_in_space(each[rows]) for each, rows in zip(evidence.profiles, self.rows, strict=True)]
+        chosen = [each[rows] for each, rows in zip(evidence.profiles, self.rows, strict=True)]
+        self.profiles = [each if each.shape[1] == 3 else in_space(each) for each in chosen]
         self.sheet = _sheet_frame(self.profiles)
-        self.flat = [((each - self.sheet[:3, 3]) @ self.sheet[:3, :3])[:, [0, 2]] for each in self.profiles]
+        self.flat = in_sheet(self.profiles, self.sheet)
         self.reasons: dict[int, str] = {}
 
     def result(self) -> Mount:
@@ -234,7 +236,7 @@ class _Calibration:
 
         # The likelier of the estimates from here and from the least squares of all distances alike.
         starts = [(each, np.array(scatter)) for each in (state, problem.plain(state))]
-        found, good = settle_agreeing(problem, starts, false_alarm=FALSE_ALARM, require=require)
+        found, good = settle_agreeing(problem, starts, require=require)
         used, state = problem.selected(good), found.state
         numbers = np.flatnonzero(kept)
         names = self.evidence.names
@@ -302,26 +304,25 @@ class _Calibration:
                 raise
             raise NoFit(f"no mount makes the profiles fit: the poses would be wrong by {wrong:.3g} mm (rms)") from error
         moved = [used.stepped(state, step) for step, _ in estimate.without_each]
-        held = np.array([used.rms_mm(each)[place] for place, each in enumerate(moved)])
-        rms, numbers = used.rms_mm(state), [n for n in range(len(members)) if n not in self.reasons]
-        order = {number: place for place, number in enumerate(numbers)}
+        rms, held = used.rms_mm(state), np.array([used.rms_mm(each)[place] for place, each in enumerate(moved)])
+        off = zip(used.counts.tolist(), rms.tolist(), held.tolist(), strict=True)
         poses = []
-        for number, name in enumerate(self.evidence.names):
-            seen, place = int(members[number].sum()), order.get(number)
+        for number, (name, profile) in enumerate(zip(self.evidence.names, self.profiles, strict=True)):
+            reason = self.reasons.get(number)
+            count, own, without = (0, None, None) if reason else next(off)
             poses.append(
                 MountPose(
                     name=name,
-                    points=seen if place is not None else 0,
-                    points_left_out=len(self.profiles[number]) - (seen if place is not None else 0),
-                    rms_mm=None if place is None else float(rms[place]),
-                    held_out_mm=None if place is None else float(held[place]),
-                    reason=self.reasons.get(number),
+                    points=count,
+                    points_left_out=len(profile) - count,
+                    rms_mm=own,
+                    held_out_mm=without,
+                    reason=reason,
                 )
             )
         std, at = np.sqrt(np.diag(covariance)), 6 + self.shape.count
         found = self.shape.found(state.artefact, float(std[at - 1]) if self.shape.size_unknown else None)
-        transform = np.eye(4)
-        transform[:3, :3], transform[:3, 3] = Rotation.from_matrix(state.rotation).as_matrix(), state.translation
+        transform = rigid_transform(Rotation.from_matrix(state.rotation).as_matrix(), state.translation)
         weights = used.counts / used.counts.sum()
         return Mount(
             T_platform_sensor=tuple(tuple(row) for row in transform.tolist()),
@@ -352,11 +353,6 @@ class _Calibration:
         return used.means(used.on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
 
 
-def _in_space(points: np.ndarray) -> np.ndarray:
-    """Points (N, 3) of a profile (N, 2) or (N, 3)."""
-    return points if points.shape[1] == 3 else np.column_stack([points[:, 0], np.zeros(len(points)), points[:, 1]])
-
-
 def _thinned(points: np.ndarray, most: int) -> np.ndarray:
     if len(points) <= most:
         return points
@@ -366,9 +362,8 @@ def _thinned(points: np.ndarray, most: int) -> np.ndarray:
 def _sheet_frame(profiles: list[np.ndarray]) -> np.ndarray:
     """Frame (4, 4) of the plane of all points, with x and z in it; the sensor's where that is its y = 0."""
     points = np.vstack(profiles)
-    frame = np.eye(4)
     if not points[:, 1].any():
-        return frame
+        return np.eye(4)
     middle = points.mean(axis=0)
     extents, axes = np.linalg.svd(_thinned(points - middle, 20_000), full_matrices=False)[1:]
     if extents[2] > 0.02 * extents[1]:
@@ -376,9 +371,7 @@ def _sheet_frame(profiles: list[np.ndarray]) -> np.ndarray:
             "the profiles do not lie in one plane of the sensor's frame: expected the points of a laser sheet, in the "
             "sensor's frame and without the motion of the platform"
         )
-    frame[:3, :3] = np.column_stack([axes[0], np.cross(axes[1], axes[0]), axes[1]])
-    frame[:3, 3] = middle
-    return frame
+    return rigid_transform(np.column_stack([axes[0], np.cross(axes[1], axes[0]), axes[1]]), middle)
 
 
 def _motion(evidence: MountEvidence) -> Motion:

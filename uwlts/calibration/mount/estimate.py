@@ -1,9 +1,10 @@
 """Estimate parameters and variance components together from groups of residuals (restricted maximum likelihood)."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Generic, Self, TypeVar
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
@@ -11,7 +12,7 @@ from scipy.stats import chi2, t
 
 from uwlts.errors import CalibrationError
 
-FALSE_ALARM = 1e-3
+_FALSE_ALARM = 1e-3
 """Probability that any pose of a campaign without wrong ones is left out."""
 LARGEST_ROUGH = 6.0
 """Times the median misfit of a pose: of 45 normal poses one in millions lies farther out."""
@@ -30,54 +31,68 @@ _LEAST_EIGENVALUE = 1e-13
 State = TypeVar("State")
 
 
-class GroupedEvidence(Protocol[State]):
+class GroupedEvidence(ABC, Generic[State]):
     """Groups of residuals (one group for each pose), their derivatives, and the variances of their errors.
 
     Groups have K residuals; shorter ones are filled up with zeros, of unit variance. ``logs`` (Q,) are logarithms of
-    the variance components' standard deviations, and of lengths.
+    the variance components' standard deviations, and of lengths. ``free`` (V, size) are steps of all V values by the
+    parameters: on a rotary table (``table``) shift of the mount along its z axis and turn about it change nothing, and
+    are none.
     """
+
+    table: bool
+
+    @property
+    @abstractmethod
+    def values(self) -> int:
+        """Number of values, of which the first six are shift and turn of the mount."""
+
+    @cached_property
+    def free(self) -> np.ndarray:
+        every = np.eye(self.values)
+        return np.delete(every, (2, 5), axis=1) if self.table else every
 
     @property
     def size(self) -> int:
         """Number of parameters."""
-        ...
+        return self.free.shape[1]
 
     @property
+    @abstractmethod
     def groups(self) -> int:
         """Number of groups."""
-        ...
 
+    @abstractmethod
     def selected(self, kept: np.ndarray) -> Self:
-        """Evidence of some of the groups (a mask)."""
-        ...
+        """Evidence of some of the groups: a mask, or their numbers."""
 
+    @abstractmethod
     def bounds(self) -> np.ndarray:
         """Bounds (Q, 2) of the components; equal where one is fixed."""
-        ...
 
+    @abstractmethod
     def stepped(self, state: State, step: np.ndarray) -> State:
         """State after a step (size,) of the parameters."""
-        ...
 
+    @abstractmethod
     def residuals(self, state: State, step: np.ndarray | None = None) -> np.ndarray:
         """Residuals (G, K) after a step from a state, with the noise of the data as at the state."""
-        ...
 
+    @abstractmethod
     def jacobian(self, state: State, step: np.ndarray | None = None) -> np.ndarray:
         """Derivatives (G, K, size) of the residuals by the step."""
-        ...
 
+    @abstractmethod
     def covariance(self, state: State) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """Function of ``logs`` that returns covariances (G, K, K) and their derivatives (Q, G, K, K) by ``logs``."""
-        ...
 
     def repeated(self, state: State) -> tuple[int, float]:
-        """Degrees of freedom and sum of squares of further residuals that show the first component alone."""
-        ...
+        """Degrees of freedom and sum of squares of further residuals that show the first component alone; none."""
+        return 0, 0.0
 
+    @abstractmethod
     def pose_directions(self, state: State) -> Sequence[np.ndarray]:
         """Orthonormal bases (K, q) of all that a wrong pose does to the residuals of each group."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,25 +215,18 @@ def settle_agreeing(
     evidence: GroupedEvidence[State],
     starts: Sequence[tuple[State, np.ndarray]],
     *,
-    false_alarm: float,
     require: Callable[[np.ndarray], None],
 ) -> tuple[RestrictedEstimate[State], np.ndarray]:
     """Estimate from the groups that agree, and their mask (G,).
 
-    While a group contradicts what the others predict, the worst one is left out.
-
-    Parameters
-    ----------
-    false_alarm
-        Probability that any group is left out where none is wrong.
-    require
-        Raises an error where a mask (G,) leaves too few groups.
+    While a group contradicts what the others predict, the worst one is left out. ``require`` raises an error where a
+    mask (G,) leaves too few groups.
     """
     kept = np.ones(evidence.groups, dtype=bool)
     while True:
         require(kept)
         found = settle(evidence.selected(kept), starts)
-        excess = found.excess(probability=false_alarm / len(kept))
+        excess = found.excess(probability=_FALSE_ALARM / len(kept))
         if excess.max() <= 1:
             return found, kept
         kept[np.flatnonzero(kept)[np.argmax(excess)]] = False

@@ -9,21 +9,26 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import SphereShape
 from uwlts.calibration.mount.estimate import RestrictedEstimate
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, cross_matrix
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, in_sheet, point_by_mount
 from uwlts.errors import CalibrationError
+from uwlts.model.calibration import rigid_transform
 from uwlts.model.mount import NextPose
 
 _TURN_RAD = np.radians(30)
 """A robot turns so far easily with the artefact in view."""
 _LEAST_TURN_RAD = np.radians(5.0)
 """Root mean square of turns about an axis below which a note says that there are too few."""
-_OPEN_MM, OPEN_RAD = 5.0, np.radians(1.0)
-"""Standard uncertainties from which a mount counts as not determined; a ruler and a protractor do better."""
-_WEAK, _LEAST_MM, _LEAST_RAD = 5.0, 0.01, np.radians(0.005)
-"""Times the best determined direction, and standard uncertainty, mm and rad: so much worse is worth a further pose."""
+_OPEN_MM = 5.0  # standard uncertainty from which the shift of a mount counts as not determined: a ruler does better
+OPEN_RAD = np.radians(1.0)
+"""The same of its turn: a protractor does better."""
+_WEAK = 5.0  # times the uncertainty of the best determined direction from which another is worth a further pose
+_LEAST_MM = 0.01  # standard uncertainty of a shift below which no direction is worth a further pose
+_LEAST_RAD = np.radians(0.005)  # the same of a turn: 0.02 mm at 220 mm
 _POINTS = 100
-_UNKNOWN_MM, _UNKNOWN_RAD = 100.0, 0.5
-"""Standard uncertainty of a mount of which nothing is known, so that open directions can be compared."""
+"""Points of a profile that a pose would add: more repeat what these say."""
+_UNKNOWN_MM = 100.0
+"""Standard uncertainty of the shift of a mount of which nothing is known, so that open directions can be compared."""
+_UNKNOWN_RAD = 0.5  # the same of its turn
 
 
 def next_pose(
@@ -44,7 +49,7 @@ def next_pose(
     prior = np.zeros(problem.size)
     prior[:3], prior[3:6] = _UNKNOWN_MM**-2.0, _UNKNOWN_RAD**-2.0
     known = RestrictedEstimate(problem, state, np.array(scatter)).information.sum(axis=0) + np.diag(prior)
-    to_point = np.hstack([np.eye(3), -cross_matrix(state.rotation @ middle)])
+    to_point = point_by_mount(state.rotation @ middle)
 
     def point_std(information: np.ndarray) -> float:
         size = 1 / np.sqrt(np.diag(information))
@@ -75,9 +80,7 @@ def next_pose(
                     f"turn the platform by {np.degrees(side * _TURN_RAD):+.0f} deg about its {'xyz'[axis]} axis from "
                     f"pose {names[nearest]}, with the {problem.shape.kind} {where}"
                 )
-                pose = np.eye(4)
-                pose[:3, :3], pose[:3, 3] = turned, position
-                best = after, words, pose
+                best = after, words, rigid_transform(turned, position)
     if best is None:
         return None
     after, words, pose = best
@@ -97,7 +100,7 @@ def _one_pose(problem: Problem, points: np.ndarray, rotation: np.ndarray, positi
 
 def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
     """Points (n, 3) of the artefact in the sensor's frame, its place (3,) there, and that in words, for each view."""
-    flat = [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in problem.points]
+    flat = in_sheet(problem.points, sheet)
     low, high = np.quantile(np.vstack(flat), (0.1, 0.9), axis=0)
     views = []
     if isinstance(problem.shape, SphereShape):

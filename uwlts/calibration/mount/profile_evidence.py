@@ -8,16 +8,17 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefacts import Seen, Shape
-from uwlts.calibration.mount.estimate import solved_step
-from uwlts.calibration.mount.profiles import LEAST_POINTS
+from uwlts.calibration.mount.artefacts import Shape
+from uwlts.calibration.mount.estimate import GroupedEvidence, solved_step
+from uwlts.calibration.mount.profiles import LEAST_POINTS, Seen
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 """Rotations (P, 3, 3) and positions (P, 3) of the platform in the base frame for a time offset, s."""
 
 _TIME_STEP_S = 1e-4
-_POINT_MM, _TURN_RAD = (1e-5, 1e2), (1e-8, 1.0)
-"""Bounds of scatter: from far below what any profiler resolves to far above what any platform errs."""
+_POINT_MM = (1e-5, 1e2)
+"""Bounds of scatter in mm: from far below what any profiler resolves to far above what any platform errs."""
+_TURN_RAD = (1e-8, 1.0)  # the same of turns
 _ROUNDING = 1e-12
 """Of the largest variance: more than rounding errors change, which make covariances singular."""
 _BINS = 32
@@ -54,7 +55,7 @@ class Scatter(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(GroupedEvidence[MountState]):
     """Points (n, 3) of every pose in the sensor's frame, mm, and which unknowns there are.
 
     The parameters are steps from a `MountState`: translation (3), rotation about the platform's axes (3), those of the
@@ -70,8 +71,6 @@ class Problem:
     scale: bool = False
     time: bool = False
     table: bool = False
-    """Whether the platform turns about its own z axis only, as a rotary table: shift along it and turn about it change
-    nothing, and are no parameters."""
 
     @cached_property
     def counts(self) -> np.ndarray:
@@ -87,24 +86,16 @@ class Problem:
         return np.vstack(self.points)
 
     @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return self.free.shape[1]
+    def values(self) -> int:
+        return 6 + self.shape.count + self.scale + self.time
 
     @property
     def groups(self) -> int:
-        """Number of poses."""
         return len(self.points)
 
     def rms_mm(self, state: MountState) -> np.ndarray:
         """Root mean square distance (P,) of the points of each pose."""
         return np.sqrt(np.bincount(self.poses, self.distances(state) ** 2) / self.counts)
-
-    @cached_property
-    def free(self) -> np.ndarray:
-        """Steps (K, size) of all K values by the parameters."""
-        every = np.eye(6 + self.shape.count + self.scale + self.time)
-        return np.delete(every, (2, 5), axis=1) if self.table else every
 
     @cached_property
     def _parts(self) -> np.ndarray:
@@ -113,8 +104,8 @@ class Problem:
     def selected(
         self, kept: np.ndarray, points: Sequence[np.ndarray] | None = None, part: Sequence[np.ndarray] | None = None
     ) -> Self:
-        """The problem of some of the poses (a mask), perhaps with other points of all poses."""
-        motion, numbers = self.motion, np.flatnonzero(kept)
+        """The problem of some of the poses, perhaps with other points of all poses."""
+        motion, numbers = self.motion, np.arange(len(self.points))[kept]
         given, parts = points or self.points, part or self.part
         return replace(
             self,
@@ -148,7 +139,6 @@ class Problem:
         return replace(self, points=points, part=part)
 
     def stepped(self, state: MountState, step: np.ndarray) -> MountState:
-        """The state after a step of the parameters."""
         step = self.free @ step
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ state.rotation
         used = 6 + self.shape.count
@@ -308,7 +298,6 @@ class Problem:
         return self.means(here if step is None else here + self.on_lines(self.distances(state, step) - here))
 
     def jacobian(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
-        """Derivatives (P, K, size) of `residuals` by the step."""
         if step is None:
             return self.means(self.derivatives(state))
         derivatives = self._derivatives(self.stepped(state, step))
@@ -316,7 +305,6 @@ class Problem:
         return self.means(derivatives @ self.free)
 
     def covariance(self, state: MountState) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        """Function that returns the covariances (P, K, K) of `residuals` and their derivatives by logs of `Scatter`."""
         there, counts, apart = self._apart
         share = self.means(self.noise_along(state)[:, 0])
         both, errors = share[:, :, None] * share[:, None], self.means(self.errors(state))
@@ -367,15 +355,24 @@ class Problem:
         return self.stepped(state, solved_step(self, state, covariances, loss=loss))
 
 
-def cross_matrix(vector: np.ndarray) -> np.ndarray:
-    """Matrix (3, 3) of the cross product with a vector (3,)."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def in_sheet(points: Sequence[np.ndarray], sheet: np.ndarray) -> list[np.ndarray]:
+    """x and z (n, 2) in the sheet of points (n, 3) of each profile; ``sheet`` (4, 4) maps its frame to the sensor's."""
+    return [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in points]
+
+
+def in_space(flat: np.ndarray) -> np.ndarray:
+    """Points or directions (n, 3) in the frame of the sheet from their x and z (n, 2)."""
+    return np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
+
+
+def point_by_mount(point: np.ndarray) -> np.ndarray:
+    """Derivatives (3, 6) of a point (3,) along the platform's axes by shift and turn of the mount."""
+    return np.hstack([np.eye(3), np.cross(point, np.eye(3))])
 
 
 def _left_jacobian(vector: np.ndarray) -> np.ndarray:
     """Derivative of exp(v + dv) exp(-v) by dv as a rotation vector (J. Sola and others 2018, arXiv:1812.01537, 145)."""
-    angle, cross = float(np.linalg.norm(vector)), cross_matrix(vector)
+    angle, cross = float(np.linalg.norm(vector)), np.cross(np.eye(3), vector)
     if angle < 1e-6:
         return np.eye(3) + cross / 2
     return np.eye(3) + (1 - np.cos(angle)) / angle**2 * cross + (angle - np.sin(angle)) / angle**3 * cross @ cross

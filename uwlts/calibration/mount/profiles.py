@@ -1,7 +1,9 @@
 """The part of a profile that shows the artefact: an arc of a sphere, the line of a plane, those of a step or ring."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Self
 
 import numpy as np
 
@@ -14,9 +16,9 @@ _TRIALS = 400
 """Curves proposed for a profile: with a tenth of it on the artefact, and neighbours as proposals, some 40 are right."""
 _REJECTED_BEYOND = 4.0
 """Robust standard deviations; of normal noise six points in a hundred thousand lie farther out."""
-_DOUBLINGS, _FEW_MORE = 3, 1.1
-"""Doublings of the distance at which points count as near, up to 30 times the noise: profilers err smoothly by less.
-Where one brings fewer than a tenth more points, those near the curve have been found."""
+_DOUBLINGS = 3
+"""Doublings of the distance at which points count as near, up to 30 times the noise: profilers err smoothly by less."""
+_FEW_MORE = 1.1  # ratio of the numbers of points near a curve, below which a wider distance finds no more of its own
 _LEAST_ARC = np.radians(30)
 """Smaller arcs are like straight lines, and their centres move by more than the noise along the sagitta."""
 LEAST_WALL = 6
@@ -28,57 +30,47 @@ _LINES = 4
 """Lines sought in a profile of a step or ring: its faces, and what lies beside them."""
 _PARALLEL = 2e-3
 """By how much faces of a step may seem to be turned against each other besides noise, rad: bow of the profiler."""
-_LEAST_SEEN, _LEAST_SEEN_COSINE = 0.95, 0.5
-"""A step shows its height at least, but for the profiler's scale, and twice that where the sheet leans by 60 deg."""
+_LEAST_SEEN = 0.95  # share of its height that a step shows at least: profilers' scales err by less
+_LEAST_SEEN_COSINE = 0.5  # cosine of the angle by which the sheet may lean against a step: 60 deg
 
 
-@dataclass(frozen=True, eq=False)
-class ProfileArc:
-    """Points of a profile on a circle: their mask (N,), its centre (2,) and radius, mm, and the points' scatter, mm."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Seen:
+    """Points of a profile on the artefact: their mask (N,), the surface (N,) of each (0 the first), scatter in mm."""
 
     members: np.ndarray
+    part: np.ndarray
+    std_mm: float
+
+    def among(self, chosen: np.ndarray) -> Self:
+        """The same in the profile from which the points were chosen by a mask."""
+        members, part = np.zeros(len(chosen), dtype=bool), np.zeros(len(chosen), dtype=int)
+        members[chosen], part[chosen] = self.members, self.part
+        return replace(self, members=members, part=part)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ProfileArc(Seen):
+    """Points on a circle: its centre (2,) and radius, mm."""
+
     centre_mm: np.ndarray
     radius_mm: float
-    std_mm: float
-
-    @property
-    def part(self) -> np.ndarray:
-        """Surface of each point (N,): there is one."""
-        return np.zeros(len(self.members), dtype=int)
-
-    def among(self, chosen: np.ndarray) -> "ProfileArc":
-        """The same in the profile from which the points were chosen by a mask."""
-        return replace(self, members=_among(self.members, chosen))
 
 
-@dataclass(frozen=True, eq=False)
-class ProfileLine:
-    """Points of a profile on a line: their mask (N,), their middle (2,), the line's direction (2,), scatter and length.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ProfileLine(Seen):
+    """Points on a line: their middle (2,), the line's direction (2,) and length, of a step or ring for the first face.
 
-    Of a step these are the points of both faces, middle and direction of the first, of a ring those of its face and
-    wall; ``part`` (N,) says which lie on another surface than the first, and on which.
+    The points are those of both faces of a step, or of face and wall of a ring.
     """
 
-    members: np.ndarray
     middle_mm: np.ndarray
     direction: np.ndarray
-    std_mm: float
     length_mm: float
-    part: np.ndarray
-
-    def among(self, chosen: np.ndarray) -> "ProfileLine":
-        """The same in the profile from which the points were chosen by a mask."""
-        return replace(self, members=_among(self.members, chosen), part=_among(self.part, chosen))
 
     def with_parts(self, others: np.ndarray) -> "ProfileLine":
         """The line with points of other surfaces, whose numbers (N,) are not 0."""
         return replace(self, members=self.members | (others > 0), part=np.where(others > 0, others, self.part))
-
-
-def _among(own: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    every = np.zeros(len(chosen), dtype=own.dtype)
-    every[chosen] = own
-    return every
 
 
 def noise_of(points: np.ndarray) -> float:
@@ -143,20 +135,38 @@ def circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return triples[:, 0] + away, np.linalg.norm(away, axis=1)
 
 
-def _refined_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> ProfileArc | None:
-    centre, radius, std = np.zeros(2), 0.0, 0.0
+def _settled(
+    members: np.ndarray, tolerance: float, off: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, float] | None:
+    """Points (N,) on a curve, found anew until they stay the same, and their scatter; None where they are too few.
+
+    ``off`` returns the distances (N,) of all points from the curve through some (N,).
+    """
+    std = 0.0
     for _ in range(_LARGEST_ROUNDS):
         if np.count_nonzero(members) < LEAST_POINTS:
             return None
-        centre, radius = _fitted_circle(points[members])
-        off = np.linalg.norm(points - centre, axis=1) - radius
-        std = MAD_TO_STD * float(np.median(np.abs(off[members])))
-        before, members = members, np.abs(off) < min(max(_REJECTED_BEYOND * std, 1e-4), 2 * tolerance)
+        away = np.abs(off(members))
+        std = MAD_TO_STD * float(np.median(away[members]))
+        before, members = members, away < min(max(_REJECTED_BEYOND * std, 1e-4), 2 * tolerance)
         if np.array_equal(before, members):
             break
-    if np.count_nonzero(members) < LEAST_POINTS or _arc_angle(points[members] - centre) < _LEAST_ARC:
+    return (members, std) if np.count_nonzero(members) >= LEAST_POINTS else None
+
+
+def _refined_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> ProfileArc | None:
+    def off(some: np.ndarray) -> np.ndarray:
+        centre, radius = _fitted_circle(points[some])
+        return np.linalg.norm(points - centre, axis=1) - radius
+
+    if (found := _settled(members, tolerance, off)) is None:
         return None
-    return ProfileArc(members, centre, radius, std)
+    members, std = found
+    centre, radius = _fitted_circle(points[members])
+    if _arc_angle(points[members] - centre) < _LEAST_ARC:
+        return None
+    part = np.zeros(len(points), dtype=int)
+    return ProfileArc(members=members, part=part, std_mm=std, centre_mm=centre, radius_mm=radius)
 
 
 def _fitted_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
@@ -193,19 +203,27 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
     off = np.abs(points @ normals.T - np.sum(points[first[proper]] * normals, axis=1)).T
     tolerance = _widened(off, tolerance)
     members = off[np.argmax(np.count_nonzero(off < tolerance, axis=1))] < tolerance
-    middle, direction, std = np.zeros(2), np.zeros(2), 0.0
-    for _ in range(_LARGEST_ROUNDS):
-        if np.count_nonzero(members) < LEAST_POINTS:
-            return None
-        middle = points[members].mean(axis=0)
-        direction = np.linalg.svd(points[members] - middle, full_matrices=False)[2][0]
-        off = (points - middle) @ np.array([-direction[1], direction[0]])
-        std = MAD_TO_STD * float(np.median(np.abs(off[members])))
-        before, members = members, np.abs(off) < min(max(_REJECTED_BEYOND * std, 1e-4), 2 * tolerance)
-        if np.array_equal(before, members):
-            break
-    length = float(np.ptp(points[members] @ direction))
-    return ProfileLine(members, middle, direction, std, length, np.zeros(len(points), dtype=int))
+
+    def line(some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        middle = points[some].mean(axis=0)
+        return middle, np.linalg.svd(points[some] - middle, full_matrices=False)[2][0]
+
+    def beside(some: np.ndarray) -> np.ndarray:
+        middle, direction = line(some)
+        return (points - middle) @ np.array([-direction[1], direction[0]])
+
+    if (found := _settled(members, tolerance, beside)) is None:
+        return None
+    members, std = found
+    middle, direction = line(members)
+    return ProfileLine(
+        members=members,
+        part=np.zeros(len(points), dtype=int),
+        std_mm=std,
+        middle_mm=middle,
+        direction=direction,
+        length_mm=float(np.ptp(points[members] @ direction)),
+    )
 
 
 def find_step(points: np.ndarray, height_mm: float | None, rng: np.random.Generator) -> ProfileLine | None:
@@ -229,7 +247,7 @@ def find_step(points: np.ndarray, height_mm: float | None, rng: np.random.Genera
     _, noise, nearer, farther, line = best
     members, part = np.zeros(len(points), bool), np.zeros(len(points), int)
     members[nearer] = members[farther] = part[farther] = True
-    return ProfileLine(members, line.middle_mm, line.direction, noise, line.length_mm, part)
+    return replace(line, members=members, part=part, std_mm=noise)
 
 
 def find_face(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | None:

@@ -9,9 +9,10 @@ import numpy as np
 from uwlts.calibration.joint.stored_estimate import StoredEstimate, stored_estimate
 from uwlts.calibration.mount.estimate import RestrictedEstimate
 from uwlts.errors import CalibrationError, DescriptionError
-from uwlts.model.any_calibration import calibration_digest, check_fits
+from uwlts.model.any_calibration import calibration_digest
 from uwlts.model.calibration import Calibration
 from uwlts.model.mount import SensorShare
+from uwlts.optics.fitness import check_fits
 from uwlts.optics.triangulation import reconstruct_profile
 from uwlts.storage.capture import Capture
 from uwlts.stripe import find_stripes

@@ -6,18 +6,19 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, Seen, SphereShape, StepShape, square_to
+from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, SphereShape, StepShape, square_to
 from uwlts.calibration.mount.estimate import RestrictedEstimate
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, cross_matrix
-from uwlts.calibration.mount.profiles import ProfileArc, ProfileLine, circles_through
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, in_sheet, in_space, point_by_mount
+from uwlts.calibration.mount.profiles import ProfileArc, ProfileLine, Seen, circles_through
 from uwlts.errors import CalibrationError
 
-_SUBSETS, _SUBSET = 40, 8
-"""Random choices of poses: with a fifth of the poses wrong one of six choices of eight has none of these."""
-_TRIED = 4
+_SUBSET = 8  # poses of a random choice: 24 linear equations for 12 unknowns
+_SUBSETS = 40  # random choices: with a fifth of the poses wrong one of six has none of these
+_TRIED = 4  # of the linear solutions for a sphere, the best ones that are refined
 _THINNED = 9
-_TURNS, _TURNS_TRIED = 5000, 10
-"""Rotations tried for a plane, some 12 deg apart, and how many of the best are refined."""
+"""Points of each profile by which a refined start is judged."""
+_TURNS = 5000  # rotations tried for a plane, some 12 deg apart
+_TURNS_TRIED = 10  # of these the best that are refined
 _RADII = (1.02, 1.15, 1.5)
 """Radius of an unknown sphere over that of its largest section."""
 _REWEIGHTED = 10
@@ -25,8 +26,8 @@ _FAR = 4.0
 """Standard uncertainties within which points of a ring's wall are sought; poses with as many misfits are left out."""
 _CLEAR = 6.0
 """Least radius over the width within which a circle's points are sought: a smaller one cannot be distinguished."""
-_CIRCLES, _JUDGED = 3000, 1500
-"""Circles tried, and points by which each is judged: where a fifth of the points are on the wall, 24 circles are."""
+_CIRCLES = 3000  # circles tried: where a fifth of the points are on the wall, 24 of them are
+_JUDGED = 1500  # points by which each is judged
 _ROUGH = Scatter(point_mm=0.1, smooth_mm=1e-4, length_mm=1.0, pose_mm=0.3, turn_rad=3e-3)
 """Scatter for the weights of the search, whose robust loss begins beyond it."""
 
@@ -92,8 +93,7 @@ def _start_of_sphere(
             for state in _linear_solutions(rotations, positions, centres, depth, subset, radius):
                 found.append((_misfit(rotations, positions, centres, depth, state), state))
     found.sort(key=lambda each: each[0])
-    rough = problem.thinned(_THINNED)
-    return _best(rough, [_in_sensor_frame(state, sheet) for _, state in found[:_TRIED]])
+    return _best(problem, [state for _, state in found[:_TRIED]], sheet)
 
 
 def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, towards: np.ndarray) -> MountState:
@@ -109,12 +109,7 @@ def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray,
     angles = -Rotation.from_matrix(rotations[0].T @ rotations).as_rotvec()[:, 2]
     centres, radii = np.array([arc.centre_mm for arc in arcs]), np.array([arc.radius_mm for arc in arcs])
     design = np.column_stack([np.ones(len(arcs)), np.cos(angles), np.sin(angles)])
-    weights, flat = np.ones(len(arcs)), np.zeros((3, 2))
-    for _ in range(_REWEIGHTED):
-        flat = np.linalg.lstsq(design * weights[:, None], centres * weights[:, None], rcond=None)[0]
-        off = np.linalg.norm(centres - design @ flat, axis=1)
-        # Cauchy's weights.
-        weights = 1 / np.sqrt(1 + (off / max(2 * float(np.median(off)), 1e-6)) ** 2)
+    flat = _robust(design, centres)
     largest, states = float(np.quantile(radii, 0.9)), []
     root = np.sqrt(complex(flat[2] @ flat[2] - flat[1] @ flat[1], -2 * flat[1] @ flat[2]))
     for radius in [problem.shape.size_mm] if problem.shape.size_mm else [share * largest for share in _RADII]:
@@ -133,7 +128,7 @@ def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray,
             translation = np.array([0.0, 0.0, height]) - rotation @ q
             place = rotations[0] @ np.array([reach, 0.0, height]) + positions[0]
             states.append(MountState(rotation, translation, np.append(place, radius)))
-    return _best(problem.thinned(_THINNED), [_in_sensor_frame(state, sheet) for state in states])
+    return _best(problem, states, sheet)
 
 
 def _linear_solutions(
@@ -200,8 +195,8 @@ def _start_of_plane(
     distance are linear then.
     """
     rotations, positions = problem.motion(0.0)
-    middles = _in_space(np.array([line.middle_mm for line in lines]))
-    directions = _in_space(np.array([line.direction for line in lines]))
+    middles = in_space(np.array([line.middle_mm for line in lines]))
+    directions = in_space(np.array([line.direction for line in lines]))
     turns = Rotation.random(_TURNS, rng=rng).as_matrix()
     seen = np.einsum("pij,tjk,pk->tpi", rotations, turns, directions)
     values, vectors = np.linalg.eigh(np.einsum("tpi,tpj->tij", seen, seen))
@@ -212,9 +207,9 @@ def _start_of_plane(
         for turn in (turns[number], turns[number] * np.array([-1.0, 1.0, -1.0])):
             places = np.einsum("pij,jk,pk->pi", rotations, turn, middles) + positions
             design = np.column_stack([np.einsum("pji,j->pi", rotations, normal), -np.ones(len(lines))])
-            solution = _robust(design, -places @ normal)
+            solution = _robust(design, -(places @ normal)[:, None])[:, 0]
             states.append(MountState(turn, solution[:3], np.append(normal, solution[3])))
-    return _best(problem.thinned(_THINNED), [_in_sensor_frame(state, sheet) for state in states])
+    return _best(problem, states, sheet)
 
 
 def _start_of_step(
@@ -246,7 +241,7 @@ def _start_of_ring(
     state = used.rough(state, scatter)
     covariance = RestrictedEstimate(used, state, np.array(scatter)).covariance[:6, :6]
     middle = state.rotation @ np.vstack(used.points).mean(axis=0)
-    to_point = np.hstack([np.eye(3), -cross_matrix(middle)])
+    to_point = point_by_mount(middle)
     known = float(np.sqrt(np.linalg.eigvalsh(to_point @ covariance @ to_point.T)[-1]))
     reach = _FAR * float(np.hypot(known, scatter.pose_mm))
     base = whole.base(state)
@@ -265,7 +260,7 @@ def _start_of_ring(
     state = replace(
         state, artefact=np.concatenate([normal, circle[:2] @ axes + distance * normal, [shape.size_mm or circle[2]]])
     )
-    flat = [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in whole.points]
+    flat = in_sheet(whole.points, sheet)
     for narrower in (1.0, 3.0, 9.0):
         problem = whole.of_seen(whole.seen_again(state, flat, max(reach / narrower, 5 * noise), rng))
         require_surfaces(problem)
@@ -301,22 +296,23 @@ def _circle_of_most(
 
 
 def _robust(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Solution of linear equations of which some are wrong, by Cauchy's weights."""
-    weights, solution = np.ones(len(design)), np.zeros(design.shape[1])
+    """Solution (k, m) of linear equations, ``design`` (N, k) and ``wanted`` (N, m), of which some are wrong.
+
+    By Cauchy's weights.
+    """
+    weights, solution = np.ones(len(design)), np.zeros((design.shape[1], wanted.shape[1]))
     for _ in range(_REWEIGHTED):
-        solution = np.linalg.lstsq(design * weights[:, None], wanted * weights, rcond=1e-10)[0]
-        off = np.abs(design @ solution - wanted)
+        solution = np.linalg.lstsq(design * weights[:, None], wanted * weights[:, None], rcond=1e-10)[0]
+        off = np.linalg.norm(design @ solution - wanted, axis=1)
         weights = 1 / np.sqrt(1 + (off / max(2 * float(np.median(off)), 1e-6)) ** 2)
     return solution
 
 
-def _in_space(flat: np.ndarray) -> np.ndarray:
-    """Points or directions (P, 2) of the sheet in its frame (P, 3)."""
-    return np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
+def _best(problem: Problem, states: list[MountState], sheet: np.ndarray) -> MountState:
+    """The state, as one of the sensor's frame, of smallest median distance after a robust refinement from each.
 
-
-def _best(rough: Problem, states: list[MountState]) -> MountState:
-    """The state of smallest median distance after a robust refinement from each, scale and time left as they are."""
-    fixed = replace(rough, scale=False, time=False)
-    refined = [fixed.rough(state, _ROUGH) for state in states]
+    Scale and time are left as they are.
+    """
+    fixed = replace(problem.thinned(_THINNED), scale=False, time=False)
+    refined = [fixed.rough(_in_sensor_frame(state, sheet), _ROUGH) for state in states]
     return min(refined, key=lambda state: float(np.median(fixed.rms_mm(state))))

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.polynomial import legendre
 from pydantic import JsonValue
 
-from uwlts.calibration.capture_evidence import AirEvidence, Progress, air_evidence
+from uwlts.calibration.capture_evidence import AirEvidence, air_evidence
 from uwlts.calibration.polynomial.polynomial_evidence import (
-    PlateMap,
     PlateStripes,
     common_header,
     object_coordinates,
@@ -18,7 +17,9 @@ from uwlts.calibration.polynomial.polynomial_evidence import (
 )
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.model.brief import Brief
 from uwlts.model.polynomial_calibration import PolynomialCalibration
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture, CaptureHeader, opened_captures
 from uwlts.stripe import StripeSettings
 
@@ -27,8 +28,8 @@ MOST_SMOOTH = 8
 _LINES_PER_DEGREE = 10  # a degree over the lines needs several lines of its own
 _DETERMINED = 1e-6  # smallest singular value over the largest: a full view has 0.1, one cut to a triangle thousandths
 _OUTLIER = 5.0  # standard deviations; of a million normal values one is farther
-# Outliers may return for so many rounds, then they stay out, so that the rounds end.
-_ROUNDS, _RETURNING_ROUNDS = 20, 10
+_ROUNDS = 20  # of leaving out outliers; a few settle
+_RETURNING_ROUNDS = 10  # in which outliers may return; then they stay out, so that the rounds end
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,20 +129,18 @@ _LARGEST_MAP_SHARE = 0.004  # the map should be good to two thousandths of the c
 _LARGEST_LINE_EXCESS = 1.5  # 1 by chance, within a few percent for thousands of points
 
 
-@dataclass(frozen=True, eq=False)
-class PolynomialResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class PolynomialResult(Brief):
     """A polynomial calibration with everything a report shows of its making.
 
     Attributes
     ----------
-    maps : from pixels to the plate, of each image
     depth, along : the fits of Z(position) and of Y(Z), with the residuals of the stripe points: of all for Z, of those
         that Z used for Y
     """
 
     calibration: PolynomialCalibration
     stripes: PlateStripes
-    maps: list[PlateMap]
     depth: LinePolynomials
     along: LinePolynomials
     warnings: list[str]
@@ -152,17 +151,21 @@ def calibrate_polynomials(
     *,
     degree: int = 6,
     stripe: StripeSettings = None,
-    progress: Progress | None = None,
+    progress: ProgressListener = unheard,
 ) -> PolynomialResult:
-    """Calibrate a sensor by polynomials, position to Z and Z to Y for each profile line.
+    """Calibrate by polynomials, position to Z and Z to Y for each profile line, completely in the medium of use.
 
     Parameters
     ----------
     target : sequence of Capture or path
-        A target in the medium of use, square to the laser's axis, that stands still in all captures while the stage
-        moves the sensor along Z. Images with the laser off show the target, those with the laser on, at the same
-        positions and in the same capture, the stripe on it.
-    degree : of all polynomials
+        Captures of a target that stands still, square to the laser's axis, while the stage moves the sensor along Z: at
+        every stage position one image under the lamp and one with the laser.
+    degree : int
+        Degree of the polynomials; there must be more stage positions.
+    stripe : StripeOptions or dict, optional
+        As for `reconstruct`.
+    progress : callable, optional
+        Called with the number of images done, the number in all, and the name of the stage.
 
     Returns
     -------
@@ -259,7 +262,7 @@ def fit_polynomials(
         )
     provenance = {"source": "polynomials from captures", "captures": list(sources), "warnings": warnings}
     calibration = calibration.model_copy(update={"residuals": figures, "provenance": provenance})
-    return PolynomialResult(calibration, stripes, maps, depth, along, warnings)
+    return PolynomialResult(calibration, stripes, depth, along, warnings)
 
 
 def _line_excess(fit: LinePolynomials, lines: np.ndarray) -> float:

@@ -13,17 +13,9 @@ from pydantic import JsonValue
 
 from uwlts._version import __version__
 from uwlts.calibration.camera.camera_parameters import CameraOptions
-from uwlts.calibration.camera.image_turns import refuse_turned_travel
 from uwlts.calibration.camera.lens import LensCalibration, LensChoice, calibrate_lens, half_doubt, jackknife
-from uwlts.calibration.camera.target_poses import CameraSolution, Poses, solve_camera
-from uwlts.calibration.capture_evidence import (
-    AirEvidence,
-    Progress,
-    StepEvidence,
-    air_evidence,
-    no_stripe_in,
-    step_evidence,
-)
+from uwlts.calibration.camera.target_poses import CameraSolution, Poses, refuse_turned_travel, solve_camera
+from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence, air_evidence, no_stripe_in, step_evidence
 from uwlts.calibration.sequential.sheet_fit import (
     SheetSolution,
     StripePoints,
@@ -31,13 +23,13 @@ from uwlts.calibration.sequential.sheet_fit import (
     object_frame,
     points_on_target,
 )
-from uwlts.calibration.sequential.step_figures import camera_figures, lens_figures, sheet_figures, window_figures
 from uwlts.calibration.sequential.step_images import label_steps
 from uwlts.calibration.sequential.window_distance import WindowSolution, solve_window
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Sensor, Window
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture, source_of
 from uwlts.stripe import StripeSettings
 
@@ -64,7 +56,6 @@ class CalibrationOptions:
     sizes_known : jointly: whether diameters and spacings of what was scanned count as calibrated where their
         uncertainty is stated; they are estimated otherwise
     strict : jointly: refuse images that do not fit, in place of leaving them out or stating an error of the model
-    bounds_mm : (low, high), optional; window distances to search
     """
 
     refractions: Literal[1, 2] = 2
@@ -77,7 +68,6 @@ class CalibrationOptions:
     same_water: bool = True
     sizes_known: bool = True
     strict: bool = False
-    bounds_mm: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +119,7 @@ def calibrate_sequentially(
     steps: Sequence[Capture] = (),
     *,
     options: CalibrationOptions | None = None,
-    progress: Progress | None = None,
+    progress: ProgressListener = unheard,
 ) -> CalibrationResult:
     """Calibrate a sensor from its captures; without step captures for use in the medium of the target's images only.
 
@@ -153,7 +143,11 @@ def calibrate_sequentially(
 
 
 def gather(
-    air: Sequence[Capture], steps: Sequence[Capture], *, options: CalibrationOptions, progress: Progress | None = None
+    air: Sequence[Capture],
+    steps: Sequence[Capture],
+    *,
+    options: CalibrationOptions,
+    progress: ProgressListener = unheard,
 ) -> Evidence:
     """Find the target, the stripes on it and on the step standard in all images; errors as `calibrate_sequentially`.
 
@@ -202,16 +196,16 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     sheet = fit_sheet(
         stripe_points.points_mm, nominal_normal=pose.normal, nominal_offset_mm=float(pose.normal @ pose.origin_mm)
     )
-    figures, apart = {"camera": camera_figures(camera)}, None
+    figures, apart = {"camera": camera.figures()}, None
     warnings = [*evidence.warnings, *seen.warnings]
     if seen.lens is not None:
         sheet, apart = _by_images(sheet, seen.lens, found), _halves_apart_rad(sheet, seen.lens, found)
-        figures["camera"] |= lens_figures(seen.lens, found)
+        figures["camera"] |= _lens_figures(seen.lens, found)
         warnings += seen.lens.half_doubts()
         if apart is not None:
             words = f"their sheets are {np.degrees(apart):.3f} deg apart"
             warnings += half_doubt(words, apart=apart, std=sheet.normal_std_rad)
-    figures["sheet"] = sheet_figures(sheet, stripe_points, apart)
+    figures["sheet"] = sheet.figures(stripe_points, apart)
     warnings += _turn_warnings(camera, sheet, evidence)
     calibration = Calibration(
         sensor_name=sensor.name,
@@ -231,8 +225,8 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
         if not used:
             why = "; ".join([*evidence.warnings, *on_steps][:3])
             raise CalibrationError(f"no step image can be used for the window's distance; {why}")
-        window = solve_window(calibration, described, used, bounds_mm=options.bounds_mm, known=sensor.uncertainty)
-        figures["window"] = window_figures(window, used)
+        window = solve_window(calibration, described, used, known=sensor.uncertainty)
+        figures["window"] = window.figures(used)
     warnings += on_steps
     how = {"refractions": options.refractions, "poses": options.poses, "medium_index": options.medium_index}
     calibration = calibration.model_copy(
@@ -292,6 +286,34 @@ def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSol
             unsquare = solved(used.images, poses=options.poses, options=replace(lens.options, pixel_aspect=None))
             warnings.append(_leaning(camera, freer, unsquare, tilt_rad=freer.stage_tilt_rad))
     return _Seen(camera, lens, used, warnings)
+
+
+def _lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonValue]:
+    """Models tried and images used, of ``found`` those alone, as files hold them; None for what is missing."""
+    rms = lens.solution.image_rms_px()
+    columns = zip(found.names(), found.images, rms, lens.moved, found.stripes, found.outliers, strict=True)
+    table: list[JsonValue] = [
+        {
+            "image": name,
+            "points": len(image.pixels),
+            "rms_px": float(miss),
+            "moves": None if np.isnan(moved) else float(moved),
+            "stripe_points": len(stripe),
+            "stripe_outliers": outliers,
+        }
+        for name, image, miss, moved, stripe, outliers in columns
+    ]
+    tried: list[JsonValue] = [
+        {"model": each.name, "rms_px": each.rms_px if np.isfinite(each.rms_px) else None} for each in lens.candidates
+    ]
+    return {
+        "halves": [{**half} for half in lens.half_values()],
+        "lens_model": lens.name,
+        "models_tried": tried,
+        "rejected_share": lens.rejected_share,
+        "images_left_out": len(lens.left_out),
+        "image_table": table,
+    }
 
 
 def common_sensor(captures: Sequence[Capture]) -> Sensor:

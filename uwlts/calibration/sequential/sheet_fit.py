@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from pydantic import JsonValue
 from scipy.spatial import ConvexHull
 
-from uwlts.calibration.camera.image_turns import turned_like
+from uwlts.calibration.camera.target_poses import turned_like
 from uwlts.errors import CalibrationError, EvaluationError
 from uwlts.fitting.least_squares import fit_robustly
 from uwlts.fitting.shapes import fit_plane
-from uwlts.model.calibration import CameraModel, SheetModel
+from uwlts.model.calibration import CameraModel, SheetModel, rigid_transform
 from uwlts.optics.camera import directions
 
 # Spread of the points along the shorter direction of the sheet over their scatter across it, and over their spread
@@ -20,7 +21,8 @@ _LEAST_SPREAD = 20.0
 _LEAST_SHAPE = 0.01
 _LARGEST_REJECTED = 0.2  # outliers are few; where more points leave the plane, there is none
 _LARGEST_TURN = np.radians(60)  # descriptions are rough; beyond this axes are exchanged or signs wrong
-_OTHER_UNIT, _LEAST_OFFSET_MM = 5.0, 10.0  # descriptions are rough, but not by this factor
+_OTHER_UNIT = 5.0  # descriptions are rough, but not by this factor
+_LEAST_OFFSET_MM = 10.0  # nearer to the camera than this the sheet's distance shows no factor
 _CROSSING = 0.3  # cosine from which it is of use to say where the sheet crosses an axis
 
 
@@ -44,6 +46,19 @@ class SheetSolution:
     rejected_share: float  # share of the points left out
     normal_std_rad: float  # largest standard deviation of the normal's direction
     turn_rad: float  # angle between the normal and the nominal one
+
+    def figures(self, points: StripePoints, halves_apart_rad: float | None) -> dict[str, JsonValue]:
+        """Distances of the stripe points from the sheet, as files hold them; the angle between the sheets of halves."""
+        return {
+            "images": len(np.unique(points.image)),
+            "points": len(points.points_mm),
+            "rms_mm": self.rms_mm,
+            "max_mm": self.max_mm,
+            "rejected_share": self.rejected_share,
+            "normal_std_deg": float(np.degrees(self.normal_std_rad)),
+            "halves_apart_deg": None if halves_apart_rad is None else float(np.degrees(halves_apart_rad)),
+            "turn_from_nominal_deg": float(np.degrees(self.turn_rad)),
+        }
 
 
 def points_on_target(
@@ -179,7 +194,4 @@ def object_frame(sheet: SheetModel, *, laser_axis: np.ndarray) -> np.ndarray:
     z = z / np.linalg.norm(z)
     if not (abs(x[2]) > 1e-9 and sheet.offset_mm / x[2] > 0):
         raise CalibrationError("the camera's axis does not meet the calibrated sheet in front of the camera")
-    transform = np.eye(4)
-    transform[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    transform[2, 3] = sheet.offset_mm / x[2]
-    return transform
+    return rigid_transform(np.stack([x, np.cross(z, x), z], axis=1), np.array([0.0, 0.0, sheet.offset_mm / x[2]]))

@@ -15,10 +15,12 @@ from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.triangulation import points_on_sheet
 
-_FEWEST_PLACES, _LEAST_TRAVEL_MM = 3, 5.0  # images of a face; fewer and nearer ones do not show that it is a plane
-# The lower face counts as one plane in all images, so that the standard stood still, as long as points scatter about it
-# so many times as much as about their lines, and by a stage's errors.
-_STOOD_STILL, _STAGE_MM = 2.0, 0.05
+_FEWEST_PLACES = 3  # images of a face: fewer do not show that it is a plane
+_LEAST_TRAVEL_MM = 5.0  # of the stage across the stripe between them: nearer ones do not show that it is a plane
+_STOOD_STILL = 2.0
+"""Times the scatter about their lines by which points may scatter about one plane of all images: the standard stood
+still then."""
+_STAGE_MM = 0.05  # error of a stage that comes in addition
 _SCALE_STD = 0.05  # relative, of profiles by a window that is only described
 _OF_SQUARE = np.sqrt(3) / 2
 """Root mean square of a²/2 over the variance of a normally distributed angle a, as 1 / cos(a) is 1 + a²/2."""

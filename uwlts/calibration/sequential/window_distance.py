@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from pydantic import JsonValue
 from scipy.optimize import least_squares, root_scalar
 
 from uwlts.calibration.sequential.step_images import StepImage, step_profile
@@ -57,6 +58,28 @@ class WindowSolution:
     image_distances_mm: np.ndarray
     curve_mm: np.ndarray
     bounds_mm: tuple[float, float]
+
+    def figures(self, steps: Sequence[StepImage]) -> dict[str, JsonValue]:
+        """Step heights and their errors, the distance's standard deviations, the curve, as files hold them."""
+        return {
+            "images": [step.source for step in steps],
+            "distance_mm": self.model.distance_mm,
+            "std_mm": self.uncertainty_mm,
+            "left_over_std_mm": self.std_mm,
+            "scatter_std_mm": self.scatter_std_mm,
+            "per_height": self.per_height,
+            "per_index": self.per_index,
+            "heights_mm": self.heights_mm.tolist(),
+            "errors_mm": self.errors_mm.tolist(),
+            "height_std_mm": self.height_std_mm.tolist(),
+            "image_distances_mm": _none_for_nan(self.image_distances_mm),
+            "curve_mm": [_none_for_nan(row) for row in self.curve_mm],
+            "bounds_mm": list(self.bounds_mm),
+        }
+
+
+def _none_for_nan(values: np.ndarray) -> list[JsonValue]:
+    return [value if np.isfinite(value) else None for value in values.tolist()]
 
 
 def solve_window(
@@ -127,8 +150,8 @@ def solve_window(
     if not low + margin < distance < high - margin:
         raise CalibrationError(
             f"the step's height fits best at the bound of the searched window distances, {low:.1f} to {high:.1f} mm: "
-            "check the medium's index and the step's height, and that the images are not turned or mirrored, or widen "
-            "the bounds"
+            "check the medium's index, the step's height and the window's described distance, and that the images are "
+            "not turned or mirrored"
         )
     own = zip(steps, scanned[usable].T - true[:, None], strict=True)
     squares, freedom = float(slopes @ slopes), len(steps) - 1

@@ -131,9 +131,9 @@ class GuidedPlan(RigPlan):
     def camera_address(self) -> str:
         """The camera's address; DescriptionError where that, or the port of a planned stage, is not given."""
         if self.camera is None:
-            raise DescriptionError("neither the plan nor the command line gives the camera: give --camera")
+            raise DescriptionError("the plan names no camera: give `camera`")
         if self.stage is not None and self.stage.port is None:
-            raise DescriptionError("neither the plan nor the command line gives the stage's port: give --stage")
+            raise DescriptionError("the plan names no serial port of the stage: give `stage`")
         return self.camera
 
     def target_in_air(self) -> bool:

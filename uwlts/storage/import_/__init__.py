@@ -1,9 +1,9 @@
 """Images of any camera and program turned into a capture."""
 
 from uwlts.storage.import_.camera_files import KnownCamera, read_intrinsics, with_intrinsics
-from uwlts.storage.import_.channels import Channel, checked_channel, one_channel
 from uwlts.storage.import_.folder import Imported, import_images
 from uwlts.storage.import_.folder_description import NAME as DESCRIPTION_NAME
+from uwlts.storage.import_.grey_values import Channel, checked_channel, one_channel
 from uwlts.storage.import_.matching import image_files
 
 __all__ = [

@@ -1,7 +1,6 @@
 """Import of a folder of images as a capture, with checks for black, saturated and stripe-free images."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -10,16 +9,15 @@ import numpy as np
 
 from uwlts._version import __version__
 from uwlts.errors import DescriptionError, ImageError
-from uwlts.files.command_files import keeps_inputs
+from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import refuse_unsuitable
 from uwlts.model.sensor import Sensor, Table
+from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import CAPTURES, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.image_file import read_image
 from uwlts.storage.image_header import ImageHeader
 from uwlts.storage.import_.centre_lines import profile_rows
-from uwlts.storage.import_.channels import is_formula, one_channel
-from uwlts.storage.import_.chromatic import chromatic_warnings
 from uwlts.storage.import_.folder_description import (
     NAME,
     ImportDescription,
@@ -27,11 +25,10 @@ from uwlts.storage.import_.folder_description import (
     described_sensor,
     read_description,
 )
-from uwlts.storage.import_.images import bits_of, grey_values, without_background
+from uwlts.storage.import_.grey_values import bits_of, grey_values, is_formula, one_channel, without_background
 from uwlts.storage.import_.matching import ImageRow, match, planned_frames, read_rows, stage_remark
 from uwlts.stripe import Stripe
 from uwlts.stripe.capture_stripes import BLACK, FEWEST_LINES, WHITE, is_black, shown_stripe, white_share
-from uwlts.targets import parse_target
 
 _SIZE_ADVICE = {
     (True, True): "the images are turned by a quarter turn: turn them back, or exchange width_px and height_px of the "
@@ -120,16 +117,16 @@ class Imported:
     warnings: tuple[str, ...]
 
 
-@keeps_inputs
+@inputs_kept()
 def import_images(
     folder: str | Path,
     out: str | Path,
     *,
     description: str | Path | None = None,
     overwrite: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: ProgressListener = unheard,
 ) -> Imported:
-    """Write the images of a folder as a capture, whole or not at all.
+    """Turn a folder of images of any camera into a capture, written whole or not at all.
 
     Where laser images have a background, all images are stored with 16 bit, the laser images as the difference plus
     2^bits: the sign of the noise about zero is part of the evidence.
@@ -137,11 +134,11 @@ def import_images(
     Parameters
     ----------
     folder : str or Path
-        The images: PNG, TIFF, BMP or JPEG, in it or in folders below it.
+        Folder of PNG, TIFF, BMP or JPEG images, in it or in folders below it.
     out : str or Path
         Capture to write.
     description : str or Path, optional
-        TOML file of an `ImportDescription`; import.toml in the folder unless given.
+        TOML file with sensor, medium, positions, and which image is what; import.toml in the folder unless given.
     overwrite : bool
         Replace an existing capture.
     progress : callable
@@ -224,11 +221,6 @@ def import_images(
         part_path(out).unlink(missing_ok=True)
         raise
     warnings = content.warnings()
-    if given.target is not None:
-        lamps = [folder / row.file for row in frames if row.light == "lamp"]
-        channel, wavelength = given.lamp_channel or given.channel, header.sensor.laser.wavelength_nm
-        target = parse_target(given.target)
-        warnings += chromatic_warnings(lamps, target, lamp_channel=channel, wavelength_nm=wavelength)
     if not in_time:
         warnings.append("the images are not in the order of their times, which are left out: the table's lines give it")
     if unmatched := matched.unmatched:

@@ -12,7 +12,7 @@ from uwlts.model.library import find, load_sensor, merged, read_table, validated
 from uwlts.model.sensor import Description, NotNegative, Sensor, Table, Vector
 from uwlts.storage.capture import CaptureHeader
 from uwlts.storage.import_.camera_files import read_intrinsics, with_intrinsics
-from uwlts.storage.import_.channels import Channel
+from uwlts.storage.import_.grey_values import Channel
 from uwlts.targets import parse_target
 
 NAME = "import.toml"

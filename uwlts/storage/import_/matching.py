@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from uwlts.errors import DescriptionError, ImageError
-from uwlts.files.command_files import note_input
+from uwlts.files.inputs import note_input
 from uwlts.files.reading import is_regular_file, read_text
 from uwlts.model.calibration import is_rigid
 from uwlts.storage.capture import POSE_ROUNDED

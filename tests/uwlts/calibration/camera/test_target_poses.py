@@ -11,7 +11,7 @@ from tests.uwlts.calibration_views import Lens, built_sensor, inside, lattice, l
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
 from uwlts.calibration.camera.target_images import TargetImage, observe, placements, z_away
 from uwlts.calibration.camera.target_poses import direct_linear, solve_camera, stage_direction
-from uwlts.errors import CalibrationError
+from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.fitting.schur_least_squares import Observation, schur_least_squares
 
 SENSOR = built_sensor()
@@ -107,7 +107,7 @@ def test_chosen_parameters_only():
     assert solution.parameters == ("f", "k1")
     assert (solution.model.cx_px, solution.model.cy_px, solution.model.distortion.k2) == (600.0, 500.0, 0.0)
     for wrong in ({"distortion": ("k7",)}, {"distortion": ("k1", "k1")}, {"soft_limit_px": 0.0}):
-        with pytest.raises(ValueError):
+        with pytest.raises(DescriptionError):
             CameraOptions(**wrong)
 
 

@@ -10,7 +10,7 @@ from tests.uwlts.joint_views import Noise, gathered, target_series
 from tests.virtual_sensors import altered
 from uwlts.calibration.camera.lens import LensChoice
 from uwlts.calibration.joint.consistency import format_deviation
-from uwlts.calibration.joint.earlier_estimate import ViewMedium
+from uwlts.calibration.joint.parameters import ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError

@@ -8,10 +8,9 @@ import pytest
 from tests.uwlts.calibration_views import WATER, built_sensor
 from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, lit_points, step_views, target_series
 from tests.uwlts.simulated_campaign import ModelErrors, drawn_reality, evidence
-from uwlts.calibration.joint.derivatives import DescribedSheet
-from uwlts.calibration.joint.earlier_estimate import Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.initial import series_start
 from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
+from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions

@@ -13,9 +13,9 @@ from tests.uwlts import drawn_stripes
 from tests.uwlts.calibration_views import STEP_MM, built_sensor
 from tests.uwlts.joint_views import Noise, gathered, lit_points, seen, target_series
 from uwlts.calibration.capture_evidence import StepEvidence
-from uwlts.calibration.joint.earlier_estimate import EarlierEstimate, Prior, ViewMedium
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
+from uwlts.calibration.joint.parameters import EarlierEstimate, Prior, ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
 from uwlts.calibration.joint.refresh import refresh, solve_refreshed
 from uwlts.calibration.joint.residuals import StepProfileEvidence
@@ -29,7 +29,7 @@ from uwlts.model.sensor import Medium
 from uwlts.optics.nominal import nominal_calibration
 from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.report.certificate import certificate_of
-from uwlts.storage.calibration_file import read_calibration, write_calibration
+from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture
 
 BUILT = built_sensor()
@@ -220,7 +220,7 @@ def test_what_was_held_is_as_the_calibration_says(earlier):
         }
     )
     known, pixels = found_estimate(calibration, WARM), np.array([[150.0, 480.0], [640.0, 520.0], [1100.0, 450.0]])
-    found = known.parameters.on_sheet(known.values, known.view, pixels).points
+    found = known.parameters.stripe_points(known.values, known.view, pixels, across=0).points
     index, along = calibration.index_of(WARM), np.eye(3)[0]
     frame = calibration.object_transform()
 
@@ -245,7 +245,7 @@ def test_correlations_of_the_earlier_estimate_count(earlier, thesis):
 def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
     result = refreshed(earlier, steps(thesis), index_std=POORLY_KNOWN)
     path = tmp_path / "new.json"
-    write_calibration(path, result.calibration)
+    result.calibration.save(path)
     calibration = read_calibration(path)
     joint, before = calibration.joint, earlier.joint
     count = len(before.parameters)
@@ -310,7 +310,7 @@ def drawn(tmp_path_factory):
     sensor = drawn_stripes.SENSOR.model_copy(
         update={"laser": drawn_stripes.SENSOR.laser.model_copy(update={"window": square})}
     )
-    write_calibration(folder / "calibration.json", calibrated(sensor, sensor))
+    calibrated(sensor, sensor).save(folder / "calibration.json")
     return folder, sensor
 
 

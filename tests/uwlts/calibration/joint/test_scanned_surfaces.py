@@ -10,11 +10,10 @@ from tests.uwlts.calibration_views import WATER
 from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, target_series
 from tests.uwlts.scan_views import NONE, SLOPE, VIEW, Body, scan_of, square_sensor, stage_direction
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
-from uwlts.calibration.joint.derivatives import DescribedSheet
-from uwlts.calibration.joint.earlier_estimate import Parameters, Prior
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.gathering import scan_stripes
 from uwlts.calibration.joint.initial import surface_scan, surface_scans
+from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior
 from uwlts.calibration.joint.procedure import JointProblem, solve_jointly
 from uwlts.calibration.joint.residuals import STEP, Residuals
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Cylinder, Plane, Spheres

@@ -11,12 +11,10 @@ from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import target_series
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
 from uwlts.calibration.joint.consistency import Findings, deviations, findings, format_deviation, understated
-from uwlts.calibration.joint.derivatives import DescribedSheet
-from uwlts.calibration.joint.earlier_estimate import EarlierEstimate, Parameters, Prior, ViewMedium
-from uwlts.calibration.joint.estimate import UNSETTLED, Estimate
+from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Noise
 from uwlts.calibration.joint.initial import series_start
 from uwlts.calibration.joint.next_shot import Outlook
-from uwlts.calibration.joint.noise import Noise
+from uwlts.calibration.joint.parameters import DescribedSheet, EarlierEstimate, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.refresh import LengthChange, WaterChange
 from uwlts.calibration.joint.residuals import STRIPE, TARGET, Residuals
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions

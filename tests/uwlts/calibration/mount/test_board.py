@@ -162,8 +162,8 @@ def test_a_target_in_water_gives_the_mount(thesis, capture_path, tmp_path):
     error = errors_of(mount.transform())
     assert np.linalg.norm(error[:3]) < 0.3 and np.degrees(np.linalg.norm(error[3:])) < 0.05
     assert (np.abs(error) < 4 * mount.std()).all()
-    uwlts.write_mount(tmp_path / "mount.json", mount)
-    assert uwlts.read_mount(tmp_path / "mount.json") == mount
+    mount.save(tmp_path / "mount.json")
+    assert uwlts.read(tmp_path / "mount.json") == mount
 
 
 def test_wrong_evidence_is_refused(thesis, capture_path):

@@ -331,7 +331,7 @@ def test_a_description_names_everything(tmp_path, rng):
     (tmp_path / "mount.toml").write_text(text.replace("FORMAT", "euler-ZYX-deg"))
     within(uwlts.calibrate_mount(tmp_path / "mount.toml"))
     (tmp_path / "wrong.toml").write_text(text.replace("FORMAT", "euler-zyx-deg"))
-    with pytest.raises(CalibrationError, match="if the poses are euler-ZYX-deg, not euler-zyx-deg"):
+    with pytest.raises(CalibrationError, match="Is their format right .Euler angles about moved axes, such as ZYX"):
         uwlts.calibrate_mount(tmp_path / "wrong.toml")
 
 
@@ -432,7 +432,7 @@ def test_the_axis_of_a_rotary_table_is_found(tmp_path, rng):
     assert turn < 5 * np.linalg.norm(std[3:5]) < np.radians(0.2)
     assert shift < 5 * np.hypot(np.linalg.norm(std[:2]), STANDOFF_MM * np.linalg.norm(std[3:5])) < 1.0
     assert std[2] == std[5] == 0, "shift along the axis and turn about it are chosen"
-    uwlts.write_mount(tmp_path / "mount.json", mount)
+    mount.save(tmp_path / "mount.json")
     assert read_mount(tmp_path / "mount.json") == mount
     # The same profiles fit the table that is mirrored in the sheet, y -> -y: its axis, an axial vector, is
     # (-x, y, -z), which lies 2 arccos |y| from the true one. Two errors of at most 5 standard deviations are apart.

@@ -29,7 +29,7 @@ from uwlts.optics.window import RayStatus
 from uwlts.reconstruction.reconstruct import reconstruct
 from uwlts.report.inventory import describe
 from uwlts.runtime.console import run
-from uwlts.storage.calibration_file import load_calibration, read_polynomials, write_calibration
+from uwlts.storage.calibration_file import load_calibration, read_polynomials
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.storage.cloud_files import read_cloud
@@ -369,7 +369,7 @@ def test_plate_map_needs_points(sensor, evidence):
 @pytest.fixture
 def file(tmp_path, result):
     path = tmp_path / "polynomials.json"
-    write_calibration(path, result.calibration)
+    result.calibration.save(path)
     return path
 
 
@@ -383,7 +383,7 @@ def test_file_gives_back_the_same(file, result):
 
 def test_the_other_kind_is_recognised_by_its_format(tmp_path, sensor):
     rays = nominal_calibration(sensor)
-    write_calibration(tmp_path / "rays.json", rays)
+    rays.save(tmp_path / "rays.json")
     assert load_calibration(tmp_path / "rays.json") == rays
     with pytest.raises(CaptureError, match="not a polynomial calibration"):
         read_polynomials(tmp_path / "rays.json")

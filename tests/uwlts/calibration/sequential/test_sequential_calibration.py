@@ -22,7 +22,7 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Medium
-from uwlts.storage.calibration_file import read_calibration, write_calibration
+from uwlts.storage.calibration_file import read_calibration
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 
@@ -111,8 +111,8 @@ def result(files):
     told = []
     with Capture(files[0]) as air, Capture(files[1]) as steps:
         made = calibrate_sequentially([air], [steps], progress=lambda *what: told.append(what))
-        assert told[len(air) - 1] == ("target", len(air), len(air))
-        assert told[-1] == ("step", len(steps), len(steps))
+        assert told[len(air) - 1] == (len(air), len(air), "target")
+        assert told[-1] == (len(steps), len(steps), "step")
         assert len(told) == len(air) + len(steps)
     return made
 
@@ -156,11 +156,14 @@ def test_images_left_out_are_reported(result):
 
 
 def test_the_file_keeps_the_figures(result, tmp_path):
-    write_calibration(tmp_path / "sensor.json", result.calibration)
+    result.calibration.save(tmp_path / "sensor.json")
     kept = read_calibration(tmp_path / "sensor.json")
     assert kept == result.calibration.model_validate(json.loads(result.calibration.model_dump_json()))
     assert kept.residuals["camera"]["rms_px"] == result.camera.rms_px()
     assert kept.residuals["window"]["distance_mm"] == kept.window.distance_mm
+    std = kept.std()
+    assert std.camera == result.camera.std() and std.window_distance_mm == result.window.uncertainty_mm
+    assert std.sheet_normal_deg == np.degrees(result.sheet.normal_std_rad)
     assert len(kept.residuals["window"]["curve_mm"]) == len(result.window.curve_mm)
     assert kept.provenance["warnings"] == result.warnings
     assert kept.provenance["step_captures"][0]["medium"] == "water"

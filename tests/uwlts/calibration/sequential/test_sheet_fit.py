@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.uwlts.calibration_views import built_sensor, lattice, lens_of, stage_images, stripes_on_target, turn
-from uwlts.calibration.camera.image_turns import refuse_turned_travel
+from uwlts.calibration.camera.target_poses import refuse_turned_travel
 from uwlts.calibration.sequential.sheet_fit import fit_sheet, object_frame, points_on_target
 from uwlts.errors import CalibrationError, RangeError
 from uwlts.model.calibration import CameraModel, SheetModel

@@ -8,8 +8,8 @@ import pytest
 from tests.uwlts.calibration_views import STEP_MM, WATER, built_sensor, step_profile, through_window
 from tests.uwlts.joint_views import gathered
 from uwlts.calibration.capture_evidence import StepEvidence
-from uwlts.calibration.joint.earlier_estimate import Prior, ViewMedium
 from uwlts.calibration.joint.initial import step_profiles
+from uwlts.calibration.joint.parameters import Prior, ViewMedium
 from uwlts.calibration.sequential.step_images import StandardTurn, label_steps
 from uwlts.calibration.sequential.window_distance import solve_window
 from uwlts.model.artefacts import StepStandard

@@ -1,0 +1,80 @@
+"""Model of a drift by the covariance that a navigation states, propagated here step by step."""
+
+import numpy as np
+import pytest
+
+from uwlts.alignment.drift_model import drift_of
+from uwlts.errors import EvaluationError
+from uwlts.model.trajectory import Trajectory
+
+SECONDS, BEFORE_S, STEP_S = 100.0, 2.0, 0.05
+BIAS_MM_S, NOISE, GYRO, HEADING_NOISE = 3.0, 2.0, 2e-4, 1e-4
+"""Velocity: mm/s, mm/s per root Hz; heading: rad/s, rad/s per root Hz."""
+DEPTH_MM, TILT = 3.0, 2e-3
+
+
+def navigated(*, by_heading: bool) -> Trajectory:
+    """Along X, then along Y, from 2 s after the navigation's start on.
+
+    The state is the error of x, y and heading, and their biases.
+    """
+    times = np.arange(-BEFORE_S, SECONDS + STEP_S / 2, STEP_S)
+    velocity = np.where(times[:, None] < SECONDS / 3, (200.0, 0.0), (0.0, 150.0))
+    spread = np.diag([0, 0, 0, BIAS_MM_S**2, BIAS_MM_S**2, GYRO**2])
+    noise = np.diag([NOISE**2, NOISE**2, HEADING_NOISE**2, 0, 0, 0]) * STEP_S
+    covariance = np.zeros((len(times), 6, 6))
+    for number, (x, y) in enumerate(velocity):
+        rows = np.array([0, 1, 5])
+        covariance[number][np.ix_(rows, rows)] = spread[:3, :3]
+        covariance[number, [2, 3, 4], [2, 3, 4]] = DEPTH_MM**2, TILT**2, TILT**2
+        step = np.eye(6)
+        step[[0, 1, 2], [3, 4, 5]] = STEP_S
+        if by_heading:
+            step[:2, 2] = -y * STEP_S, x * STEP_S
+        spread = step @ spread @ step.T + noise
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[1:, :2, 3] = np.cumsum(velocity * STEP_S, axis=0)[:-1]
+    used = times >= 0
+    return Trajectory(times[used], poses[used], covariance[used])
+
+
+@pytest.mark.parametrize("by_heading", [True, False])
+def test_rates_walks_and_dead_reckoning_are_found_from_the_covariance(by_heading: bool):
+    found = drift_of(navigated(by_heading=by_heading), None, None)
+    assert found.stated
+    assert found.dead_reckoned == by_heading
+    size, walk = found.std**2, found.std**2 * found.walk
+    # What is measured all along walks within the bounds of twice its variance.
+    np.testing.assert_allclose(size[2:5], 2 * np.array([DEPTH_MM, TILT, TILT]) ** 2)
+    np.testing.assert_allclose(found.walk[2:5], 1.0)
+    # The part that the heading causes is taken off; its random walk leaves some of it.
+    rates = np.sqrt((size - walk)[[0, 1, 5]])
+    np.testing.assert_allclose(rates, np.array([BIAS_MM_S, BIAS_MM_S, GYRO]) * SECONDS, rtol=0.05)
+    # The rate has drifted for 2 s before: v(t) - v(0) is no square alone.
+    np.testing.assert_allclose(walk[:2], NOISE**2 * SECONDS, rtol=0.5)
+    np.testing.assert_allclose(walk[5], HEADING_NOISE**2 * SECONDS, rtol=0.1)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.3])
+def test_a_walk_is_told_from_a_rate_that_began_before(rate: float):
+    times = np.linspace(0, SECONDS, 200)
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    poses[:, 0, 3] = times
+    grown = times + (rate * times) ** 2
+    found = drift_of(Trajectory(times, poses, grown[:, None, None] * np.diag(np.repeat([4.0, 1e-6], 3))), None, None)
+    np.testing.assert_allclose(found.std**2, grown[-1] * np.repeat([4.0, 1e-6], 3), rtol=0.01)
+    np.testing.assert_allclose(found.walk, SECONDS / grown[-1], rtol=0.01)
+
+
+def test_a_drift_that_is_given_states_its_size_alone():
+    found = drift_of(navigated(by_heading=True), 300.0, 1.0)
+    assert not found.stated and not found.dead_reckoned
+    np.testing.assert_allclose(found.std, np.repeat([300.0, np.radians(1.0)], 3))
+
+
+def test_a_path_without_covariance_needs_the_size_of_its_drift():
+    path = navigated(by_heading=False)
+    with pytest.raises(EvaluationError, match="give drift_mm and drift_deg"):
+        drift_of(Trajectory(path.times_s, path.poses), None, None)
+    with pytest.raises(EvaluationError, match="both parts"):
+        drift_of(path, 300.0, None)

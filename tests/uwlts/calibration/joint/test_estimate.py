@@ -1,0 +1,46 @@
+"""Number of independent residuals among correlated ones, on drawn residuals for which it is known."""
+
+import numpy as np
+import pytest
+
+from uwlts.calibration.joint.estimate import judged
+from uwlts.calibration.joint.residuals import TARGET, Residuals
+
+IMAGES = 9
+
+
+def together(images):
+    """How many residuals count as one, by the points (n, 2) of images and their residuals (n, 2).
+
+    Each image shows points of its own, a little beside those of the others.
+    """
+    places = [np.column_stack([at + 0.01 * number, np.zeros(len(at))]) for number, (at, _) in enumerate(images)]
+    parts = [
+        Residuals(TARGET, found.ravel(), np.empty((found.size, 0)), np.empty((found.size, 0)), np.arange(0), number)
+        for number, (_, found) in enumerate(images)
+    ]
+    return judged(TARGET, parts, places).together
+
+
+def lattice(columns, rows):
+    x, y = np.meshgrid(np.linspace(-1, 1, columns), np.linspace(-1, 1, rows))
+    return 100.0 * np.column_stack([x.ravel(), y.ravel()])
+
+
+@pytest.mark.parametrize(("columns", "rows", "expected"), [(10, 10, 10.0), (20, 10, 20.0), (6, 4, 1.0)])
+def test_what_a_cubic_describes_says_as_much_as_its_ten_coefficients(columns, rows, expected):
+    """n points of an image that err by a polynomial of third order are as good as ten; 24 are too few to tell.
+
+    4 x^3 - 3 x and x (2 y^2 - 1), whose sizes vary so little that none is taken for an outlier.
+    """
+    at = lattice(columns, rows)
+    x, y = at.T / 100.0
+    residuals = 0.1 * np.column_stack([4 * x**3 - 3 * x, x * (2 * y**2 - 1)])
+    assert together([(at, residuals)] * IMAGES) == pytest.approx(expected, rel=1e-9)
+
+
+def test_independent_residuals_say_as_much_as_they_are():
+    """Twenty squares of each image have the mean one; of nine images five exceed 1.8 once in ten million times."""
+    rng = np.random.default_rng(0)
+    at = lattice(10, 10)
+    assert 1.0 <= together([(at, rng.normal(0, 0.1, at.shape)) for _ in range(IMAGES)]) < 1.8

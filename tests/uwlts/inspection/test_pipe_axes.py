@@ -1,0 +1,125 @@
+"""Inspections of pipes along any axis: the same findings, none lost, none twice, none on clean pipes.
+
+Pipes are those of `tests.oracles.pipes`. Gates on depths are 4.5 standard uncertainties, which a normal error exceeds 7
+times in a million; each search has a false alarm with a probability of 1e-4, all of them together with 2 %.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import uwlts
+from tests.oracles.pipes import Bump, ScannedPipe, scan_pipe
+from uwlts.fitting.shapes import fit_cylinder
+from uwlts.inspection.features import Feature, FeatureKind, Inspection
+from uwlts.inspection.pipe_form import fit_pipe, refit_pipe
+from uwlts.storage.cloud import PointCloud
+
+AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0), "tilted": (1.0, 0.3, -0.2)}
+GATE, FALSE_ALARM = 4.5, 1e-4
+SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (0, *range(2, 20)))]
+DEPTHS_MM = 0.3, 0.6, 1.2, 2.0, 3.0
+"""The shallowest is fifteen times the noise of a point; the deepest is within the 6 % of the radius that count."""
+BLEMISHES = FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION
+
+
+def cloud_of(pipe: ScannedPipe) -> PointCloud:
+    return PointCloud(pipe.points_mm, np.ones(len(pipe.points_mm)), pipe.frame, pipe.line)
+
+
+def inspected(pipe: ScannedPipe) -> Inspection:
+    return uwlts.inspect_pipe(cloud_of(pipe), false_alarm=FALSE_ALARM)
+
+
+def matched(pipe: ScannedPipe, found: Inspection, bumps: list[Bump]) -> list[Feature]:
+    """The one feature of each bump, at its place and with its depth, and no others."""
+    left, own = list(found.of(*BLEMISHES)), []
+    for bump in bumps:
+        near = [each for each in left if pipe.distance_mm(bump, each.place_mm) < 0.15 * bump.diameter_mm]
+        assert len(near) == 1, (bump, [each.name for each in near], found.notes)
+        size = near[0].values[0]
+        assert size.value == pytest.approx(abs(bump.height_mm), abs=GATE * size.uncertainty)
+        assert size.uncertainty < 0.1 * abs(bump.height_mm)
+        assert (near[0].kind == FeatureKind.PROTRUSION) == (bump.height_mm > 0)
+        left.remove(near[0])
+        own += near
+    assert not left, [each.values for each in left]
+    return own
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("axis", AXES.values(), ids=AXES)
+def test_all_pits_are_found_along_any_axis(axis: tuple[float, float, float], seed: int) -> None:
+    """Pits all around, of which one is where the pipe is cut open every few times."""
+    rng = np.random.default_rng([seed, 1])
+    turn = 2 * np.pi / len(DEPTHS_MM)
+    bumps = [
+        Bump(
+            along_mm=float(rng.uniform(-25, 25)),
+            angle=float(turn * (k + rng.uniform(-0.1, 0.1))),
+            diameter_mm=8 + 3 * depth,
+            height_mm=-depth,
+        )
+        for k, depth in enumerate(rng.permutation(DEPTHS_MM))
+    ]
+    pipe = scan_pipe(rng, axis=axis, length_mm=90.0, bumps=bumps, holes=[(0.0, 2.5 * turn, 6.0)])
+    found = inspected(pipe)
+    matched(pipe, found, bumps)
+    assert not any("is not listed" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("axis", AXES.values(), ids=AXES)
+def test_clean_pipes_have_no_findings_along_any_axis(axis: tuple[float, float, float], seed: int) -> None:
+    rng = np.random.default_rng([seed, 2])
+    arc = 2 * np.pi if seed % 2 else 0.8 * np.pi
+    found = inspected(scan_pipe(rng, axis=axis, arc=arc, spacing_mm=1.5, holes=[(5.0, 1.0, 15.0)]))
+    assert not found.of(*BLEMISHES) and not any("is not listed" in note for note in found.notes)
+
+
+def test_a_dent_at_the_cut_is_one_finding() -> None:
+    """Dents wider than both sides overlap, about a gap that decides where the pipe is cut open, at -0.02 rad."""
+    for seed in range(6):
+        rng, angle = np.random.default_rng([seed, 3]), -0.02 + 0.005 * (seed - 2.5)
+        dent = Bump(along_mm=0.0, angle=float(angle), diameter_mm=70.0, height_mm=-3.0)
+        pipe = scan_pipe(
+            rng, axis=(1, 0, 0), arc=2 * np.pi - 0.04, length_mm=150.0, spacing_mm=2.0, bumps=[dent], lost=0.0
+        )
+        (own,) = matched(pipe, inspected(pipe), [dent])
+        assert own.kind == FeatureKind.DENT
+
+
+@pytest.mark.parametrize("axis", AXES.values(), ids=AXES)
+def test_noise_turns_no_frame(axis: tuple[float, float, float]) -> None:
+    """Both directions across stay where they are from scan to scan, and from one fit of a pipe to the next."""
+    across = []
+    for seed in range(20):
+        rng = np.random.default_rng([seed, 4])
+        pipe = scan_pipe(rng, axis=axis, length_mm=60.0, spacing_mm=4.0)
+        across.append(fit_cylinder(pipe.points_mm).across)
+        cloud = cloud_of(pipe)
+        form = fit_pipe(cloud)
+        again = refit_pipe(cloud, form, left_out=rng.random(len(cloud)) < 0.3)
+        turned = np.angle(np.exp(1j * (again.angle - form.angle)))
+        # The axis moves by its noise: 0.02 mm over the root of a thousand points.
+        assert np.abs(turned).max() < 1e-3
+        assert np.abs(again.along_mm - form.along_mm).max() < 0.05
+    assert np.ptp(across, axis=0).max() < 1e-3
+
+
+def test_what_is_left_out_is_named() -> None:
+    """Points off the pipe, and sections that were hardly seen."""
+    rng = np.random.default_rng(5)
+    deep = Bump(along_mm=0.0, angle=1.0, diameter_mm=30.0, height_mm=-8.0)
+    pipe = scan_pipe(rng, axis=(0, 1, 0), spacing_mm=2.0, bumps=[deep])
+    along, angle = pipe.own_places(pipe.points_mm)
+    kept = (along < 20) | (along > 50) | (np.abs(angle) < 0.3)
+    seen = replace(pipe, points_mm=pipe.points_mm[kept], frame=pipe.frame[kept], line=pipe.line[kept])
+    notes = inspected(seen).notes
+    off = next(note for note in notes if "off the pipe" in note)
+    height = deep.heights(along, angle, pipe.radius_mm)
+    # Those within the noise of the limit may fall on either side.
+    expected = [np.count_nonzero(kept & (height <= limit)) for limit in (-3.7, -3.5)]
+    assert expected[0] <= int(off.split()[0]) <= expected[1] and expected[0] > 10
+    assert sum("no section from" in note for note in notes) in (2, 3)

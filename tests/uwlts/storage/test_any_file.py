@@ -1,0 +1,61 @@
+"""One function reads every file of the program, and results write themselves."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import uwlts
+from uwlts.errors import CaptureError, DescriptionError, OutputError
+from uwlts.model.trajectory import Trajectory
+from uwlts.storage.cloud import PointCloud
+
+
+def cloud_of(count: int) -> PointCloud:
+    rng = np.random.default_rng(1)
+    return PointCloud(rng.normal(size=(count, 3)), np.ones(count), np.zeros(count), np.arange(count))
+
+
+def test_results_are_saved_and_read_back(tmp_path: Path):
+    cloud, calibration = cloud_of(7), uwlts.nominal("thesis", medium="water")
+    path = Trajectory(np.arange(3.0), np.tile(np.eye(4), (3, 1, 1)))
+    for result, name in ((cloud, "a.ply"), (cloud, "a.h5"), (calibration, "a.json"), (path, "a.csv")):
+        result.save(tmp_path / name)
+        found = uwlts.read(tmp_path / name)
+        assert type(found) is type(result)
+        with pytest.raises(OutputError, match="`overwrite`"):
+            result.save(tmp_path / name)
+        result.save(tmp_path / name, overwrite=True)
+    np.testing.assert_array_equal(uwlts.read(tmp_path / "a.ply").points_mm, cloud.points_mm)
+    assert uwlts.read(tmp_path / "a.json") == calibration
+    np.testing.assert_array_equal(uwlts.read(tmp_path / "a.csv").times_s, path.times_s)
+
+
+def test_what_cannot_be_read_is_said_with_what_can(tmp_path: Path):
+    (tmp_path / "a.json").write_text('{"format": "uwlts-evaluation", "version": 1}')
+    (tmp_path / "a.txt").write_text("words")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.attrs["format"] = np.bytes_("another")
+    for name, found in (("a.json", "uwlts-evaluation"), ("a.txt", ".txt"), ("a.h5", "another")):
+        with pytest.raises(CaptureError, match=f"{found}.*this reads captures and ground truth .* trajectories"):
+            uwlts.read(tmp_path / name)
+    with pytest.raises(CaptureError, match=r"missing\.h5"):
+        uwlts.read(tmp_path / "missing.h5")
+    (tmp_path / "a.csv").write_text("x,y\n1,2\n")
+    with pytest.raises(DescriptionError):
+        uwlts.read(tmp_path / "a.csv")
+
+
+def test_results_are_short_texts():
+    """Sizes in place of arrays: a screen has some 40 lines of 100 characters."""
+    for result in (cloud_of(100_000), uwlts.nominal("thesis", medium="water")):
+        lines = repr(result).splitlines()
+        assert len(lines) < 40 and max(map(len, lines)) <= 100
+    assert "points_mm: 100000 x 3 float64" in repr(cloud_of(100_000))
+    assert "<td>100000 x 3 float64</td>" in cloud_of(100_000)._repr_html_()
+
+
+def test_a_nominal_calibration_is_of_its_medium():
+    assert uwlts.nominal("thesis", medium="water").medium_kind == uwlts.load_sensor("thesis").media["water"].kind
+    assert uwlts.nominal("thesis", medium="air").medium_kind == "air"

@@ -1,0 +1,5 @@
+"""Runs the ``twin`` command as ``python -m twin``."""
+
+from twin.cli import main
+
+main()

@@ -1,0 +1,137 @@
+"""Recording of a scene into a capture, with its ground truth, and what a platform reports, in files beside it."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import fields
+from importlib.metadata import version
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from twin.backend.llvm import threads_kept
+from twin.options import Options
+from twin.recording.frame_truth import FrameTruth, depth_map
+from twin.recording.studio import ShotLight, Studio, medium_of, with_window
+from twin.scene.description import Scene
+from twin.scene.motion import Shot
+from twin.scene.platforms import Platform
+from uwlts.errors import OutputError
+from uwlts.model.sensor import Sensor, Table
+from uwlts.model.trajectory import Trajectory
+from uwlts.runtime.progress import ProgressListener, unheard
+from uwlts.storage.capture import CaptureHeader
+from uwlts.storage.capture_writer import CaptureWriter
+from uwlts.storage.pose_files import trajectory_path
+from uwlts.storage.truth import Truth, TruthHeader, truth_path, write_truth
+
+
+def record_scene(
+    scene: Scene,
+    sensor: Sensor,
+    path: str | Path,
+    *,
+    as_built: Sensor | None = None,
+    options: Options = Options(),
+    overwrite: bool = False,
+    resume: bool = False,
+    progress: ProgressListener = unheard,
+) -> None:
+    """Render a scene into a capture at ``path`` and its ground truth into the file beside it.
+
+    Images show ``as_built`` (the sensor itself unless given), the capture states ``sensor``. An interrupted run leaves
+    ``path.part`` with all complete frames; ``resume`` goes on from there and gives the same capture as an undisturbed
+    run. ``progress(done, total)`` is called after every frame. DesignError and DescriptionError where the sensor or the
+    scene cannot work; OutputError where a file exists already, or cannot be written.
+    """
+    path = Path(path)
+    if truth_path(path).exists() and not (overwrite or resume):
+        raise OutputError(f"{truth_path(path)} exists already; give another name, or `overwrite` to replace it")
+    motion = scene.motion
+    report = motion.course().report if isinstance(motion, Platform) else None
+    if report is not None and trajectory_path(path).exists() and not (overwrite or resume):
+        raise OutputError(f"{trajectory_path(path)} exists already; give another name, or `overwrite` to replace it")
+    studio = Studio(as_built or sensor, scene, options)
+    # What an operator would note: nominal values only.
+    header = CaptureHeader(
+        name=path.stem,
+        sensor=with_window(sensor, mounted=studio.sensor.camera.window.mounted),
+        medium_name=scene.medium,
+        medium=medium_of(sensor, scene),
+        stage_direction=(1.0, 0.0, 0.0) if isinstance(motion, Platform) else motion.recorded_direction(),
+        T_platform_sensor=tuple(map(tuple, motion.mount.matrix().tolist())) if isinstance(motion, Platform) else None,
+        saturation_dn=sensor.detector.full_scale_dn(),
+        target=scene.target,
+        artefact=scene.artefact,
+        provenance={
+            "source": "twin",
+            "seed": studio.options.seed,
+            "spp": studio.options.spp,
+            "effects": [*studio.options.names()],
+            "variant": mi.variant(),
+            **{package: version(package) for package in ("mitsuba", "drjit", "uwlts")},
+        },
+    )
+    shots = list(scene.motion.shots())
+    truths: list[FrameTruth] = []
+    dtype = np.dtype(np.uint8 if sensor.detector.bits == 8 else np.uint16)
+    # Whoever measures must not learn it, so it is not in the finished capture.
+    plan: Table = {
+        "scene": scene.model_dump(mode="json"),
+        "as_built": studio.sensor.model_dump(mode="json"),
+        "seed": studio.options.seed,
+        "spp": studio.options.spp,
+    }
+    known = isinstance(motion, Platform) and motion.states_covariance
+    lines = studio.peak_finder is not None
+    kinds = {"centre_lines": lines, "moving": studio.speed_mm_per_s() != 0, "covariances": known}
+    files = {"overwrite": overwrite, "resume": resume}
+    with (
+        CaptureWriter(path, header, dtype=dtype, **kinds, plan=plan, **files) as writer,
+        ThreadPoolExecutor(1) as camera,
+        threads_kept() as threads,
+    ):
+        done = len(writer)
+
+        def take(light: ShotLight, shot: Shot, index: int) -> None:
+            writer.append(studio.frame_of(light, shot, index))
+
+        def end(index: int, taken: Future[None] | None) -> None:
+            if taken is not None:
+                taken.result()
+            progress(index + 1, len(shots))
+
+        # An image is exposed and written while the light of the next one is rendered.
+        before: Future[None] | None = None
+        for index, shot in enumerate(shots):
+            dr.set_thread_count(_threads_for(shot, threads))
+            # The light first: the truth goes on from where it found the stripe.
+            light = studio.light(shot, index) if index >= done else None
+            truths.append(studio.truth(shot))
+            if index > 0:
+                end(index - 1, before)
+            before = None if light is None else camera.submit(take, light, shot, index)
+        end(len(shots) - 1, before)
+        if report is not None:
+            Trajectory(*report).save(trajectory_path(path), overwrite=overwrite or resume)
+        described = TruthHeader(sensor=studio.sensor, medium=studio.medium, scene=scene.model_dump(mode="json"))
+        truth = truth_of_recording(studio, truths, shots)
+        write_truth(truth_path(path), described, truth, overwrite=overwrite or resume)
+
+
+def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], shots: Sequence[Shot]) -> Truth:
+    """The truths of a recording's frames as one, with the depth map of the first of its ``shots``."""
+    stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
+    poses = np.stack([studio.pose(shot) for shot in shots])
+    return Truth(**stacked, depth_mm=depth_map(studio.renderer, poses[0]), pose=poses)
+
+
+def _threads_for(shot: Shot, threads: int) -> int:
+    """How many of Dr.Jit's threads render a shot while another thread exposes and writes the one before.
+
+    Between the many small kernels of a laser image they would keep that one from its processor; a lamp image has few
+    large kernels.
+    """
+    return threads if shot.light == "lamp" else min(threads, max(1, (os.cpu_count() or 1) - 1))

@@ -1,0 +1,123 @@
+"""Robot arm of six joints: its kinematics, and the errors of its joints and links."""
+
+from typing import Literal
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from twin.scene.placed import Pose
+from twin.scene.platforms import LEAD_S, Carried, Route, stop_at
+from uwlts.errors import DescriptionError
+from uwlts.model.sensor import NotNegative, Positive, Vector
+
+_ARC_S = 0.05
+"""Step in which the joints follow a path."""
+_STARTS = 40
+"""Random starts of the search for joint angles: an arm has up to 8 postures for a pose, and some starts find none."""
+_REACHED = 1e-6
+"""Largest misfit of a pose that is reached: share of the arm's length, and rad."""
+
+
+class Robot(Route):
+    """A robot arm of six joints, whose joints and links err.
+
+    ``base`` is where it stands in the scene, its z axis along the first joint. ``links`` are its Denavit-Hartenberg
+    parameters (distal): d and a in mm, alpha in deg. Joints have wrong zeros by ``joint_zero_std_deg``, scatter from
+    place to place by ``joint_repeat_std_deg``, and their gears err twice per turn of the motor by
+    ``joint_gear_std_deg`` (``gear_ratio`` motor turns per turn, as strain-wave gears do); links are wrong by
+    ``link_std_mm`` in d and a. The controller reports the flange by its own lengths and angles.
+    """
+
+    kind: Literal["robot"]
+    base: Pose = Pose(position_mm=(-600.0, 0.0, 0.0))
+    # Universal Robots UR5e, the maker's table "DH parameters for calculations of kinematics and dynamics".
+    links: tuple[Vector, Vector, Vector, Vector, Vector, Vector] = (
+        (162.5, 0.0, 90.0),
+        (0.0, -425.0, 0.0),
+        (0.0, -392.2, 0.0),
+        (133.3, 0.0, 90.0),
+        (99.7, 0.0, -90.0),
+        (99.6, 0.0, 0.0),
+    )
+    joint_zero_std_deg: NotNegative = 0.0
+    joint_repeat_std_deg: NotNegative = 0.0
+    joint_gear_std_deg: NotNegative = 0.0
+    gear_ratio: Positive = 101.0
+    link_std_mm: NotNegative = 0.0
+
+    def carried(self, rng: np.random.Generator) -> Carried:
+        times = self._knots[0]
+        if not self.stops:
+            times = np.linspace(-LEAD_S, times[-1] + LEAD_S, 2 + int((times[-1] + 2 * LEAD_S) / _ARC_S))
+        base, links = self.base.matrix(), np.array(self.links)
+        angles = _joint_angles(np.linalg.inv(base) @ self.commanded()(times), links)
+        wrong = links + self.link_std_mm * rng.standard_normal((6, 3)) * (1, 1, 0)
+        zero, gear = (
+            np.radians(std) * rng.standard_normal(6) for std in (self.joint_zero_std_deg, self.joint_gear_std_deg)
+        )
+        places = len(self._knots[0])
+        repeat = np.radians(self.joint_repeat_std_deg) * rng.standard_normal((places, 6))
+        phases = rng.uniform(0, 2 * np.pi, 6)
+
+        def over_time(at: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+            if self.stops:
+                return values[stop_at(at, wanted)]
+            return np.stack([np.interp(wanted, at, column) for column in values.T], axis=1)
+
+        smooth = None if self.stops else CubicSpline(times, angles)
+
+        def joints(wanted: np.ndarray) -> np.ndarray:
+            return over_time(times, angles, wanted) if smooth is None else smooth(wanted)
+
+        def true(wanted: np.ndarray) -> np.ndarray:
+            at = joints(wanted)
+            errors = zero + over_time(self._knots[0], repeat, wanted) + gear * np.sin(2 * self.gear_ratio * at + phases)
+            return base @ _flange(at + errors, wrong)
+
+        return Carried(true, lambda wanted: base @ _flange(joints(wanted), links))
+
+
+def _flange(angles: np.ndarray, links: np.ndarray) -> np.ndarray:
+    """Pose (N, 4, 4) of the flange in the robot's base at joint angles (N, 6) in rad (Denavit, Hartenberg 1955)."""
+    pose = np.tile(np.eye(4), (len(angles), 1, 1))
+    for joint, (d, a, alpha) in zip(angles.T, links, strict=True):
+        c, s, ca, sa = np.cos(joint), np.sin(joint), np.cos(np.radians(alpha)), np.sin(np.radians(alpha))
+        link = np.zeros((len(joint), 4, 4))
+        link[:, 0] = np.stack([c, -s * ca, s * sa, a * c], axis=1)
+        link[:, 1] = np.stack([s, c * ca, -c * sa, a * s], axis=1)
+        link[:, 2] = (0, sa, ca, d)
+        link[:, 3, 3] = 1
+        pose = pose @ link
+    return pose
+
+
+def _joint_angles(poses: np.ndarray, links: np.ndarray) -> np.ndarray:
+    """Joint angles (N, 6) in rad that bring the flange to poses (N, 4, 4) of the base, each near the one before.
+
+    DescriptionError where the arm does not reach a pose.
+    """
+    length = float(np.abs(links[:, :2]).sum())
+
+    def misfit(angles: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        found = _flange(angles[None], links)[0]
+        turn = Rotation.from_matrix(found[:3, :3] @ wanted[:3, :3].T).as_rotvec()
+        return np.append((found[:3, 3] - wanted[:3, 3]) / length, turn)
+
+    rng, found, start = np.random.default_rng(0), [], None
+    for number, wanted in enumerate(poses):
+        starts = rng.uniform(-np.pi, np.pi, (_STARTS, 6))
+        for begin in starts if start is None else [start, *(start + 0.3 * starts)]:
+            solution = least_squares(misfit, begin, args=(wanted,), method="lm", xtol=1e-12, ftol=1e-14, gtol=1e-14)
+            if np.abs(solution.fun).max() < _REACHED:
+                break
+        else:
+            place = ", ".join(f"{x:.0f}" for x in wanted[:3, 3])
+            raise DescriptionError(
+                f"the robot does not reach place {number + 1}, its flange at ({place}) mm of its base: move the base, "
+                "or give longer links"
+            )
+        start = solution.x
+        found.append(start)
+    return np.array(found)

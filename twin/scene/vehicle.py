@@ -1,0 +1,195 @@
+"""Underwater vehicle: the sea that moves it, and the drift of its navigation.
+
+Formulas follow T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control (Wiley, 2011; "Fossen"), and
+J. A. Farrell, Aided Navigation (McGraw-Hill, 2008; "Farrell").
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import model_validator
+from scipy.spatial.transform import Rotation
+
+from twin.scene.platforms import LEAD_S, Carried, Route
+from uwlts.model.sensor import Description, NotNegative, Positive
+
+_GRAVITY = 9.81
+_COMPONENTS = 24
+_STEP_S = 0.05
+"""Step of the navigation's errors: far below the time in which any of them changes."""
+
+
+class Sea(Description):
+    """Waves above a vehicle, by their significant height at the surface, and what of them moves the vehicle.
+
+    At ``depth_mm`` the water moves on circles, along ``towards_deg`` (from X to Y of the scene) and up and down. The
+    vehicle follows with ``share`` of it, as its control leaves it, and rolls and pitches by ``tilt_deg`` (rms).
+    """
+
+    significant_height_mm: NotNegative = 0.0
+    depth_mm: NotNegative = 10_000.0
+    towards_deg: float = 0.0
+    share: NotNegative = 1.0
+    tilt_deg: NotNegative = 0.0
+
+
+def waves_of(sea: Sea, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+    """Function of times (N,) in s for shifts, mm, and turns, rad, (N, 6) in the scene.
+
+    Pierson and Moskowitz's spectrum by the significant height H (Fossen, section 8.2.1), with the peak at
+    w0 = 0.4 sqrt(g / H): S(w) = 5/16 H^2 w0^4 w^-5 exp(-1.25 (w0 / w)^4). Waves of deep water decay with the depth by
+    exp(-w^2 depth / g). Each of the components is a sinusoid of random phase; their frequencies lie at random within
+    bands, so that the motion does not repeat.
+    """
+    still = sea.significant_height_mm == 0 and sea.tilt_deg == 0
+    height = max(sea.significant_height_mm, 100.0) * 1e-3
+    peak = 0.4 * np.sqrt(_GRAVITY / height)
+    edges = np.linspace(0.5 * peak, 3.0 * peak, _COMPONENTS + 1)
+    frequency, band = rng.uniform(edges[:-1], edges[1:]), edges[1] - edges[0]
+    spectrum = 5 / 16 * height**2 * peak**4 * frequency**-5 * np.exp(-1.25 * (peak / frequency) ** 4)
+    size = 1e3 * np.sqrt(2 * spectrum * band)
+    if sea.significant_height_mm == 0:
+        size = 0 * size
+    size = sea.share * size * np.exp(-(frequency**2) * sea.depth_mm * 1e-3 / _GRAVITY)
+    weight = np.sqrt(spectrum / spectrum.sum() * 2) * np.radians(sea.tilt_deg)
+    phases, tilt_phases = rng.uniform(0, 2 * np.pi, _COMPONENTS), rng.uniform(0, 2 * np.pi, (2, _COMPONENTS))
+    towards = np.radians(sea.towards_deg)
+
+    def at(times: np.ndarray) -> np.ndarray:
+        found = np.zeros((len(times), 6))
+        if still:
+            return found
+        turns = np.multiply.outer(times, frequency)
+        surge = np.cos(turns + phases) @ size
+        found[:, 0], found[:, 1] = surge * np.cos(towards), surge * np.sin(towards)
+        found[:, 2] = np.sin(turns + phases) @ size
+        for axis in (0, 1):
+            found[:, 3 + axis] = np.sin(turns + tilt_phases[axis]) @ weight
+        return found
+
+    return at
+
+
+class Navigation(Description):
+    """Errors of an inertial navigation aided by a Doppler log, a depth sensor and inclinometers.
+
+    Velocity has white noise of ``velocity_mm_per_sqrt_s`` (mm/s per root Hz: after t s the position has walked by that
+    times the root of t) and a bias of ``velocity_bias_mm_per_s`` that changes within ``bias_time_s``. The heading walks
+    by ``heading_deg_per_sqrt_s`` and drifts by a gyro's bias of ``gyro_bias_deg_per_s``; a wrong heading turns the way
+    travelled. Roll and pitch (``tilt_std_deg``) and depth (``depth_std_mm``) are measured, so that their errors stay
+    bounded; they change within ``aided_time_s``. The navigation states the covariance of exactly these errors.
+    """
+
+    velocity_mm_per_sqrt_s: NotNegative = 0.0
+    velocity_bias_mm_per_s: NotNegative = 0.0
+    heading_deg_per_sqrt_s: NotNegative = 0.0
+    gyro_bias_deg_per_s: NotNegative = 0.0
+    bias_time_s: Positive = 300.0
+    tilt_std_deg: NotNegative = 0.0
+    depth_std_mm: NotNegative = 0.0
+    aided_time_s: Positive = 60.0
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """Errors of the reported pose at times: shift in mm, rotation in rad about the scene's axes."""
+
+    times_s: np.ndarray
+    values: np.ndarray
+    covariances: np.ndarray
+
+    def errors(self, times_s: np.ndarray) -> np.ndarray:
+        """Errors (N, 6), between the steps linear."""
+        return np.stack([np.interp(times_s, self.times_s, column) for column in self.values.T], axis=1)
+
+    def covariance(self, times_s: np.ndarray) -> np.ndarray:
+        """Covariances (N, 6, 6) that the navigation states."""
+        flat = self.covariances.reshape(len(self.times_s), -1)
+        found = np.stack([np.interp(times_s, self.times_s, column) for column in flat.T], axis=1)
+        return found.reshape(-1, 6, 6)
+
+
+def drift_of(
+    navigation: Navigation,
+    poses: Callable[[np.ndarray], np.ndarray],
+    *,
+    lead_s: float,
+    lasting_s: float,
+    rng: np.random.Generator,
+) -> Drift:
+    """Errors of the navigation of a vehicle with true poses, from 0 at ``lead_s`` before the time 0 on.
+
+    The state holds errors of position (3), roll and pitch (2), heading, bias of velocity (2), of the gyro, and is
+    propagated with its covariance: x' = F x + w, P' = F P F^T + Q (Farrell, sections 4.6 and 4.9). Depth, roll and
+    pitch are Gauss-Markov processes of first order in their stationary state.
+    """
+    n = navigation
+    times = np.arange(-lead_s, lasting_s + lead_s + _STEP_S, _STEP_S)
+    velocity = np.gradient(poses(times)[:, :3, 3], times, axis=0)
+    aided, biased = np.exp(-_STEP_S / n.aided_time_s), np.exp(-_STEP_S / n.bias_time_s)
+    bounded = np.array([n.depth_std_mm, *np.radians([n.tilt_std_deg] * 2)])
+    bias = np.array([n.velocity_bias_mm_per_s] * 2 + [np.radians(n.gyro_bias_deg_per_s)])
+    walk = np.array([n.velocity_mm_per_sqrt_s] * 2 + [np.radians(n.heading_deg_per_sqrt_s)])
+    noise = np.zeros(9)
+    noise[[0, 1, 5]] = walk**2 * _STEP_S
+    noise[2:5] = bounded**2 * (1 - aided**2)
+    noise[6:] = bias**2 * (1 - biased**2)
+    start = np.zeros(9)
+    start[2:5], start[6:] = bounded**2, bias**2
+    state, spread = np.sqrt(start) * rng.standard_normal(9), np.diag(start)
+    drawn = np.sqrt(noise) * rng.standard_normal((len(times), 9))
+    step = np.diag([1.0, 1.0, aided, aided, aided, 1.0, biased, biased, biased])
+    step[[0, 1, 5], [6, 7, 8]] = _STEP_S
+    values, covariances = np.empty((len(times), 9)), np.empty((len(times), 9, 9))
+    for number, (x, y, _) in enumerate(velocity):
+        values[number], covariances[number] = state, spread
+        # A heading that is wrong by e turns the velocity v: the position errs by e z x v.
+        step[0, 5], step[1, 5] = -y * _STEP_S, x * _STEP_S
+        state = step @ state + drawn[number]
+        spread = step @ spread @ step.T + np.diag(noise)
+    return Drift(times, values[:, :6], covariances[:, :6, :6])
+
+
+class Vehicle(Route):
+    """An underwater vehicle that waves move and thrusters shake, and that navigates by INS and DVL.
+
+    The scene's Z points down. `Sea` moves it, and its `Navigation` drifts. The sensor
+    vibrates along each axis by ``vibration_mm`` and turns by ``vibration_deg`` at ``vibration_hz`` (amplitudes).
+    """
+
+    kind: Literal["vehicle"]
+    sea: Sea = Sea()
+    navigation: Navigation = Navigation()
+    vibration_hz: Positive = 25.0
+    vibration_mm: NotNegative = 0.0
+    vibration_deg: NotNegative = 0.0
+
+    @model_validator(mode="after")
+    def _moves(self) -> "Vehicle":
+        if self.stops:
+            raise ValueError("a vehicle does not stop: give speed_mm_per_s, or a trajectory")
+        return self
+
+    def carried(self, rng: np.random.Generator) -> Carried:
+        commanded = self.commanded()
+        waves, phases = waves_of(self.sea, rng), rng.uniform(0, 2 * np.pi, 6)
+        sizes = np.append(np.full(3, self.vibration_mm), np.full(3, np.radians(self.vibration_deg)))
+
+        def true(times: np.ndarray) -> np.ndarray:
+            poses = commanded(times).copy()
+            moved = waves(times) + sizes * np.sin(2 * np.pi * self.vibration_hz * times[:, None] + phases)
+            poses[:, :3, 3] += moved[:, :3]
+            poses[:, :3, :3] = Rotation.from_rotvec(moved[:, 3:]).as_matrix() @ poses[:, :3, :3]
+            return poses
+
+        drift = drift_of(self.navigation, true, lead_s=2 * LEAD_S, lasting_s=float(self._knots[0][-1]), rng=rng)
+
+        def reported(times: np.ndarray) -> np.ndarray:
+            poses, errors = true(times).copy(), drift.errors(times)
+            poses[:, :3, 3] += errors[:, :3]
+            poses[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
+            return poses
+
+        return Carried(true, reported, drift.covariance)

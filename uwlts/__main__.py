@@ -1,0 +1,5 @@
+"""Runs the ``uwlts`` command as ``python -m uwlts``."""
+
+from uwlts.cli import main
+
+main()

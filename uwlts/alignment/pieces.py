@@ -1,0 +1,181 @@
+"""Pieces of a path, each about as long as the stripe is wide, and the patches of the surface that each shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from uwlts.alignment.options import AlignmentOptions
+from uwlts.errors import EvaluationError
+from uwlts.fitting.patches import Patches, disc_radius, surface_patches
+from uwlts.model.trajectory import Trajectory
+from uwlts.storage.cloud import PointCloud
+
+_FEWEST_POINTS = 200
+"""Points of a piece: fewer hold no patches."""
+_ACROSS = 1e-6
+"""Ridge relative to the extent of the neighbours of a patch: across a surface times do not grow."""
+_ALONE_MM2 = 1e-9
+"""Ridge of a patch without neighbours, about which times do not grow."""
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """Points of a scan, with the platform's places when they were measured, by its navigation.
+
+    Attributes
+    ----------
+    cloud : PointCloud
+    moments_s : (M,)
+        Times of the images.
+    image : (N,) int
+        Image of each point.
+    platform_mm, velocity_mm_s : (M, 3)
+    parts : tuple of (K,) int
+        Numbers of the points of each piece.
+    radius_mm : float
+        Radius of patches.
+    speed_mm_s : float
+        Speed of the stripe over the surface.
+    """
+
+    cloud: PointCloud
+    moments_s: np.ndarray
+    image: np.ndarray
+    platform_mm: np.ndarray
+    velocity_mm_s: np.ndarray
+    parts: tuple[np.ndarray, ...]
+    radius_mm: float
+    speed_mm_s: float
+
+    @classmethod
+    def along(cls, cloud: PointCloud, times_s: np.ndarray, trajectory: Trajectory) -> Survey:
+        """Divide a cloud, with times (N,) of its points by the trajectory's clock, into pieces."""
+        moments, image = np.unique(times_s, return_inverse=True)
+        order = np.argsort(image, kind="stable")
+        by_image = np.split(cloud.points_mm[order], np.searchsorted(image[order], np.arange(1, len(moments))))
+        swath = float(np.median([np.linalg.norm(np.ptp(points, axis=0)) for points in by_image]))
+        middles = np.array([points.mean(axis=0) for points in by_image])
+        way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(middles, axis=0), axis=1)))
+        count = max(2, round(way[-1] / swath))
+        number = np.minimum((way / way[-1] * count).astype(int), count - 1)[image]
+        parts = tuple(np.flatnonzero(number == each) for each in range(count))
+        radius = disc_radius(cloud.points_mm[parts[count // 2]])
+        platform, velocity = trajectory.poses_at(moments)[:, :3, 3], trajectory.rates_at(moments)[:, :3]
+        long_enough = tuple(part for part in parts if len(part) >= _FEWEST_POINTS)
+        return cls(cloud, moments, image, platform, velocity, long_enough, radius, way[-1] / float(np.ptp(moments)))
+
+    def points_along(self, part: np.ndarray, corrections: np.ndarray) -> np.ndarray:
+        """Return points (K, 3), by their numbers, along the path with corrections (M, 6) of the images."""
+        image = self.image[part]
+        return moved(corrections[image], self.platform_mm[image], self.cloud.points_mm[part])
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A part of the path, and P patches of its surface.
+
+    Attributes
+    ----------
+    part : (K,) int
+        Numbers of its points.
+    patches : Patches
+        Along the corrected path when they were fitted.
+    back : (P, 3, 3)
+        From the surface around each patch then to that by the navigation.
+    places_mm : (P, 3)
+        Of the patches by the navigation.
+    times_s, slopes_s_mm : (P,) and (P, 3)
+        Times of the patches, and how they grow over the surface.
+    platform_mm, velocity_mm_s : (P, 3)
+        Place and velocity of the platform at these times.
+    held_out : (P,) bool
+        Patches that judge the estimate.
+    """
+
+    part: np.ndarray
+    patches: Patches
+    back: np.ndarray
+    places_mm: np.ndarray
+    times_s: np.ndarray
+    slopes_s_mm: np.ndarray
+    platform_mm: np.ndarray
+    velocity_mm_s: np.ndarray
+    held_out: np.ndarray
+
+    @property
+    def middle_s(self) -> float:
+        """Time in the middle of the piece."""
+        return float(np.median(self.times_s))
+
+    def along(self, corrections: np.ndarray, rates: np.ndarray) -> Patches:
+        """Return the patches along the path with corrections and their rates per second (P, 6) at their times.
+
+        Images move one by one: a surface along the path is not turned with them, but sheared by their drift.
+        """
+        places = moved(corrections, self.platform_mm, self.places_mm)
+        tangents = np.einsum("pij,pkj->pki", self.around(corrections, rates) @ self.back, self.patches.axes[:, :2])
+        first = tangents[:, 0] / np.linalg.norm(tangents[:, 0], axis=1, keepdims=True)
+        normal = np.cross(first, tangents[:, 1])
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        axes = np.stack([first, np.cross(normal, first), normal], axis=1)
+        return replace(self.patches, places_mm=places, axes=axes, one_sided=False)
+
+    def around(self, corrections: np.ndarray, rates: np.ndarray) -> np.ndarray:
+        """Return the derivatives (P, 3, 3) of the corrected surface around patches, by that of the navigation.
+
+        Of p' = R(t) (p - X(t)) + X(t) + s(t) by p, with the time t that grows over the surface, the turn R, the shift
+        s, and the platform's place X.
+        """
+        turn = Rotation.from_rotvec(corrections[:, 3:])
+        drifting = np.cross(rates[:, 3:], turn.apply(self.places_mm - self.platform_mm)) + rates[:, :3]
+        drifting += self.velocity_mm_s - turn.apply(self.velocity_mm_s)
+        return turn.as_matrix() + drifting[:, :, None] * self.slopes_s_mm[:, None]
+
+
+def fit_piece(
+    survey: Survey, part: np.ndarray, corrections: np.ndarray, rates: np.ndarray, options: AlignmentOptions
+) -> Piece | None:
+    """Fit patches to points, by their numbers, along the path with corrections and rates (M, 6) of the images.
+
+    Return None where the points are on no surface.
+    """
+    known = None if survey.cloud.uncertainty is None else survey.cloud.uncertainty[part]
+    # Errors that all points share do not discriminate between the passes of a path.
+    known = None if known is None else replace(known, patterns_mm=known.patterns_mm[:0], poses_mm=None)
+    try:
+        points = survey.points_along(part, corrections)
+        patches = surface_patches(points, known, radius_mm=survey.radius_mm)
+    except EvaluationError:
+        return None
+    image = survey.image[part[patches.numbers]]
+    platform, times = survey.platform_mm[image], survey.moments_s[image]
+    turned_back = Rotation.from_rotvec(-corrections[image, 3:])
+    places = turned_back.apply(patches.places_mm - platform - corrections[image, :3]) + platform
+    cubes = np.floor(places / (options.held_out_cube * survey.radius_mm)).astype(np.int64)
+    held_out = (cubes @ np.array([1, 2, 3])) % options.held_out_every == 0
+    slopes = _slopes(places, times, 2 * survey.radius_mm)
+    piece = Piece(part, patches, np.empty(0), places, times, slopes, platform, survey.velocity_mm_s[image], held_out)
+    return replace(piece, back=np.linalg.inv(piece.around(corrections[image], rates[image])))
+
+
+def _slopes(places: np.ndarray, times: np.ndarray, reach_mm: float) -> np.ndarray:
+    """How times (P,) grow over places (P, 3), s/mm, by their neighbours."""
+    pairs = KDTree(places).query_pairs(reach_mm, output_type="ndarray")
+    first, second = np.vstack([pairs, pairs[:, ::-1]]).T
+    about, later = places[second] - places[first], times[second] - times[first]
+    normal, right = np.zeros((len(places), 3, 3)), np.zeros((len(places), 3))
+    np.add.at(normal, first, about[:, :, None] * about[:, None])
+    np.add.at(right, first, about * later[:, None])
+    ridge = _ACROSS * np.trace(normal, axis1=1, axis2=2) + _ALONE_MM2
+    normal += ridge[:, None, None] * np.eye(3)
+    return np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+
+
+def moved(corrections: np.ndarray, platform_mm: np.ndarray, places_mm: np.ndarray) -> np.ndarray:
+    """Return places (N, 3) after corrections (N, 6) about the platform's places (N, 3)."""
+    turned = Rotation.from_rotvec(corrections[:, 3:]).apply(places_mm - platform_mm)
+    return turned + platform_mm + corrections[:, :3]

@@ -1,5 +1,0 @@
-"""Runs the command as ``python -m uwlts.cli``."""
-
-from uwlts.cli import main
-
-main()

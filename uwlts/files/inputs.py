@@ -1,0 +1,118 @@
+"""Inputs of a command or function: none of its outputs replaces one of them, under whatever name.
+
+Within `inputs_kept` every file that is opened for reading (`uwlts.files.reading`) is noted, and so is every file that
+is to be written, before the work and again before it is moved to its place (`uwlts.files.writing`). The first that sees
+a file on both sides refuses it. Files are known by device and inode, which all their names share.
+"""
+
+import os
+import stat
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from uwlts.errors import OutputError
+
+OUTPUTS = frozenset({"out", "coloured", "pictures", "aligned", "page", "poses_out"})
+"""Names of the parameters of commands that say where to write; all others that name a file are read."""
+
+_Identity = tuple[int, int]
+
+
+@dataclass
+class _Work:
+    """Existing files that a piece of work reads, will replace, and has made itself; claims on outputs till its end."""
+
+    read: dict[_Identity, Path] = field(default_factory=dict)
+    written: dict[_Identity, Path] = field(default_factory=dict)
+    made: set[_Identity] = field(default_factory=set)
+    claims: ExitStack = field(default_factory=ExitStack)
+
+
+_work: ContextVar[_Work | None] = ContextVar("work", default=None)
+
+
+@contextmanager
+def inputs_kept() -> Iterator[None]:
+    """Keep the inputs of a piece of work, as a context or as a decorator; what it calls belongs to it.
+
+    It holds in this thread. Other threads, such as those of a page, do works of their own.
+    """
+    if _work.get() is not None:
+        yield
+        return
+    work = _Work()
+    token = _work.set(work)
+    try:
+        with work.claims:
+            yield
+    finally:
+        _work.reset(token)
+
+
+def refuse_named_inputs(arguments: Mapping[str, object]) -> None:
+    """Raise OutputError if a command's arguments, by name, have one file as an input and as an output."""
+    for name, value in arguments.items():
+        if name not in OUTPUTS:
+            for path in _paths(value):
+                note_input(path)
+    for name in OUTPUTS.intersection(arguments):
+        for path in _paths(arguments[name]):
+            refuse_input(path)
+
+
+def note_input(path: str | os.PathLike[str]) -> None:
+    """Note a file that the running work reads; OutputError if it is to write it, unless it has made it itself."""
+    if (work := _work.get()) and (identity := _identity(path)) and identity not in work.made:
+        # A file that was replaced may have left its inode to another.
+        if (output := work.written.get(identity)) and _identity(output) == identity:
+            raise _same(output, Path(path))
+        work.read.setdefault(identity, Path(path))
+
+
+def refuse_input(target: str | os.PathLike[str]) -> None:
+    """Note a file that is to be written; OutputError if the running work has read it."""
+    if (work := _work.get()) and (identity := _identity(target)):
+        if read := work.read.get(identity):
+            raise _same(Path(target), read)
+        work.written[identity] = Path(target)
+
+
+def note_made(path: str | os.PathLike[str]) -> None:
+    """Note a file that the running work has made, or that is its own: it may read it, and write it again."""
+    if (work := _work.get()) and (identity := _identity(path)):
+        work.made.add(identity)
+        # What was read there is gone, and has left its inode to this file.
+        work.read.pop(identity, None)
+
+
+def hold_until_end(claim: AbstractContextManager[None]) -> None:
+    """Enter a claim on an output until the running work ends; without a work nothing is claimed."""
+    if work := _work.get():
+        work.claims.enter_context(claim)
+
+
+def _same(output: Path, read: Path) -> OutputError:
+    also = "" if os.path.abspath(output) == os.path.abspath(read) else f" (it is the same file as {read})"
+    return OutputError(f"cannot write {output}: it is an input of this command{also}; give another name")
+
+
+def _paths(value: object) -> Iterable[Path]:
+    """Paths that an argument may name, also behind a prefix, as in replay:PATH."""
+    if isinstance(value, str | os.PathLike):
+        yield Path(value)
+        yield Path(os.fspath(value).partition(":")[2])
+    elif isinstance(value, Sequence) and not isinstance(value, bytes):
+        for each in value:
+            yield from _paths(each)
+
+
+def _identity(path: str | os.PathLike[str]) -> _Identity | None:
+    """Device and inode of a regular file; None for anything else, and for names that cannot be files."""
+    try:
+        found = os.stat(path)
+    except (OSError, ValueError):
+        return None
+    return (found.st_dev, found.st_ino) if stat.S_ISREG(found.st_mode) else None

@@ -1,0 +1,108 @@
+"""Table of a sensor's design: resolution, line length, depth range and speckle limit by the design formulas."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from uwlts.model.library import load_sensor
+from uwlts.model.sensor import Sensor
+from uwlts.optics.design import (
+    depth_mm,
+    depth_per_pixel_mm,
+    line_length_mm,
+    line_needed_mm,
+    measuring_volume,
+    nominal_setup,
+    scheimpflug_angle_rad,
+    speckle_limit_um,
+    thesis_factor,
+    window_thickness_mm,
+)
+
+
+class DesignRow(NamedTuple):
+    """A row of the design table."""
+
+    name: str
+    value: float
+    unit: str
+    source: str
+
+
+def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
+    """Calculate what a sensor can do by the design formulas: resolution, line length, depth range, speckle limit.
+
+    Depths and ranges run along the camera's axis unless named otherwise.
+
+    Parameters
+    ----------
+    sensor : str, Path or Sensor
+        Name or path of a sensor description, or the description itself.
+    medium : str
+        One of the sensor's media.
+
+    Raises
+    ------
+    DescriptionError
+        The sensor or the medium is unknown, or the description cannot be read.
+    DesignError
+        As `uwlts.optics.design.nominal_setup`.
+    """
+    sensor = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
+    camera = sensor.camera
+    setup, leaning = nominal_setup(sensor, sensor.medium(medium))
+    window, tangent = setup.window, math.tan(setup.triangulation_angle_rad)
+    sides = {"width": camera.width_px, "height": camera.height_px}
+    along = sides.pop(camera.stripe_along)
+    (across,) = sides.values()
+    standoff, outer = float(depth_mm(setup, 0.0)), window.outer_mm
+    per_pixel = float(depth_per_pixel_mm(setup, 0.0))
+    by_factor = float(depth_per_pixel_mm(replace(setup, window=thesis_factor(window.medium_index)), 0.0))
+    near, far = measuring_volume(setup, side_px=across)
+    near_line, line, far_line = line_length_mm(
+        setup, np.array([sensor.volume.near_mm + outer, standoff, sensor.volume.far_mm + outer]), side_px=along
+    )
+    apparent = float(window.reach_mm(standoff))
+    tilt = scheimpflug_angle_rad(
+        triangulation_angle_rad=math.atan(window.medium_index * tangent),
+        magnification=camera.focal_length_mm / apparent,
+    )
+    speckle = speckle_limit_um(
+        wavelength_nm=sensor.laser.wavelength_nm,
+        focal_length_mm=camera.focal_length_mm,
+        f_number=camera.f_number,
+        distance_mm=apparent,
+    )
+    glass = window_thickness_mm(
+        pressure_mpa=1.0, unsupported_diameter_mm=camera.window.aperture_diameter_mm, strength_mpa=60.0
+    )
+    needed = line_needed_mm(pipe_diameter_mm=300.0, passes=5)
+    snell = "with Snell's law"
+    return [
+        DesignRow("stand-off from the pupil", standoff, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("stand-off from the window", standoff - outer, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("sheet in view, nearest to the window", near - outer, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("sheet in view, farthest from the window", far - outer, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("depth in view", far - near, "mm", f"Eq. 2.8 {snell}"),
+        DesignRow("depth in view along the laser's axis", (far - near) * leaning, "mm", "over cos theta_t"),
+        DesignRow("depth per pixel at the stand-off", per_pixel, "mm/px", f"Eq. 2.9 {snell}"),
+        DesignRow("depth per pixel along the laser's axis", per_pixel * leaning, "mm/px", "over cos theta_t"),
+        DesignRow("depth per pixel by the thesis's factor n", by_factor, "mm/px", "Eq. 2.9 over n, section 3.1.2"),
+        DesignRow("line length at the volume's near end", float(near_line), "mm", f"Eq. 2.10, corrected, {snell}"),
+        DesignRow("line length at the stand-off", float(line), "mm", f"Eq. 2.10, corrected, {snell}"),
+        DesignRow("line length at the volume's far end", float(far_line), "mm", f"Eq. 2.10, corrected, {snell}"),
+        DesignRow("line needed for a 300 mm pipe in 5 passes", needed, "mm", "Figure 27"),
+        DesignRow("image plane to lens axis, sheet in focus", math.degrees(tilt), "deg", "Eq. 2.12, Scheimpflug"),
+        DesignRow("speckle limit across the camera's axis", speckle, "um", "Dorsch et al. 1994, contrast 0.71"),
+        DesignRow("speckle limit along the laser's axis", speckle * leaning / tangent, "um", "over sin theta_t"),
+        DesignRow("fused silica window for 1 MPa, clamped", glass, "mm", "Eq. 3.2, safety factor 4, 60 MPa"),
+    ]
+
+
+def table_lines(rows: list[DesignRow]) -> list[str]:
+    """The table as text."""
+    width = max(len(row.name) for row in rows)
+    return [f"{row.name:<{width}}  {row.value:>8.4g} {row.unit:<5}  {row.source}" for row in rows]

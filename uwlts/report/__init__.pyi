@@ -1,0 +1,9 @@
+from . import plot as plot
+from .camera_page import write_camera as write_camera
+from .campaign_page import write_campaign as write_campaign
+from .certificate import check_certificate as check_certificate
+from .certificate_page import write_certificate as write_certificate
+from .change_page import write_change as write_change
+from .findings_page import write_findings as write_findings
+from .model_comparison import write_models as write_models
+from .registration_page import write_registration as write_registration

@@ -1,0 +1,326 @@
+"""Commands that are made of public functions: parameters, types, defaults and help are the functions' own.
+
+A command is a body that is called with a `Call` of its function, and with the options that the body alone has. What a
+function takes beside text (arrays, opened files) stays out of the command line.
+"""
+
+import ast
+import inspect
+import re
+import sys
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from functools import cache, cached_property, reduce
+from operator import or_
+from pathlib import Path
+from types import ModuleType, NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from cyclopts import App, Parameter
+
+from uwlts.runtime.console import as_options, progress_bar
+
+_LISTENERS = ("progress", "report", "warn")
+"""Parameters by which functions show what they do; a command prints it."""
+_WORDS = (str, int, float, bool)
+
+
+@dataclass(frozen=True)
+class Before:
+    """Check of a command's output before the work; in the annotation of its option."""
+
+    check: Callable[..., None]
+    """Called with the path and ``overwrite``."""
+
+
+@dataclass(frozen=True)
+class Shortcuts:
+    """Options that give entries of a function's settings, such as ``--method`` for an entry of ``stripe``."""
+
+    setting: str
+    options: Mapping[str, Any]
+    """Annotations of the options by the names of the entries."""
+
+
+def derived(
+    app: App,
+    package: ModuleType,
+    function: str,
+    *,
+    also: Sequence[tuple[ModuleType, str]] = (),
+    shortcuts: Shortcuts | None = None,
+    summary: str | None = None,
+) -> Callable[[Callable[..., None]], "Derived"]:
+    """Make a command of a public function of a package; what is decorated is its body, named as the command.
+
+    The body takes a `Call`, and as parameters of its own what the command takes besides. Those without an annotation
+    are parameters of the function, or of one of the functions ``also``, whose defaults and text they have.
+
+    The function is imported when the command is run or its own help is shown. ``summary`` replaces the prose of its
+    docstring, if the command does more.
+    """
+
+    def register(body: Callable[..., None]) -> Derived:
+        made = Derived(package, function, body, tuple(also), shortcuts, summary)
+        name = body.__name__.strip("_").replace("_", "-")
+        app.command(f"{body.__module__}:{body.__name__}", name=name, help=made.__doc__)
+        return made
+
+    return register
+
+
+@dataclass(frozen=True)
+class Call:
+    """The function of a command with what was given on the command line.
+
+    Attributes
+    ----------
+    given : dict
+        Arguments of the function that were given, by name, in the types that it takes; those of ``*`` under that name.
+    explicit : dict
+        All that was given, also for the body alone.
+    """
+
+    function: Callable[..., Any]
+    parameters: Mapping[str, inspect.Parameter]
+    given: dict[str, Any]
+    explicit: dict[str, Any]
+
+    def __call__(self, **more: Any) -> Any:
+        """Call the function with what was given and more, while its progress is shown."""
+        heard = {name: listen for name, listen in (("report", say), ("warn", warn)) if name in self.parameters}
+        given = self.given | more | heard
+        first = next((value for value in self.explicit.values() if isinstance(value, str | Path)), "")
+        title = f"{self.function.__name__.replace('_', ' ')} {Path(first).name}".strip()
+        with progress_bar(title) if "progress" in self.parameters else nullcontext() as progress:
+            given |= {} if progress is None else {"progress": progress}
+            return self.function(*given.pop("*", ()), **given)
+
+
+class Derived:
+    """A command as cyclopts takes it: callable, with a signature and a docstring."""
+
+    def __init__(
+        self,
+        package: ModuleType,
+        function: str,
+        body: Callable[..., None],
+        also: tuple[tuple[ModuleType, str], ...],
+        shortcuts: Shortcuts | None,
+        summary: str | None,
+    ):
+        self._package, self._function, self._also, self._shortcuts = package, function, also, shortcuts
+        self._body = body
+        self.__name__ = body.__name__
+        prose = summary or _as_help(_sections(docstring(package, function))[0], descriptions(package, function))
+        self.__doc__ = f"{prose.rstrip()}\n\n{inspect.getdoc(body)}"
+
+    @property
+    def function(self) -> Callable[..., Any]:
+        """The function that the command is made of."""
+        return getattr(self._package, self._function)
+
+    @property
+    def __signature__(self) -> inspect.Signature:
+        return self._made
+
+    @property
+    def __annotations__(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return {name: one.annotation for name, one in self._made.parameters.items()}
+
+    @cached_property
+    def _taken(self) -> dict[str, inspect.Parameter]:
+        """Parameters of the function, with their types."""
+        hints, parameters = get_type_hints(self.function), inspect.signature(self.function).parameters
+        return {name: one.replace(annotation=hints[name]) for name, one in parameters.items()}
+
+    @cached_property
+    def _own(self) -> dict[str, inspect.Parameter]:
+        """Parameters of the body behind the call; those without an annotation are made like the functions'."""
+        own = dict(list(inspect.signature(self._body, eval_str=True).parameters.items())[1:])
+        for name, one in own.items():
+            if one.annotation is inspect.Parameter.empty and name not in self._taken:
+                sources = (_options_of(*function) for function in self._also)
+                found = next(options[name] for options in sources if name in options)
+                own[name] = one.replace(annotation=found.annotation, default=found.default)
+        return own
+
+    @cached_property
+    def _made(self) -> inspect.Signature:
+        taken, options = self._taken, _options_of(self._package, self._function)
+        if self._shortcuts is not None:
+            entries = self._shortcuts.options.items()
+            options |= {
+                name: inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=hint)
+                for name, hint in entries
+            }
+        own = [one for name, one in self._own.items() if name not in taken]
+        return inspect.Signature(sorted([*options.values(), *own], key=_place), return_annotation=None)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> None:
+        """Check the outputs, and run the body."""
+        bound = self._made.bind(*args, **kwargs)
+        explicit = dict(bound.arguments)
+        bound.apply_defaults()
+        for name, one in self._made.parameters.items():
+            checks = [each for each in getattr(one.annotation, "__metadata__", ()) if isinstance(each, Before)]
+            for before in checks if bound.arguments[name] is not None else ():
+                before.check(Path(bound.arguments[name]), overwrite=bound.arguments.get("overwrite", False))
+        given = {name: self._plain(name, value) for name, value in explicit.items() if name in self._taken}
+        if self._shortcuts is not None:
+            entries = {name: explicit[name] for name in self._shortcuts.options if name in explicit}
+            if settings := settings_of(self._shortcuts.setting, explicit.get(self._shortcuts.setting, ())) | entries:
+                given[self._shortcuts.setting] = settings
+        for name, one in self._taken.items():
+            if one.kind is one.VAR_POSITIONAL and name in given:
+                given["*"] = given.pop(name)
+        call = Call(self.function, self._taken, given, explicit)
+        self._body(call, **{name: bound.arguments[name] for name in self._own})
+
+    def _plain(self, name: str, value: Any) -> Any:
+        """A value as the function takes it: one of its single words by itself, not as a tuple."""
+        kinds = _members(self._taken[name].annotation)
+        alone = [word for kind in kinds if get_origin(kind) is Literal for word in get_args(kind)]
+        return value[0] if isinstance(value, tuple) and len(value) == 1 and value[0] in alone else value
+
+
+def _options_of(package: ModuleType, function: str) -> dict[str, inspect.Parameter]:
+    """Parameters of a function that can be given as text, typed for the command line."""
+    taken, described = getattr(package, function), descriptions(package, function)
+    hints, options = get_type_hints(taken), {}
+    for name, one in inspect.signature(taken).parameters.items():
+        kind = None if name in _LISTENERS or one.kind is one.VAR_KEYWORD else typed(hints[name])
+        if kind is None:
+            continue
+        text, default = _as_help(described[name], described), one.default
+        parameter = Parameter(help=text, negative="") if kind is bool else Parameter(help=text)
+        if get_origin(kind) is tuple and get_args(kind)[-1] is ...:
+            if default is not one.empty:
+                default = () if default is None else (default,) if isinstance(default, str) else default
+            shown = " ".join if default and default is not one.empty else False
+            together = get_origin(get_args(kind)[0]) is not tuple
+            parameter = Parameter(help=text, negative="", consume_multiple=together, show_default=shown)
+        options[name] = one.replace(annotation=Annotated[kind, parameter], default=default)
+    return options
+
+
+def _place(one: inspect.Parameter) -> tuple[int, bool]:
+    """Order in a signature: by kind, and those without default first."""
+    return one.kind, one.default is not one.empty
+
+
+def _members(hint: Any) -> Iterator[Any]:
+    """Types of a union, or the type itself, without their annotations."""
+    if get_origin(hint) is Annotated:
+        yield from _members(get_args(hint)[0])
+    elif get_origin(hint) in (Union, UnionType):
+        for each in get_args(hint):
+            yield from _members(each)
+    else:
+        yield hint
+
+
+def typed(hint: Any) -> Any:
+    """The type of an option for a parameter: what of its type can be given as text; None where nothing can."""
+    kinds = list(_members(hint))
+    words = [kind for kind in _WORDS if kind in kinds] or [kind for kind in kinds if kind is Path]
+    literals = [kind for kind in kinds if get_origin(kind) is Literal]
+    for kind in kinds:
+        element = typed(get_args(kind)[0]) if get_origin(kind) in (Sequence, tuple) else None
+        if element is None or (words and element not in words):
+            continue
+        if get_origin(kind) is tuple and get_args(kind)[-1] is not ...:
+            return _or_none(kind, kinds)
+        if literals and get_origin(element) is Literal:
+            element = Literal[(*(word for one in literals for word in get_args(one)), *get_args(element))]
+        return tuple[element, ...]
+    if literals and not words:
+        return _or_none(reduce(or_, literals), kinds)
+    if words:
+        return _or_none(reduce(or_, words), kinds)
+    return tuple[str, ...] if any(get_origin(kind) is Mapping for kind in kinds) else None
+
+
+def _or_none(kind: Any, kinds: Iterable[Any]) -> Any:
+    return kind | None if NoneType in kinds else kind
+
+
+def settings_of(option: str, texts: Sequence[str]) -> dict[str, Any]:
+    """Settings that were given as NAME=VALUE; DescriptionError for another text."""
+    from uwlts.errors import DescriptionError
+    from uwlts.files.reading import parsed_json
+
+    settings: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not (name and equals and value):
+            raise DescriptionError(f"`{option}` {text}: expected NAME=VALUE, such as half_window_px=32")
+        try:
+            settings[name] = parsed_json(value)
+        except ValueError:
+            settings[name] = value
+    return settings
+
+
+# --- docstrings, read from the source: the list of all commands needs none of the functions' libraries
+
+
+def descriptions(package: ModuleType, function: str) -> dict[str, str]:
+    """The docstring's text of each parameter; "As for `other`" leads to that function's."""
+    found = {}
+    sections = _sections(docstring(package, function))
+    parameters = dict(zip(sections[1::2], sections[2::2], strict=True)).get("Parameters", "")
+    for listed, block in re.findall(r"^(\w.*)\n((?:    .*\n?|\n(?=    ))+)", parameters, flags=re.MULTILINE):
+        other = re.match(r"\s*As for `(?:\w+\.)?(\w+)`", block)
+        elsewhere = descriptions(package, other[1]) if other else {}
+        names = listed.split(" : ")[0].split(", ")
+        found |= {name.lstrip("*"): elsewhere.get(name, " ".join(block.split())) for name in names}
+    return found
+
+
+def _as_help(text: str, names: Collection[str]) -> str:
+    """Text of a docstring as a command's help: options in place of parameters, and no backticks."""
+    return as_options(text, names).replace("`", "")
+
+
+def _sections(text: str) -> list[str]:
+    """The docstring's prose, then titles and texts of its sections in turn."""
+    return re.split(r"^(\w+)\n-+\n", f"{text}\n", flags=re.MULTILINE)
+
+
+@cache
+def docstring(package: ModuleType, function: str) -> str:
+    """Docstring of a function that the package's stub names, without importing it."""
+    stub = Path(f"{package.__file__}i")
+    modules = {
+        alias.name: node.module
+        for node in ast.walk(ast.parse(stub.read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+    }
+    place = stub.parent.joinpath(*modules[function].split("."))
+    source = (place / "__init__.py" if place.is_dir() else place.with_suffix(".py")).read_text(encoding="utf-8")
+    found = re.search(rf'^def {function}\(.*?"""(.*?)"""', source, flags=re.MULTILINE | re.DOTALL)
+    if found is None:
+        raise ValueError(f"{function} has no docstring in {place}")
+    return inspect.cleandoc(found[1])
+
+
+# --- what commands print
+
+
+def say(line: str) -> None:
+    """Print a line at once, also into a pipe."""
+    print(line, flush=True)
+
+
+def show(lines: Iterable[str]) -> None:
+    """Print lines."""
+    print("\n".join(lines))
+
+
+def warn(*texts: str) -> None:
+    """Print warnings on standard error."""
+    for text in texts:
+        print(f"warning: {text}", file=sys.stderr, flush=True)
