@@ -123,7 +123,8 @@ class StripeCandidates:
     def __getitem__(self, some: np.ndarray) -> StripeCandidates:
         """Those that an index array or a mask chooses."""
         columns = self.line, self.centre_px, self.amplitude, self.width_px, self.log_likelihood
-        return StripeCandidates(*(column[some] for column in columns), self.count, self.stripe_along)
+        kept = (column[some] for column in columns)
+        return StripeCandidates(*kept, count=self.count, stripe_along=self.stripe_along)
 
     def split(self, sheets: int = 2) -> list[Stripe]:
         """Return one `Stripe` for each of so many sheets of light, in the order of growing places.

@@ -250,9 +250,8 @@ def joined(parts: Sequence[PointCloud]) -> PointCloud:
     poses = [each.poses_mm for each in known if each.poses_mm is not None]
     deviations = [part.deviation_mm for part in parts if part.deviation_mm is not None]
     times = [part.time_s for part in parts if part.time_s is not None]
-    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in PER_POINT}
     return PointCloud(
-        **columns,
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in PER_POINT),
         deviation_mm=np.concatenate(deviations) if len(deviations) == len(parts) else None,
         uncertainty=PointUncertainty(
             np.concatenate([each.random_mm2 for each in known]),

@@ -8,8 +8,8 @@ laser images and says why there is no stripe.
 """
 
 from uwlts.model.stripe import CaptureStripes, Stripe, StripeCandidates, StripeStatus
-from uwlts.stripe.capture_stripes import find_stripes, warm_up, why_no_stripe
-from uwlts.stripe.extract import extract_candidates, extract_stripe, stripe_in
+from uwlts.stripe.capture_stripes import find_stripes, why_no_stripe
+from uwlts.stripe.extract import extract_candidates, extract_stripe, stripe_in, warm_up
 from uwlts.stripe.methods import method_names
 from uwlts.stripe.options import PeakRule, StripeOptions, StripeSettings
 

@@ -1,19 +1,17 @@
-"""The stripes of all laser images of a recording, and why images show none."""
+"""The stripes of all laser images of a capture, and why images show none."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
+from collections.abc import Iterable
 from typing import Literal
 
 import cv2
 import numpy as np
 
 from uwlts.errors import CaptureError, ImageError
-from uwlts.model.stripe import CaptureStripes, Stripe, StripeCandidates, StripeStatus
+from uwlts.model.stripe import CaptureStripes, StripeStatus
 from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.stripe.direct import direct_stripes, farther
 from uwlts.stripe.exposures import BracketImages, fused_images
-from uwlts.stripe.extract import LARGEST, extract_stripe, stripe_and_rivals
-from uwlts.stripe.options import PeakRule, StripeOptions, StripeSettings
+from uwlts.stripe.extract import direct_stripe_in, extract_stripe
+from uwlts.stripe.options import StripeOptions, StripeSettings
 
 BLACK = 0.02
 """Share of the full scale that no pixel of a black image reaches: above offset and noise of a covered lens."""
@@ -23,9 +21,6 @@ WHITE = 0.5
 
 FEWEST_LINES = 20
 """Profile lines with a stripe from which an image shows one; noise passes for it on single lines."""
-
-_WARM_LINES = 200
-"""Lines of the image that warms up: enough for stripes to go on."""
 
 _CLEARLY = 3
 """A stripe runs across if so many times as many lines show it when the image is read the other way; a right one is
@@ -51,16 +46,13 @@ def find_stripes(
     found: list[tuple[np.ndarray, ...]] = []
     numbers: list[int] = []
 
-    def images() -> Iterator[tuple[Stripe, StripeCandidates | None, StripeOptions]]:
-        for number, seen, saturation in fused_images(capture):
-            numbers.append(number)
-            yield stripe_and_rivals(seen, stripe_along=along, options=chosen, saturation=saturation)
-            progress(number + 1, len(capture))
-
-    for stripe in direct_stripes(images(), farther=farther(capture.header.sensor)):
+    for number, seen, saturation in fused_images(capture):
+        stripe = direct_stripe_in(seen, stripe_along=along, options=chosen, saturation=saturation)
+        numbers.append(number)
         good = stripe.lines
         of_lines = (values[good] for values in (stripe.centre_px, stripe.amplitude, stripe.width_px))
         found.append((stripe.status, good, *of_lines))
+        progress(number + 1, len(capture))
     if not found:
         raise CaptureError(
             f"{capture.path.name} holds no image with the laser on among {len(capture)}: nothing to reconstruct"
@@ -79,25 +71,6 @@ def find_stripes(
         raise CaptureError(f"no stripe in any of the {len(found)} laser images of {capture.path.name}: {reason}")
     frame = np.repeat(numbers, [len(good) for _, good, *_ in found])
     return CaptureStripes(frame, *columns, lines_by_status=by_status)
-
-
-def warm_up(dtype: np.dtype | type = np.uint8, options: StripeOptions = StripeOptions()) -> None:
-    """Load all that finding stripes in images of a type needs, or compile it where that was never done on this machine.
-
-    Otherwise the first images of a stream wait for it: some tenths of a second, and some seconds once. The rule of
-    direct light and `extract_candidates` are among it, and what only saturated stripes need.
-    """
-    half = options.half_window_px
-    place, lines = np.arange(8 * half), np.arange(_WARM_LINES)[:, None]
-    # A stripe, and beside it a dimmer one that comes and goes.
-    beside = 0.3 * (lines % 20 < 10)
-    seen = [share * np.exp(-0.5 * np.square((place - at * half) / 2.0)) for share, at in ((1.0, 2), (beside, 5))]
-    image = np.broadcast_to(100.0 * sum(seen), (_WARM_LINES, 8 * half)).astype(dtype)
-    for method in (options.method, "quadratic"):
-        extract_stripe(image, stripe_along="height", options=replace(options, method=method))
-    rivals = replace(options, peak=PeakRule.DIRECT)
-    how = {"stripe_along": "height", "options": rivals, "saturation": LARGEST[image.dtype]}
-    list(direct_stripes((stripe_and_rivals(image, **how) for _ in "ab"), farther=1))
 
 
 def is_black(image: np.ndarray, full_dn: float) -> bool:

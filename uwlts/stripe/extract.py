@@ -11,17 +11,21 @@ import numpy as np
 from uwlts.errors import ImageError
 from uwlts.model.stripe import Stripe, StripeCandidates, StripeStatus
 from uwlts.stripe.block_contrast import MEDIAN_SURROUNDINGS, block_contrast, block_extremes, noise_from_contrast
+from uwlts.stripe.direct import direct_stripe
 from uwlts.stripe.learned import find_learned
 from uwlts.stripe.methods import amplitudes, place_centre
 from uwlts.stripe.options import LEARNED, PeakRule, StripeOptions
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, noise_gain
 from uwlts.stripe.search import MARGIN, SearchRules, look_at, search, search_all, search_rules, with_rivals
 
-LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
+_LARGEST = {np.dtype(np.uint8): 255.0, np.dtype(np.uint16): 65535.0, np.dtype(np.float32): math.inf}
 """Grey value at which pixels of each type clip at the latest."""
 
 _MANY = 0.25
 """Lines with a stripe that is too wide, over those with one that is measured, from which a wider window is tried."""
+
+_WARM_LINES = 200
+"""Lines of the image that warms up: enough for stripes to go on."""
 
 _LEAST_NOISE = 0.3
 """Grey levels: standard deviation of rounding to whole ones."""
@@ -100,21 +104,17 @@ def stripe_in(
     return extract_stripe(seen, stripe_along=stripe_along, options=options, saturation=saturation)
 
 
-def stripe_and_rivals(
-    image: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions, saturation: float
-) -> tuple[Stripe, StripeCandidates | None, StripeOptions]:
-    """Return the stripe with its ends, all candidates on lines with more than one, and the options that found them.
-
-    The candidates are None under rules other than `PeakRule.DIRECT`, where no line has more than one, and for the
-    stripe of a 3D camera. With candidates, window and least height in the options are those that suited the image.
-    """
-    if isinstance(image, Stripe):
-        return image, None, options
-    found = _searched(image, stripe_along, options, None, saturation)
-    rivals = found.rivals() if options.peak is PeakRule.DIRECT else None
-    if rivals is None or found.rules is None:
-        return found.stripe, None, found.options
-    return found.stripe, rivals, replace(found.options, threshold_floor=found.rules.fine)
+def direct_stripe_in(
+    seen: np.ndarray | Stripe, *, stripe_along: str, options: StripeOptions, saturation: float
+) -> Stripe:
+    """As `stripe_in`, without reflections under the rule `PeakRule.DIRECT` (`uwlts.stripe.direct`)."""
+    if isinstance(seen, Stripe) or options.peak is not PeakRule.DIRECT:
+        return stripe_in(seen, stripe_along=stripe_along, options=options, saturation=saturation)
+    found = _searched(seen, stripe_along, options, None, saturation)
+    stripe, rivals = found.stripe, found.rivals()
+    if rivals is not None:
+        stripe = direct_stripe(stripe, rivals, jump_px=found.options.jump_px)
+    return leave_ends_out(stripe, found.options)
 
 
 def leave_ends_out(stripe: Stripe, options: StripeOptions) -> Stripe:
@@ -143,6 +143,24 @@ def leave_ends_out(stripe: Stripe, options: StripeOptions) -> Stripe:
     return stripe.without(found[beside[lines : lines + len(found)]], StripeStatus.END)
 
 
+def warm_up(dtype: np.dtype | type = np.uint8, options: StripeOptions = StripeOptions()) -> None:
+    """Load all that finding stripes in images of a type needs, or compile it where that was never done on this machine.
+
+    Otherwise the first images of a stream wait for it: some tenths of a second, and some seconds once. The rule of
+    direct light and `extract_candidates` are among it, and what only saturated stripes need.
+    """
+    half = options.half_window_px
+    place, lines = np.arange(8 * half), np.arange(_WARM_LINES)[:, None]
+    # A stripe, and beside it a dimmer one that comes and goes.
+    beside = 0.3 * (lines % 20 < 10)
+    seen = [share * np.exp(-0.5 * np.square((place - at * half) / 2.0)) for share, at in ((1.0, 2), (beside, 5))]
+    image = np.broadcast_to(100.0 * sum(seen), (_WARM_LINES, 8 * half)).astype(dtype)
+    for method in (options.method, "quadratic"):
+        extract_stripe(image, stripe_along="height", options=replace(options, method=method))
+    rivals = replace(options, peak=PeakRule.DIRECT)
+    direct_stripe_in(image, stripe_along="height", options=rivals, saturation=_LARGEST[image.dtype])
+
+
 def _searched(
     image: np.ndarray,
     stripe_along: str,
@@ -162,7 +180,7 @@ def _searched(
         )
     if saturation is not None and not 0 < saturation < math.inf:
         raise ImageError(f"saturation is {saturation!r}; expected the positive grey value at which pixels clip")
-    clip = LARGEST[image.dtype] if saturation is None else saturation
+    clip = _LARGEST[image.dtype] if saturation is None else saturation
 
     signal = image
     if background is not None:
@@ -243,7 +261,7 @@ class _Search:
         if self.rules is None:
             own = np.intersect1d(lines, stripe.lines)
             columns = (each[own] for each in (stripe.centre_px, stripe.amplitude, stripe.width_px))
-            return StripeCandidates(own, *columns, np.zeros(len(own)), count, along)
+            return StripeCandidates(own, *columns, log_likelihood=np.zeros(len(own)), count=count, stripe_along=along)
         board = np.ascontiguousarray(self.board[:, lines].T)
         line, clear, peak = search_all(self.profiles, board, lines, self.rules, fewest=2 if rivals else 1)
         if not rivals:
@@ -298,7 +316,7 @@ def _check_image(image: np.ndarray, *, name: str) -> None:
     """ImageError for what is not a two-dimensional, finite uint8, uint16 or float32 array."""
     if not isinstance(image, np.ndarray):
         raise ImageError(f"the {name} is a {type(image).__name__}; expected a NumPy array")
-    if image.dtype not in LARGEST:
+    if image.dtype not in _LARGEST:
         raise ImageError(f"the {name} has type {image.dtype}; convert it to uint8, uint16 or float32")
     if image.ndim != 2:
         raise ImageError(f"the {name} has shape {image.shape}; expected (height, width): choose one channel")

@@ -19,9 +19,21 @@ LEAST_KERNEL = 1.0
 would err by 0.015 px with the pixel phase instead of 0.005."""
 
 FLANK = 5
-"""Pixels of background taken on either side of a peak."""
+"""Pixels of background taken on either side of a peak: room for two low-passed values three pixels apart."""
 
-FIRST, STRONGEST, LAST = -1, 0, 1
+TAIL_SIGMAS = 4.0
+"""Sigmas to which Gaussian weights are summed; beyond, each is below 0.0004 of the highest."""
+
+_PEAK_SIGMAS = 3.0
+"""Sigmas from a peak's middle to its background, where a Gaussian has fallen to 0.011 of its height."""
+
+_LOW_PASS_SIGMAS = 3.5
+"""Sigmas to which the low-pass reaches; its last weight is below 0.0022 of the middle one."""
+
+FIRST = -1
+STRONGEST = 0
+LAST = 1
+"""Which of several stripes on a line counts, as `SearchRules` has it for compiled code."""
 
 
 class SearchRules(NamedTuple):
@@ -181,7 +193,7 @@ def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> 
     smooth_sigma = (x_right - x_left) * np.float32(1.0 / FWHM_PER_SIGMA)
     sigma = math.sqrt(max(smooth_sigma * smooth_sigma - np.float32(rules.smoothing * rules.smoothing), np.float32(0.0)))
 
-    reach = min(math.ceil(np.float32(3.0) * smooth_sigma), half - FLANK)
+    reach = min(math.ceil(np.float32(_PEAK_SIGMAS) * smooth_sigma), half - FLANK)
     near = math.floor(middle + np.float32(0.5))
     before = _flank(smooth, near - reach - FLANK + 1)
     after = _flank(smooth, near + reach - 1)
@@ -249,8 +261,8 @@ def _flank(smooth: np.ndarray, first: int) -> np.float32:
 
 @lru_cache(maxsize=16)
 def low_pass(sigma: float) -> np.ndarray:
-    """Gaussian weights to 3.5 sigma, sum 1."""
-    reach = math.ceil(3.5 * sigma)
+    """Gaussian weights, sum 1."""
+    reach = math.ceil(_LOW_PASS_SIGMAS * sigma)
     weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     return (weight / weight.sum()).astype(np.float32)
 
@@ -267,7 +279,7 @@ def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, mo
     count, size = peak.window.shape
     for m in range(count):
         pixels, ground, middle, width = peak.window[m], peak.base[m], float(centre[m]), float(sigma[m])
-        reach, sharpness = math.ceil(4.0 * width), 1.0 / (width * width)
+        reach, sharpness = math.ceil(TAIL_SIGMAS * width), 1.0 / (width * width)
         # A centre that has left its window has a sum all the same.
         near = min(max(math.floor(middle + 0.5), 0), size - 1)
         # A Gaussian by recurrence: the ratio of neighbouring values falls by the same factor from pixel to pixel.

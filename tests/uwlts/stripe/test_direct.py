@@ -9,7 +9,6 @@ import pytest
 from uwlts.errors import RangeError
 from uwlts.model.library import load_sensor
 from uwlts.stripe import StripeOptions, StripeStatus, extract_candidates, extract_stripe, find_stripes
-from uwlts.stripe.direct import farther
 
 LINES, LENGTH = 400, 320
 BRIGHTEST = StripeOptions(peak="strongest", ambiguous_ratio=1.0)
@@ -146,9 +145,3 @@ def test_two_sheets_are_split_in_their_order():
     assert likelihood[1] / likelihood[0] == pytest.approx((140 / 60) ** 2, rel=0.3)
     with pytest.raises(RangeError, match="sheets is 0"):
         candidates.split(0)
-
-
-def test_which_way_is_farther_follows_from_the_sensors_description():
-    sensor = load_sensor("thesis")
-    # Seen from the camera beside the laser, what is farther lies towards the laser's side of the image.
-    assert farther(sensor) == 1

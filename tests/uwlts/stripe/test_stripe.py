@@ -575,8 +575,7 @@ import gc
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 from uwlts.stripe import StripeOptions, extract_candidates, extract_stripe, warm_up
-from uwlts.stripe.direct import direct_stripes
-from uwlts.stripe.extract import stripe_and_rivals
+from uwlts.stripe.extract import direct_stripe_in
 
 def compiled():
     loops = [each for each in gc.get_objects() if isinstance(each, Dispatcher)]
@@ -591,10 +590,9 @@ image = image + 90 * np.exp(-0.5 * ((place - 220 + 0.1 * lines) / 2) ** 2) * (li
 image = np.random.default_rng(1).normal(image, 2).clip(0, 255).astype(np.uint8)
 extract_stripe(image, stripe_along="width")
 assert len(extract_candidates(image, stripe_along="width").line) > 500
-how = {"stripe_along": "width", "options": StripeOptions(), "saturation": 255.0}
-seen = [stripe_and_rivals(image, **how) for _ in range(2)]
-assert seen[0][1] is not None
-list(direct_stripes(seen, farther=1))
+how = {"stripe_along": "width", "options": StripeOptions()}
+direct = direct_stripe_in(image, saturation=255.0, **how).lines
+assert len(direct) != len(extract_stripe(image, **how).lines)
 print({name for name, count in compiled().items() if count != before.get(name)})
 """
 

@@ -16,7 +16,10 @@ from importlib import import_module
 import numpy as np
 
 from uwlts.runtime.compiled import compiled
-from uwlts.stripe.peak_window import LEAST_KERNEL, PeakWindow
+from uwlts.stripe.peak_window import LEAST_KERNEL, TAIL_SIGMAS, PeakWindow
+
+_ONE_PIXEL = 0.3
+"""Sigma, px, of light within one pixel (1 / sqrt 12, rounded): no stripe is narrower in an image."""
 
 
 @lru_cache
@@ -46,7 +49,7 @@ def _best_heights(peak: PeakWindow, centre: np.ndarray, result: np.ndarray) -> N
     size = peak.window.shape[1]
     for m in range(centre.size):
         pixels, ground, middle = peak.window[m], peak.base[m], centre[m]
-        sigma = max(peak.sigma[m], np.float32(0.3))
+        sigma = max(peak.sigma[m], np.float32(_ONE_PIXEL))
         width = max(peak.sigma[m], np.float32(LEAST_KERNEL))
         near = min(max(math.floor(middle + np.float32(0.5)), 0), size - 1)
         # A Gaussian by recurrence on both sides; see `gaussian_moments`.
@@ -55,7 +58,7 @@ def _best_heights(peak: PeakWindow, centre: np.ndarray, result: np.ndarray) -> N
         after, before = math.exp(-sharpness * (half + offset)), math.exp(-sharpness * (half - offset))
         falling = after * before
         total, right, left = weight * (pixels[near] - ground), weight * after, weight * before
-        for k in range(1, math.ceil(np.float32(4.0) * width) + 1):
+        for k in range(1, math.ceil(np.float32(TAIL_SIGMAS) * width) + 1):
             if near + k < size:
                 total += right * (pixels[near + k] - ground)
             if near - k >= 0:

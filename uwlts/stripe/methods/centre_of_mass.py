@@ -10,15 +10,19 @@ from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import PeakWindow, part_inside
 
 _ITERATIONS = 6
+"""Passes in which the window follows the centre, as many for each line."""
+
+_HALF_SIGMAS = 2.25
+"""Sigmas from the centre to the ends of the window: most of the light; further pixels add more noise than light."""
 
 
 def centres(peak: PeakWindow) -> np.ndarray:
     """Centre of mass in a window symmetric about itself.
 
-    The window reaches 2.25 sigma to either side, pixels cut by its ends count in part, and it follows the centre until
-    both agree, so that nothing is cut off more on one side than on the other. A wider window would collect noise.
+    Pixels cut by the window's ends count in part, and it follows the centre until both agree, so that nothing is cut
+    off more on one side than on the other.
     """
-    half = np.float32(2.25) * peak.kernel_sigma()
+    half = np.float32(_HALF_SIGMAS) * peak.kernel_sigma()
     centre = peak.middle.copy()
     _follow(peak, half, centre)
     return centre

@@ -10,6 +10,7 @@ from uwlts.runtime.compiled import compiled
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA, PeakWindow, part_inside
 
 _ITERATIONS = 6
+"""Fits, each about the vertex of the one before, as many for each line."""
 
 
 def centres(peak: PeakWindow) -> np.ndarray:
