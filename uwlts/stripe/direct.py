@@ -80,11 +80,12 @@ def direct_stripe(
     line, number, centre, amplitude, width = (each[kept] for each in (line, number, *columns))
     number = np.unique(number, return_inverse=True)[1]
     single, state = np.bincount(line)[line] == 1, np.empty(len(line), np.int8)
-    slopes = np.empty((2, len(line)))
-    _fit_slopes(line, centre, number, rule.gap_lines, *slopes)
-    _take(line, _margins(line, centre, number, slopes, jump_px, rule), single, rule.margin, state)
+    before, after = np.empty((2, len(line)))
+    _fit_slopes(line, centre, number, rule.gap_lines, before, after)
+    _take(line, _margins(line, centre, number, before, after, jump_px, rule), single, rule.margin, state)
     _refuse_alone(number, single, state)
-    _open_meetings(line, centre, number, *slopes, rule.meeting_lines, rule.meeting_jumps * jump_px, state)
+    reach_px = rule.meeting_jumps * jump_px
+    _open_meetings(line, centre, number, before, after, rule.meeting_lines, reach_px, state)
     taken = (state == _TAKEN) & np.isfinite(width)
     status = stripe.status.copy()
     status[line], status[line[taken]] = StripeStatus.AMBIGUOUS, StripeStatus.OK
@@ -93,19 +94,25 @@ def direct_stripe(
 
 
 def _margins(
-    line: np.ndarray, centre: np.ndarray, number: np.ndarray, slopes: np.ndarray, jump_px: float, rule: DirectRule
+    line: np.ndarray,
+    centre: np.ndarray,
+    number: np.ndarray,
+    before: np.ndarray,
+    after: np.ndarray,
+    jump_px: float,
+    rule: DirectRule,
 ) -> np.ndarray:
     """Cost (M,), in jumps beyond the best path, of the best path through each candidate."""
-    (before, after), (through, backwards) = slopes, np.empty((2, len(line)))
+    through, backwards = np.empty((2, len(line)))
     # Of its lines, a stripe is seen on this share; that of a faint one is missed on others by chance.
     first, last = np.full(number.max() + 1, line.max()), np.zeros(number.max() + 1, line.dtype)
     np.minimum.at(first, number, line)
     np.maximum.at(last, number, line)
     missed = rule.skipped * (np.bincount(number) / (last - first + 1))[number]
-    how = {"gap": rule.gap_lines, "jump_px": jump_px, "skipped": rule.skipped}
-    _least_cost(line, centre, before, after, missed, **how, result=through)
+    gap, skipped = rule.gap_lines, rule.skipped
+    _least_cost(line, centre, before, after, missed, gap, jump_px, skipped, through)
     turned = (values[::-1].copy() for values in (line.max() - line, centre, -after, -before, missed))
-    _least_cost(*turned, **how, result=backwards)
+    _least_cost(*turned, gap=gap, jump_px=jump_px, skipped=skipped, result=backwards)
     through += backwards[::-1]
     return through - through.min()
 
