@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -465,6 +466,6 @@ def _read_hdf5(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     known = None
     if needed[0] in arrays:
         known = PointUncertainty(*(arrays[name] for name in needed), poses_mm=arrays.get("poses_mm"))
-    per_point = {name: arrays[name] for name in KINDS if name in arrays}
+    per_point: dict[str, Any] = {name: arrays[name] for name in KINDS if name in arrays}
     metadata, known = _without_shared(header.metadata, known)
     return PointCloud(**per_point, uncertainty=known, metadata=metadata), total
