@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import shutil
 import subprocess
@@ -95,6 +96,7 @@ def open_chromium(path: Path) -> Iterator[Browser]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description="Print the Chromium in which tests open web pages.").parse_args()
     try:
         print(f"Chromium: {find_chromium()}")
     except SetupError as error:

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 import uwlts
 from tests.uwlts.alignment.test_align import LOOP_MM
 from tests.uwlts.path_views import ALTITUDE_MM, STEP_MM, bed, ride, scan
-from twin.scene.platforms import Vehicle
+from twin.scene.vehicle import Vehicle
 from uwlts.alignment.crossing_search import add_overlaps, close_hypothesis
 from uwlts.alignment.drift_model import DriftModel, drift_of
 from uwlts.alignment.options import AlignmentOptions

@@ -129,6 +129,16 @@ def test_a_rod_before_a_floor_and_a_groove_in_it_stay():
         assert len(stripes.line) >= LINES - 8  # two lines on either side of each of both jumps
 
 
+def test_a_block_whose_edges_show_the_floor_beside_it_stays():
+    """On the two lines of its edges both are seen, and either may be the laser's own."""
+    block, floor = on(150, 260, 120 + 0 * X), np.fmax.reduce([on(0, 151, 200 + 0 * X), on(259, LINES, 200 + 0 * X)])
+    stripes = found(drawn((block, 60), (floor, 80)))
+    true = np.where(np.isnan(block), floor, block)
+    inside = ~np.isin(stripes.line, (150, 259))
+    assert np.abs(stripes.centre_px - true[stripes.line])[inside].max() < 3
+    assert np.count_nonzero(np.isin(stripes.line, np.arange(151, 259))) > 100
+
+
 def test_two_sheets_are_split_in_their_order():
     near, far = 100 + 0.1 * X, 180 + 0.05 * X
     candidates = extract_candidates(drawn((near, 60), (on(0, 300, far), 140)), stripe_along="width", saturation=255)

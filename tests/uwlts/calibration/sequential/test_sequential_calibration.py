@@ -162,7 +162,10 @@ def test_the_file_keeps_the_figures(result, tmp_path):
     assert kept.residuals["camera"]["rms_px"] == result.camera.rms_px()
     assert kept.residuals["window"]["distance_mm"] == kept.window.distance_mm
     std = kept.std()
-    assert std.camera == result.camera.std() and std.window_distance_mm == result.window.uncertainty_mm
+    found = result.camera.std()
+    assert (std.fx_px, std.fy_px, std.cx_px, std.cy_px) == (found["f"], found["f"], found["cx"], found["cy"])
+    assert std.distortion == {name: found[name] for name in std.distortion} and len(std.distortion) == len(found) - 3
+    assert std.window_distance_mm == result.window.uncertainty_mm
     assert std.sheet_normal_deg == np.degrees(result.sheet.normal_std_rad)
     assert len(kept.residuals["window"]["curve_mm"]) == len(result.window.curve_mm)
     assert kept.provenance["warnings"] == result.warnings
