@@ -236,7 +236,7 @@ def _result(
 
 
 def _crossing(estimate: PathEstimate, pair: Pair) -> Crossing:
-    now, held = estimate.distances(pair[1], pair[0], reach_mm=2 * estimate.reach_mm)
+    now, held = estimate.compared(pair)
     # The same patches, as they lay by the path as it was.
     shift = np.zeros_like(now.places_mm)
     for number, rows, sign in zip(pair, (now.target, now.source), (-1.0, 1.0), strict=True):

@@ -93,7 +93,7 @@ def add_overlaps(estimate: PathEstimate, count: int) -> PathEstimate:
             pair = earlier, later
             reach = None if pair in closed else _reach(estimate, pair)
             if reach is not None and reach.max() < estimate.reach_mm:
-                found, _ = estimate.distances(later, earlier, reach_mm=2 * estimate.reach_mm)
+                found, _ = estimate.compared(pair)
                 new += [pair] if len(found.source) >= estimate.options.fewest_patches else []
     if not new:
         return estimate

@@ -16,7 +16,7 @@ from scipy.linalg import solve_triangular
 from uwlts.alignment.options import AlignmentOptions
 from uwlts.alignment.path_prior import PathPrior
 from uwlts.alignment.pieces import Piece, Survey
-from uwlts.fitting.patches import PatchDistances, Patches, distances_between
+from uwlts.fitting.patches import PatchDistances, Patches, distances_between, rigid_derivatives
 
 Pair = tuple[int, int]
 """Numbers of two pieces that show the same surface, the earlier first."""
@@ -83,9 +83,13 @@ class PathEstimate:
         found = distances_between(self.surfaces[source], np.eye(4), self.surfaces[target], np.eye(4), reach_mm=reach_mm)
         return found, self.pieces[source].held_out[found.source] | self.pieces[target].held_out[found.target]
 
+    def compared(self, pair: Pair) -> tuple[PatchDistances, np.ndarray]:
+        """Return the `distances` of the later piece of a pair from the earlier one, within twice the reach."""
+        return self.distances(pair[1], pair[0], reach_mm=2 * self.reach_mm)
+
     def agrees(self, pair: Pair) -> bool:
         """Check whether the surfaces of a pair agree, also where they were held out."""
-        found, held_out = self.distances(pair[1], pair[0], reach_mm=2 * self.reach_mm)
+        found, held_out = self.compared(pair)
         options = self.options
         fits = np.abs(found.distance_mm) < options.agreeing_sigmas * found.std_mm
         if np.count_nonzero(fits) < options.fewest_patches or np.mean(fits) < options.least_agreeing:
@@ -102,7 +106,7 @@ class PathEstimate:
             time = piece.times_s[middle][None]
             twist = np.eye(6)
             platform = piece.platform_mm[middle] + self.corrections(time)[0, :3]
-            twist[:3, 3:] = np.cross(np.eye(3), at_mm - platform).T
+            twist[:3] = rigid_derivatives(at_mm, np.eye(3), platform)
             result += sign * twist[:, :, None] * self.prior.basis(time)[0]
         return result.reshape(6, -1)
 

@@ -76,7 +76,7 @@ def refine_nodes(estimate: PathEstimate) -> PathEstimate:
     """Return the same correction with nodes as close as patches require where pairs overlap; `solve` goes on."""
     survey, options, times = estimate.survey, estimate.options, []
     for earlier, later in estimate.pairs:
-        found, _ = estimate.distances(later, earlier, reach_mm=2 * estimate.reach_mm)
+        found, _ = estimate.compared((earlier, later))
         times += [estimate.pieces[later].times_s[found.source], estimate.pieces[earlier].times_s[found.target]]
     step = options.node_spacing * survey.radius_mm / survey.speed_mm_s
     even = PathPrior.over(
@@ -174,12 +174,13 @@ def _add_pair(estimate: PathEstimate, pair: Pair, normal: np.ndarray, gradient: 
     if not ways:
         return
     middle = np.vstack([used.places_mm for _, _, used, _ in ways]).mean(axis=0)
-    observable = _observable([each[2:] for each in ways], middle)
-    for source, target, used, weight in ways:
-        twists = rigid_derivatives(used.places_mm, used.normals, middle) @ observable
+    twists = [rigid_derivatives(used.places_mm, used.normals, middle) for _, _, used, _ in ways]
+    observable = _observable([(*way[2:], twist) for way, twist in zip(ways, twists, strict=True)], middle)
+    for (source, target, used, weight), twist in zip(ways, twists, strict=True):
+        seen = twist @ observable
         derivatives = np.zeros((len(weight), 6, estimate.prior.count))
         for number, at, sign in ((source, used.source, 1.0), (target, used.target, -1.0)):
-            piece, by = estimate.pieces[number], twists.copy()
+            piece, by = estimate.pieces[number], seen.copy()
             # Beside the middle of a patch the surface was seen a little earlier or later.
             off = used.places_mm - estimate.surfaces[number].places_mm[at]
             later = np.einsum("qi,qi->q", piece.slopes_s_mm[at], off)
@@ -195,13 +196,16 @@ def _add_pair(estimate: PathEstimate, pair: Pair, normal: np.ndarray, gradient: 
         gradient[near] += derivatives.T @ (weight * used.distance_mm)
 
 
-def _observable(ways: list[tuple[PatchDistances, np.ndarray]], middle: np.ndarray) -> np.ndarray:
-    """Projection (6, 6) of shift and turn to the part that the surfaces determine."""
+def _observable(ways: list[tuple[PatchDistances, np.ndarray, np.ndarray]], middle: np.ndarray) -> np.ndarray:
+    """Projection (6, 6) of shift and turn to the part that the surfaces determine.
+
+    The ways are distances, their weights (Q,), and their derivatives (Q, 6) by shift and turn about the middle.
+    """
     normal, feigned = np.zeros((6, 6)), np.zeros((6, 6))
-    places = np.vstack([used.places_mm for used, _ in ways]) - middle
+    places = np.vstack([used.places_mm for used, *_ in ways]) - middle
     scale = np.repeat([1.0, 1 / float(np.sqrt(np.mean(np.sum(places**2, axis=1))))], 3)
-    for used, weight in ways:
-        by = rigid_derivatives(used.places_mm, used.normals, middle) * scale
+    for used, weight, twist in ways:
+        by = twist * scale
         normal += by.T @ (weight[:, None] * by)
 
         def scaled_twists(directions: np.ndarray, places: np.ndarray = used.places_mm) -> np.ndarray:

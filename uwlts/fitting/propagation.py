@@ -29,7 +29,7 @@ class PointErrors:
     image_mm : (K, N, 3) or (K, N)
         Moves for one standard deviation of each part of the position and pose of an image.
     image : (N,) int
-        Image of each point, from 0.
+        Image of each point.
     patterns_mm : (M, N, 3) or (M, N) or None
         Moves for one standard deviation of each pattern that all points share; None if the cloud states nothing.
     """
@@ -42,13 +42,13 @@ class PointErrors:
     @classmethod
     def of(cls, known: PointUncertainty, frame: np.ndarray) -> PointErrors:
         """Return the errors of points with an uncertainty and images (N,)."""
-        return cls(noise_mm(known), known.by_image_mm(), _numbered(frame), known.patterns_mm)
+        return cls(noise_mm(known), known.by_image_mm(), frame, known.patterns_mm)
 
     @classmethod
     def along(cls, cloud: PointCloud, chosen: np.ndarray, normals: np.ndarray) -> PointErrors:
         """Return the errors of the chosen (K,) points of a cloud along normals (K, 3)."""
         frame = cloud.frame[chosen]
-        image = _numbered(frame) if np.any(frame >= 0) else np.arange(len(chosen))
+        image = frame if np.any(frame >= 0) else np.arange(len(chosen))
         if (known := cloud.uncertainty) is None:
             return cls(np.zeros(len(chosen)), np.empty((0, len(chosen))), image, None)
         known = known[chosen]
@@ -111,6 +111,11 @@ class PointErrors:
             return random, None
         moved = weights @ self.patterns_mm.T
         return random, moved @ moved.T
+
+
+def neighbours_in_order(count: int) -> np.ndarray:
+    """Return groups (N,) of neighbours that may err together: eight points that follow each other."""
+    return np.arange(count) // 8
 
 
 def covariance_of_groups(along: np.ndarray, group: np.ndarray) -> np.ndarray:

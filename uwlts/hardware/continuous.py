@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from uwlts.errors import EvaluationError, HardwareError, RangeError
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import robust_std
 from uwlts.hardware.camera_interface import CameraDevice, GrabbedFrame
 from uwlts.hardware.grbl import GrblStage, StageReport
 from uwlts.hardware.scan_plan import Continuous, ScanPlan
@@ -358,7 +358,7 @@ def _line_through(reports: list[StageReport]) -> _Line:
 
     speed, start, away = fitted()
     for _ in range(2):
-        scatter = max(MAD_TO_STD * float(np.median(np.abs(away))), 1e-6)
+        scatter = max(robust_std(away), 1e-6)
         kept = np.abs(away) <= _OUTLIER * scatter
         speed, start, away = fitted()
     # Two of the degrees of freedom are the line's.

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.errors import HardwareError
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import robust_std
 from uwlts.hardware.rig import Rig, not_few, stripe_of
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Seen
@@ -213,5 +213,5 @@ def _relief(before: Place, here: Place, after: Place) -> Relief | None:
 
 def _standard_error(scatter_px: np.ndarray, motion_px_per_mm: np.ndarray) -> float:
     """Standard error of the slip of all lines, in mm."""
-    spread = MAD_TO_STD * np.median(np.abs(scatter_px - np.median(scatter_px)))
+    spread = robust_std(scatter_px - np.median(scatter_px))
     return float(_GRAIN * spread / np.sqrt(np.sum(motion_px_per_mm**2)))

@@ -22,7 +22,7 @@ from uwlts.evaluation.figures import TOWARDS_SENSOR
 from uwlts.evaluation.step_faces import StepFace, label_step_faces
 from uwlts.fitting.least_squares import evenly_thinned, fit_robustly, robust_std
 from uwlts.fitting.point_spacing import footprint_on
-from uwlts.fitting.propagation import PointErrors
+from uwlts.fitting.propagation import PointErrors, neighbours_in_order
 from uwlts.fitting.shapes import fit_plane
 from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, Inspection, plain_value
 from uwlts.storage.cloud import PointCloud
@@ -81,8 +81,7 @@ def inspect_step(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     EvaluationError
         There are no two such faces.
     """
-    cloud = loaded_cloud(cloud)
-    _require_points(cloud)
+    cloud = _cloud_of_faces(cloud)
     normal = _largest_plane(cloud.points_mm)[0]
     labels = label_step_faces(cloud.points_mm, height_mm=_height_between(cloud.points_mm @ normal))
     lower, upper = (np.flatnonzero(labels == face) for face in (StepFace.LOWER, StepFace.UPPER))
@@ -98,7 +97,7 @@ def inspect_step(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     residuals = np.concatenate([base.residuals_mm, other.residuals_mm])
     turned = base.axes[:2] @ other.axes[:2].T
     slopes = np.hstack([-base.rows[1:], turned @ other.rows[1:]])
-    random, common = errors.covariances(np.vstack([row, slopes]), residuals, _groups(cloud, used))
+    random, common = errors.covariances(np.vstack([row, slopes]), residuals, neighbours_in_order(len(used)))
     angle = np.array([base.axes[k] @ other.axes[2] for k in (0, 1)])
     values = (
         _plain(FeatureKind.STEP, "height", height, random, common, 0),
@@ -131,11 +130,9 @@ def inspect_flange(
     EvaluationError
         The cloud has no frames and lines, or no face.
     """
-    cloud, datum = loaded_cloud(cloud), None if datum is None else loaded_cloud(datum)
-    _require_points(cloud)
-    on_face = _largest_plane(cloud.points_mm)[1]
-    face = _face_of(cloud, on_face)
-    used = on_face
+    cloud, datum = _cloud_of_faces(cloud), None if datum is None else loaded_cloud(datum)
+    used = _largest_plane(cloud.points_mm)[1]
+    face = _face_of(cloud, used)
     values = [_flatness(cloud, face, used)]
     holes, features, notes = [], [], []
     for edges in _gaps(cloud, face, used):
@@ -190,8 +187,7 @@ def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     EvaluationError
         The cloud has no frames and lines, or no gap goes through it.
     """
-    cloud = loaded_cloud(cloud)
-    _require_points(cloud)
+    cloud = _cloud_of_faces(cloud)
     # Both plates, which may be offset: everything on either side of the widest hole in the profiles.
     everything = np.arange(len(cloud))
     face = _face_of(cloud, _largest_plane(cloud.points_mm)[1])
@@ -287,9 +283,12 @@ class _Hole:
     blur_mm: float
 
 
-def _require_points(cloud: PointCloud) -> None:
+def _cloud_of_faces(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
+    """The cloud, read if it is a file; EvaluationError if it has too few points."""
+    cloud = loaded_cloud(cloud)
     if len(cloud) < _FEWEST:
         raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST} are needed")
+    return cloud
 
 
 def _largest_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -318,11 +317,11 @@ def _largest_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _height_between(levels: np.ndarray) -> float:
     """Distance of the two levels with most points."""
-    size = float(np.ptp(np.quantile(levels, [0.001, 0.999])))
-    count, edges = np.histogram(levels, bins=200, range=tuple(np.quantile(levels, [0.001, 0.999])))
+    low, high = np.quantile(levels, [0.001, 0.999])
+    count, edges = np.histogram(levels, bins=200, range=(low, high))
     first = int(np.argmax(count))
     apart = np.abs(np.arange(200) - first) > 6
-    if size <= 0 or not count[apart].any():
+    if high <= low or not count[apart].any():
         raise EvaluationError("there is one level only: show both faces of the step")
     second = int(np.argmax(np.where(apart, count, 0)))
     return float(abs(edges[second] - edges[first]))
@@ -336,11 +335,6 @@ def _face_of(cloud: PointCloud, chosen: np.ndarray) -> _Face:
     design = np.column_stack([np.ones(len(local)), local[:, :2]])
     rows = np.linalg.solve(design.T @ design, design.T)
     return _Face(fit.point_mm, axes, local[:, 2], rows, fit.std_mm)
-
-
-def _groups(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
-    """Neighbours that may err together: eight that follow each other in their order."""
-    return np.arange(len(used)) // 8
 
 
 def _plain(
@@ -579,7 +573,7 @@ def _parallelism(cloud: PointCloud, face: _Face, used: np.ndarray, datum: PointC
     for own, plane, chosen in ((cloud, face, used), (datum, other, on_datum)):
         errors: PointErrors = PointErrors.along(own, chosen, np.broadcast_to(plane.axes[2], (len(chosen), 3)))
         rows = (face.axes[:2] @ plane.axes[:2].T) @ plane.rows[1:]
-        by_noise, by_common = errors.covariances(rows, plane.residuals_mm, _groups(own, chosen))
+        by_noise, by_common = errors.covariances(rows, plane.residuals_mm, neighbours_in_order(len(chosen)))
         random = random + by_noise
         if by_common is not None:
             common = by_common if common is None else common + by_common
@@ -605,5 +599,5 @@ def _flush(cloud: PointCloud, face: _Face, plates: list[np.ndarray], middle: np.
     both, weights = np.concatenate(used), np.concatenate(parts)[None]
     offset = float(weights[0] @ ((cloud.points_mm[both] - face.point_mm) @ face.axes[2]))
     errors = PointErrors.along(cloud, both, np.broadcast_to(face.axes[2], (len(both), 3)))
-    random, common = errors.covariances(weights, np.concatenate(residuals), _groups(cloud, both))
+    random, common = errors.covariances(weights, np.concatenate(residuals), neighbours_in_order(len(both)))
     return _plain(FeatureKind.GAP, "flush", abs(offset), random, common, 0)

@@ -110,7 +110,8 @@ def _searched(cloud: PointCloud, form: PipeForm, chosen: np.ndarray, false_alarm
         first, last = np.flatnonzero(angle < _OVERLAP), np.flatnonzero(angle > 2 * np.pi - _OVERLAP)
         copied = np.concatenate([copied, first, last])
         angle = np.concatenate([angle, angle[first] + 2 * np.pi, angle[last] - 2 * np.pi])
-    surface = _unrolled(cloud, form, chosen[copied], angle)
+    errors = PointErrors.along(cloud, chosen, form.outwards[chosen])[copied]
+    surface = _unrolled(cloud, form, chosen[copied], angle, errors)
     search = search_blemishes(surface, false_alarm=false_alarm)
     beyond = np.abs(surface.places[:, 1] / form.radius_mm - np.pi) - np.pi
     found = [each for each in search.indications if np.median(beyond[each.points]) <= _SEARCHED]
@@ -148,9 +149,10 @@ def _joined(search: BlemishSearch, copied: np.ndarray, count: int) -> BlemishSea
     )
 
 
-def _unrolled(cloud: PointCloud, form: PipeForm, chosen: np.ndarray, angle: np.ndarray) -> UnrolledSurface:
+def _unrolled(
+    cloud: PointCloud, form: PipeForm, chosen: np.ndarray, angle: np.ndarray, errors: PointErrors
+) -> UnrolledSurface:
     """The surface of the chosen points (M,), unrolled by angles (M,), which may count from anywhere."""
-    errors = PointErrors.along(cloud, chosen, form.outwards[chosen])
     heights = form.distance_mm[chosen]
     spread = max(robust_std(heights - np.median(heights)), 1e-9)
     std = errors.single_mm if np.all(errors.single_mm > 0) else np.full(len(heights), spread)
@@ -165,7 +167,7 @@ def _blemish_features(
 ) -> tuple[list[Feature], list[str]]:
     """What was found, as features, and a note for each that became none."""
     errors = PointErrors.along(cloud, chosen, form.outwards[chosen])
-    flat = _unrolled(cloud, form, chosen, form.angle[chosen])
+    flat = _unrolled(cloud, form, chosen, form.angle[chosen], errors)
     measured: list[tuple[Blemish, float, float]] = []
     notes = [_left_out(cloud, chosen[[each.point]], each.height_mm, each.reason) for each in search.unresolved]
     for indication in search.indications:

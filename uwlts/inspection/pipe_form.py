@@ -9,7 +9,7 @@ import numpy as np
 
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import evenly_thinned, fit_biweight, fit_robustly
-from uwlts.fitting.propagation import PointErrors
+from uwlts.fitting.propagation import PointErrors, neighbours_in_order
 from uwlts.fitting.shapes import CylinderFit, fit_cylinder
 from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, amplitude_value, plain_value
 from uwlts.storage.cloud import PointCloud
@@ -288,8 +288,7 @@ def _section_values(
     left: np.ndarray,
 ) -> tuple[FeatureValue, ...]:
     kind = FeatureKind.SECTION
-    groups = np.unique(np.arange(len(left)) // 8, return_inverse=True)[1]
-    random, common = errors.covariances(weights, left, groups)
+    random, common = errors.covariances(weights, left, neighbours_in_order(len(left)))
     shared = None if common is None else 2 * float(np.sqrt(common[0, 0]))
     diameter = 2 * (form.radius_mm + coefficients[0])
     values = [plain_value(kind, "diameter", float(diameter), 2 * float(np.sqrt(random[0, 0])), shared)]
@@ -341,7 +340,7 @@ def _groups(form: PipeForm, used: np.ndarray) -> np.ndarray:
     along = form.along_mm[used]
     row = np.floor((along - along.min()) / max(float(np.ptp(along)), 1e-9) * 11.999).astype(np.int64)
     sector = np.floor((form.angle[used] + np.pi) / (2 * np.pi) * (_SECTORS - 1e-6)).astype(np.int64)
-    return np.unique(row * _SECTORS + sector, return_inverse=True)[1]
+    return row * _SECTORS + sector
 
 
 def _terms(arc: float) -> tuple[str, ...]:

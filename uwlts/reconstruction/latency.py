@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uwlts.errors import EvaluationError
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import robust_std
 
 _LARGEST_S = 0.5
 """Latency that is looked for at most: that of slow drivers."""
@@ -80,7 +80,7 @@ def measure_latency(centre_px: np.ndarray, stage_mm: np.ndarray, speed_mm_per_s:
     away = slope = np.empty(0)
     for _ in range(_ROUNDS):
         away, slope = surface.at(position - shift, seen)
-        scatter = MAD_TO_STD * np.median(np.abs(away - np.median(away))) if len(away) else 0.0
+        scatter = robust_std(away - np.median(away)) if len(away) else 0.0
         near = np.abs(away) <= max(_OUTLIER * scatter, 1e-6)
         if np.count_nonzero(near) < _FEWEST or not (slope[near] ** 2).sum() > 0:
             raise EvaluationError(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations, pairwise, permutations
 
 import numpy as np
@@ -101,6 +102,7 @@ class JointRegistration:
         self.patterns = [np.zeros(len(each.patterns_mm)) for each in patches]
         self.start_std, self.sphere_mm = start_std, sphere_mm
         self.local_middles = np.array([each.places_mm.mean(axis=0) for each in patches])
+        self._start_middles_mm = self.middles_mm
         self.sizes = np.array([_usual_distance(p.places_mm) for p in patches])
         ends = 6 * (len(patches) - 1) + np.cumsum([0, *map(len, self.patterns)])
         self.pattern_columns = [np.arange(a, b) for a, b in pairwise(ends)]
@@ -120,9 +122,17 @@ class JointRegistration:
         """(N, 3): middles of the scans in the common frame."""
         return np.einsum("nij,nj->ni", self.poses[:, :3, :3], self.local_middles) + self.poses[:, :3, 3]
 
-    def evidence(self, reach_mm: float) -> dict[tuple[int, int], PairEvidence]:
-        """What all pairs of scans that overlap or share spheres say, about the present state."""
-        found = self._distances(reach_mm)
+    def distances(self, reach_mm: float) -> dict[tuple[int, int], PatchDistances]:
+        """Return the distances of the patches of each scan from each other one that it overlaps."""
+        moved = [self._moved(number) for number in range(len(self.patches))]
+        found = {
+            (a, b): distances_between(moved[a], self.poses[a], moved[b], self.poses[b], reach_mm=reach_mm)
+            for a, b in permutations(range(len(moved)), 2)
+        }
+        return {pair: distances for pair, distances in found.items() if len(distances.source)}
+
+    def evidence(self, found: dict[tuple[int, int], PatchDistances]) -> dict[tuple[int, int], PairEvidence]:
+        """Return what all pairs of scans that overlap or share spheres say, by the `distances` of the present state."""
         others = [np.ones(len(each)) for each in self.patches]
         for (a, _), distances in found.items():
             others[a][distances.source] += 1
@@ -130,26 +140,16 @@ class JointRegistration:
         common = common_markers(centres, _SPHERE_REACH * (self.sphere_mm or 0.0))
         pairs = {}
         for a, b in combinations(range(len(self.patches)), 2):
-            ways = [
-                (source, target, found[source, target])
-                for source, target in ((a, b), (b, a))
-                if (source, target) in found
-            ]
-            if sum(len(distances.source) for *_, distances in ways) < FEWEST_OF_PAIR:
-                ways = []
+            ways = _both_ways(found, a, b) if _patches_of(found, a, b) >= FEWEST_OF_PAIR else []
             shared = [(views[a], views[b], len(views)) for views in common if a in views and b in views]
             if ways or shared:
                 pairs[a, b] = self._pair(a, b, ways, others, shared)
         return pairs
 
-    def narrow_overlaps(self, reach_mm: float) -> tuple[tuple[int, int, int], ...]:
-        """Return the pairs of scans that overlap too little to count, with the number of patches."""
-        found = self._distances(reach_mm)
-        counts = {
-            (a, b): sum(len(found[way].source) for way in ((a, b), (b, a)) if way in found)
-            for a, b in combinations(range(len(self.patches)), 2)
-        }
-        return tuple((a, b, count) for (a, b), count in counts.items() if 0 < count < FEWEST_OF_PAIR)
+    def narrow_overlaps(self, found: dict[tuple[int, int], PatchDistances]) -> tuple[tuple[int, int, int], ...]:
+        """Return the pairs of scans that overlap too little to count, with the number of patches, by `distances`."""
+        counts = ((a, b, _patches_of(found, a, b)) for a, b in combinations(range(len(self.patches)), 2))
+        return tuple((a, b, count) for a, b, count in counts if 0 < count < FEWEST_OF_PAIR)
 
     def solved(self, pairs: Sequence[PairEvidence]) -> Solved:
         """The least-squares step by the evidence of pairs and what is known beforehand."""
@@ -218,15 +218,6 @@ class JointRegistration:
                 "start, a larger reach, spheres, or search the start (search)"
             )
 
-    def _distances(self, reach_mm: float) -> dict[tuple[int, int], PatchDistances]:
-        """Distances of the patches of each scan from each other one that it overlaps."""
-        moved = [self._moved(number) for number in range(len(self.patches))]
-        found = {
-            (a, b): distances_between(moved[a], self.poses[a], moved[b], self.poses[b], reach_mm=reach_mm)
-            for a, b in permutations(range(len(moved)), 2)
-        }
-        return {pair: distances for pair, distances in found.items() if len(distances.source)}
-
     def _moved(self, number: int) -> Patches:
         patches, amounts = self.patches[number], self.patterns[number]
         return replace(patches, places_mm=patches.places_mm + np.tensordot(amounts, patches.patterns_mm, axes=1))
@@ -254,27 +245,27 @@ class JointRegistration:
         others: list[np.ndarray],
         spheres: list[tuple[MarkerSphere, MarkerSphere, int]],
     ) -> PairEvidence:
-        unknown, count, middles = len(self.units), self.unknown_poses, self.middles_mm
+        unknown, middles = len(self.units), self.middles_mm
         relative = np.concatenate([each.distance_mm / each.std_mm for *_, each in ways]) if ways else np.empty(0)
         spread = noise_factor(relative)
         blocks, residuals, weights, deviations = [], [], [], []
-        spurious = np.zeros((count, count))
+        spurious = np.zeros((self.unknown_poses, self.unknown_poses))
         for source, target, found in ways:
             std = found.std_mm * spread
             # Both directions count by half, and K scans of one place have K (K - 1) / 2 pairs and K - 1 differences.
             each = 1 / (others[source][found.source] * self.patches[source].alike(len(found.source)))
             weight = biweight(found.distance_mm / std) / std**2 * each
+            by_poses = partial(self._by_poses, source, target, found.places_mm)
             block = np.zeros((len(weight), unknown))
+            block[:, : self.unknown_poses] = by_poses(found.normals)
             for number, rows, sign in ((source, found.source, 1.0), (target, found.target, -1.0)):
-                if len(columns := self.pose_columns[number]):
-                    block[:, columns] = sign * rigid_derivatives(found.places_mm, found.normals, middles[number])
                 turned = self.patches[number].patterns_mm[:, rows] @ self.poses[number, :3, :3].T
                 block[:, self.pattern_columns[number]] = sign * np.einsum("mqi,qi->qm", turned, found.normals)
             blocks.append(block)
             residuals.append(found.distance_mm)
             weights.append(weight)
             deviations.append(found.std_mm)
-            spurious += self._spurious(source, target, found, weight)
+            spurious += information_of_slopes(found.normals, weight * found.slope_variance, by_poses)
         for first, second, views in spheres:
             covariance = first.covariance + second.covariance
             root = np.linalg.cholesky(np.linalg.inv(covariance)).T
@@ -282,9 +273,7 @@ class JointRegistration:
             block = np.zeros((3, unknown))
             for number, marker, sign in ((a, first, 1.0), (b, second, -1.0)):
                 if len(columns := self.pose_columns[number]):
-                    block[:, columns] = sign * rigid_derivatives(
-                        np.tile(marker.centre_mm, (3, 1)), root, middles[number]
-                    )
+                    block[:, columns] = sign * rigid_derivatives(marker.centre_mm, root, middles[number])
                 block[:, self.pattern_columns[number]] = sign * root @ marker.patterns_mm.T
             blocks.append(block)
             residuals.append(off)
@@ -303,24 +292,18 @@ class JointRegistration:
             len(spheres),
         )
 
-    def _spurious(self, source: int, target: int, found: PatchDistances, weight: np.ndarray) -> np.ndarray:
-        """Information (P, P) that the noise of the normals alone would give."""
-        middles = self.middles_mm
-
-        def by_poses(directions: np.ndarray) -> np.ndarray:
-            block = np.zeros((len(weight), self.unknown_poses))
-            for number, sign in ((source, 1.0), (target, -1.0)):
-                if len(columns := self.pose_columns[number]):
-                    block[:, columns] = sign * rigid_derivatives(found.places_mm, directions, middles[number])
-            return block
-
-        return information_of_slopes(found.normals, weight * found.slope_variance, by_poses)
+    def _by_poses(self, source: int, target: int, places: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Derivatives (Q, P) of distances between two scans along directions (Q, 3) by all poses."""
+        block, middles = np.zeros((len(places), self.unknown_poses)), self.middles_mm
+        for number, sign in ((source, 1.0), (target, -1.0)):
+            if len(columns := self.pose_columns[number]):
+                block[:, columns] = sign * rigid_derivatives(places, directions, middles[number])
+        return block
 
     def _from_start(self) -> np.ndarray:
         """Shifts and turns (P,) of the poses from the start."""
         turned = Rotation.from_matrix(self.poses[1:, :3, :3] @ self.start[1:, :3, :3].transpose(0, 2, 1)).as_rotvec()
-        before = np.einsum("nij,nj->ni", self.start[1:, :3, :3], self.local_middles[1:]) + self.start[1:, :3, 3]
-        return np.hstack([self.middles_mm[1:] - before, turned]).ravel()
+        return np.hstack([(self.middles_mm - self._start_middles_mm)[1:], turned]).ravel()
 
 
 def fit_pair(source: Patches, target: Patches, start: np.ndarray) -> tuple[np.ndarray, PatchDistances] | None:
@@ -332,14 +315,24 @@ def fit_pair(source: Patches, target: Patches, start: np.ndarray) -> tuple[np.nd
     joint = JointRegistration([target, source], [[], []], np.array([np.eye(4), start]), start_std=None, sphere_mm=None)
     reach = _PAIR_REACH * max(source.radius_mm, target.radius_mm)
     for _ in range(_PAIR_ROUNDS):
-        if not (pairs := joint.evidence(reach)):
+        if not (pairs := joint.evidence(joint.distances(reach))):
             return None
         joint.move(joint.solved(list(pairs.values())).step)
         reach = max(NARROWER * reach, source.radius_mm)
-    pairs = joint.evidence(reach)
+    pairs = joint.evidence(joint.distances(reach))
     if not pairs or len(joint.solved(list(pairs.values())).open_directions):
         return None
     return joint.poses[1], distances_between(source, joint.poses[1], target, np.eye(4), reach_mm=reach)
+
+
+def _both_ways(found: dict[tuple[int, int], PatchDistances], a: int, b: int) -> list[tuple[int, int, PatchDistances]]:
+    """Source, target and distances of two scans, each from the other one, as far as they overlap."""
+    return [(*way, found[way]) for way in ((a, b), (b, a)) if way in found]
+
+
+def _patches_of(found: dict[tuple[int, int], PatchDistances], a: int, b: int) -> int:
+    """Number of patches in the overlap of two scans."""
+    return sum(len(distances.source) for *_, distances in _both_ways(found, a, b))
 
 
 def _alike(patterns: Sequence[np.ndarray], shared: Sequence[dict[str, np.ndarray]]) -> np.ndarray:

@@ -278,7 +278,7 @@ def register(
     least = 2 * max(each.radius_mm for each in patches)
     reach = least if search else reach_mm or _REACH * float(np.median([_size(scan) for scan in scans]))
     for done in range(_ROUNDS):
-        pairs = joint.evidence(reach)
+        pairs = joint.evidence(joint.distances(reach))
         joint.require_connected(list(pairs), names)
         step = joint.solved(list(pairs.values())).step
         joint.move(step)
@@ -290,7 +290,8 @@ def register(
             break
         reach = max(NARROWER * reach, least)
     progress(steps, steps)
-    pairs = joint.evidence(reach)
+    distances = joint.distances(reach)
+    pairs = joint.evidence(distances)
     solved = joint.solved(list(pairs.values()))
     _require_settled(solved, joint.unknown_poses)
     amounts = np.concatenate(joint.patterns)
@@ -304,7 +305,7 @@ def register(
         open_movements=_open_movements(solved.open_directions, joint.middles_mm, joint.sizes),
         pairs=tuple(_fit_of(joint, key, pairs, solved) for key in pairs),
         overlaps=tuple(_overlap(pair) for pair in pairs.values()),
-        narrow_overlaps=joint.narrow_overlaps(reach),
+        narrow_overlaps=joint.narrow_overlaps(distances),
         scale=float(np.sqrt(np.mean(amounts**2))) if len(amounts) else np.nan,
         cloud=merged_cloud(scans, names, joint, solved.covariance),
     )

@@ -74,9 +74,9 @@ def test_overlaps_of_few_patches_are_named_and_do_not_count():
         patches.append(surface_patches(points + [0, 0, 300] + 0.02 * rng.standard_normal(points.shape), None))
     start = np.tile(np.eye(4), (3, 1, 1))
     joint = JointRegistration(patches, [[], [], []], start, start_std=None, sphere_mm=None)
-    ((first, third, count),) = joint.narrow_overlaps(1.0)
+    ((first, third, count),) = joint.narrow_overlaps(joint.distances(1.0))
     assert (first, third) == (0, 2) and 0 < count < FEWEST_OF_PAIR
-    assert set(joint.evidence(1.0)) == {(0, 1), (1, 2)}
+    assert set(joint.evidence(joint.distances(1.0))) == {(0, 1), (1, 2)}
 
 
 def test_a_registration_that_does_not_settle_is_an_error(monkeypatch):

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Evidence, outliers
 from uwlts.calibration.joint.residuals import SHIFT, TARGET, Residuals, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SurfaceScanEvidence
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import robust_std
 from uwlts.model.parameter_keys import (
     LensParameter,
     MediumIndex,
@@ -149,10 +149,10 @@ class _Image:
     @classmethod
     def of(cls, residuals: Residuals, evidence: Evidence) -> "_Image":
         values = residuals.values
-        scatter = MAD_TO_STD * float(np.median(np.abs(values)))
+        scatter = robust_std(values)
         # Residuals of neighbouring points or lines share what a wrong model does to them.
         steps = np.diff(values.reshape(-1, 2 if residuals.kind == TARGET else 1), axis=0)
-        noise = MAD_TO_STD * float(np.median(np.abs(steps))) / np.sqrt(2.0) if len(steps) else scatter
+        noise = robust_std(steps) / np.sqrt(2.0) if len(steps) else scatter
         source, kind = evidence.sources[residuals.image], residuals.kind
         return cls(source, kind, (kind, evidence.view), scatter, noise)
 
@@ -379,7 +379,7 @@ def _of_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) ->
         # The first position has no error of its own, so all others share its.
         errors = errors - np.median(np.append(errors, 0.0))
         # One that is far off bends the camera and so moves the others too.
-        wrong = np.abs(errors) > _WRONG * max(std, MAD_TO_STD * float(np.median(np.abs(errors))))
+        wrong = np.abs(errors) > _WRONG * max(std, robust_std(errors))
         rms = float(np.sqrt(np.mean(errors**2)))
         if 0 < wrong.sum() <= max(1, len(errors) // 4):
             stood = zip((piece.sources[image] for image in images[wrong]), errors[wrong], strict=True)

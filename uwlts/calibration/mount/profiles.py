@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import MAD_TO_STD, robust_std
 from uwlts.fitting.shapes import algebraic_centres
 
 LEAST_POINTS = 12
@@ -78,7 +78,7 @@ def noise_of(points: np.ndarray) -> float:
     depth = points[:, 1] - np.interp(points[:, 0], points[[0, -1], 0], points[[0, -1], 1])
     # The variance of a second difference is 1 + 4 + 1 times that of a point.
     second = np.diff(depth, 2)
-    return MAD_TO_STD * float(np.median(np.abs(second - np.median(second)))) / 6**0.5
+    return robust_std(second - np.median(second)) / 6**0.5
 
 
 def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generator) -> ProfileArc | None:
@@ -147,7 +147,7 @@ def _settled(
         if np.count_nonzero(members) < LEAST_POINTS:
             return None
         away = np.abs(off(members))
-        std = MAD_TO_STD * float(np.median(away[members]))
+        std = robust_std(away[members])
         before, members = members, away < min(max(_REJECTED_BEYOND * std, 1e-4), 2 * tolerance)
         if np.array_equal(before, members):
             break

@@ -16,7 +16,7 @@ from uwlts.calibration.polynomial.polynomial_evidence import (
     stripes_on_plate,
 )
 from uwlts.errors import CalibrationError, RangeError
-from uwlts.fitting.least_squares import MAD_TO_STD
+from uwlts.fitting.least_squares import robust_std
 from uwlts.model.brief import Brief
 from uwlts.model.polynomial_calibration import PolynomialCalibration
 from uwlts.runtime.progress import ProgressListener, unheard
@@ -83,7 +83,7 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
                 "line at all depths"
             )
         residuals = y - design @ solution
-        spread = MAD_TO_STD * np.median(np.abs(residuals[used]))
+        spread = robust_std(residuals[used])
         # Rounding alone must not make outliers of exact data.
         within = np.abs(residuals) <= max(_OUTLIER * spread, 1e-9 * float(np.ptp(y)))
         if rounds >= _RETURNING_ROUNDS:
