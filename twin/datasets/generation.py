@@ -28,7 +28,7 @@ from twin.options import CPU, Variant, use_variant
 from twin.recording.campaigns import PLAN, keep_to_plan
 from uwlts.errors import DescriptionError, DesignError, OutputError
 from uwlts.files.inputs import inputs_kept
-from uwlts.files.writing import OtherWriterError, one_writer
+from uwlts.files.writing import OtherWriterError, one_writer, refuse_other_writer
 from uwlts.model.placement import camera_from_object
 from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.runtime.workers import work_through
@@ -177,8 +177,7 @@ def _prepare(folder: Path, jobs: list[_Job], plan: dict[str, JsonValue], *, over
     """Make the folder ready for a plan; OutputError where another run is at work in what is to be replaced."""
     try:
         for job in jobs:
-            with one_writer(job.path):
-                pass
+            refuse_other_writer(job.path)
     except OtherWriterError:
         if overwrite:
             raise

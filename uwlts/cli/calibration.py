@@ -7,8 +7,9 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import uwlts
-from uwlts.cli.options import STRIPE, CalibrationOut, Overwrite, a_file, a_page, app, wrote
+from uwlts.cli.options import STRIPE, CalibrationOut, Overwrite, a_file, a_page, app, wrote, wrote_page
 from uwlts.errors import DescriptionError
+from uwlts.files.writing import refuse_unsuitable
 from uwlts.runtime.command_line import Call, derived, say, show, warn
 
 _EVIDENCE = ("air", "water", "step", "scan")
@@ -76,7 +77,7 @@ def camera(
     *,
     out: Annotated[
         Path,
-        a_file(".yaml", ".yml"),
+        a_file(".yaml", ".yml", beside=".html"),
         Parameter(
             help="ROS CameraInfo to write (YAML), which uwlts import reads as intrinsics, and a page with all images "
             "beside it, those left out with the reason."
@@ -85,12 +86,9 @@ def camera(
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts camera photographs --target board.toml --out camera.yaml"""
-    from uwlts.files.writing import refuse_unsuitable
     from uwlts.report.camera_page import camera_lines
 
-    page = out.with_suffix(".html")
-    refuse_unsuitable(page, overwrite=overwrite)
-    found = call()
+    found, page = call(), out.with_suffix(".html")
     found.save(out, overwrite=overwrite)
     uwlts.report.write_camera(page, found, overwrite=overwrite)
     wrote(camera_lines(found), found.warnings, out, page)
@@ -122,7 +120,6 @@ def refresh(
 ) -> None:
     """Example: uwlts refresh calibration.json --step step-today.h5 --out today.json"""
     from uwlts.calibration.joint.next_shot import advice_lines
-    from uwlts.files.writing import refuse_unsuitable
 
     path = out or Path(call.given["calibration"]).with_suffix(".refreshed.json")
     refuse_unsuitable(path, overwrite=overwrite)
@@ -157,7 +154,7 @@ def models(
     warn(*comparison.warnings)
     if out is not None:
         uwlts.report.write_models(out, comparison, overwrite=overwrite)
-        print(f"wrote {out} and {out.with_suffix('.json').name}")
+        wrote_page(out)
 
 
 @derived(app, uwlts.report, "write_certificate")
@@ -189,7 +186,7 @@ def certificate(
         return
     page, content = call()
     show(certificate_lines(content))
-    print(f"wrote {page} and {page.with_suffix('.json').name}")
+    wrote_page(page)
 
 
 @derived(app, uwlts, "verify")

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import uwlts
-from uwlts.cli.options import CalibrationOut, Overwrite, app
+from uwlts.cli.options import CalibrationOut, Overwrite, app, wrote_files
 from uwlts.runtime.command_line import Call, derived, show, warn
 
 
@@ -19,7 +19,7 @@ def design(call: Call) -> None:
 def nominal(call: Call, *, out: CalibrationOut, overwrite: Overwrite = False) -> None:
     """Example: uwlts nominal thesis --medium water --out nominal.json"""
     call().save(out, overwrite=overwrite)
-    print(f"wrote {out}")
+    wrote_files(out)
 
 
 @derived(app, uwlts, "describe")

@@ -7,12 +7,21 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 import uwlts
-from uwlts.cli.options import ColouredOut, Overwrite, a_file, a_page, app, write_coloured, wrote
+from uwlts.cli.options import (
+    ColouredOut,
+    Overwrite,
+    a_file,
+    a_page,
+    app,
+    write_coloured,
+    wrote,
+    wrote_files,
+    wrote_page,
+)
 from uwlts.runtime.command_line import Call, derived, show
 
 _INSPECTIONS = [(uwlts, f"inspect_{kind}") for kind in ("pipe", "weld", "flange")]
 """Functions whose options an inspection has."""
-_OPTIONS = ("section_mm", "wall_mm", "false_alarm", "largest_ovality", "datum")
 
 
 @derived(app, uwlts, "evaluate")
@@ -54,7 +63,7 @@ def compare(
     title = f"{Path(call.given['cloud']).name} against {Path(call.given['reference']).name}"
     uwlts.report.write_change(out, change, title=title, coloured=coloured, overwrite=overwrite)
     show(change.lines())
-    print(f"wrote {out} and {out.with_suffix('.json').name}")
+    wrote_page(out)
 
 
 @derived(
@@ -93,7 +102,7 @@ def inspect(
     if out:
         found.save(out, overwrite=overwrite)
     if out or coloured:
-        wrote([], [], coloured, out)
+        wrote_files(coloured, out)
 
 
 @derived(app, uwlts, "gauge_study")
@@ -108,7 +117,7 @@ def gauge(
     show(study.lines())
     if out:
         study.save(out, overwrite=overwrite)
-        print(f"wrote {out}")
+        wrote_files(out)
 
 
 @derived(app, uwlts.report, "write_findings", also=_INSPECTIONS)
@@ -118,7 +127,7 @@ def findings_report(
     """Example: uwlts findings-report pipe.ply --wall-mm 9.5 --calibration water.json --out pipe.html --pdf"""
     from uwlts.pages.toolkit import json_beside
 
-    found = call(**{name: call.explicit[name] for name in _OPTIONS if name in call.explicit})
+    found = call()
     out = Path(call.given["out"])
     beside = [json_beside(out, "findings"), *([out.with_suffix(".pdf")] if call.given.get("pdf") else [])]
     show(found.lines())

@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 import uwlts
-from uwlts.cli.options import STRIPE, Overwrite, a_cloud, a_file, a_page, app, wrote
+from uwlts.cli.options import STRIPE, Overwrite, a_cloud, a_file, a_page, app, wrote, wrote_files
 from uwlts.runtime.command_line import Before, Call, derived, show, warn
 
 
@@ -75,7 +75,7 @@ def register(
         found.save_poses(poses_out, overwrite=overwrite)
     if page:
         uwlts.report.write_registration(page, found, overwrite=overwrite)
-    wrote([], [], out, poses_out, page)
+    wrote_files(out, poses_out, page)
 
 
 @derived(app, uwlts, "align_trajectory")
@@ -84,7 +84,7 @@ def align(
     *,
     out: Annotated[
         Path,
-        a_file(".csv"),
+        a_file(".csv", beside=".json"),
         Parameter(
             help="Corrected trajectory to write, with the covariance of each pose (CSV), and the crossings as JSON "
             "beside it."
@@ -96,16 +96,12 @@ def align(
     overwrite: Overwrite = False,
 ) -> None:
     """Example: uwlts align pass.ply --trajectory pass.trajectory.csv --drift-mm 300 --drift-deg 1 --out path.csv"""
-    from uwlts.files.writing import refuse_unsuitable
-
-    beside = out.with_suffix(".json")
-    refuse_unsuitable(beside, overwrite=overwrite)
     found = call()
     show(found.lines())
     found.save(out, overwrite=overwrite)
     if aligned:
         found.cloud.save(aligned, overwrite=overwrite)
-    print(f"wrote {out} and {beside.name}" + (f", {aligned}" if aligned else ""))
+    print(f"wrote {out} and {out.with_suffix('.json').name}" + (f", {aligned}" if aligned else ""))
 
 
 @derived(app, uwlts, "mesh")

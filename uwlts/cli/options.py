@@ -66,9 +66,15 @@ def a_page(kind: str = "") -> Before:
     return Before(check)
 
 
-def a_file(*endings: str) -> Before:
-    """Check of a file whose name has one of some endings."""
-    return Before(partial(refuse_unsuitable, endings=endings))
+def a_file(*endings: str, beside: str = "") -> Before:
+    """Check of a file whose name has one of some endings, and of one that gets another ending beside it."""
+
+    def check(path: Path, *, overwrite: bool) -> None:
+        refuse_unsuitable(path, overwrite=overwrite, endings=endings)
+        if beside:
+            refuse_unsuitable(path.with_suffix(beside), overwrite=overwrite)
+
+    return Before(check)
 
 
 Overwrite = Annotated[bool, Parameter(negative="", help="Replace existing files.")]
@@ -99,4 +105,14 @@ def wrote(lines: Iterable[str], warnings: Iterable[str], *paths: Path | None) ->
     """Print a result, warnings about it, and the files it was written to."""
     show(lines)
     warn(*warnings)
+    wrote_files(*paths)
+
+
+def wrote_files(*paths: Path | None) -> None:
+    """Print the files that a result was written to."""
     print(f"wrote {', '.join(str(path) for path in paths if path is not None)}")
+
+
+def wrote_page(page: Path) -> None:
+    """Print a page and the JSON beside it that a result was written to."""
+    print(f"wrote {page} and {page.with_suffix('.json').name}")

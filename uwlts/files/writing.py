@@ -143,8 +143,7 @@ _locks: dict[Path, int] = {}
 def one_writer(target: Path, *, patience_s: float = 0.0) -> Iterator[None]:
     """Be the only process that writes a file; OtherWriterError where another one still does after ``patience_s``."""
     target = Path(os.path.realpath(target))
-    # No suffix of the output's, by which folders are searched.
-    path = target.with_name(f".{target.name.replace('.', '-')}.lock")
+    path = _lock_of(target)
     if fcntl is None or path in _locks:
         yield
         return
@@ -158,6 +157,18 @@ def one_writer(target: Path, *, patience_s: float = 0.0) -> Iterator[None]:
                 )
             time.sleep(_AGAIN_S)
         yield
+
+
+def refuse_other_writer(target: Path) -> None:
+    """Raise OtherWriterError if another process is writing a file; what a killed one has left of its lock goes."""
+    if _lock_of(Path(os.path.realpath(target))).exists():
+        with one_writer(target):
+            pass
+
+
+def _lock_of(target: Path) -> Path:
+    # No suffix of the output's, by which folders are searched.
+    return target.with_name(f".{target.name.replace('.', '-')}.lock")
 
 
 def _lock(path: Path) -> bool:

@@ -78,22 +78,20 @@ class Call:
     ----------
     given : dict
         Arguments of the function that were given, by name, in the types that it takes; those of ``*`` under that name.
-    explicit : dict
-        All that was given, also for the body alone.
+    title : str
+        Title of its progress.
     """
 
     function: Callable[..., Any]
     parameters: Mapping[str, inspect.Parameter]
     given: dict[str, Any]
-    explicit: dict[str, Any]
+    title: str
 
     def __call__(self, **more: Any) -> Any:
         """Call the function with what was given and more, while its progress is shown."""
         heard = {name: listen for name, listen in (("report", say), ("warn", warn)) if name in self.parameters}
         given = self.given | more | heard
-        first = next((value for value in self.explicit.values() if isinstance(value, str | Path)), "")
-        title = f"{self.function.__name__.replace('_', ' ')} {Path(first).name}".strip()
-        with progress_bar(title) if "progress" in self.parameters else nullcontext() as progress:
+        with progress_bar(self.title) if "progress" in self.parameters else nullcontext() as progress:
             given |= {} if progress is None else {"progress": progress}
             return self.function(*given.pop("*", ()), **given)
 
@@ -139,11 +137,12 @@ class Derived:
     def _own(self) -> dict[str, inspect.Parameter]:
         """Parameters of the body behind the call; those without an annotation are made like the functions'."""
         own = dict(list(inspect.signature(self._body, eval_str=True).parameters.items())[1:])
-        for name, one in own.items():
-            if one.annotation is inspect.Parameter.empty and name not in self._taken:
-                sources = (_options_of(*function) for function in self._also)
-                found = next(options[name] for options in sources if name in options)
-                own[name] = one.replace(annotation=found.annotation, default=found.default)
+        like = [name for name, one in own.items() if one.annotation is one.empty and name not in self._taken]
+        # The first function that has an option gives it.
+        sources = [_options_of(*function) for function in reversed(self._also)] if like else []
+        options = {name: one for source in sources for name, one in source.items()}
+        for name in like:
+            own[name] = own[name].replace(annotation=options[name].annotation, default=options[name].default)
         return own
 
     @cached_property
@@ -168,6 +167,8 @@ class Derived:
             for before in checks if bound.arguments[name] is not None else ():
                 before.check(Path(bound.arguments[name]), overwrite=bound.arguments.get("overwrite", False))
         given = {name: self._plain(name, value) for name, value in explicit.items() if name in self._taken}
+        if any(one.kind is one.VAR_KEYWORD for one in self._taken.values()):
+            given |= {name: value for name, value in explicit.items() if name in self._own}
         if self._shortcuts is not None:
             entries = {name: explicit[name] for name in self._shortcuts.options if name in explicit}
             if settings := settings_of(self._shortcuts.setting, explicit.get(self._shortcuts.setting, ())) | entries:
@@ -175,7 +176,9 @@ class Derived:
         for name, one in self._taken.items():
             if one.kind is one.VAR_POSITIONAL and name in given:
                 given["*"] = given.pop(name)
-        call = Call(self.function, self._taken, given, explicit)
+        first = next((value for value in explicit.values() if isinstance(value, str | Path)), "")
+        title = f"{self.function.__name__.replace('_', ' ')} {Path(first).name}".strip()
+        call = Call(self.function, self._taken, given, title)
         self._body(call, **{name: bound.arguments[name] for name in self._own})
 
     def _plain(self, name: str, value: Any) -> Any:
@@ -290,16 +293,21 @@ def _sections(text: str) -> list[str]:
 
 
 @cache
-def docstring(package: ModuleType, function: str) -> str:
-    """Docstring of a function that the package's stub names, without importing it."""
-    stub = Path(f"{package.__file__}i")
-    modules = {
+def _modules(package: ModuleType) -> dict[str, str]:
+    """Modules of the names in a package's stub."""
+    stub = Path(f"{package.__file__}i").read_text(encoding="utf-8")
+    return {
         alias.name: node.module
-        for node in ast.walk(ast.parse(stub.read_text(encoding="utf-8")))
+        for node in ast.parse(stub).body
         if isinstance(node, ast.ImportFrom) and node.module
         for alias in node.names
     }
-    place = stub.parent.joinpath(*modules[function].split("."))
+
+
+@cache
+def docstring(package: ModuleType, function: str) -> str:
+    """Docstring of a function that the package's stub names, without importing it."""
+    place = Path(str(package.__file__)).parent.joinpath(*_modules(package)[function].split("."))
     source = (place / "__init__.py" if place.is_dir() else place.with_suffix(".py")).read_text(encoding="utf-8")
     found = re.search(rf'^def {function}\(.*?"""(.*?)"""', source, flags=re.MULTILINE | re.DOTALL)
     if found is None:

@@ -58,23 +58,23 @@ def read(
     if pose_format.partition(":")[0] in ("ros", "tum"):
         return read_trajectory(path, pose_format=pose_format, unit=pose_unit)
     require_regular_file(path)
-    match [each for each in path.suffixes if each != ".part"]:
-        case [*_, ".json"]:
-            match found := read_json(path, called="file of this program").get("format"):
-                case _ if found in (CALIBRATION, POLYNOMIALS_FORMAT):
-                    return load_calibration(path)
-                case _ if found == MOUNT:
-                    return read_mount(path)
-            raise CaptureError(f"{path} is JSON of the format {found!r}; this reads {_READABLE}")
-        case [*_, ".csv"]:
-            return read_trajectory(path, pose_format=pose_format, unit=pose_unit)
-        case _ if is_cloud(path):
-            return read_cloud(path)
-        case [*_, ".h5"]:
-            match found := format_of(path):
-                case _ if found == TRUTH:
-                    return read_truth(path)[1]
-                case _ if found in (CAPTURE, None):
-                    return Capture(path)
-            raise CaptureError(f"{path} is HDF5 of the format {found!r}; this reads {_READABLE}")
+    ending = next((each for each in reversed(path.suffixes) if each != ".part"), "")
+    if ending == ".json":
+        found = read_json(path, called="file of this program").get("format")
+        if found in (CALIBRATION, POLYNOMIALS_FORMAT):
+            return load_calibration(path)
+        if found == MOUNT:
+            return read_mount(path)
+        raise CaptureError(f"{path} is JSON of the format {found!r}; this reads {_READABLE}")
+    if ending == ".csv":
+        return read_trajectory(path, pose_format=pose_format, unit=pose_unit)
+    if is_cloud(path):
+        return read_cloud(path)
+    if ending == ".h5":
+        found = format_of(path)
+        if found == TRUTH:
+            return read_truth(path)[1]
+        if found in (CAPTURE, None):
+            return Capture(path)
+        raise CaptureError(f"{path} is HDF5 of the format {found!r}; this reads {_READABLE}")
     raise CaptureError(f"{path} ends with {path.suffix or 'no ending'}; this reads {_READABLE}")
