@@ -4,7 +4,8 @@ VENV := .venv
 PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 OLDEST := .venv-oldest
-ARAVIS := $(PYTHON) -m uwlts.runtime.shared_library
+WITH_ARAVIS = $(call with_packages,$(PYTHON) -m uwlts.runtime.shared_library,libaravis-0.8-0)
+WITH_BROWSER = $(call with_packages,$(PYTHON) -m tests.browser,chromium-headless-shell fonts-dejavu-core)
 
 # An activated environment, or settings that redirect Python or pip, must not reach into .venv.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV PIP_USER PIP_TARGET PIP_PREFIX PIP_REQUIRE_VIRTUALENV
@@ -35,9 +36,9 @@ test: PYTEST_OPTIONS := -m "not slow"
 # Threads of two test processes on two cores would wait for each other in every small product of matrices.
 test test-full: export OPENBLAS_NUM_THREADS := 1
 test test-full: style
-	@$(call with_packages,$(ARAVIS),libaravis-0.8-0)
+	@$(WITH_ARAVIS)
 	@# Without a browser only the tests of pages fail; without any font a page shows no text.
-	-@$(call with_packages,$(PYTHON) -m tests.browser,chromium-headless-shell fonts-dejavu-core)
+	-@$(WITH_BROWSER)
 	@# Types are checked beside the tests, in time that those leave: many wait for simulated hardware and for pages.
 	@found=$$(mktemp); nice $(VENV)/bin/basedpyright >$$found 2>&1 & checking=$$!; \
 	trap 'kill $$checking 2>/dev/null; rm -f $$found' EXIT; trap 'exit 130' INT TERM; \
@@ -50,7 +51,7 @@ test-full: oldest
 oldest: export NUMBA_CACHE_DIR := $(CURDIR)/$(OLDEST)/numba
 oldest: export OPENBLAS_NUM_THREADS := 1
 oldest: setup $(OLDEST)/.installed
-	@$(call with_packages,$(ARAVIS),libaravis-0.8-0)
+	@$(WITH_ARAVIS)
 	@echo "oldest: documented commands with the oldest allowed libraries"
 	@# They use what newer libraries below them call outdated.
 	@$(OLDEST)/bin/python -m pytest -q -n 2 -W default::DeprecationWarning \
@@ -71,8 +72,8 @@ fuzz: setup
 	@$(PYTHON) -m tests.fuzz $(if $(CASES),--cases $(CASES)) $(READERS)
 
 soak: setup
-	@$(call with_packages,$(ARAVIS),libaravis-0.8-0)
-	@$(call with_packages,$(PYTHON) -m tests.browser,chromium-headless-shell fonts-dejavu-core)
+	@$(WITH_ARAVIS)
+	@$(WITH_BROWSER)
 	@$(PYTHON) -m tests.soak $(IMAGES)
 
 bench: setup

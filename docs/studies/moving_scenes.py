@@ -117,7 +117,7 @@ def form(points: np.ndarray, view: np.ndarray) -> Form:
 def vehicle(path: Path) -> str:
     """How far points are off with what the navigation reports, and with the true path and mount."""
     motion, truth = truth_of(path)
-    reported = uwlts.read(str(path).replace(".h5", ".trajectory.csv"), pose_format="quaternion-xyzw")
+    reported = uwlts.read(str(path).replace(".h5", ".trajectory.csv"))
     with uwlts.read(path) as capture:
         times, stated = capture.time_s[:] + motion.clock_offset_s, np.trace(capture.pose_covariance[-1, :3, :3])
     cloud = uwlts.reconstruct(

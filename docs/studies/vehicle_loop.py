@@ -79,7 +79,7 @@ def main(folder: Path) -> None:
     motion, truth = truth_of(capture)
     assert truth.pose is not None
     offset = motion.clock_offset_s
-    reported = uwlts.read(trajectory_path(capture), pose_format="quaternion-xyzw")
+    reported = uwlts.read(trajectory_path(capture))
     cloud = uwlts.reconstruct(
         capture, uwlts.nominal("thesis-small", medium="water"), trajectory=reported, clock_offset_s=offset
     )

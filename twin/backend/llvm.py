@@ -178,21 +178,23 @@ def main() -> int:
     """Command line of this module; returns the exit status."""
     try:
         print(f"chosen: {find_llvm()}")
+        _try_kernel()
     except SetupError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    # A child process compiles the kernel, where an abort inside LLVM does no harm.
+    return 0
+
+
+def _try_kernel() -> None:
+    """Compile and run a kernel in a child process, where an abort inside LLVM does no harm."""
     trial = [sys.executable, "-c", _TRIAL.format(number=float(time.time_ns() % SINGLE_PRECISION_INTEGERS))]
     try:
         done = subprocess.run(trial, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TRIAL_SECONDS)
-    except subprocess.TimeoutExpired:
-        print(f"error: a trial kernel of Dr.Jit did not end within {TRIAL_SECONDS} s", file=sys.stderr)
-        return 2
+    except subprocess.TimeoutExpired as error:
+        raise SetupError(f"a trial kernel of Dr.Jit did not end within {TRIAL_SECONDS} s") from error
     if done.returncode != 0:
         end = "\n  ".join(done.stderr.strip().splitlines()[-5:])
-        print(f"error: a trial kernel of Dr.Jit failed, exit status {done.returncode}:\n  {end}", file=sys.stderr)
-        return 2
-    return 0
+        raise SetupError(f"a trial kernel of Dr.Jit failed, exit status {done.returncode}:\n  {end}")
 
 
 if __name__ == "__main__":

@@ -25,8 +25,8 @@ from twin.datasets.labels import labelled
 from twin.datasets.loading import CARD
 from twin.datasets.shards import SUFFIXES, Sample, written_shard
 from twin.options import CPU, Variant, use_variant
-from twin.recording.campaigns import PLAN, keep_to_plan
-from uwlts.errors import DescriptionError, DesignError, OutputError
+from twin.recording.campaigns import PLAN, keep_to_plan, made_folder
+from uwlts.errors import DescriptionError, DesignError
 from uwlts.files.inputs import inputs_kept
 from uwlts.files.writing import OtherWriterError, one_writer, refuse_other_writer
 from uwlts.model.placement import camera_from_object
@@ -106,10 +106,7 @@ def dataset(
     draw_scene(described, 0)
     jobs = _jobs(described, folder, variant)
     plan = _plan(described, variant)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
+    made_folder(folder)
     with one_writer(folder / PLAN, patience_s=_PATIENCE_S):
         _prepare(folder, jobs, plan, overwrite=overwrite)
     waiting = [job for job in jobs if not job.path.is_file()]

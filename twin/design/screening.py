@@ -26,8 +26,8 @@ from pydantic import JsonValue
 
 from twin.design.designs import Columns, Design, designs_of, failed, judged, number_of_designs
 from twin.design.study import Study
-from twin.recording.campaigns import keep_to_plan
-from uwlts.errors import CaptureError, OutputError
+from twin.recording.campaigns import keep_to_plan, made_folder
+from uwlts.errors import CaptureError
 from uwlts.files.reading import require_regular_file
 from uwlts.files.writing import written_aside
 from uwlts.runtime.progress import ProgressListener, unheard
@@ -106,15 +106,6 @@ def write_csv(path: Path, columns: Columns) -> None:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
-
-
-def made_folder(folder: Path) -> Path:
-    """The folder, made if there is none."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot make the folder {folder}: {error.strerror}") from error
-    return folder
 
 
 JOURNAL = "optimiser.log"

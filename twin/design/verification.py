@@ -26,10 +26,10 @@ from twin.backend.llvm import threads_kept
 from twin.design.designs import Marked
 from twin.design.figures_of_merit import figures_of, scatter_at
 from twin.design.parameters import parameters_of
-from twin.design.screening import made_folder
 from twin.design.study import Study
 from twin.design.verification_scenes import PlannedRecording, recordings
 from twin.options import CPU, Options, use_variant
+from twin.recording.campaigns import made_folder
 from uwlts import errors
 from uwlts.errors import Error
 from uwlts.files.writing import written_aside

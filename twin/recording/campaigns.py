@@ -152,10 +152,7 @@ def _record_all(
     progress: ProgressListener,
 ) -> None:
     """Render what is not complete into a folder that keeps to a plan; ``recorded`` is the pattern of its captures."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
+    made_folder(folder)
     # Two at once would take each other's unfinished recordings for interrupted ones.
     with one_writer(folder / PLAN):
         files = {file for job in jobs for file in job.files}
@@ -173,6 +170,15 @@ def _record_all(
         counted = count(total - sum(job.images for job in waiting))
         progress(next(counted), total)
         work_through(_record, waiting, workers=workers, on_message=lambda _: progress(next(counted), total))
+
+
+def made_folder(folder: Path) -> Path:
+    """Return the folder, made if there is none; OutputError if it cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
+    return folder
 
 
 def keep_to_plan(

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from twin.scene.placed import Pose
-from twin.scene.platforms import SPOT_MM, Carried, Platform, Route
+from twin.scene.platforms import SPOT_MM, Carried, Platform, Route, displaced
 from uwlts.model.sensor import NotNegative, Positive
 
 
@@ -49,13 +49,11 @@ class LinearGuide(Route):
         begun, phase = commanded(np.zeros(1))[0, :3, 3], rng.uniform(0, 2 * np.pi)
 
         def true(times: np.ndarray) -> np.ndarray:
-            poses = commanded(times).copy()
+            poses = commanded(times)
             along = (poses[:, :3, 3] - begun) @ guide[:, 0]
             errors = np.stack([bend(along / travel) for bend in bends], axis=1)
             errors[:, 0] += 1e-3 * self.periodic_um * np.sin(2 * np.pi * along / self.pitch_mm + phase)
-            poses[:, :3, 3] += errors[:, :3] @ guide.T
-            poses[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:] @ guide.T).as_matrix() @ poses[:, :3, :3]
-            return poses
+            return displaced(poses, np.hstack([errors[:, :3] @ guide.T, errors[:, 3:] @ guide.T]))
 
         return Carried(true, commanded)
 

@@ -173,10 +173,9 @@ class Platform(Description, ABC):
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Poses that the platform reports at times of the camera's clock, and their covariances."""
         turn_std = np.radians(self.rotation_std_deg)
-        poses = carried.reported(times).copy()
-        poses[:, :3, 3] += self.position_std_mm * rng.standard_normal((len(times), 3))
-        turned = Rotation.from_rotvec(turn_std * rng.standard_normal((len(times), 3))).as_matrix()
-        poses[:, :3, :3] = turned @ poses[:, :3, :3]
+        shifts = self.position_std_mm * rng.standard_normal((len(times), 3))
+        turns = turn_std * rng.standard_normal((len(times), 3))
+        poses = displaced(carried.reported(times), np.hstack([shifts, turns]))
         if not self.states_covariance:
             return poses, None
         white = np.diag([self.position_std_mm**2] * 3 + [turn_std**2] * 3)
@@ -188,9 +187,9 @@ class Route(Platform):
     """Base of platforms that follow a path of the sensor, as it is by the mount's drawing.
 
     ``waypoints`` are its places one after the other, or ``trajectory`` is a file of times and poses in
-    ``trajectory_format`` and ``trajectory_unit`` (`uwlts.read`); a relative path starts at the scene's
-    folder. Between them it follows Akima's curve (rotations a spline), at a speed of about ``speed_mm_per_s`` and at
-    most ``turn_deg_per_s``. With a speed of 0 it stops at every waypoint.
+    ``trajectory_format`` and ``trajectory_unit`` (`uwlts.read`); a relative path starts at the scene's folder. Between
+    them it follows Akima's curve (rotations a spline), at a speed of about ``speed_mm_per_s`` and at most
+    ``turn_deg_per_s``. With a speed of 0 it stops at every waypoint.
     """
 
     waypoints: tuple[Pose, ...] = ()
@@ -282,6 +281,19 @@ def _path(times: np.ndarray, poses: np.ndarray, *, stops: bool) -> Poses:
         return found
 
     return at
+
+
+def displaced(poses: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Return poses (N, 4, 4) with errors (N, 6): a shift, then a turn in rad about the own place, by scene axes."""
+    moved = poses.copy()
+    moved[:, :3, 3] += errors[:, :3]
+    moved[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ moved[:, :3, :3]
+    return moved
+
+
+def interpolated(times: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return values (N, K) between those (T, K) at times, linearly."""
+    return np.stack([np.interp(wanted, times, column) for column in values.T], axis=1)
 
 
 def stop_at(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from twin.scene.placed import Pose
-from twin.scene.platforms import LEAD_S, Carried, Route, stop_at
+from twin.scene.platforms import LEAD_S, Carried, Route, interpolated, stop_at
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import NotNegative, Positive, Vector
 
@@ -64,7 +64,7 @@ class Robot(Route):
         def over_time(at: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
             if self.stops:
                 return values[stop_at(at, wanted)]
-            return np.stack([np.interp(wanted, at, column) for column in values.T], axis=1)
+            return interpolated(at, values, wanted)
 
         smooth = None if self.stops else CubicSpline(times, angles)
 

@@ -10,9 +10,8 @@ from typing import Literal
 
 import numpy as np
 from pydantic import model_validator
-from scipy.spatial.transform import Rotation
 
-from twin.scene.platforms import LEAD_S, Carried, Route
+from twin.scene.platforms import LEAD_S, Carried, Route, displaced, interpolated
 from uwlts.model.sensor import Description, NotNegative, Positive
 
 _GRAVITY = 9.81
@@ -102,13 +101,12 @@ class Drift:
 
     def errors(self, times_s: np.ndarray) -> np.ndarray:
         """Errors (N, 6), between the steps linear."""
-        return np.stack([np.interp(times_s, self.times_s, column) for column in self.values.T], axis=1)
+        return interpolated(self.times_s, self.values, times_s)
 
     def covariance(self, times_s: np.ndarray) -> np.ndarray:
         """Covariances (N, 6, 6) that the navigation states."""
         flat = self.covariances.reshape(len(self.times_s), -1)
-        found = np.stack([np.interp(times_s, self.times_s, column) for column in flat.T], axis=1)
-        return found.reshape(-1, 6, 6)
+        return interpolated(self.times_s, flat, times_s).reshape(-1, 6, 6)
 
 
 def drift_of(
@@ -155,8 +153,8 @@ def drift_of(
 class Vehicle(Route):
     """An underwater vehicle that waves move and thrusters shake, and that navigates by INS and DVL.
 
-    The scene's Z points down. `Sea` moves it, and its `Navigation` drifts. The sensor
-    vibrates along each axis by ``vibration_mm`` and turns by ``vibration_deg`` at ``vibration_hz`` (amplitudes).
+    The scene's Z points down. `Sea` moves it, and its `Navigation` drifts. The sensor vibrates along each axis by
+    ``vibration_mm`` and turns by ``vibration_deg`` at ``vibration_hz`` (amplitudes).
     """
 
     kind: Literal["vehicle"]
@@ -178,18 +176,12 @@ class Vehicle(Route):
         sizes = np.append(np.full(3, self.vibration_mm), np.full(3, np.radians(self.vibration_deg)))
 
         def true(times: np.ndarray) -> np.ndarray:
-            poses = commanded(times).copy()
-            moved = waves(times) + sizes * np.sin(2 * np.pi * self.vibration_hz * times[:, None] + phases)
-            poses[:, :3, 3] += moved[:, :3]
-            poses[:, :3, :3] = Rotation.from_rotvec(moved[:, 3:]).as_matrix() @ poses[:, :3, :3]
-            return poses
+            vibrations = sizes * np.sin(2 * np.pi * self.vibration_hz * times[:, None] + phases)
+            return displaced(commanded(times), waves(times) + vibrations)
 
         drift = drift_of(self.navigation, true, lead_s=2 * LEAD_S, lasting_s=float(self._knots[0][-1]), rng=rng)
 
         def reported(times: np.ndarray) -> np.ndarray:
-            poses, errors = true(times).copy(), drift.errors(times)
-            poses[:, :3, 3] += errors[:, :3]
-            poses[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ poses[:, :3, :3]
-            return poses
+            return displaced(true(times), drift.errors(times))
 
         return Carried(true, reported, drift.covariance)

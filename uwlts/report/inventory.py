@@ -206,6 +206,10 @@ def _figure_lines(calibration: Calibration | PolynomialCalibration, **shown: tup
 
 def mount_lines(mount: Mount) -> list[str]:
     """The transform with its 95 % intervals, the artefact, the scatter found, poses left out and the next pose."""
+
+    def within(std: float | None) -> str:
+        return "given" if std is None else f"+-{mount.coverage_factor * std:.3f}"
+
     half = mount.coverage_factor * mount.std()
     transform = mount.transform()
     rotation = Rotation.from_matrix(transform[:3, :3])
@@ -223,14 +227,14 @@ def mount_lines(mount: Mount) -> list[str]:
         x, y, z = (row[3] for row in found.T_base_target[:3])
         lines.append(f"target, mm                origin at {_vector((x, y, z))}")
     elif isinstance(found, SphereFound):
-        known = "given" if found.radius_std_mm is None else f"+-{mount.coverage_factor * found.radius_std_mm:.3f}"
+        known = within(found.radius_std_mm)
         lines.append(f"sphere, mm                at {_vector(found.centre_mm)}, radius {found.radius_mm:.3f} ({known})")
     elif isinstance(found, StepFound):
-        known = "given" if found.height_std_mm is None else f"+-{mount.coverage_factor * found.height_std_mm:.3f}"
+        known = within(found.height_std_mm)
         place = f"normal {_vector(found.normal)}, distance {found.distance_mm:.3f} mm"
         lines.append(f"step                      {place}, height {abs(found.height_mm):.3f} mm ({known})")
     elif isinstance(found, RingFound):
-        known = "given" if found.radius_std_mm is None else f"+-{mount.coverage_factor * found.radius_std_mm:.3f}"
+        known = within(found.radius_std_mm)
         place = f"axis {_vector(found.axis)} through {_vector(found.centre_mm)}"
         lines.append(f"ring, mm                  {place}, radius {found.radius_mm:.3f} ({known})")
     else:

@@ -239,22 +239,25 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
     missed = [(sign * (over(name) - bound) / (abs(bound) or 1.0) - _BESIDE) for name, sign, bound in study.bounds()]
     limits = list(zip(missed, itertools.cycle(_LIMITS), (tables.bound_text(*each) for each in study.bounds())))
     fails = np.max(missed, axis=0, initial=-1.0)
+    beyond, misses = np.where(works, fails, 0.0), bool((fails[works] > 0).any())
+    dots = [
+        (np.flatnonzero(sample(chosen, np.zeros(len(places), bool), _MOST_DOTS)), style, size)
+        for chosen, style, size in ((works, ".", 1.5), (~works, "x", 3.0))
+    ]
+    variables = [study.variables[name] for name in (x, y)]
     figure, panels = _panels(shown_figures(judged))
     for number, (axes, name) in enumerate(panels):
         _fill(axes, mesh, over(name), good=fails <= 0)
-        if (fails[works] > 0).any():
-            outside = np.where(works, fails, 0.0)
-            axes.tricontourf(mesh, outside, levels=[0.0, 1.01 * outside.max()], colors="#e4e7eb", alpha=0.72)
+        if misses:
+            axes.tricontourf(mesh, beyond, levels=[0.0, 1.01 * beyond.max()], colors="#e4e7eb", alpha=0.72)
         for values, colour, label in limits if len(study.free()) == 2 else ():
             if values[works].min() < 0 < values[works].max():
                 axes.tricontour(mesh, np.where(works, values, 0.0), levels=[0.0], colors=colour, linestyles="--")
                 axes.plot([], [], color=colour, linestyle="--", label=label)
-        for chosen, style, size in ((works, ".", 1.5), (~works, "x", 3.0)):
-            shown = np.flatnonzero(sample(chosen, np.zeros(len(places), bool), _MOST_DOTS))
+        for shown, style, size in dots:
             axes.plot(mesh.x[shown], mesh.y[shown], style, color=INK, markersize=size, alpha=0.5, rasterized=True)
         _mark(axes, marked, x, y)
         axes.grid(visible=False)
-        variables = [study.variables[name] for name in (x, y)]
         axes.set(xlabel=tables.label_of(x), ylabel="" if number % _PANEL_COLUMNS else tables.label_of(y))
         axes.set(xscale=variables[0].scale, yscale=variables[1].scale)
         # Designs on the border of the range are seen wholly.
@@ -262,7 +265,7 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
         axes.set(xlim=xlim, ylim=ylim)
     legend_below(figure)
     others = [tables.words_of(name) for name in study.free() if name not in (x, y)]
-    ends = {name: study.variables[name].ends() for name in (x, y)}
+    ends = {name: variable.ends() for name, variable in zip((x, y), variables, strict=True)}
     outside = [m.label for m in marked if not all(a <= m.design.number_of(n) <= b for n, (a, b) in ends.items())]
     parts = (
         f"{tables.listed(others).capitalize()} also vary: each place shows the design there that misses the "
@@ -270,7 +273,7 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
         if others
         else "",
         "Linear between the designs (dots).",
-        "Grey: a constraint is missed." if (fails[works] > 0).any() else "",
+        "Grey: a constraint is missed." if misses else "",
         "Crosses: designs cannot work; the table of reasons says why." if not works.all() else "",
         f"Outside the ranges: {tables.listed(outside)}." if outside else "",
     )

@@ -90,7 +90,8 @@ def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Markup | None, str
     if base is not chosen:
         with suppress(Error):
             other = drawing.views_of(base.sensor, study.medium_of(base.sensor))
-    return svg_of(drawing.draw(*views, other)), _DRAWN + (f" Dashed grey behind: {base.label}." if other else "")
+    behind = f" Dashed grey behind, as far as it fits in: {base.label}." if other else ""
+    return svg_of(drawing.draw(*views, other)), _DRAWN + behind
 
 
 def _over_what_is_free(judged: Judged, marked: Sequence[Marked]) -> tuple[str, tuple[Markup, str] | None]:
