@@ -394,7 +394,7 @@ def test_descriptions_are_read_with_their_defaults():
         ({"marker_diameter_mm": 5.0}, "less than diameter_mm"),
         ({"origin": [14, 5]}, "marker_x is at"),
         ({"origin": [15, 5]}, "origin is at"),
-        ({"marker_y": [4, 0]}, "on one line"),
+        ({"marker_y": [4, 0]}, "collinear"),
     ],
 )
 def test_impossible_circle_targets_are_refused(change, message):
