@@ -221,8 +221,14 @@ TARGETS: dict[str, tuple[Damage, str]] = {
     "switched": (switched, "found in no image of x.h5: .*lamp and laser images are exchanged"),
     "laser off": (images(black, laser=True), "no stripe in any of the 5 laser images of x.h5: all are black"),
     "laser white": (images(white, laser=True), "no stripe in any of the 5 laser images of x.h5: all are white"),
-    "no stripe": (images(noise, laser=True), "no stripe in any of the 5 .* of x.h5: no bright line stands out"),
-    "stripe across": (images(turned_square), "no stripe in any of the 5 .* in 5 of 5 one runs across: .* quarter turn"),
+    "no stripe": (
+        images(noise, laser=True),
+        "no stripe in any of the 5 .* of x.h5: no bright line is above the background",
+    ),
+    "stripe across": (
+        images(turned_square),
+        "no stripe in any of the 5 .* 5 of 5 images show a stripe across .* rotated by 90 deg",
+    ),
     "lamp only": (lambda frames: [f for f in frames if not f.laser_on], "x.h5: no image with the laser on; take one"),
     "laser only": (lambda frames: [f for f in frames if f.laser_on], "all of them were taken with the laser on"),
     "elsewhere": (

@@ -130,8 +130,14 @@ def _examine_port(port: str, description: str) -> Finding:
     return Finding("serial port", "warning", f"{named}: no permission, {fault}", advice)
 
 
-FRAMES, _FRAME_S = 10, 5.0
-_BRIGHTEST_MEDIAN, _DARKEST_MEAN = 0.9, 0.002
+FRAMES = 10
+"""Frames grabbed to test a camera."""
+_FRAME_S = 5.0
+"""Longest wait for a frame, s."""
+_BRIGHTEST_MEDIAN = 0.9
+"""Median grey value, as a fraction of the full scale, above which an image is overexposed."""
+_DARKEST_MEAN = 0.002
+"""Mean grey value, as a fraction of the full scale, below which an image is dark."""
 
 BEHAVIOUR = {
     1: (255, "else the motor leaves its step at rest"),

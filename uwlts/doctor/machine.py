@@ -44,13 +44,18 @@ class Finding:
         return cls(subject, "warning" if advice else "ok", found, advice)
 
 
-FRAME_BYTES, FRAMES_PER_S = 1280 * 1024, 60
+FRAME_BYTES = 1280 * 1024
+"""Size of an 8-bit frame of the thesis's camera, bytes."""
+FRAMES_PER_S = 60
+"""Frame rate that the disk has to sustain, 1/s."""
 _TRIAL_BYTES = 64_000_000
 # 7500 profiles: the bench's travel of 750 mm in steps of 0.1 mm, uncompressed.
 _SCAN_BYTES = 7500 * FRAME_BYTES
 _RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 _RECOMMENDED_BUFFER = 33_554_432
-_LEAST_PROCESSORS, _LEAST_MEMORY = 2, 4e9
+_LEAST_PROCESSORS = 2
+_LEAST_MEMORY = 4e9
+"""Least memory, bytes."""
 
 
 def examine(folder: Path) -> list[Finding]:

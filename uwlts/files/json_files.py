@@ -12,8 +12,10 @@ from uwlts.errors import CaptureError, Error, problems_of
 from uwlts.files.reading import MOST_JSON_BYTES, parsed_json, read_text, with_article
 from uwlts.files.writing import written_aside
 
-_SHOWN, _BRIEF = 3, 80
-"""Entries that are named where two descriptions differ, and characters of each value."""
+_SHOWN = 3
+"""Most differing entries that a message names."""
+_BRIEF = 80
+"""Most characters of a value in a message."""
 
 AnyModel = TypeVar("AnyModel", bound=BaseModel)
 

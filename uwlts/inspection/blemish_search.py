@@ -1,10 +1,11 @@
-"""Search for pits and protrusions on an unrolled surface, at all sizes, with a stated probability of a false alarm.
+"""Search for pits and protrusions of all sizes on an unrolled surface, at a given probability of a false alarm.
 
 At every place and for every size the depth of a bell (1 - t^2)^2 is fitted together with a tilted plane through its
-surroundings (a matched filter that needs no full sampling). Over its local scatter this is a random field of unit
-variance where nothing is, and the probability that it exceeds a level anywhere on the area is the expected Euler
-characteristic of what lies above (Adler and Taylor, Random Fields and Geometry, 2007; Worsley et al., Human Brain
-Mapping 4, 1996, Table I). So the threshold follows from the probability, not the other way round.
+surroundings. This is a matched filter that does not need complete sampling.
+
+Divided by its local scatter, the depth on an undamaged surface is a random field of unit variance. The probability that
+it exceeds a level anywhere is the expected Euler characteristic of the excursion set (Adler and Taylor, Random Fields
+and Geometry, 2007; Worsley et al., Human Brain Mapping 4, 1996, Table I). The threshold follows from this probability.
 """
 
 from __future__ import annotations
@@ -20,47 +21,94 @@ from scipy.spatial import KDTree
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import MAD_TO_STD, fit_biweight, robust_std
 
-_POINTS_IN_SMALLEST = 12
-"""Points in the disc of the smallest size: three profiles or more where points are far denser along than across."""
-_CELLS_PER_RADIUS = 3
-_WINDOW = 1.8
-"""Radius of the fitted surroundings in those of the bell."""
-_RATIO = np.sqrt(2.0)
-"""Of sizes that follow each other: the bell of one size keeps 95 % of its signal in the next."""
-_LEAST_INFORMATION = 0.4
-"""Of the usual information on a bell's depth: with less the place is at an edge or in a hole."""
-_BLOCK = 24.0
-"""Side of the squares in which the local scatter is taken, in radii: some 180 independent places."""
+
+@dataclass(frozen=True, kw_only=True)
+class BlemishSearchRule:
+    """Numbers of the search.
+
+    The threshold of an indication follows from the probability of a false alarm. The numbers below were chosen by hand
+    with the reasons stated, not fitted to data. Results with these numbers are checked on the rendered pipes of
+    docs/studies/inspection.py and on the simulated surfaces of tests/uwlts/inspection/test_inspect.py.
+
+    Attributes
+    ----------
+    points_in_smallest : int
+        Points in a disc of the smallest size: at least three profiles, even if points are much denser along profiles.
+    cells_per_radius : int
+        Cells of the maps per radius of a bell.
+    window : float
+        Radius of the fitted surroundings, in radii of the bell.
+    size_ratio : float
+        Ratio of successive sizes: a bell of one size keeps 95 % of its signal at the next size.
+    least_information : float
+        Fraction of the median information on a bell's depth, below which a place is at an edge or in a hole.
+    scatter_block : float
+        Side of the squares for estimates of the local scatter, in radii: about 180 independent places.
+    largest_size : float
+        Largest radius as a fraction of the area's shorter side: larger bells leave no surroundings.
+    most_cells : int
+        Most cells of a map, limited by memory.
+    rounds : int
+        Most rounds of searching and removing indications.
+    fewest_points : int
+        Fewest points of an indication; twice as many are needed around it.
+    neighbours : int
+        Nearest points that each point is compared with to find outliers.
+    outlier : float
+        Distance of an outlier from the median of its neighbours, in robust standard deviations.
+    enlargements : int
+        Most enlargements of the window around a peak, while its region reaches the window's edge.
+    enlargement : float
+        Ratio of the window's sides before and after an enlargement.
+    core : float
+        Radius, in radii of the bell, within which all points belong to the indication.
+    edge_share : float
+        Height of the region's edge as a fraction of the blemish's height, as metal loss is boxed in pipe inspection.
+    edge_std : float
+        Least height of the region's edge, in standard deviations of a local mean.
+    """
+
+    points_in_smallest: int = 12
+    cells_per_radius: int = 3
+    window: float = 1.8
+    size_ratio: float = np.sqrt(2.0)
+    least_information: float = 0.4
+    scatter_block: float = 24.0
+    largest_size: float = 1 / 6
+    most_cells: int = 4_000_000
+    rounds: int = 10
+    fewest_points: int = 6
+    neighbours: int = 9
+    outlier: float = 6.0
+    enlargements: int = 3
+    enlargement: float = 1.7
+    core: float = 0.8
+    edge_share: float = 0.1
+    edge_std: float = 3.0
+
+
+SEARCH_RULE = BlemishSearchRule()
+
 _MAD_EFFICIENCY = 0.37
-"""Efficiency of the median absolute deviation at the normal distribution (Huber, Robust Statistics, 1981, 5.1)."""
-_LARGEST_SHARE = 1 / 6
-"""Of the area's shorter side: larger bells leave no surroundings."""
-_MOST_CELLS = 4_000_000
-_ROUNDS = 10
-_FEWEST = 6
-"""Points of an indication."""
-_NEIGHBOURS = 9
-"""Nearest points with which each is compared."""
-_OUTLIER = 6.0
-"""Robust standard deviations from their median that make an outlier."""
-_EDGE_SHARE = 0.1
-"""Of a blemish's depth, where its region ends."""
-_GROWN = 3
-"""Times that the window about a peak grows at most, if its region reaches the edge."""
-_GROWTH = 1.7
-"""Growth of the window's side."""
-_CORE = 0.8
-"""Of the bell's radius: points that belong to the peak in any case."""
-_EDGE_STD = 3.0
-"""Standard deviations of a cell's mean from which it belongs to a blemish that holds its neighbour."""
+"""Efficiency of the median absolute deviation for a normal distribution (Huber, Robust Statistics, 1981, 5.1)."""
 
 
 @dataclass(frozen=True, eq=False)
 class UnrolledSurface:
-    """An unrolled surface: places (N, 2) in mm, heights (N,) over the undamaged shape, and standard deviations (N,).
+    """Unrolled surface of N points.
 
-    ``footprint_mm`` (N, 2) are standard deviations along both axes of the part of the surface that a point is the mean
-    of, zero where not known; ``footprint_std`` is the relative standard uncertainty of their squares.
+    Attributes
+    ----------
+    places : (N, 2) float64
+        Places on the surface, mm.
+    heights : (N,) float64
+        Heights above the undamaged shape, mm.
+    std : (N,) float64
+        Standard deviations of the heights, mm.
+    footprint_mm : (N, 2) float64
+        Standard deviations, along both axes, of the part of the surface that a point averages over; zero if unknown.
+    footprint_std : float
+        Relative standard uncertainty of the squared footprints.
     """
 
     places: np.ndarray
@@ -72,10 +120,24 @@ class UnrolledSurface:
 
 @dataclass(frozen=True, eq=False)
 class Indication:
-    """A place where a surface departs from its shape: its middle (2,), radius, signed height, and its points.
+    """Significant departure of a surface from its shape.
 
-    ``z`` is its height in standard deviations, ``false_alarm`` the probability that noise exceeds it anywhere;
-    ``noise_mm`` the standard deviation of a point that gives the local means their scatter.
+    Attributes
+    ----------
+    place : (2,) float64
+        Middle, mm.
+    radius_mm : float
+        Radius of the bell.
+    height_mm : float
+        Signed height.
+    z : float
+        Height in standard deviations.
+    false_alarm : float
+        Probability that noise exceeds ``z`` anywhere.
+    noise_mm : float
+        Standard deviation of independent point noise that explains the scatter of local means.
+    points : (K,) int
+        Points of the indication.
     """
 
     place: np.ndarray
@@ -88,8 +150,8 @@ class Indication:
 
 
 @dataclass(frozen=True, eq=False)
-class Unresolved:
-    """A significant departure whose region was not found: the nearest point, its signed height, and why."""
+class UnresolvedDeparture:
+    """Significant departure without a region: the nearest point, its signed height in mm, and the reason."""
 
     point: int
     height_mm: float
@@ -98,16 +160,29 @@ class Unresolved:
 
 @dataclass(frozen=True, eq=False)
 class BlemishSearch:
-    """Indications, and significant departures that became none.
+    """Result of a search on N points.
 
-    ``outliers`` (N,) bool are outliers, ``plain`` (N,) bool the points that are none and belong to no indication.
-    ``level_mm`` (N,) is the depth from which the smallest size counts, ``noise_mm`` (N,) a point's effective noise.
+    Attributes
+    ----------
+    indications : tuple of Indication
+    unresolved : tuple of UnresolvedDeparture
+    outliers : (N,) bool
+    undamaged : (N,) bool
+        Points that are neither outliers nor in an indication.
+    level_mm : (N,) float64
+        Least significant height of an indication of the smallest size.
+    noise_mm : (N,) float64
+        Effective noise of each point.
+    smallest_mm : float
+        Smallest radius of the search.
+    false_alarm : float
+        Probability of any false indication.
     """
 
     indications: tuple[Indication, ...]
-    unresolved: tuple[Unresolved, ...]
+    unresolved: tuple[UnresolvedDeparture, ...]
     outliers: np.ndarray
-    plain: np.ndarray
+    undamaged: np.ndarray
     level_mm: np.ndarray
     noise_mm: np.ndarray
     smallest_mm: float
@@ -115,67 +190,106 @@ class BlemishSearch:
 
 
 def search_blemishes(surface: UnrolledSurface, *, false_alarm: float) -> BlemishSearch:
-    """Find where a surface departs from its shape.
+    """Find significant departures of a surface from its shape.
 
-    ``false_alarm`` is the probability that anything is found, inwards or outwards, where nothing is. The most
-    significant are taken first and their points left out of all that follows, until nothing is left.
+    The most significant indications are taken first. Their points are removed before the next round, until no
+    indication is left.
+
+    Parameters
+    ----------
+    surface
+        Points on the unrolled surface.
+    false_alarm
+        Probability of any indication, inwards or outwards, on an undamaged surface.
+
+    Raises
+    ------
+    EvaluationError
+        The surface has too few points.
     """
     places, tree = surface.places, KDTree(surface.places)
-    if len(places) < 20 * _POINTS_IN_SMALLEST:
-        raise EvaluationError(f"{len(places)} points are too few to search for blemishes")
-    outliers = _isolated(surface, tree)
-    smallest = float(np.median(tree.query(places[:: max(1, len(places) // 2000)], k=_POINTS_IN_SMALLEST)[0][:, -1]))
-    largest = max(_LARGEST_SHARE * float(np.min(np.ptp(places, axis=0))), smallest)
-    # A mesh of cells that memory cannot hold is not needed to see the larger sizes.
+    if len(places) < 20 * SEARCH_RULE.points_in_smallest:
+        raise EvaluationError(
+            f"{len(places)} points are too few to search for blemishes; "
+            f"{20 * SEARCH_RULE.points_in_smallest} are needed"
+        )
+    outliers = _find_outliers(surface, tree)
+    smallest = float(
+        np.median(tree.query(places[:: max(1, len(places) // 2000)], k=SEARCH_RULE.points_in_smallest)[0][:, -1])
+    )
+    largest = max(SEARCH_RULE.largest_size * float(np.min(np.ptp(places, axis=0))), smallest)
+    # The smallest size is larger if its map would not fit into memory.
     area = float(np.prod(np.ptp(places, axis=0)))
-    smallest = max(smallest, _CELLS_PER_RADIUS * float(np.sqrt(area / _MOST_CELLS)))
-    radii = smallest * _RATIO ** np.arange(1 + max(0, int(np.log(largest / smallest) / np.log(_RATIO))))
-    plain, found, unresolved = ~outliers, [], []
-    maps: list[_Map] = []
+    smallest = max(smallest, SEARCH_RULE.cells_per_radius * float(np.sqrt(area / SEARCH_RULE.most_cells)))
+    radii = smallest * SEARCH_RULE.size_ratio ** np.arange(
+        1 + max(0, int(np.log(largest / smallest) / np.log(SEARCH_RULE.size_ratio)))
+    )
+    undamaged, found, unresolved = ~outliers, [], []
+    maps: list[_BellMap] = []
     threshold = np.inf
-    for number in range(_ROUNDS + 1):
-        maps = [_matched(surface, plain, radius) for radius in radii]
+    for number in range(SEARCH_RULE.rounds + 1):
+        maps = [_fit_bells(surface, undamaged, radius) for radius in radii]
         maps = [each for each in maps if each.area_mm2 > 0]
         if not maps:
             break
-        threshold = _threshold(maps, false_alarm)
-        peaks = _chosen(maps, threshold)
+        threshold = _solve_threshold(maps, false_alarm)
+        peaks = _choose_peaks(maps, threshold)
         if not peaks:
             break
         for peak in peaks:
             try:
-                if number == _ROUNDS:
-                    raise EvaluationError(f"{_ROUNDS} rounds of the search did not come to an end there")
-                found.append(_indication(surface, plain, tree, maps, peak, smallest))
+                if number == SEARCH_RULE.rounds:
+                    raise EvaluationError(f"{SEARCH_RULE.rounds} rounds of the search found it again each time")
+                found.append(_delimit(surface, undamaged, tree, maps, peak, smallest))
                 points = found[-1].points
             except EvaluationError as error:
-                unresolved.append(Unresolved(int(tree.query(peak.place)[1]), peak.height, str(error)))
+                unresolved.append(UnresolvedDeparture(int(tree.query(peak.place)[1]), peak.height, str(error)))
                 points = tree.query_ball_point(peak.place, peak.radius)
-            plain[points] = False
+            undamaged[points] = False
     level, noise = np.full(len(places), np.nan), np.full(len(places), np.nan)
     if maps:
         level = threshold * maps[0].level_at(places)
         noise = maps[0].noise_at(places)
-    known = tuple(found), tuple(unresolved), outliers, plain, level, noise
+    known = tuple(found), tuple(unresolved), outliers, undamaged, level, noise
     return BlemishSearch(*known, smallest, false_alarm)
 
 
-def _isolated(surface: UnrolledSurface, tree: KDTree) -> np.ndarray:
-    """Points (N,) bool that stand alone off their neighbours, on slopes measured by how these scatter."""
-    found: Any = tree.query(surface.places, k=_NEIGHBOURS + 1)
+def _find_outliers(surface: UnrolledSurface, tree: KDTree) -> np.ndarray:
+    """Return a mask (N,) of points far from their neighbours, relative to the neighbours' scatter."""
+    found: Any = tree.query(surface.places, k=SEARCH_RULE.neighbours + 1)
     nearest = found[1][:, 1:]
     beside = surface.heights[nearest]
     middle = np.median(beside, axis=1)
     spread = MAD_TO_STD * np.median(np.abs(beside - middle[:, None]), axis=1)
     usual = float(np.median(spread))
-    return np.abs(surface.heights - middle) > _OUTLIER * np.maximum(spread, usual)
+    return np.abs(surface.heights - middle) > SEARCH_RULE.outlier * np.maximum(spread, usual)
 
 
 @dataclass(frozen=True, eq=False)
-class _Map:
-    """Fitted bells of one radius on a grid of places: heights, information (1 / variance for unit noise), the local
-    mean and standard deviation of height times root information, significance z as of a normal variable, and the
-    area, half perimeters and root spectral moments that give false alarms."""
+class _BellMap:
+    """Fitted bells of one radius on a grid of places.
+
+    Attributes
+    ----------
+    radius, cell : float
+        Radius of the bells and side of a cell, mm.
+    origin : (2,) float64
+        Corner of the grid.
+    height : (I, J) float64
+        Heights of the bells, mm.
+    information : (I, J) float64
+        Inverse variances of the heights for unit point noise.
+    spread : (I, J) float64
+        Local standard deviation of height times root information.
+    z : (I, J) float64
+        Significance, as a standard normal variable.
+    area_mm2 : float
+        Searched area.
+    moments : (2,) float64
+        Root spectral moments along both axes, 1/mm.
+    sides : (2,) float64
+        Sides of the searched area, mm.
+    """
 
     radius: float
     origin: np.ndarray
@@ -189,7 +303,7 @@ class _Map:
     sides: np.ndarray
 
     def false_alarms(self, level: float) -> float:
-        """Expected Euler characteristic of where either sign exceeds a level."""
+        """Return the expected Euler characteristic of the region where |z| exceeds a level."""
         bell = np.exp(-0.5 * level**2)
         flat = self.area_mm2 * float(np.prod(self.moments)) * level * bell / (2 * np.pi) ** 1.5
         edge = float(self.sides @ self.moments) * bell / (2 * np.pi)
@@ -200,31 +314,31 @@ class _Map:
         return tuple(np.clip(at.T, 0, np.array(self.z.shape)[:, None] - 1))
 
     def level_at(self, places: np.ndarray) -> np.ndarray:
-        """Standard deviation (N,) of a bell's height at places."""
+        """Return the standard deviation (N,) of a bell's height at places."""
         at = self._cells(places)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(np.isfinite(self.z[at]), self.spread[at] / np.sqrt(self.information[at]), np.nan)
 
     def noise_at(self, places: np.ndarray) -> np.ndarray:
-        """Effective standard deviation (N,) of a point of unit weight at places."""
+        """Return the effective standard deviation (N,) of a point of unit weight at places."""
         return self.spread[self._cells(places)]
 
 
-def _matched(surface: UnrolledSurface, plain: np.ndarray, radius: float) -> _Map:
-    cell = radius / _CELLS_PER_RADIUS
-    places = surface.places[plain]
+def _fit_bells(surface: UnrolledSurface, undamaged: np.ndarray, radius: float) -> _BellMap:
+    cell = radius / SEARCH_RULE.cells_per_radius
+    places = surface.places[undamaged]
     origin = surface.places.min(axis=0) - 0.5 * cell
     shape = tuple((np.floor(np.ptp(surface.places, axis=0) / cell).astype(int) + 2).tolist())
-    # Weights over those of the usual point: heights stay in mm, and the scatter is that of such a point.
-    weight = np.square(np.median(surface.std) / surface.std[plain])
+    # Weights relative to a point of median noise: heights stay in mm, and the scatter refers to such a point.
+    weight = np.square(np.median(surface.std) / surface.std[undamaged])
     flat = np.ravel_multi_index(tuple(np.floor((places - origin) / cell).astype(int).T), shape)
     size = int(np.prod(shape))
     mass = np.bincount(flat, weight, size).reshape(shape)
-    load = np.bincount(flat, weight * surface.heights[plain], size).reshape(shape)
-    reach = int(np.ceil(_WINDOW * _CELLS_PER_RADIUS))
-    axis = np.arange(-reach, reach + 1) / _CELLS_PER_RADIUS
+    load = np.bincount(flat, weight * surface.heights[undamaged], size).reshape(shape)
+    reach = int(np.ceil(SEARCH_RULE.window * SEARCH_RULE.cells_per_radius))
+    axis = np.arange(-reach, reach + 1) / SEARCH_RULE.cells_per_radius
     u, v = np.meshgrid(axis, axis, indexing="ij")
-    window = (np.hypot(u, v) <= _WINDOW).astype(float)
+    window = (np.hypot(u, v) <= SEARCH_RULE.window).astype(float)
     bell = np.square(np.maximum(1 - u**2 - v**2, 0))
     padded = [fft.next_fast_len(length + 2 * reach, real=True) for length in shape]
     base = [window, window * u, window * v, bell]
@@ -239,7 +353,7 @@ def _matched(surface: UnrolledSurface, plain: np.ndarray, radius: float) -> _Map
     for (i, j), kernel in pairs.items():
         normal[..., i, j] = normal[..., j, i] = correlated(spectra[0], kernel)
     right = np.stack([correlated(spectra[1], kernel) for kernel in base], axis=-1)
-    # Where the window holds next to nothing the plane is not determined, and neither is the bell.
+    # In a nearly empty window neither the plane nor the bell is determined.
     ridge = 1e-9 * (normal[..., 0, 0] + 1e-9)
     inner = normal[..., :3, :3] + ridge[..., None, None] * np.eye(3)
     filled = normal[..., 0, 0] > 1e-6
@@ -249,19 +363,19 @@ def _matched(surface: UnrolledSurface, plain: np.ndarray, radius: float) -> _Map
     amplitude = right[..., 3] - np.einsum("...i,...i->...", normal[..., :3, 3], solved[..., 1])
     seen = filled & (information > 1e-9)
     usual = float(np.median(information[seen])) if seen.any() else np.inf
-    seen &= information > _LEAST_INFORMATION * usual
+    seen &= information > SEARCH_RULE.least_information * usual
     root = np.sqrt(np.where(seen, information, 1.0))
     scaled = np.where(seen, amplitude / root, np.nan)
-    spread, z = _standardised(scaled, max(1, round(_BLOCK * _CELLS_PER_RADIUS)))
+    spread, z = _standardise(scaled, max(1, round(SEARCH_RULE.scatter_block * SEARCH_RULE.cells_per_radius)))
     height = np.where(seen, amplitude / np.where(seen, information, 1.0), np.nan)
-    moments = np.array([_moment(z, axis, cell) for axis in (0, 1)])
+    moments = np.array([_spectral_moment(z, axis, cell) for axis in (0, 1)])
     area = cell**2 * float(np.count_nonzero(seen))
     sides = cell * np.array([np.count_nonzero(seen.any(axis=1)), np.count_nonzero(seen.any(axis=0))])
-    return _Map(radius, origin, cell, height, information, spread, z, area, moments, sides)
+    return _BellMap(radius, origin, cell, height, information, spread, z, area, moments, sides)
 
 
-def _standardised(values: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
-    """Local standard deviation of a field, and its value over that as of a normal variable."""
+def _standardise(values: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the local standard deviation of a field, and the field as a standard normal variable."""
     counts = [max(1, round(length / block)) for length in values.shape]
     edges = [np.linspace(0, length, count + 1).astype(int) for length, count in zip(values.shape, counts, strict=True)]
     middle, spread, freedom = (np.full(counts, np.nan) for _ in range(3))
@@ -269,11 +383,11 @@ def _standardised(values: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarra
         for j in range(counts[1]):
             own = values[edges[0][i] : edges[0][i + 1], edges[1][j] : edges[1][j + 1]]
             own = own[np.isfinite(own)]
-            if len(own) < 4 * np.pi * _CELLS_PER_RADIUS**2:
+            if len(own) < 4 * np.pi * SEARCH_RULE.cells_per_radius**2:
                 continue
             middle[i, j] = np.median(own)
             spread[i, j] = MAD_TO_STD * np.median(np.abs(own - middle[i, j]))
-            freedom[i, j] = max(3.0, _MAD_EFFICIENCY * len(own) / (np.pi * _CELLS_PER_RADIUS**2))
+            freedom[i, j] = max(3.0, _MAD_EFFICIENCY * len(own) / (np.pi * SEARCH_RULE.cells_per_radius**2))
     known = np.isfinite(spread)
     if not known.any():
         return np.full(values.shape, np.nan), np.full(values.shape, np.nan)
@@ -290,7 +404,7 @@ def _standardised(values: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarra
     )
     spread = np.maximum(spread, 1e-12)
     t = (values - middle) / spread
-    # A scatter of few places is itself uncertain: Student's t, turned into the normal variable of the same probability.
+    # A scatter from few places is uncertain: map Student's t to the normal variable of equal probability.
     log_tail = np.minimum(_log_tail_of_t(np.abs(t), freedom), np.log(0.5))
     return spread, np.sign(t) * _normal_of_log_tail(log_tail)
 
@@ -304,8 +418,8 @@ def _normal_of_log_tail(log_tail: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(log_tail), -stats.norm.ppf(np.exp(np.nan_to_num(log_tail, nan=np.log(0.5)))), np.nan)
 
 
-def _moment(z: np.ndarray, axis: int, cell: float) -> float:
-    """Root of the second spectral moment, 1 / mm: standard deviation of the slope of a field of unit variance."""
+def _spectral_moment(z: np.ndarray, axis: int, cell: float) -> float:
+    """Return the root second spectral moment, 1/mm: standard deviation of the slope of a unit-variance field."""
     step = np.diff(z, axis=axis)
     step = step[np.isfinite(step)]
     if len(step) < 10:
@@ -313,15 +427,15 @@ def _moment(z: np.ndarray, axis: int, cell: float) -> float:
     return robust_std(step) / cell
 
 
-def _threshold(maps: Sequence[_Map], false_alarm: float) -> float:
-    """The level that noise exceeds with a probability anywhere at any size: the sizes' sum is an upper bound."""
+def _solve_threshold(maps: Sequence[_BellMap], false_alarm: float) -> float:
+    """Return the level that noise exceeds with the given probability. The sum over sizes is an upper bound."""
     level: Any = optimize.brentq(lambda z: sum(m.false_alarms(z) for m in maps) - false_alarm, 1.0, 40.0)
     return float(level)
 
 
 @dataclass(frozen=True, eq=False)
 class _Peak:
-    """A peak of a map: its place (2,), radius, height, z, and its height over the noise of independent points."""
+    """Peak of a map: place (2,), radius, height, z, and height divided by the noise of independent points."""
 
     place: np.ndarray
     radius: float
@@ -330,16 +444,16 @@ class _Peak:
     strength: float
 
 
-def _chosen(maps: Sequence[_Map], threshold: float) -> list[_Peak]:
-    """The strongest peaks that are significant, or cover one that is, and do not touch each other.
+def _choose_peaks(maps: Sequence[_BellMap], threshold: float) -> list[_Peak]:
+    """Return the strongest significant peaks that do not touch each other.
 
-    Large blemishes raise the scatter in the maps of their own size; their parts are significant in those of smaller
-    ones. Strength is by the scatter of the smallest size, which blemishes raise least.
+    A peak is also taken if it covers a significant peak of a smaller size: large blemishes increase the scatter in the
+    maps of their own size. Strength therefore refers to the scatter at the smallest size.
     """
     peaks = []
     for each in maps:
         size = np.nan_to_num(np.abs(each.height) * np.sqrt(np.maximum(each.information, 0)))
-        top = (size == ndimage.maximum_filter(size, 2 * _CELLS_PER_RADIUS + 1)) & (size > 0)
+        top = (size == ndimage.maximum_filter(size, 2 * SEARCH_RULE.cells_per_radius + 1)) & (size > 0)
         for i, j in np.argwhere(top):
             place = each.origin + (np.array([i, j]) + 0.5) * each.cell
             noise = float(maps[0].noise_at(place[None])[0])
@@ -365,37 +479,44 @@ def _chosen(maps: Sequence[_Map], threshold: float) -> list[_Peak]:
     return kept
 
 
-def _indication(
-    surface: UnrolledSurface, plain: np.ndarray, tree: KDTree, maps: Sequence[_Map], peak: _Peak, smallest: float
+def _delimit(
+    surface: UnrolledSurface,
+    undamaged: np.ndarray,
+    tree: KDTree,
+    maps: Sequence[_BellMap],
+    peak: _Peak,
+    smallest: float,
 ) -> Indication:
-    """A peak with its region: cells about it that depart from the surroundings in the same direction.
+    """Return a peak with its region: adjacent cells that depart in the same direction.
 
-    EvaluationError where too few points are in the region or around it.
+    EvaluationError if the region or its surroundings have too few points.
     """
     noise, reach, points = float(maps[0].noise_at(peak.place[None])[0]), 3.0 * peak.radius, np.zeros(0, int)
-    for _ in range(_GROWN):
+    for _ in range(SEARCH_RULE.enlargements):
         near = np.array(tree.query_ball_point(peak.place, reach), int)
-        near = near[plain[near]]
+        near = near[undamaged[near]]
         places, heights = surface.places[near] - peak.place, surface.heights[near]
-        inside, cut = _region(places, heights, peak, noise=noise, reach=reach, step=max(smallest, peak.radius / 4))
+        inside, cut = _grow_region(places, heights, peak, noise=noise, reach=reach, step=max(smallest, peak.radius / 4))
         points = near[inside]
         if not cut:
             break
-        reach *= _GROWTH
-    if len(points) < _FEWEST:
-        raise EvaluationError(f"it has {len(points)} points of its own; {_FEWEST} are needed")
+        reach *= SEARCH_RULE.enlargement
+    if len(points) < SEARCH_RULE.fewest_points:
+        raise EvaluationError(f"it has {len(points)} points; {SEARCH_RULE.fewest_points} are needed")
     chance = min(1.0, sum(each.false_alarms(peak.z) for each in maps))
     return Indication(peak.place, peak.radius, peak.height, peak.z, chance, noise, points)
 
 
-def _region(
+def _grow_region(
     places: np.ndarray, heights: np.ndarray, peak: _Peak, *, noise: float, reach: float, step: float
 ) -> tuple[np.ndarray, bool]:
-    """Points (n,) bool of a peak at the origin, and whether its region reaches the window's edge."""
+    """Return a mask (n,) of the points of a peak at the origin, and whether the region reaches the window's edge."""
     away = np.hypot(*places.T)
     ring = away > 0.5 * reach
-    if np.count_nonzero(ring) < 2 * _FEWEST:
-        raise EvaluationError(f"{np.count_nonzero(ring)} undamaged points are around it; {2 * _FEWEST} are needed")
+    if np.count_nonzero(ring) < 2 * SEARCH_RULE.fewest_points:
+        raise EvaluationError(
+            f"{np.count_nonzero(ring)} undamaged points surround it; {2 * SEARCH_RULE.fewest_points} are needed"
+        )
     base = np.column_stack([np.ones(len(places)), places])
     left = heights - base @ (fit_biweight(base, heights, ring)[0] @ heights)
     side = int(np.ceil(2 * reach / step)) + 1
@@ -406,11 +527,13 @@ def _region(
     total = 9 * ndimage.uniform_filter(np.bincount(flat, left, side**2).reshape(side, side), 3)
     filled = count > 0.5
     mean = np.where(filled, np.sign(peak.height) * total / np.maximum(count, 0.5), -np.inf)
-    level = np.maximum(_EDGE_SHARE * float(mean.max()), _EDGE_STD * noise / np.sqrt(np.maximum(count, 1)))
+    level = np.maximum(
+        SEARCH_RULE.edge_share * float(mean.max()), SEARCH_RULE.edge_std * noise / np.sqrt(np.maximum(count, 1))
+    )
     labelled: Any = ndimage.label(mean > level)
     middle = int(reach / step)
     own = labelled[0][middle - 1 : middle + 2, middle - 1 : middle + 2]
     region = np.isin(labelled[0], own[own > 0])
     wide = ndimage.binary_dilation(region)
     cut = bool(region[[0, 1, -2, -1], :].any() or region[:, [0, 1, -2, -1]].any())
-    return wide[cells[:, 0], cells[:, 1]] | (away < _CORE * peak.radius), cut
+    return wide[cells[:, 0], cells[:, 1]] | (away < SEARCH_RULE.core * peak.radius), cut

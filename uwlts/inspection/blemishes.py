@@ -1,11 +1,14 @@
 """Depth, extent and lost metal of a blemish on an unrolled surface, with uncertainty.
 
-The surface is a local quadratic through the points near each place of a grid; the undamaged surface is a plane through
-the points around the blemish. What the quadratic and the footprint of each point smooth is put back: what points would
-see of the surface that was found is taken off them, and the rest, smoothed, is added to it (twicing: Tukey, Exploratory
-Data Analysis, 1977, 16C; Van Cittert, Z. Phys. 69, 1931). All are sums over the points, so that the points' errors run
-through to every value: by each pattern that all points share, and by noise drawn anew (GUM Supplement 1, JCGM
-101:2008).
+The surface is a local quadratic through the points near each place of a grid. The undamaged surface is a plane through
+the points around the blemish.
+
+The quadratics and the footprints of the points smooth the surface. Twicing corrects this: the heights that the points
+would measure on the smoothed surface are subtracted from their own heights, and the smoothed residuals are added
+(Tukey, Exploratory Data Analysis, 1977, 16C; Van Cittert, Z. Phys. 69, 1931).
+
+All depths are linear in the heights of the points. Point errors are therefore propagated to every value: common
+patterns one by one, and noise by repeated draws (GUM Supplement 1, JCGM 101:2008).
 """
 
 from __future__ import annotations
@@ -21,47 +24,70 @@ from scipy.spatial import KDTree
 from uwlts.errors import EvaluationError
 from uwlts.fitting.least_squares import fit_biweight
 from uwlts.fitting.propagation import PointErrors
-from uwlts.inspection.blemish_search import BlemishSearch, Indication, UnrolledSurface
-from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR, FeatureKind, FeatureValue, plain_value
+from uwlts.inspection.blemish_search import SEARCH_RULE, BlemishSearch, Indication, UnrolledSurface
+from uwlts.inspection.features import COVERAGE, COVERAGE_FACTOR, SEED, FeatureKind, FeatureValue, plain_value
 
-_DRAWS = 120
-"""Draws of noise: three are beyond either end of a 95 % interval."""
-_TO_LEVEL = 48
-"""Draws for the noise of depths: their standard deviation is right to 10 %."""
-_SEED = 635
-"""Of the draws, so that the same cloud has the same values."""
-_EXPONENTS = 1, 2, 3
-"""Of bells (1 - t^2)^p: from a paraboloid with a sharp edge to one that runs out slowly."""
-_BANDWIDTH = 0.35
-"""Radius of the local quadratic, relative to the blemish's: it lowers the depth of a bell by 0.3 %."""
-_POINTS = 150
-"""Points in the local quadratic from which its radius is smaller: the noise is a sixth of one point's."""
-_EDGE_SHARE = 0.1
-"""Depth of the contour, relative to the blemish's, as metal loss is boxed in pipe inspection."""
-_EDGE_STD = 3.0
-"""Least depth of the contour in standard deviations of the depths."""
-_RING = 0.6
-"""Width of the surroundings in the blemish's radius."""
-_FEWEST = 12
+
+@dataclass(frozen=True, kw_only=True)
+class BlemishRule:
+    """Numbers of the measurement of a blemish.
+
+    Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the rendered
+    pipes of docs/studies/inspection.py and on the simulated ones of tests/uwlts/inspection/test_inspect.py. The edge of
+    a blemish is that of the search (`SEARCH_RULE`).
+
+    Attributes
+    ----------
+    draws : int
+        Noise draws: three exceed either end of a 95 % interval.
+    depth_draws : int
+        Noise draws for the standard deviation of depths, which 48 give to 10 %.
+    exponents : tuple of int
+        Exponents p of simulated bells (1 - t^2)^p, from a paraboloid with a sharp edge to a bell with a flat edge.
+    bandwidth : float
+        Radius of the local quadratic, in radii of the blemish: it lowers the depth of a bell by 0.3 %.
+    points : int
+        Most points in a local quadratic, whose radius is reduced to this: its noise is a sixth of one point's.
+    ring : float
+        Width of the surroundings, in radii of the blemish.
+    fewest_points : int
+        Fewest undamaged points in the surroundings.
+    most_variance : float
+        Largest variance of a quadratic's value, times its number of points; it is 3 to 5 inside the point set.
+    cells : int
+        Cells of the grid across the blemish.
+    subdivision : int
+        Subdivision of cells for contours, on a cubic spline.
+    dent : float
+        Least length and width of a dent, as a fraction of the pipe's diameter; smaller hollows are pits.
+    """
+
+    draws: int = 120
+    depth_draws: int = 48
+    exponents: tuple[int, ...] = (1, 2, 3)
+    bandwidth: float = 0.35
+    points: int = 150
+    ring: float = 0.6
+    fewest_points: int = 12
+    most_variance: float = 12.0
+    cells: int = 26
+    subdivision: int = 2
+    dent: float = 0.1
+
+
+_RULE = BlemishRule()
+
 _NODES = [
     (np.sqrt(3.0) * np.array([a, b]), (2 / 3 if a == 0 else 1 / 6) * (2 / 3 if b == 0 else 1 / 6))
     for a in (-1, 0, 1)
     for b in (-1, 0, 1)
 ]
 """Places and weights of a normal distribution in two dimensions (Gauss-Hermite, exact to the fifth power)."""
-_MOST_VARIANCE = 12.0
-"""Of a quadratic's value times the number of its points; amid them it is 3 to 5."""
-_CELLS = 26
-"""Cells of the grid across the blemish."""
-_FINER = 2
-"""Parts of a cell in which contours are followed, on a cubic spline."""
-_DENT_SHARE = 0.1
-"""Of the diameter: a hollow that is longer and wider is called a dent. Shape alone does not tell what made it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Blemish:
-    """A measured blemish: its values, its deepest place (2,) and its size along both axes, mm, and its points."""
+    """Measured blemish: kind, values, deepest place (2,), size along both axes and depth in mm, and its points."""
 
     kind: FeatureKind
     values: tuple[FeatureValue, ...]
@@ -79,39 +105,61 @@ def measure_blemish(
     diameter_mm: float,
     wall_mm: float | None = None,
 ) -> Blemish:
-    """Values of an indication. EvaluationError where too few points lie around it for an undamaged surface."""
+    """Measure an indication.
+
+    Parameters
+    ----------
+    surface
+        Unrolled surface of N points.
+    search
+        Result of the search on this surface.
+    indication
+        Indication that is measured.
+    errors
+        Errors of the N points along their normals.
+    diameter_mm
+        Diameter of the pipe, which distinguishes dents from pits.
+    wall_mm
+        Thickness of the undamaged wall, for the remaining wall.
+
+    Raises
+    ------
+    EvaluationError
+        Too few points around the indication to determine the undamaged surface.
+    """
     field = _Field.about(surface, search, indication)
     sign = float(np.sign(indication.height_mm))
     heights = sign * surface.heights[field.near]
     depths = field.depths(heights)
-    deepest, between = field.deepest(heights)
+    deepest, between = field.find_deepest(heights)
     depth = float(depths[deepest]) + between
-    # Single points that, were they independent, would scatter local means as these do.
+    # Noise of independent points that explains the scatter of local means.
     noise = indication.noise_mm * surface.std[field.near] / float(np.median(surface.std))
-    rng, own = np.random.default_rng(_SEED), errors[field.near]
-    moves = replace(own, single_mm=noise).drawn(_DRAWS, rng)
+    rng, own = np.random.default_rng(SEED), errors[field.near]
+    moves = replace(own, single_mm=noise).drawn(_RULE.draws, rng)
     inside = np.arange(len(noise)) < len(indication.points)
-    scale = np.where(inside, field.scatter_over(heights, moves[:_TO_LEVEL], inside), 1.0)
+    scale = np.where(inside, field.scatter_ratio(heights, moves[: _RULE.depth_draws], inside), 1.0)
     moves = [scale * each for each in moves]
-    by_noise = np.std([field.depths(each) for each in moves[:_TO_LEVEL]], axis=0, ddof=1)
-    edge = max(_EDGE_SHARE * depth, _EDGE_STD * float(np.median(by_noise[field.region])))
+    by_noise = np.std([field.depths(each) for each in moves[: _RULE.depth_draws]], axis=0, ddof=1)
+    edge = max(SEARCH_RULE.edge_share * depth, SEARCH_RULE.edge_std * float(np.median(by_noise[field.region])))
     seen = field.figures(depths, edge, deepest)
     seen[0] += between
-    # Errors of blemishes of this size, known exactly, that are seen by these points: noise, sampling and smoothing.
+    # Errors of simulated blemishes of this size, measured at these points: noise, sampling and smoothing.
     wrong = []
     for move in moves:
-        bell = _Bell.like(seen, edge, field.grid[deepest], indication.radius_mm, rng)
+        bell = _Bell.resembling(seen, edge, field.grid[deepest], indication.radius_mm, rng)
         shift = rng.uniform(-0.5, 0.5, 2) * search.smallest_mm
-        wrong.append(field.measured(field.seen_of(bell, shift) + move, edge) - bell.figures(edge))
+        wrong.append(field.measure(field.observe(bell, shift) + move, edge) - bell.figures(edge))
     low, bias, high = np.quantile(wrong, [0.5 - 0.5 * COVERAGE, 0.5, 0.5 + 0.5 * COVERAGE], axis=0)
     random = 0.5 * (high - low) / COVERAGE_FACTOR
     plain = np.maximum(seen - bias, 0)
-    # What hangs on the footprint's size.
+    # Uncertainty by the footprints' size.
     resolved = field.figures(field.depths(heights, share=1 - field.footprint_std), edge, deepest) - seen
     resolved[0] += between
     random = np.sqrt(random**2 + bias**2 + resolved**2)
 
     def changed(pattern: np.ndarray) -> np.ndarray:
+        """Return the change of all figures by a pattern of height errors."""
         found = field.figures(depths + field.depths(pattern), edge, deepest) - seen
         found[0] += between
         return found
@@ -120,7 +168,7 @@ def measure_blemish(
     length, width = plain[1], plain[2]
     kind = FeatureKind.PROTRUSION
     if sign < 0:
-        kind = FeatureKind.DENT if min(length, width) >= _DENT_SHARE * diameter_mm else FeatureKind.PIT
+        kind = FeatureKind.DENT if min(length, width) >= _RULE.dent * diameter_mm else FeatureKind.PIT
     names = ("height" if sign > 0 else "depth", "length", "width", "area", *(("lost area",) if sign < 0 else ()))
     values = [
         plain_value(kind, name, plain[k], random[k], None if common is None else common[k], least=0.0)
@@ -136,7 +184,7 @@ def measure_blemish(
 
 @dataclass(frozen=True, eq=False)
 class _Bell:
-    """A blemish depth (1 - t^2)^p of elliptic outline with half axes (2,) about a middle (2,), mm."""
+    """Blemish of depth (1 - t^2)^p and elliptic outline, with half axes (2,) about a middle (2,), mm."""
 
     middle: np.ndarray
     half: np.ndarray
@@ -144,20 +192,25 @@ class _Bell:
     exponent: int
 
     @classmethod
-    def like(cls, seen: np.ndarray, edge: float, middle: np.ndarray, radius: float, rng: np.random.Generator) -> _Bell:
-        """One with the depth, length and width that were ``seen`` at an edge; of the radius where they are zero."""
-        exponent = int(rng.choice(_EXPONENTS))
+    def resembling(
+        cls, seen: np.ndarray, edge: float, middle: np.ndarray, radius: float, rng: np.random.Generator
+    ) -> _Bell:
+        """Return a bell with the measured depth, length and width at an edge.
+
+        The half axes equal the radius if the measured sizes are zero.
+        """
+        exponent = int(rng.choice(_RULE.exponents))
         rim = float(np.sqrt(1 - min(edge / seen[0], 0.99) ** (1 / exponent)))
         half = np.where(seen[1:3] > 0, 0.5 * seen[1:3] / rim, radius)
         return cls(middle, half, float(seen[0]), exponent)
 
-    def at(self, places: np.ndarray) -> np.ndarray:
-        """Depths (N,) at places (N, 2)."""
+    def depths_at(self, places: np.ndarray) -> np.ndarray:
+        """Return depths (N,) at places (N, 2)."""
         t2 = np.sum(np.square((places - self.middle) / self.half), axis=1)
         return self.depth * np.maximum(1 - t2, 0) ** self.exponent
 
     def figures(self, edge: float) -> np.ndarray:
-        """Depth; length, width, area and lost area within the contour of an edge's depth."""
+        """Return the depth, and length, width, area and lost area within the contour at the edge depth."""
         rim = float(np.sqrt(1 - min(edge / self.depth, 1.0) ** (1 / self.exponent)))
         t = np.linspace(0, rim, 101)
         lost = 2 * self.half[0] * self.depth * float(np.trapezoid((1 - t * t) ** self.exponent, t))
@@ -167,12 +220,32 @@ class _Bell:
 
 @dataclass(frozen=True, eq=False)
 class _Field:
-    """Depths on a grid (G, 2) of shape ``shape`` as sums over the points ``near`` (n,).
+    """Depths on a grid of G places, as linear functions of the heights of n points near a blemish.
 
-    ``places`` and ``size`` (n, 2) are those of the points and their footprints, ``smooth`` (G, n) are local
-    quadratics, ``design`` (n, 3) and ``plane`` (3, n) the undamaged plane's terms and their sums over the points,
-    ``seen`` (n, G) is what points of their footprint see of depths on the grid, ``sharp`` (n, G) what points without
-    one would. ``region`` (G,) are the cells of the blemish, ``stride`` half a bandwidth in cells.
+    Attributes
+    ----------
+    near : (n,) int
+        Points of the blemish, then the undamaged points around it.
+    places, size : (n, 2) float64
+        Places of these points and their footprints, mm.
+    grid : (G, 2) float64
+        Places of the grid, mm.
+    shape : pair of int
+        Shape of the grid.
+    cell : float
+        Side of a cell, mm.
+    smooth : (G, n) sparse
+        Local quadratics.
+    design, plane : (n, 3) and (3, n) float64
+        Terms of the undamaged plane, and their least-squares rows.
+    seen, sharp : (n, G) sparse
+        Heights that points with and without their footprint measure for given depths on the grid.
+    footprint_std : float
+        Relative standard uncertainty of the squared footprints.
+    stride : int
+        Half a bandwidth in cells.
+    region : (G,) bool
+        Cells of the blemish.
     """
 
     near: np.ndarray
@@ -192,24 +265,25 @@ class _Field:
 
     @classmethod
     def about(cls, surface: UnrolledSurface, search: BlemishSearch, indication: Indication) -> _Field:
+        """Set up the grid and its operators around an indication."""
         own = surface.places[indication.points]
         low, high = own.min(axis=0), own.max(axis=0)
         radius = 0.25 * float(np.sum(high - low))
-        reach = max(_RING * radius, 3 * search.smallest_mm)
+        reach = max(_RULE.ring * radius, 3 * search.smallest_mm)
         inside = np.all((surface.places > low - reach) & (surface.places < high + reach), axis=1)
         is_own = np.zeros(len(surface.places), bool)
         is_own[indication.points] = True
-        around = np.flatnonzero(inside & search.plain)
+        around = np.flatnonzero(inside & search.undamaged)
         around = around[KDTree(own).query(surface.places[around])[0] <= reach]
-        if len(around) < _FEWEST:
-            raise EvaluationError(f"{len(around)} undamaged points are around it; {_FEWEST} are needed")
+        if len(around) < _RULE.fewest_points:
+            raise EvaluationError(f"{len(around)} undamaged points surround it; {_RULE.fewest_points} are needed")
         near = np.concatenate([indication.points, around])
         middle = 0.5 * (low + high)
         places, heights = surface.places[near] - middle, surface.heights[near]
         ring = np.arange(len(near)) >= len(indication.points)
         dense = len(indication.points) / max(float(np.prod(high - low)), 1e-9)
-        bandwidth = max(min(_BANDWIDTH * radius, float(np.sqrt(_POINTS / np.pi / dense))), search.smallest_mm)
-        cell = float(np.max(high - low)) / _CELLS
+        bandwidth = max(min(_RULE.bandwidth * radius, float(np.sqrt(_RULE.points / np.pi / dense))), search.smallest_mm)
+        cell = float(np.max(high - low)) / _RULE.cells
         sides = [np.arange(a - cell, b + 2 * cell, cell) for a, b in zip(low - middle, high - middle, strict=True)]
         shape = len(sides[0]), len(sides[1])
         grid = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -218,9 +292,11 @@ class _Field:
         region = KDTree(places[~ring]).query(grid)[0] < bandwidth
         stride = max(1, round(0.5 * bandwidth / cell))
         size = surface.footprint_mm[near]
-        sharp = seen = _interpolation((places - grid[0]) / cell, shape)
+        sharp = seen = _interpolation_rows((places - grid[0]) / cell, shape)
         if np.any(size > 0):
-            parts = [weight * _interpolation((places + node * size - grid[0]) / cell, shape) for node, weight in _NODES]
+            parts = [
+                weight * _interpolation_rows((places + node * size - grid[0]) / cell, shape) for node, weight in _NODES
+            ]
             seen = sparse.csr_array(sum(parts[1:], parts[0]))
         design = np.column_stack([np.ones(len(places)), places])
         plane = fit_biweight(design, heights, ring)[0]
@@ -228,9 +304,9 @@ class _Field:
         return cls(near, *known, smooth, design, plane, seen, sharp, surface.footprint_std, stride, region)
 
     def depths(self, heights: np.ndarray, *, steps: int = 1, share: float = 1.0) -> np.ndarray:
-        """Heights (G,) over the undamaged surface for heights (n,) of the points.
+        """Return heights (G,) above the undamaged surface for point heights (n,).
 
-        What smoothing hides is put back in so many ``steps``, with a ``share`` of what the footprint makes of that.
+        Smoothing is corrected ``steps`` times. ``share`` scales the footprints' part in this correction.
         """
         left = heights - self.design @ (self.plane @ heights)
         first = self.smooth @ left
@@ -242,24 +318,27 @@ class _Field:
             depths = depths + self.smooth @ (left - there)
         return depths
 
-    def deepest(self, heights: np.ndarray) -> tuple[int, float]:
-        """The deepest cell of the smooth surface, as a sharp one's noise is too deep, and how much cells miss."""
+    def find_deepest(self, heights: np.ndarray) -> tuple[int, float]:
+        """Return the deepest cell of the smooth surface, and the interpolated depth minus the depth of this cell.
+
+        The maximum of the corrected surface would be biased by its larger noise.
+        """
         smooth = self.depths(heights, steps=0)
         top = int(np.argmax(np.where(self.region, smooth, -np.inf)))
-        return top, self.vertex(smooth, top) - float(smooth[top])
+        return top, self.interpolate_depth(smooth, top) - float(smooth[top])
 
-    def measured(self, heights: np.ndarray, edge: float) -> np.ndarray:
-        """Figures of heights (n,) at their own deepest place."""
-        top, between = self.deepest(heights)
+    def measure(self, heights: np.ndarray, edge: float) -> np.ndarray:
+        """Return the figures for point heights (n,), at their own deepest place."""
+        top, between = self.find_deepest(heights)
         found = self.figures(self.depths(heights), edge, top)
         found[0] += between
         return found
 
-    def scatter_over(self, heights: np.ndarray, moves: list[np.ndarray], inside: np.ndarray) -> float:
-        """Scatter of heights (n,) about their depths ``inside`` (n,) over that around it; 1 at least.
+    def scatter_ratio(self, heights: np.ndarray, moves: list[np.ndarray], inside: np.ndarray) -> float:
+        """Return the ratio of residual scatter ``inside`` (n,) the blemish to that around it; at least 1.
 
-        Each is over that of the noise ``moves``, as depths take up a part of it. On the slopes of a blemish a stripe
-        scatters more than beside it.
+        A stripe scatters more on the slopes of a blemish. Both scatters are divided by those of the noise ``moves``,
+        because the fit absorbs a part of the noise.
         """
 
         def squares(each: np.ndarray) -> np.ndarray:
@@ -269,14 +348,16 @@ class _Field:
         own, around = squares(heights) / np.maximum(np.mean([squares(each) for each in moves], axis=0), 1e-300)
         return max(1.0, float(np.sqrt(own / max(around, 1e-300))))
 
-    def seen_of(self, bell: _Bell, shift: np.ndarray) -> np.ndarray:
-        """Heights (n,) that the points, with their footprints, would see of a bell elsewhere."""
+    def observe(self, bell: _Bell, shift: np.ndarray) -> np.ndarray:
+        """Return the heights (n,) that the points with their footprints would measure on a shifted bell."""
         if not np.any(self.size > 0):
-            return bell.at(self.places - shift)
-        return sum((weight * bell.at(self.places - shift + node * self.size) for node, weight in _NODES), np.zeros(1))
+            return bell.depths_at(self.places - shift)
+        return sum(
+            (weight * bell.depths_at(self.places - shift + node * self.size) for node, weight in _NODES), np.zeros(1)
+        )
 
-    def vertex(self, depths: np.ndarray, top: int) -> float:
-        """Largest depth between the cells: of the parabolas through the deepest cell and its neighbours."""
+    def interpolate_depth(self, depths: np.ndarray, top: int) -> float:
+        """Return the largest depth between cells, from parabolas through the deepest cell and its neighbours."""
         field, at = depths.reshape(self.shape), np.array(np.unravel_index(top, self.shape))
         depth = float(field[tuple(at)])
         for step in self.stride * np.eye(2, dtype=int):
@@ -289,14 +370,17 @@ class _Field:
 
     @cached_property
     def fine_region(self) -> np.ndarray:
-        """The cells of the blemish on the grid in which contours are followed."""
-        size = [_FINER * (n - 1) + 1 for n in self.shape]
+        """Cells of the blemish on the finer grid for contours."""
+        size = [_RULE.subdivision * (n - 1) + 1 for n in self.shape]
         return np.asarray(ndimage.zoom(self.region.reshape(self.shape), np.divide(size, self.shape), order=0))
 
     def figures(self, depths: np.ndarray, edge: float, deepest: int) -> np.ndarray:
-        """Depth in the ``deepest`` cell; length, width, area and lost area within the contour of an edge's depth."""
-        size = [_FINER * (n - 1) + 1 for n in self.shape]
-        cell, top = self.cell / _FINER, tuple(_FINER * k for k in np.unravel_index(deepest, self.shape))
+        """Return the depth of cell ``deepest``, and length, width, area and lost area within the contour at an edge."""
+        size = [_RULE.subdivision * (n - 1) + 1 for n in self.shape]
+        cell, top = (
+            self.cell / _RULE.subdivision,
+            tuple(_RULE.subdivision * k for k in np.unravel_index(deepest, self.shape)),
+        )
         fine = np.asarray(ndimage.zoom(depths.reshape(self.shape), np.divide(size, self.shape), order=3))
         labelled: Any = ndimage.label(self.fine_region & (fine > edge), structure=np.ones((3, 3)))
         labels, depth = labelled[0], float(depths[deepest])
@@ -304,15 +388,15 @@ class _Field:
             return np.array([depth, 0.0, 0.0, 0.0, 0.0])
         grown = ndimage.binary_dilation(labels == label, structure=np.ones((3, 3)))
         field = np.where(grown, fine, -np.inf)
-        length, lost = _crossing(field.max(axis=1), edge, cell)
-        width, _ = _crossing(field.max(axis=0), edge, cell)
+        length, lost = _measure_section(field.max(axis=1), edge, cell)
+        width, _ = _measure_section(field.max(axis=0), edge, cell)
         steep = np.maximum(np.hypot(*np.gradient(fine, cell)) * cell, 1e-9)
         share = np.clip((np.where(grown, fine, -1e9) - edge) / steep + 0.5, 0, 1)
         return np.array([depth, length, width, float(share.sum()) * cell**2, lost])
 
 
-def _crossing(profile: np.ndarray, edge: float, cell: float) -> tuple[float, float]:
-    """Length over which a profile exceeds an edge, between interpolated crossings, and its area there."""
+def _measure_section(profile: np.ndarray, edge: float, cell: float) -> tuple[float, float]:
+    """Return the length over which a profile exceeds an edge, with interpolated ends, and its area there."""
     above = np.flatnonzero(profile > edge)
     if not len(above):
         return 0.0, 0.0
@@ -330,10 +414,11 @@ def _crossing(profile: np.ndarray, edge: float, cell: float) -> tuple[float, flo
     return length, body + rims
 
 
-def _interpolation(places: np.ndarray, shape: tuple[int, int]) -> sparse.csr_array:
-    """Rows (n, G) of values on a grid at places (n, 2) in cells, exact for quadratics; nothing beyond its border.
+def _interpolation_rows(places: np.ndarray, shape: tuple[int, int]) -> sparse.csr_array:
+    """Return rows (n, G) that interpolate a grid at places (n, 2) in cells, and are zero beyond its border.
 
-    Cubic convolution (Keys, IEEE Transactions on Acoustics, Speech and Signal Processing 29, 1981, Eq. 15).
+    Cubic convolution, exact for quadratics (Keys, IEEE Transactions on Acoustics, Speech and Signal Processing 29,
+    1981, Eq. 15).
     """
     first = np.floor(places).astype(int)
     steps = np.arange(-1, 3)
@@ -349,9 +434,10 @@ def _interpolation(places: np.ndarray, shape: tuple[int, int]) -> sparse.csr_arr
 
 
 def _quadratic_rows(grid: np.ndarray, places: np.ndarray, tree: KDTree, bandwidth: float) -> sparse.csr_array:
-    """Rows (G, n) whose products with heights are the values of local quadratics at the grid's places.
+    """Return rows (G, n) that give local quadratics at the grid's places as products with heights.
 
-    Weights are Epanechnikov's; where fewer than nine points are near, the mean of the three nearest is taken.
+    Weights are Epanechnikov's. A place with fewer than nine points in the window takes the mean of its three nearest
+    points.
     """
     columns, values, starts = [], [], [0]
     nearest: Any = tree.query(grid, k=3)
@@ -366,8 +452,8 @@ def _quadratic_rows(grid: np.ndarray, places: np.ndarray, tree: KDTree, bandwidt
             normal = (design * weight[:, None]).T @ design
             if np.linalg.cond(normal) < 1e8:
                 row = np.linalg.solve(normal, np.eye(6)[0]) @ (design * weight[:, None]).T
-                # Beside the points a quadratic runs away.
-                row = row if row @ row < _MOST_VARIANCE / len(chosen) else None
+                # Quadratics extrapolate badly beside the points.
+                row = row if row @ row < _RULE.most_variance / len(chosen) else None
         if row is None:
             chosen, row = fallback, np.full(3, 1 / 3)
         columns.append(chosen)

@@ -1,4 +1,4 @@
-"""Features of an inspected object: their values with uncertainty, their place in the cloud, and their definitions."""
+"""Features of an inspected object: values with uncertainty, place in the cloud, and definitions."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -13,10 +13,14 @@ COVERAGE = 0.95
 """Coverage probability of the intervals of all values."""
 COVERAGE_FACTOR = 1.96
 """Standard normal quantile of (1 + COVERAGE) / 2."""
+SEED = 635
+"""Seed of all noise draws, so that equal clouds give equal values."""
+WITHOUT_UNCERTAINTY = "the cloud does not contain uncertainties: intervals contain the scatter of its points only"
+"""Note on an inspection of such a cloud."""
 
 
 class FeatureKind(StrEnum):
-    """Kind of a feature; a section is one across a pipe."""
+    """Kind of a feature. A section is a cross-section of a pipe."""
 
     PIPE = "pipe"
     SECTION = "section"
@@ -32,7 +36,7 @@ class FeatureKind(StrEnum):
 
 @dataclass(frozen=True)
 class Definition:
-    """What a value of a feature is, and the document that defines it or the quantity that it serves."""
+    """Definition of a value: unit, text, and the document that defines it or the quantity that it serves."""
 
     unit: str
     text: str
@@ -125,16 +129,16 @@ DEFINITIONS: dict[FeatureKind, dict[str, Definition]] = {
 
 @dataclass(frozen=True)
 class FeatureValue:
-    """A value of a feature in its definition's unit.
+    """Value of a feature, in its definition's unit.
 
     Attributes
     ----------
     name, unit : str
     value : float
     random : float
-        Standard uncertainty by noise of the points and positions of the stage.
+        Standard uncertainty by the noise of points and stage positions.
     systematic : float or None
-        Standard uncertainty by what is common to all points; None where the cloud does not state it.
+        Standard uncertainty by errors common to all points; None if the cloud does not contain such errors.
     low, high : float
         Ends of the 95 % coverage interval; never below zero for values that cannot be negative.
     """
@@ -149,17 +153,17 @@ class FeatureValue:
 
     @property
     def uncertainty(self) -> float:
-        """Combined standard uncertainty, of what is known."""
+        """Combined standard uncertainty of the known parts."""
         return float(np.hypot(self.random, self.systematic or 0.0))
 
     def text(self) -> str:
-        """Name, value and half of the interval in words."""
+        """Return name, value and interval as text."""
         return f"{self.name} {self.value:.4g} ({self.low:.4g} to {self.high:.4g}) {self.unit}"
 
 
 @dataclass(frozen=True, eq=False)
 class Feature:
-    """A feature that was found.
+    """Feature found in a cloud.
 
     Attributes
     ----------
@@ -167,19 +171,19 @@ class Feature:
     name : str
         Unique in its inspection, such as "pit 3".
     values : tuple of FeatureValue
-        By the names in ``DEFINITIONS[kind]``, which hold unit, text and source of each.
+        Values by the names in ``DEFINITIONS[kind]``.
     place_mm : (3,) float64
-        Its middle, in the cloud's frame; of a pit the deepest place.
+        Middle in the cloud's frame; for a pit the deepest place.
     axes : (3, 3) float64
-        Unit directions in rows, in the cloud's frame: along its length, its width, and outwards. Of a pipe and a
-        section two directions across the axis, then the axis.
+        Unit vectors in rows, in the cloud's frame: along the feature's length, its width, and outwards. For a pipe and
+        a section: two directions across the axis, then the axis.
     extent_mm : (3,) float64
-        Its size along these.
+        Size along these directions.
     points : (K,) int
         Indices of its points in the cloud.
     false_alarm : float or None
-        Probability that noise alone gives so clear an indication anywhere on the inspected area; None where nothing
-        had to be detected.
+        Probability that noise gives an indication of this significance anywhere on the inspected area; None for
+        features that need no detection.
     """
 
     kind: FeatureKind
@@ -192,17 +196,17 @@ class Feature:
     false_alarm: float | None = None
 
     def __getitem__(self, name: str) -> FeatureValue:
-        """The value of a name; KeyError where the feature has none."""
+        """Return the value of a name; raise KeyError if it does not exist."""
         for value in self.values:
             if value.name == name:
                 return value
-        raise KeyError(f"{self.name} has no {name}: {', '.join(value.name for value in self.values)}")
+        raise KeyError(f"{self.name} does not have {name}; it has {', '.join(value.name for value in self.values)}")
 
     def __contains__(self, name: str) -> bool:
         return any(value.name == name for value in self.values)
 
     def record(self) -> Table:
-        """The feature as JSON, with the number of its points."""
+        """Return the feature as JSON, with its number of points."""
         defined = DEFINITIONS[self.kind]
         return {
             "kind": str(self.kind),
@@ -230,20 +234,20 @@ class Feature:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Inspection(Brief, RecordFile):
-    """What an inspection found in a cloud.
+    """Result of an inspection.
 
     Attributes
     ----------
     kind : str
-        What was looked for: "pipe", "weld", "step", "flange" or "gap".
+        Kind of object: "pipe", "weld", "step", "flange" or "gap".
     features : tuple of Feature
-        The whole first, then its parts.
+        The whole object first, then its parts.
     deviation_mm : (N,) float64
-        Distance of every point of the cloud from the undamaged surface, positive outwards; NaN where it was left out.
+        Distance of each point of the cloud from the undamaged surface, positive outwards; NaN for omitted points.
     level_mm : (N,) float64
-        Depth from which an indication of the smallest size counts at that point; NaN where none is looked for.
+        Least significant depth of an indication of the smallest size at each point; NaN without a search.
     notes : tuple of str
-        What limits the result, for its reader.
+        Limitations of the result.
     """
 
     kind: str
@@ -253,11 +257,11 @@ class Inspection(Brief, RecordFile):
     notes: tuple[str, ...] = ()
 
     def of(self, *kinds: FeatureKind) -> tuple[Feature, ...]:
-        """The features of some kinds."""
+        """Return the features of the given kinds."""
         return tuple(feature for feature in self.features if feature.kind in kinds)
 
     def record(self) -> Table:
-        """Features and notes as JSON."""
+        """Return features and notes as JSON."""
         return {
             "kind": self.kind,
             "coverage": COVERAGE,
@@ -266,7 +270,7 @@ class Inspection(Brief, RecordFile):
         }
 
     def lines(self) -> list[str]:
-        """The inspection as text: one line for each feature."""
+        """Return the inspection as text, one line per feature."""
         lines = [f"{each.name:16}{', '.join(value.text() for value in each.values)}" for each in self.features]
         return [*lines, *(f"note: {note}" for note in self.notes)]
 
@@ -274,7 +278,7 @@ class Inspection(Brief, RecordFile):
 def plain_value(
     kind: FeatureKind, name: str, value: float, random: float, systematic: float | None, *, least: float = -np.inf
 ) -> FeatureValue:
-    """A value with a symmetric interval, cut at the least that it can be."""
+    """Return a value with a symmetric interval, cut off at the least possible value."""
     half = COVERAGE_FACTOR * float(np.hypot(random, systematic or 0.0))
     low, high = max(value - half, least), max(value + half, least)
     unit = DEFINITIONS[kind][name].unit
@@ -285,11 +289,10 @@ def plain_value(
 def amplitude_value(
     kind: FeatureKind, name: str, vector: np.ndarray, random: np.ndarray, systematic: np.ndarray | None, *, scale: float
 ) -> FeatureValue:
-    """Length of a vector (2,) with covariances (2, 2), times a scale.
+    """Return the length of a vector (2,) with covariances (2, 2), times a scale.
 
-    The length of a noisy vector is too large: its square by the trace of the covariance, which is taken off (Rice,
-    Bell System Technical Journal 24, 1945, section 3.10). The interval reaches down to zero where the vector is not
-    significant.
+    Noise increases the squared length of a vector by the trace of its covariance, which is subtracted (Rice, Bell
+    System Technical Journal 24, 1945, section 3.10). The interval reaches zero if the vector is not significant.
     """
     total = random if systematic is None else random + systematic
     length = float(np.linalg.norm(vector))
@@ -297,7 +300,7 @@ def amplitude_value(
     along = vector / length if length > 0 else np.array([1.0, 0.0])
 
     def std(covariance: np.ndarray) -> float:
-        # Near zero the direction is chance.
+        # The direction of a vector near zero is random: use the largest variance.
         near = float(np.linalg.eigvalsh(covariance)[-1])
         far = float(along @ covariance @ along)
         share = min(length**2 / max(float(np.trace(total)), 1e-300) / 9, 1.0)

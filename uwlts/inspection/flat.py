@@ -1,7 +1,7 @@
-"""Inspection of flat things: a step between two faces, a flange's face with its holes, a gap between two plates.
+"""Inspection of flat objects: a step between two faces, a flange with its holes, a gap between two plates.
 
-Faces are least-squares planes. Edges are found along the profiles, from how much of the stripe's brightness the blur
-has left to the last point on a face, and are known to half a point's spacing.
+Faces are least-squares planes. Edges are found along the profiles. The brightness of the last point on a face, reduced
+by the blur, gives the distance to the edge. Without brightness or blur it is half a point spacing.
 """
 
 from __future__ import annotations
@@ -24,44 +24,87 @@ from uwlts.fitting.least_squares import evenly_thinned, fit_robustly, robust_std
 from uwlts.fitting.point_spacing import footprint_on
 from uwlts.fitting.propagation import PointErrors, neighbours_in_order
 from uwlts.fitting.shapes import fit_plane
-from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, Inspection, plain_value
+from uwlts.inspection.features import WITHOUT_UNCERTAINTY, Feature, FeatureKind, FeatureValue, Inspection, plain_value
 from uwlts.storage.cloud import PointCloud
 from uwlts.storage.cloud_files import loaded_cloud
 
-_FEWEST = 200
-_PROPOSALS = 600
-"""Planes through three points that are tried for the largest face."""
-_THINNED = 3000
-"""Points on which they are judged."""
-_NEAR_SHARE = 2e-3
-"""Of the cloud's size: how near to a proposed plane a point has to be; flatter faces than that are refined after."""
-_OFF_FACE = 6.0
-"""Standard deviations from a face at which a point is not on it."""
-_LEAST_GAP = 4
-"""Lines without a point on the face from which they are a gap; fewer are lines that were lost."""
-_EDGE_STD = 1 / np.sqrt(12.0)
-"""Of a point's spacing: an edge lies anywhere between two lines (GUM, 4.3.7)."""
-_EDGE_BLUR = 0.5
-"""Standard uncertainty, in the spacing of points, of where all edges are seen together: the camera's blur lets the
-stripe end up to about a line beyond the edge."""
-_WHOLE_LINES = range(5, 12)
-"""Lines from an edge whose brightness is that of the face."""
-_FEWEST_EDGES = 8
-_FEWEST_IMAGES = 2
-"""Images in which the lines of a hole are missing, from which it counts as one; in a single image lines are lost."""
-_ROUND_SHARE = 0.08
-"""Of a hole's radius: scatter of its edge from which it is none."""
-_HOLE_ARC = 200.0
-"""Degrees of a hole's edge that have to be seen."""
-_SAME_SHARE = 0.2
-"""By which the diameters of bolt holes may differ."""
-_REFINED = 4
-_FLAT_CELLS = 24
-"""Across the face; the means of cells are its smoothed form."""
-_EDGE_LINES = 4
-"""Lines next to an edge that do not count for the flatness: the camera's blur mixes in what lies beyond."""
-_DRAWS = 48
-"""Draws of noise for the flatness: their standard deviation is right to 10 %."""
+
+@dataclass(frozen=True, kw_only=True)
+class FlatRule:
+    """Numbers of the inspection of faces, edges, holes and gaps.
+
+    Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the rendered
+    scans of docs/studies/inspection.py and on the simulated ones of tests/uwlts/inspection/test_inspect.py.
+
+    Attributes
+    ----------
+    fewest_points : int
+        Fewest points of a cloud, a face or a plate.
+    proposals : int
+        Random planes through three points that are tried for the largest face.
+    judging_points : int
+        Points, evenly thinned, that compare these planes.
+    near : float
+        Largest distance of a point from a proposed plane, as a fraction of the cloud's size. The plane is refined
+        afterwards.
+    refinements : int
+        Robust fits that refine the largest face.
+    off_face : float
+        Largest distance of a point from its face, in standard deviations.
+    histogram_bins : int
+        Bins of the histogram of heights that separates both faces of a step.
+    level_bins : int
+        Bins next to the first face that belong to this face, not to the second one.
+    gap_lines : int
+        Fewest consecutive lines of a gap; fewer lines may be missing by noise.
+    edge_std : float
+        Standard uncertainty of an edge, in point spacings: rectangular distribution between two lines (GUM, 4.3.7).
+    edge_blur : float
+        Standard uncertainty common to all edges, in point spacings: by the camera's blur the stripe may end up to about
+        one line beyond the edge.
+    plain_lines : range
+        Lines from an edge whose brightness is that of the face without the edge.
+    fewest_edges : int
+        Fewest edge points of a hole or of each side of a gap.
+    fewest_images : int
+        Fewest images that show a hole; in a single image lines may be missing by noise.
+    roundness : float
+        Largest scatter of the edge of a round hole, as a fraction of its radius.
+    hole_arc_deg : float
+        Least arc of a hole's edge, deg.
+    same_diameter : float
+        Largest difference of the diameters of bolt holes, as a fraction.
+    flat_cells : int
+        Cells across a face. The flatness is the range of their means.
+    edge_lines : int
+        Lines next to an edge without influence on the flatness: by the camera's blur they also show what is beyond.
+    draws : int
+        Noise draws for the flatness; 48 give a standard deviation to 10 %.
+    """
+
+    fewest_points: int = 200
+    proposals: int = 600
+    judging_points: int = 3000
+    near: float = 2e-3
+    refinements: int = 4
+    off_face: float = 6.0
+    histogram_bins: int = 200
+    level_bins: int = 6
+    gap_lines: int = 4
+    edge_std: float = 1 / np.sqrt(12.0)
+    edge_blur: float = 0.5
+    plain_lines: range = range(5, 12)
+    fewest_edges: int = 8
+    fewest_images: int = 2
+    roundness: float = 0.08
+    hole_arc_deg: float = 200.0
+    same_diameter: float = 0.2
+    flat_cells: int = 24
+    edge_lines: int = 4
+    draws: int = 48
+
+
+_RULE = FlatRule()
 
 _facing_plane = partial(fit_plane, towards=TOWARDS_SENSOR)
 
@@ -72,23 +115,23 @@ def inspect_step(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     Parameters
     ----------
     cloud
-        As for `inspect_pipe`.
+        See `inspect_pipe`.
 
     Raises
     ------
     CaptureError
         The file cannot be read.
     EvaluationError
-        There are no two such faces.
+        The cloud does not show two such faces.
     """
-    cloud = _cloud_of_faces(cloud)
-    normal = _largest_plane(cloud.points_mm)[0]
-    labels = label_step_faces(cloud.points_mm, height_mm=_height_between(cloud.points_mm @ normal))
+    cloud = _load_faces(cloud)
+    normal = _find_largest_plane(cloud.points_mm)[0]
+    labels = label_step_faces(cloud.points_mm, height_mm=_estimate_step_height(cloud.points_mm @ normal))
     lower, upper = (np.flatnonzero(labels == face) for face in (StepFace.LOWER, StepFace.UPPER))
-    base = _face_of(cloud, lower)
-    other = _face_of(cloud, upper)
+    base = _fit_face(cloud, lower)
+    other = _fit_face(cloud, upper)
     used = np.concatenate([lower, upper])
-    # The mean of the upper face less the lower one's plane below its middle, and the slopes of both.
+    # Height: mean of the upper face minus the lower plane below its middle. Slopes: difference of both planes.
     lever = np.append(1.0, (cloud.points_mm[upper].mean(axis=0) - base.point_mm) @ base.axes[:2].T)
     row = np.concatenate([-lever @ base.rows, np.full(len(upper), 1 / len(upper))])
     distance = cloud.points_mm[used] @ base.axes[2] - base.point_mm @ base.axes[2]
@@ -100,108 +143,108 @@ def inspect_step(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     random, common = errors.covariances(np.vstack([row, slopes]), residuals, neighbours_in_order(len(used)))
     angle = np.array([base.axes[k] @ other.axes[2] for k in (0, 1)])
     values = (
-        _plain(FeatureKind.STEP, "height", height, random, common, 0),
-        _angle(FeatureKind.STEP, angle, random[1:, 1:], None if common is None else common[1:, 1:]),
+        _make_value(FeatureKind.STEP, "height", height, random, common, 0),
+        _make_angle(FeatureKind.STEP, angle, random[1:, 1:], None if common is None else common[1:, 1:]),
     )
     points = cloud.points_mm[used]
     extent = np.append(np.ptp((points - base.point_mm) @ base.axes[:2].T, axis=0), height)
     feature = Feature(FeatureKind.STEP, "step", values, points.mean(axis=0), base.axes, extent, used)
-    return _inspection("step", cloud, (feature,), [(lower, base), (upper, other)])
+    return _make_inspection("step", cloud, (feature,), [(lower, base), (upper, other)])
 
 
 def inspect_flange(
     cloud: PointCloud | str | os.PathLike[str], *, datum: PointCloud | str | os.PathLike[str] | None = None
 ) -> Inspection:
-    """Measure a flange's face: flatness, holes, bolt circle, and its parallelism to the face of another cloud.
+    """Measure a flange's face: flatness, holes, bolt circle, and parallelism to the face of another cloud.
 
-    Of the holes the largest is the bore, those of like diameter are for bolts.
+    The largest hole is the bore; the other holes, if they have equal diameters, are bolt holes.
 
     Parameters
     ----------
     cloud
-        As for `inspect_pipe`.
+        See `inspect_pipe`.
     datum
-        Cloud of another face in the same frame, to which the flange's face is to be parallel, or its file.
+        Cloud of another face in the same frame, or its file. The parallelism refers to this face.
 
     Raises
     ------
     CaptureError
-        The file cannot be read.
+        A file cannot be read.
     EvaluationError
-        The cloud has no frames and lines, or no face.
+        The cloud does not contain frames and lines, or a face.
     """
-    cloud, datum = _cloud_of_faces(cloud), None if datum is None else loaded_cloud(datum)
-    used = _largest_plane(cloud.points_mm)[1]
-    face = _face_of(cloud, used)
-    values = [_flatness(cloud, face, used)]
+    cloud, datum = _load_faces(cloud), None if datum is None else loaded_cloud(datum)
+    used = _find_largest_plane(cloud.points_mm)[1]
+    face = _fit_face(cloud, used)
+    values = [_measure_flatness(cloud, face, used)]
     holes, features, notes = [], [], []
-    for edges in _gaps(cloud, face, used):
+    for edges in _find_gaps(cloud, face, used):
         try:
-            holes.append(_hole(edges))
+            holes.append(_fit_hole(edges))
         except EvaluationError as error:
-            if len(np.unique(edges.frame)) >= _FEWEST_IMAGES:
-                notes.append(_left_out(face, edges.places.mean(axis=0), str(error)))
+            if len(np.unique(edges.frame)) >= _RULE.fewest_images:
+                notes.append(_note_omission(face, edges.places.mean(axis=0), str(error)))
     if holes:
         largest = max(holes, key=lambda hole: hole.radius_mm)
         bolts = [hole for hole in holes if hole is not largest]
         if bolts:
             usual = float(np.median([hole.radius_mm for hole in bolts]))
-            same = [abs(hole.radius_mm - usual) < _SAME_SHARE * usual for hole in bolts]
+            same = [abs(hole.radius_mm - usual) < _RULE.same_diameter * usual for hole in bolts]
             notes += [
-                _left_out(
-                    face, hole.middle, f"its diameter is {2 * hole.radius_mm:.4g} mm, the others' {2 * usual:.4g}"
+                _note_omission(
+                    face,
+                    hole.middle,
+                    f"its diameter is {2 * hole.radius_mm:.4g} mm, that of the others {2 * usual:.4g} mm",
                 )
-                for hole, alike in zip(bolts, same, strict=True)
-                if not alike
+                for hole, is_same in zip(bolts, same, strict=True)
+                if not is_same
             ]
-            bolts = [hole for hole, alike in zip(bolts, same, strict=True) if alike]
+            bolts = [hole for hole, is_same in zip(bolts, same, strict=True) if is_same]
         if largest.radius_mm < 1.5 * max((hole.radius_mm for hole in bolts), default=0.0):
             bolts = holes
         else:
-            values.append(_diameter(FeatureKind.FLANGE, "bore", largest))
+            values.append(_make_diameter(FeatureKind.FLANGE, "bore", largest))
         offsets = [np.nan] * len(bolts)
         if len(bolts) >= 3:
-            circle, offsets = _bolt_circle(bolts)
+            circle, offsets = _measure_bolt_circle(bolts)
             values.append(circle)
         for number, (hole, offset) in enumerate(zip(bolts, offsets, strict=True), start=1):
-            features.append(_hole_feature(face, hole, number, offset))
+            features.append(_make_hole_feature(face, hole, number, offset))
     if datum is not None:
-        values.append(_parallelism(cloud, face, used, datum))
+        values.append(_measure_parallelism(cloud, face, used, datum))
     extent = np.append(np.ptp((cloud.points_mm[used] - face.point_mm) @ face.axes[:2].T, axis=0), values[0].value)
     whole = Feature(FeatureKind.FLANGE, "flange", tuple(values), face.point_mm, face.axes, extent, used)
-    return _inspection("flange", cloud, (whole, *features), [(used, face)], notes)
+    return _make_inspection("flange", cloud, (whole, *features), [(used, face)], notes)
 
 
 def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
-    """Measure the gap between two plates that the profiles cross: width, parallelism and flush.
+    """Measure a gap between two plates, scanned across: width, parallelism and flush.
 
     Parameters
     ----------
     cloud
-        As for `inspect_pipe`.
+        See `inspect_pipe`.
 
     Raises
     ------
     CaptureError
         The file cannot be read.
     EvaluationError
-        The cloud has no frames and lines, or no gap goes through it.
+        The cloud does not contain frames and lines, or no gap crosses the profiles.
     """
-    cloud = _cloud_of_faces(cloud)
-    # Both plates, which may be offset: everything on either side of the widest hole in the profiles.
+    cloud = _load_faces(cloud)
+    # Gaps are searched for in all points, as the plates may be offset.
     everything = np.arange(len(cloud))
-    face = _face_of(cloud, _largest_plane(cloud.points_mm)[1])
-    found = _gaps(cloud, face, everything)
+    face = _fit_face(cloud, _find_largest_plane(cloud.points_mm)[1])
+    found = _find_gaps(cloud, face, everything)
     if not found:
-        raise EvaluationError("no gap goes through the profiles: scan across it, so that each profile has both edges")
+        raise EvaluationError("no gap found: scan across it, so that each profile shows both edges")
     edges = max(found, key=lambda each: len(np.unique(each.frame)))
-    # Ends of the gaps alternate: first the one with the smaller line.
+    # The edge with the smaller line number comes first.
     sides = edges.places[edges.first], edges.places[~edges.first]
     middle = edges.places.mean(axis=0)
-    if min(map(len, sides)) < _FEWEST_EDGES:
-        raise EvaluationError(
-            f"the gap was seen in {min(map(len, sides))} profiles; at least {_FEWEST_EDGES} are needed"
-        )
+    if min(map(len, sides)) < _RULE.fewest_edges:
+        raise EvaluationError(f"{min(map(len, sides))} profiles show the gap; at least {_RULE.fewest_edges} are needed")
     along = np.linalg.svd(np.vstack([side - side.mean(axis=0) for side in sides]))[2][0]
     across = np.array([-along[1], along[0]])
     turn = np.stack([along, across])
@@ -215,10 +258,10 @@ def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     sign = np.sign(lines[1][0] - lines[0][0])
     left = np.concatenate([p - d @ line for p, d, line in zip(places, design, lines, strict=True)])
     weights = sign * np.hstack([-rows[0], rows[1]])
-    noise = max(float(np.sqrt(np.sum(left**2) / max(len(left) - 4, 1))), edges.spacing * _EDGE_STD)
+    noise = max(float(np.sqrt(np.sum(left**2) / max(len(left) - 4, 1))), edges.spacing * _RULE.edge_std)
     random = noise**2 * weights @ weights.T
-    # Both edges are blurred alike, whether or not the cloud states more.
-    common = np.diag([(2 * _EDGE_BLUR * edges.spacing) ** 2, 0.0])
+    # Blur shifts both edges in opposite directions, even if the cloud does not state it.
+    common = np.diag([(2 * _RULE.edge_blur * edges.spacing) ** 2, 0.0])
     order = np.concatenate([np.flatnonzero(edges.first), np.flatnonzero(~edges.first)])
     if edges.patterns is not None:
         moved = weights @ (edges.patterns[:, order] @ across).T
@@ -228,29 +271,29 @@ def inspect_gap(cloud: PointCloud | str | os.PathLike[str]) -> Inspection:
     angle = float(np.degrees(np.arctan(slope)))
     stds = [None if each is None else float(np.degrees(np.sqrt(each[1, 1]))) for each in (random, common)]
     values = [
-        _plain(kind, "width", float(width), random, common, 0),
+        _make_value(kind, "width", float(width), random, common, 0),
         plain_value(kind, "parallelism", abs(angle), stds[0] or 0.0, stds[1], least=0.0),
     ]
     local = (cloud.points_mm - face.point_mm) @ face.axes[:2].T - middle
     side = sign * (local @ across - np.mean([line[0] for line in lines]))
     clear = 0.5 * abs(float(width)) + 2 * edges.spacing
     plates = [np.flatnonzero(side < -clear), np.flatnonzero(side > clear)]
-    values.append(_flush(cloud, face, plates, middle))
+    values.append(_measure_flush(cloud, face, plates, middle))
     place = face.point_mm + middle @ face.axes[:2]
     axes = np.vstack([turn @ face.axes[:2], face.axes[2]])
     extent = np.array([float(np.ptp((edges.places - middle) @ along)), abs(float(width)), values[-1].value])
     feature = Feature(kind, "gap", tuple(values), place, axes, extent, edges.points)
     notes = [
-        _left_out(face, each.places.mean(axis=0), f"{number} profiles cross it, fewer than the gap")
+        _note_omission(face, each.places.mean(axis=0), f"{number} profiles cross it, fewer than the measured gap")
         for each in found
-        if each is not edges and (number := len(np.unique(each.frame))) >= _FEWEST_IMAGES
+        if each is not edges and (number := len(np.unique(each.frame))) >= _RULE.fewest_images
     ]
-    return _inspection("gap", cloud, (feature,), [], notes)
+    return _make_inspection("gap", cloud, (feature,), [], notes)
 
 
 @dataclass(frozen=True, eq=False)
 class _Face:
-    """A plane: point (3,), axes (3, 3) in it and outwards, residuals (n,), and rows (3, n) of its level and slopes."""
+    """Plane: point (3,), axes (3, 3) in it and outwards, residuals (n,), and rows (3, n) of its level and slopes."""
 
     point_mm: np.ndarray
     axes: np.ndarray
@@ -260,8 +303,23 @@ class _Face:
 
 
 class _Edges(NamedTuple):
-    """Edge points in a face: places (E, 2), the image of each, whether it comes first along its profile, the motion
-    (M, E, 2) with each pattern, the indices of the face's points beside them, and the usual spacing of points."""
+    """Edge points in a face.
+
+    Attributes
+    ----------
+    places : (E, 2) float64
+        Places in the face, mm.
+    frame : (E,) int
+        Image of each point.
+    first : (E,) bool
+        Whether the point comes first along its profile.
+    patterns : (M, E, 2) float64 or None
+        Displacements by the common patterns.
+    points : (E,) int
+        Adjacent points of the cloud.
+    spacing : float
+        Median point spacing, mm.
+    """
 
     places: np.ndarray
     frame: np.ndarray
@@ -273,7 +331,21 @@ class _Edges(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Hole:
-    """A circle in a face: middle (2,), radius, covariance (3, 3), changes (M, 3) with patterns, edge points, blur."""
+    """Circle in a face.
+
+    Attributes
+    ----------
+    middle : (2,) float64
+    radius_mm : float
+    random : (3, 3) float64
+        Covariance of middle and radius by noise.
+    moved : (M, 3) float64 or None
+        Changes of middle and radius by the common patterns.
+    points : (E,) int
+        Points of the edge.
+    blur_mm : float
+        Standard uncertainty of the radius by the camera's blur.
+    """
 
     middle: np.ndarray
     radius_mm: float
@@ -283,51 +355,53 @@ class _Hole:
     blur_mm: float
 
 
-def _cloud_of_faces(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
-    """The cloud, read if it is a file; EvaluationError if it has too few points."""
+def _load_faces(cloud: PointCloud | str | os.PathLike[str]) -> PointCloud:
+    """Return the cloud, read if it is a file; raise EvaluationError if it has too few points."""
     cloud = loaded_cloud(cloud)
-    if len(cloud) < _FEWEST:
-        raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_FEWEST} are needed")
+    if len(cloud) < _RULE.fewest_points:
+        raise EvaluationError(f"the cloud has {len(cloud)} points; at least {_RULE.fewest_points} are needed")
     return cloud
 
 
-def _largest_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Normal (3,) towards the sensor and indices of the points of the plane that holds most of them."""
-    thinned = evenly_thinned(points, _THINNED)
+def _find_largest_plane(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normal (3,), towards the sensor, and the points' indices of the plane with most points."""
+    thinned = evenly_thinned(points, _RULE.judging_points)
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     rng = np.random.default_rng(0)
-    corners = thinned[rng.integers(len(thinned), size=(_PROPOSALS, 3))]
+    corners = thinned[rng.integers(len(thinned), size=(_RULE.proposals, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
     normals, corners = normals[length > 0] / length[length > 0, None], corners[length > 0, 0]
     levels = np.einsum("pi,pi->p", normals, corners)
-    near = np.abs(thinned @ normals.T - levels) < _NEAR_SHARE * size
+    near = np.abs(thinned @ normals.T - levels) < _RULE.near * size
     best = int(np.argmax(near.sum(axis=0)))
-    inside = np.abs(points @ normals[best] - levels[best]) < _NEAR_SHARE * size
+    inside = np.abs(points @ normals[best] - levels[best]) < _RULE.near * size
     normal = normals[best]
-    for _ in range(_REFINED):
+    for _ in range(_RULE.refinements):
         fit = fit_robustly(_facing_plane, points[inside]).fit
         normal, distance = fit.normal, fit.distances_mm(points)
         spread = robust_std(distance[inside])
-        inside = np.abs(distance) < _OFF_FACE * max(spread, 1e-9)
-    if np.count_nonzero(inside) < _FEWEST:
-        raise EvaluationError(f"the largest flat face holds {np.count_nonzero(inside)} points; {_FEWEST} are needed")
+        inside = np.abs(distance) < _RULE.off_face * max(spread, 1e-9)
+    if np.count_nonzero(inside) < _RULE.fewest_points:
+        raise EvaluationError(
+            f"the largest flat face holds {np.count_nonzero(inside)} points; {_RULE.fewest_points} are needed"
+        )
     return normal, np.flatnonzero(inside)
 
 
-def _height_between(levels: np.ndarray) -> float:
-    """Distance of the two levels with most points."""
+def _estimate_step_height(levels: np.ndarray) -> float:
+    """Return the distance of the two most frequent heights."""
     low, high = np.quantile(levels, [0.001, 0.999])
-    count, edges = np.histogram(levels, bins=200, range=(low, high))
+    count, edges = np.histogram(levels, bins=_RULE.histogram_bins, range=(low, high))
     first = int(np.argmax(count))
-    apart = np.abs(np.arange(200) - first) > 6
+    apart = np.abs(np.arange(len(count)) - first) > _RULE.level_bins
     if high <= low or not count[apart].any():
-        raise EvaluationError("there is one level only: show both faces of the step")
+        raise EvaluationError("only one face found: the cloud has to show both faces of the step")
     second = int(np.argmax(np.where(apart, count, 0)))
     return float(abs(edges[second] - edges[first]))
 
 
-def _face_of(cloud: PointCloud, chosen: np.ndarray) -> _Face:
+def _fit_face(cloud: PointCloud, chosen: np.ndarray) -> _Face:
     points = cloud.points_mm[chosen]
     fit = fit_plane(points, towards=TOWARDS_SENSOR)
     axes = np.array([fit.axes[0], np.cross(fit.normal, fit.axes[0]), fit.normal])
@@ -337,22 +411,22 @@ def _face_of(cloud: PointCloud, chosen: np.ndarray) -> _Face:
     return _Face(fit.point_mm, axes, local[:, 2], rows, fit.std_mm)
 
 
-def _plain(
+def _make_value(
     kind: FeatureKind, name: str, value: float, random: np.ndarray, common: np.ndarray | None, at: int
 ) -> FeatureValue:
     shared = None if common is None else float(np.sqrt(common[at, at]))
     return plain_value(kind, name, value, float(np.sqrt(random[at, at])), shared, least=0.0)
 
 
-def _angle(kind: FeatureKind, slopes: np.ndarray, random: np.ndarray, common: np.ndarray | None) -> FeatureValue:
-    """Angle in deg between two planes whose slopes differ by (2,)."""
+def _make_angle(kind: FeatureKind, slopes: np.ndarray, random: np.ndarray, common: np.ndarray | None) -> FeatureValue:
+    """Return the angle in deg between two planes whose slopes differ by (2,)."""
     size = float(np.linalg.norm(slopes))
     along = slopes / size if size > 0 else np.array([1.0, 0.0])
     stds = [None if each is None else float(np.degrees(np.sqrt(along @ each @ along))) for each in (random, common)]
     return plain_value(kind, "parallelism", float(np.degrees(np.arctan(size))), stds[0] or 0.0, stds[1], least=0.0)
 
 
-def _inspection(
+def _make_inspection(
     kind: str,
     cloud: PointCloud,
     features: tuple[Feature, ...],
@@ -363,21 +437,24 @@ def _inspection(
     for own, face in faces:
         deviation[own] = face.residuals_mm
     if cloud.uncertainty is None:
-        notes = "the cloud states no uncertainty: intervals are of the scatter of its points alone", *notes
+        notes = WITHOUT_UNCERTAINTY, *notes
     return Inspection(kind, features, deviation, np.full(len(cloud), np.nan), tuple(notes))
 
 
-def _left_out(face: _Face, place: np.ndarray, reason: str) -> str:
-    """Note on a hole at a place (2,) of a face that is not listed."""
+def _note_omission(face: _Face, place: np.ndarray, reason: str) -> str:
+    """Return a note on an omitted hole at a place (2,) of a face."""
     x, y, z = face.point_mm + place @ face.axes[:2]
-    return f"a hole at ({x:.1f}, {y:.1f}, {z:.1f}) mm is not listed: {reason}"
+    return f"a hole at ({x:.1f}, {y:.1f}, {z:.1f}) mm is omitted: {reason}"
 
 
-def _flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> FeatureValue:
-    """Range of the means of small cells of the face, less what noise alone adds to it (by drawing it again)."""
-    inner = _away_from_edges(cloud, used)
+def _measure_flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> FeatureValue:
+    """Return the range of the cell means of a face.
+
+    Noise increases the range. This bias is estimated by drawing the noise again, and subtracted.
+    """
+    inner = _mask_inner_points(cloud, used)
     local = (cloud.points_mm[used] - face.point_mm) @ face.axes[:2].T
-    cell = float(np.ptp(local, axis=0).max()) / _FLAT_CELLS
+    cell = float(np.ptp(local, axis=0).max()) / _RULE.flat_cells
     index = np.unique(np.floor(local / cell).astype(int), axis=0, return_inverse=True)[1].ravel()
     count = np.bincount(index[inner], minlength=int(index.max()) + 1)
     full = count >= max(8, 0.2 * np.median(count))
@@ -395,31 +472,34 @@ def _flatness(cloud: PointCloud, face: _Face, used: np.ndarray) -> FeatureValue:
     def changed(moves: np.ndarray) -> float:
         return float(np.ptp(found + means(moves))) - value
 
-    drawn = [changed(moves) for moves in noisy.drawn(_DRAWS)]
+    drawn = [changed(moves) for moves in noisy.drawn(_RULE.draws)]
     bias, common = max(float(np.mean(drawn)), 0.0), errors.by_patterns(changed)
     random = float(np.hypot(np.std(drawn), bias))
     shared = None if common is None else float(common)
     return plain_value(FeatureKind.FLANGE, "flatness", max(value - bias, 0.0), random, shared, least=0.0)
 
 
-def _away_from_edges(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
-    """Which of the points (N,) have enough lines beside them that were seen, on both sides; all without lines."""
+def _mask_inner_points(cloud: PointCloud, used: np.ndarray) -> np.ndarray:
+    """Return a mask (N,) of the points that are not near an edge; all points if lines are unknown."""
     if np.any(cloud.frame[used] < 0) or np.any(cloud.line[used] < 0):
         return np.ones(len(used), bool)
     order = np.lexsort((cloud.line[used], cloud.frame[used]))
     frame, line = cloud.frame[used][order], cloud.line[used][order]
-    # Single lost lines are no edge.
-    run = np.cumsum(np.append(0, (np.diff(frame) != 0) | (np.diff(line) >= _LEAST_GAP)))
+    # Few missing lines are no edge.
+    run = np.cumsum(np.append(0, (np.diff(frame) != 0) | (np.diff(line) >= _RULE.gap_lines)))
     first, last = np.searchsorted(run, run), np.searchsorted(run, run, side="right") - 1
     inner = np.empty(len(used), bool)
-    inner[order] = (line - line[first] >= _EDGE_LINES) & (line[last] - line >= _EDGE_LINES)
+    inner[order] = (line - line[first] >= _RULE.edge_lines) & (line[last] - line >= _RULE.edge_lines)
     return inner
 
 
-def _gaps(cloud: PointCloud, face: _Face, used: np.ndarray) -> list[_Edges]:
-    """Edges of the holes that profiles cross, each hole by itself: gaps that overlap in neighbouring images."""
+def _find_gaps(cloud: PointCloud, face: _Face, used: np.ndarray) -> list[_Edges]:
+    """Return the edges of each hole that profiles cross. Overlapping gaps of neighbouring images are one hole."""
     if np.any(cloud.frame[used] < 0) or np.any(cloud.line[used] < 0):
-        raise EvaluationError("edges are found along the profiles, and the cloud has no frames and lines")
+        raise EvaluationError(
+            "edges are found along the profiles, but the cloud does not contain frames and lines: take a cloud that "
+            "`reconstruct` has made"
+        )
     order = np.lexsort((cloud.line[used], cloud.frame[used]))
     own = used[order]
     frame, line = cloud.frame[own], cloud.line[own]
@@ -427,10 +507,10 @@ def _gaps(cloud: PointCloud, face: _Face, used: np.ndarray) -> list[_Edges]:
     same = frame[1:] == frame[:-1]
     step = np.linalg.norm(np.diff(local, axis=0), axis=1)
     spacing = float(np.median(step[same & (np.diff(line) == 1)]))
-    at = np.flatnonzero(same & (np.diff(line) >= _LEAST_GAP) & (step > _LEAST_GAP * spacing))
+    at = np.flatnonzero(same & (np.diff(line) >= _RULE.gap_lines) & (step > _RULE.gap_lines * spacing))
     if not len(at):
         return []
-    beyond = _beyond_last(cloud, own, np.append(0, np.cumsum(~same)), face, spacing)
+    beyond = _locate_edges(cloud, own, np.append(0, np.cumsum(~same)), face, spacing)
     number = np.unique(cloud.frame, return_inverse=True)[1]
     image = number[own[at]]
     lower, upper = line[at], line[at + 1]
@@ -457,11 +537,11 @@ def _gaps(cloud: PointCloud, face: _Face, used: np.ndarray) -> list[_Edges]:
     return result
 
 
-def _beyond_last(cloud: PointCloud, own: np.ndarray, row: np.ndarray, face: _Face, spacing: float) -> np.ndarray:
-    """How far beyond a point (N,) an edge lies if it is the last one before it: (N, 2), after and before it in its row.
+def _locate_edges(cloud: PointCloud, own: np.ndarray, row: np.ndarray, face: _Face, spacing: float) -> np.ndarray:
+    """Return the distances (N, 2) from each point to an edge after it and before it along its profile.
 
-    Blur of standard deviation s leaves the share Phi(d / s) of a stripe's brightness at a distance d within an edge.
-    Where brightness or blur is not known, or the share tells nothing, the edge is half a spacing away.
+    A blur with standard deviation s leaves the fraction Phi(d / s) of the brightness at a distance d within the edge.
+    The distance is half a spacing if brightness or blur is unknown, or if the result exceeds one spacing.
     """
     result = np.full((len(own), 2), 0.5 * spacing)
     bright = cloud.intensity[own].astype(float)
@@ -472,7 +552,7 @@ def _beyond_last(cloud: PointCloud, own: np.ndarray, row: np.ndarray, face: _Fac
     if not (np.isfinite(bright).all() and (blur > 0).all()):
         return result
     for side, sign in ((0, -1), (1, 1)):
-        inner = np.stack([np.clip(np.arange(len(own)) + sign * k, 0, len(own) - 1) for k in _WHOLE_LINES])
+        inner = np.stack([np.clip(np.arange(len(own)) + sign * k, 0, len(own) - 1) for k in _RULE.plain_lines])
         known = (row[inner] == row).all(axis=0)
         share = bright / np.maximum(np.median(bright[inner], axis=0), 1e-9)
         within = blur * norm.ppf(np.clip(share, 0.02, 0.98))
@@ -481,31 +561,36 @@ def _beyond_last(cloud: PointCloud, own: np.ndarray, row: np.ndarray, face: _Fac
     return result
 
 
-def _hole(edges: _Edges) -> _Hole:
-    """A round hole by least squares of its edge. EvaluationError where that is not round or not seen all around."""
-    if len(edges.places) < _FEWEST_EDGES:
-        raise EvaluationError(f"its edge has {len(edges.places)} points; at least {_FEWEST_EDGES} are needed")
-    solved = _circle(edges.places)
+def _fit_hole(edges: _Edges) -> _Hole:
+    """Fit a round hole to its edge by least squares.
+
+    EvaluationError if the edge is not round, or too little of the edge is known.
+    """
+    if len(edges.places) < _RULE.fewest_edges:
+        raise EvaluationError(f"its edge has {len(edges.places)} points, at least {_RULE.fewest_edges} are needed")
+    solved = _fit_circle(edges.places)
     away = edges.places - solved[:2]
     distance = np.linalg.norm(away, axis=1)
     left = distance - solved[2]
     angle = np.sort(np.degrees(np.arctan2(away[:, 1], away[:, 0])))
     seen = 360 - float(np.max(np.diff(np.append(angle, angle[0] + 360))))
     scatter = float(np.sqrt(np.sum(left**2) / (len(left) - 3)))
-    if scatter > (limit := max(_ROUND_SHARE * solved[2], 1.5 * edges.spacing)):
-        raise EvaluationError(f"it is not round: its edge is off a circle by {scatter:.2g} mm, more than {limit:.2g}")
-    if seen < _HOLE_ARC:
-        raise EvaluationError(f"{seen:.0f} deg of its edge were seen; {_HOLE_ARC:.0f} are needed")
+    if scatter > (limit := max(_RULE.roundness * solved[2], 1.5 * edges.spacing)):
+        raise EvaluationError(
+            f"it is not round: its edge scatters about a circle by {scatter:.2g} mm, more than {limit:.2g} mm"
+        )
+    if seen < _RULE.hole_arc_deg:
+        raise EvaluationError(f"the cloud shows {seen:.0f} deg of its edge; {_RULE.hole_arc_deg:.0f} deg are needed")
     rows = np.linalg.pinv(np.column_stack([away / distance[:, None], np.ones(len(left))]))
-    random = max(scatter, edges.spacing * _EDGE_STD) ** 2 * rows @ rows.T
+    random = max(scatter, edges.spacing * _RULE.edge_std) ** 2 * rows @ rows.T
     moved = None
     if edges.patterns is not None:
         moved = np.einsum("mej,ej->me", edges.patterns, away / distance[:, None]) @ rows.T
-    return _Hole(solved[:2], float(solved[2]), random, moved, edges.points, _EDGE_BLUR * edges.spacing)
+    return _Hole(solved[:2], float(solved[2]), random, moved, edges.points, _RULE.edge_blur * edges.spacing)
 
 
-def _circle(places: np.ndarray) -> np.ndarray:
-    """Middle and radius (3,) of the least-squares circle (Gauss-Newton from the algebraic one)."""
+def _fit_circle(places: np.ndarray) -> np.ndarray:
+    """Return middle and radius (3,) of the least-squares circle (Gauss-Newton from the algebraic circle)."""
     centre = places.mean(axis=0)
     local = places - centre
     solved = np.linalg.lstsq(np.column_stack([2 * local, np.ones(len(local))]), np.sum(local**2, axis=1), rcond=None)[0]
@@ -518,20 +603,20 @@ def _circle(places: np.ndarray) -> np.ndarray:
         result = result + step
         if np.abs(step).max() < 1e-9:
             return result
-    raise EvaluationError(f"no circle fits the {len(places)} places: the least squares do not settle")
+    raise EvaluationError(f"no circle fits the {len(places)} places: the least-squares fit does not converge")
 
 
-def _diameter(kind: FeatureKind, name: str, hole: _Hole) -> FeatureValue:
-    # Both ends of a diameter are blurred alike, whether or not the cloud states more.
+def _make_diameter(kind: FeatureKind, name: str, hole: _Hole) -> FeatureValue:
+    # Blur shifts both ends of a diameter in opposite directions, even if the cloud does not state it.
     shared = 0.0 if hole.moved is None else float(np.linalg.norm(hole.moved[:, 2]))
     common = 2 * float(np.hypot(shared, hole.blur_mm))
     return plain_value(kind, name, 2 * hole.radius_mm, 2 * float(np.sqrt(hole.random[2, 2])), common)
 
 
-def _bolt_circle(bolts: list[_Hole]) -> tuple[FeatureValue, list[float]]:
-    """Diameter of the circle through the middles, and the distance of each from its place on an even division."""
+def _measure_bolt_circle(bolts: list[_Hole]) -> tuple[FeatureValue, list[float]]:
+    """Return the bolt circle's diameter, and each hole's distance from its place on an even division."""
     middles = np.array([hole.middle for hole in bolts])
-    circle = _circle(middles)
+    circle = _fit_circle(middles)
     away = middles - circle[:2]
     units = away / np.linalg.norm(away, axis=1, keepdims=True)
     rows = np.linalg.pinv(np.column_stack([units, np.ones(len(bolts))]))
@@ -543,7 +628,7 @@ def _bolt_circle(bolts: list[_Hole]) -> tuple[FeatureValue, list[float]]:
         common = 2 * float(np.linalg.norm(rows[2] @ along))
     value = plain_value(FeatureKind.FLANGE, "bolt circle", 2 * float(circle[2]), random, common)
     angle = np.arctan2(away[:, 1], away[:, 0])
-    # Holes that were not seen leave their places free: the division is that of the smallest angle between two.
+    # Holes may be missing: the smallest angle between two holes gives the division.
     between = np.diff(np.sort(np.append(angle, angle.min() + 2 * np.pi)))
     count = max(len(bolts), round(2 * np.pi / float(np.min(between))))
     phase = np.angle(np.mean(np.exp(1j * count * angle))) / count
@@ -552,8 +637,8 @@ def _bolt_circle(bolts: list[_Hole]) -> tuple[FeatureValue, list[float]]:
     return value, np.linalg.norm(middles - even, axis=1).tolist()
 
 
-def _hole_feature(face: _Face, hole: _Hole, number: int, offset: float) -> Feature:
-    values = [_diameter(FeatureKind.HOLE, "diameter", hole)]
+def _make_hole_feature(face: _Face, hole: _Hole, number: int, offset: float) -> Feature:
+    values = [_make_diameter(FeatureKind.HOLE, "diameter", hole)]
     if np.isfinite(offset):
         random = float(np.sqrt(np.trace(hole.random[:2, :2]) / 2))
         common = None if hole.moved is None else float(np.sqrt(np.mean(np.sum(hole.moved[:, :2] ** 2, axis=0))))
@@ -563,10 +648,10 @@ def _hole_feature(face: _Face, hole: _Hole, number: int, offset: float) -> Featu
     return Feature(FeatureKind.HOLE, f"hole {number}", tuple(values), place, face.axes, extent, hole.points)
 
 
-def _parallelism(cloud: PointCloud, face: _Face, used: np.ndarray, datum: PointCloud) -> FeatureValue:
-    """Angle to the largest face of another cloud, whose calibration counts as independent."""
-    on_datum = _largest_plane(datum.points_mm)[1]
-    other = _face_of(datum, on_datum)
+def _measure_parallelism(cloud: PointCloud, face: _Face, used: np.ndarray, datum: PointCloud) -> FeatureValue:
+    """Return the angle to the largest face of another cloud, whose calibration is taken as independent."""
+    on_datum = _find_largest_plane(datum.points_mm)[1]
+    other = _fit_face(datum, on_datum)
     facing = 1.0 if face.axes[2] @ other.axes[2] > 0 else -1.0
     slopes = facing * face.axes[:2] @ other.axes[2]
     random, common = np.zeros((2, 2)), None
@@ -577,17 +662,17 @@ def _parallelism(cloud: PointCloud, face: _Face, used: np.ndarray, datum: PointC
         random = random + by_noise
         if by_common is not None:
             common = by_common if common is None else common + by_common
-    return _angle(FeatureKind.FLANGE, slopes, random, common)
+    return _make_angle(FeatureKind.FLANGE, slopes, random, common)
 
 
-def _flush(cloud: PointCloud, face: _Face, plates: list[np.ndarray], middle: np.ndarray) -> FeatureValue:
-    """Offset along the normal of two plates at a place between them."""
-    if min(map(len, plates)) < _FEWEST:
-        raise EvaluationError("too few points on one side of the gap for its plate")
+def _measure_flush(cloud: PointCloud, face: _Face, plates: list[np.ndarray], middle: np.ndarray) -> FeatureValue:
+    """Return the offset of two plates along the normal at a place between them."""
+    if min(map(len, plates)) < _RULE.fewest_points:
+        raise EvaluationError(f"the smaller plate has {min(map(len, plates))} points; {_RULE.fewest_points} are needed")
     parts, used, residuals = [], [], []
     for sign, chosen in zip((-1.0, 1.0), plates, strict=True):
         local = (cloud.points_mm[chosen] - face.point_mm) @ face.axes.T
-        near = np.abs(local[:, 2] - np.median(local[:, 2])) < _OFF_FACE * max(
+        near = np.abs(local[:, 2] - np.median(local[:, 2])) < _RULE.off_face * max(
             robust_std(local[:, 2] - np.median(local[:, 2])), 1e-9
         )
         chosen, local = chosen[near], local[near]
@@ -600,4 +685,4 @@ def _flush(cloud: PointCloud, face: _Face, plates: list[np.ndarray], middle: np.
     offset = float(weights[0] @ ((cloud.points_mm[both] - face.point_mm) @ face.axes[2]))
     errors = PointErrors.along(cloud, both, np.broadcast_to(face.axes[2], (len(both), 3)))
     random, common = errors.covariances(weights, np.concatenate(residuals), neighbours_in_order(len(both)))
-    return _plain(FeatureKind.GAP, "flush", abs(offset), random, common, 0)
+    return _make_value(FeatureKind.GAP, "flush", abs(offset), random, common, 0)

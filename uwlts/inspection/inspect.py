@@ -1,4 +1,4 @@
-"""Inspection of a cloud by the kind of object that it shows."""
+"""Inspection of a cloud by kind of object."""
 
 import inspect
 import os
@@ -23,8 +23,8 @@ INSPECTIONS: dict[InspectionKind, Callable[..., Inspection]] = {
 
 
 def inspected(cloud: PointCloud | str | os.PathLike[str], kind: InspectionKind, **options: object) -> Inspection:
-    """Inspect a cloud by the function of a kind; EvaluationError for an option that the kind does not have."""
+    """Inspect a cloud as a kind of object; EvaluationError for an option that this kind does not have."""
     function = INSPECTIONS[kind]
     if foreign := [f"`{name}`" for name in options if name not in inspect.signature(function).parameters]:
-        raise EvaluationError(f"a {kind} has no {', '.join(foreign)}: leave it out")
+        raise EvaluationError(f"the inspection of a {kind} does not take {', '.join(foreign)}: remove the option")
     return function(cloud, **options)

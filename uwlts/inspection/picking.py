@@ -1,4 +1,4 @@
-"""Lengths and shapes measured where someone points in a cloud, with their uncertainty."""
+"""Lengths and shapes measured at picked places of a cloud, with uncertainty."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,16 +20,16 @@ _FITS: dict[Shape, Callable[[np.ndarray], SphereFit | FlatFit | CylinderFit]] = 
     "cylinder": fit_cylinder,
 }
 _MOST_POINTS = 20_000
-"""More add nothing but time: what remains is common to all points."""
+"""Most points of a fit; with more points the errors common to all of them dominate."""
 _DRAWS = 8
-"""Draws of noise: the standard deviation of so many is right to 27 %."""
+"""Noise draws; eight give a standard deviation to 27 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class Inspected:
-    """What was measured: figures in mm by their names, their uncertainty where the cloud has one, and the points used.
+    """Measured figures in mm by name, their uncertainties if the cloud has any, and the numbers of points.
 
-    Of a length ``points`` are the two that it joins; of a shape ``points_used`` of those near it agree with it.
+    For a length, ``points_used`` is 2. For a shape, it counts the points that agree with the fit.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Inspected:
     points_rejected: int
 
     def text(self) -> str:
-        """In a line, with expanded uncertainties (k = 2) where they are known."""
+        """Return a line of text, with expanded uncertainties (k = 2) if they are known."""
         figures = []
         for name, value in self.figures_mm.items():
             known = self.uncertainty.get(name)
@@ -50,20 +50,20 @@ class Inspected:
 
 
 def point_near(cloud: PointCloud, place_mm: np.ndarray) -> int:
-    """Index of the point nearest to a place (3,)."""
+    """Return the index of the point nearest to a place (3,)."""
     if len(cloud) == 0:
-        raise EvaluationError("the cloud has no points to measure")
+        raise EvaluationError("the cloud is empty: there are no points to measure")
     return int(np.argmin(np.sum((cloud.points_mm - place_mm) ** 2, axis=1)))
 
 
 def length_between(cloud: PointCloud, first: int, second: int) -> Inspected:
-    """Distance between two points of a cloud.
+    """Return the distance between two points of a cloud.
 
-    Its uncertainty is that of the two points with what they share (GUM, Eq. 13): a pattern of the calibration moves
-    both, the position of an image both if they are of one image.
+    Its uncertainty includes errors that both points share (GUM, Eq. 13): the calibration's patterns, and the position
+    of their image if both are in one image.
     """
     if first == second:
-        raise EvaluationError("both ends of the length are the same point: pick another one")
+        raise EvaluationError("both ends of the length are the same point: pick another point")
     way = cloud.points_mm[second] - cloud.points_mm[first]
     length = float(np.linalg.norm(way))
     unit = way / length if length else np.array([0.0, 0.0, 1.0])
@@ -81,15 +81,14 @@ def length_between(cloud: PointCloud, first: int, second: int) -> Inspected:
 
 
 def shape_near(cloud: PointCloud, place_mm: np.ndarray, radius_mm: float, shape: Shape) -> Inspected:
-    """The shape that best fits the points within a radius of a place (3,), those off it left out.
+    """Fit a shape robustly to the points within a radius of a place (3,).
 
-    Uncertainties are as of an artefact's figures (`uwlts.evaluation.figure_uncertainty`): the fit is repeated with
-    each pattern of the calibration, and with noise drawn anew. EvaluationError where the points do not determine the
-    shape.
+    Uncertainties are propagated as for artefacts (`uwlts.evaluation.figure_uncertainty`): the fit is repeated with each
+    pattern of the calibration and with drawn noise. EvaluationError if the points do not determine the shape.
     """
     near = np.flatnonzero(np.sum((cloud.points_mm - place_mm) ** 2, axis=1) <= radius_mm**2)
     if len(near) == 0:
-        raise EvaluationError(f"no points within {radius_mm:g} mm of the place: pick another one, or a larger radius")
+        raise EvaluationError(f"no points within {radius_mm:g} mm of the place: pick another place or a larger radius")
     near = near[:: -(-len(near) // _MOST_POINTS)]
     points, fit = cloud.points_mm[near], _FITS[shape]
     robust = fit_robustly(fit, points)

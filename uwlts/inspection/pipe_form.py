@@ -14,38 +14,79 @@ from uwlts.fitting.shapes import CylinderFit, fit_cylinder
 from uwlts.inspection.features import Feature, FeatureKind, FeatureValue, amplitude_value, plain_value
 from uwlts.storage.cloud import PointCloud
 
-_TO_START = 6000
-"""Points for the first cylinder; more add nothing to a start."""
-_MOST_POINTS = 150_000
-"""Points for the form; with more what remains is common to all of them."""
-_ROUNDS = 12
-"""Rounds of the axis at most; each divides its error by some ten."""
-_STILL_MM = 1e-6
-"""Move of the axis that ends the rounds."""
-_SECTORS = 72
-"""Sectors of 5 deg, as of a pipe standard (`uwlts.evaluation.artefact_figures`)."""
-_LEAST_ARC = np.pi
-"""Arc from which the ovality is known: of less a shift of the axis passes for it."""
 LARGEST_OVALITY = 0.02
-"""Of the diameter: the largest out of roundness that a pipe may have where it cannot be seen, unless the pipe's own
-specification is given. A choice: pipes bent in the yard or dented by handling are less round than new line pipe."""
-_WHOLE_ARC = np.radians(300.0)
-"""Arc from which the third and fourth harmonics are fitted too, so that they do not pass for others."""
-_FEWEST_OF_SECTION = 60
-"""Points of a section."""
-_LEAST_SHARE = 0.8
-"""Part of the whole pipe's arc (up to half of its circumference) that a section shows."""
-_MOST_SECTIONS = 12
-MOST_OFF_SHARE = 0.06
-"""Of the radius: the deepest blemish or ovality that still counts as the pipe's surface."""
+"""Largest ovality of a pipe without a specification, as a fraction of its diameter, if the cloud does not show it.
+
+A choice: pipes bent in the yard or dented by handling are less round than new line pipe.
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipeFormRule:
+    """Numbers of the fit of a pipe's form.
+
+    Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the rendered
+    pipes of docs/studies/inspection.py and on the simulated ones of tests/uwlts/inspection/test_inspect.py.
+
+    Attributes
+    ----------
+    start_points : int
+        Points for the first cylinder; more points would not change this start.
+    most_points : int
+        Most points of the fit; with more points the errors common to all of them dominate.
+    rounds : int
+        Most rounds of the fit; each divides the error of the axis by about ten.
+    still_mm : float
+        Change of the axis, mm, that ends the rounds.
+    sectors : int
+        Sectors around the pipe: 5 deg each, as for a pipe standard (`uwlts.evaluation.artefact_figures`).
+    lengths : int
+        Parts of the length within which errors of neighbouring points are correlated.
+    oval_arc : float
+        Least arc, rad, that determines the ovality; on a smaller arc it is not separable from a shift of the axis.
+    whole_arc : float
+        Least arc, rad, for a fit of the third and fourth harmonics, which would bias the others.
+    section_points : int
+        Fewest points of a section.
+    section_arc : float
+        Least arc of a section, as a fraction of the whole pipe's arc (at most half of the circumference).
+    most_sections : int
+        Number of sections by default.
+    off_pipe : float
+        Distance from the pipe, as a fraction of its radius, of the deepest blemish or largest ovality that still counts
+        as its surface.
+    """
+
+    start_points: int = 6000
+    most_points: int = 150_000
+    rounds: int = 12
+    still_mm: float = 1e-6
+    sectors: int = 72
+    lengths: int = 12
+    oval_arc: float = np.pi
+    whole_arc: float = np.radians(300.0)
+    section_points: int = 60
+    section_arc: float = 0.8
+    most_sections: int = 12
+    off_pipe: float = 0.06
+
+
+FORM_RULE = PipeFormRule()
 
 
 @dataclass(frozen=True, eq=False)
 class PipeFrame:
-    """Cylindrical frame of a pipe: a point (3,) of the axis, and two directions across and the axis as rows (3, 3).
+    """Cylindrical frame of a pipe.
 
-    Places along count from the point, angles from the first direction towards the second. Only `PipeFrame.about` and
-    `PipeFrame.moved` make one; the second keeps the directions across, so that places and angles stay comparable.
+    Places along count from `point_mm`, angles from the first direction across towards the second. `shift_and_tilt`
+    keeps the directions across, so that places and angles of successive fits are comparable.
+
+    Attributes
+    ----------
+    point_mm : (3,) float64
+        Point on the axis.
+    axes : (3, 3) float64
+        Unit vectors in rows: two directions across, and the axis.
     """
 
     point_mm: np.ndarray
@@ -53,12 +94,12 @@ class PipeFrame:
 
     @classmethod
     def about(cls, cylinder: CylinderFit, points_mm: np.ndarray) -> PipeFrame:
-        """Frame of a cylinder, with its point in the middle of points (N, 3)."""
+        """Return the frame of a cylinder, with its point in the middle of points (N, 3)."""
         point, axis = cylinder.point_mm, cylinder.axis
         return cls(point + axis * np.median((points_mm - point) @ axis), np.array([*cylinder.across, axis]))
 
-    def moved(self, shift: np.ndarray, slopes: np.ndarray) -> PipeFrame:
-        """The frame shifted (2,), mm, and its axis turned by slopes (2,), both along the directions across."""
+    def shift_and_tilt(self, shift: np.ndarray, slopes: np.ndarray) -> PipeFrame:
+        """Return the frame shifted by (2,) mm, with its axis tilted by slopes (2,), along the directions across."""
         across = self.axes[:2]
         third = self.axes[2] + slopes @ across
         third = third / np.linalg.norm(third)
@@ -66,25 +107,43 @@ class PipeFrame:
         first = first / np.linalg.norm(first)
         return PipeFrame(self.point_mm + shift @ across, np.array([first, np.cross(third, first), third]))
 
-    def places(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Places (N,) along and angles around the axis of points (N, 3), and their distances from it."""
+    def cylindrical(self, points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return places (N,) along and angles around the axis, and distances from it, of points (N, 3)."""
         x, y, along = ((points_mm - self.point_mm) @ self.axes.T).T
         return along, np.arctan2(y, x), np.hypot(x, y)
 
-    def outwards(self, angle: np.ndarray) -> np.ndarray:
-        """Unit normals (N, 3) of a round pipe at angles (N,)."""
+    def normals_at(self, angle: np.ndarray) -> np.ndarray:
+        """Return unit normals (N, 3) of a round pipe at angles (N,)."""
         return np.cos(angle)[:, None] * self.axes[0] + np.sin(angle)[:, None] * self.axes[1]
 
 
 @dataclass(frozen=True, eq=False)
 class PipeForm:
-    """The undamaged pipe.
+    """Undamaged form of a pipe in a cloud of N points.
 
-    ``along_mm``, ``angle``, ``distance_mm`` (N,) are places of all points in its ``frame``, and their distances from
-    the form, positive outwards. ``used`` (U,) are the points
-    that determine it, ``weights`` (K, U) those of the points in its ``coefficients`` (K,)
-    called ``terms``; places along the axis count in units of ``scale_mm``. ``largest_ovality`` is that, over the
-    diameter, which it may have where it was not seen.
+    Attributes
+    ----------
+    frame : PipeFrame
+    radius_mm : float
+        Mean radius.
+    along_mm, angle : (N,) float64
+        Place along the axis and angle, rad, of all points.
+    distance_mm : (N,) float64
+        Distance of all points from the form, positive outwards.
+    used : (U,) int
+        Points that determine the form.
+    arc : float
+        Part of the circumference, rad, that these points cover.
+    terms : tuple of str
+        Names of the K terms of the radial distance.
+    coefficients : (K,) float64
+        Coefficients of the terms, mm.
+    weights : (K, U) float64
+        Derivatives of the coefficients by the radial distances of the points.
+    scale_mm : float
+        Unit of places along the axis in the terms.
+    largest_ovality : float
+        Assumed largest ovality divided by the diameter, if the points do not determine the ovality.
     """
 
     frame: PipeFrame
@@ -103,79 +162,86 @@ class PipeForm:
     @property
     def outwards(self) -> np.ndarray:
         """Unit normals (N, 3) of the round pipe at the points."""
-        return self.frame.outwards(self.angle)
+        return self.frame.normals_at(self.angle)
 
-    def at(self, along_mm: np.ndarray, angle: np.ndarray) -> np.ndarray:
-        """Points (M, 3) of the form."""
+    def points_at(self, along_mm: np.ndarray, angle: np.ndarray) -> np.ndarray:
+        """Return points (M, 3) of the form at places and angles (M,)."""
         radius = self.radius_mm + _design(along_mm, angle, self.scale_mm, self.terms) @ self.coefficients
         along = np.asarray(along_mm)[:, None] * self.frame.axes[2]
-        return self.frame.point_mm + along + radius[:, None] * self.frame.outwards(angle)
+        return self.frame.point_mm + along + radius[:, None] * self.frame.normals_at(angle)
 
     @property
     def is_seen_round(self) -> bool:
-        """Whether enough of the circumference was seen for the ovality."""
-        return self.arc >= _LEAST_ARC
+        """True if the points determine the ovality."""
+        return self.arc >= FORM_RULE.oval_arc
 
 
 def fit_pipe(cloud: PointCloud, *, largest_ovality: float = LARGEST_OVALITY) -> PipeForm:
-    """Form of the pipe that most points of a cloud lie on.
+    """Fit the form of the pipe that contains most points of a cloud.
 
-    A cylinder by orthogonal distances, then harmonics of the radial distance around (out of roundness) and along (bow,
-    taper), all at once by iterated weights (Tukey's biweight). EvaluationError where the points determine no pipe.
+    A cylinder is fitted by orthogonal distances. Then harmonics of the radial distance around the pipe (out of
+    roundness) and along it (bow, taper) are fitted together with Tukey's biweight. EvaluationError if the points
+    determine no pipe.
     """
-    fitted = evenly_thinned(np.arange(len(cloud)), _MOST_POINTS)
+    fitted = evenly_thinned(np.arange(len(cloud)), FORM_RULE.most_points)
     points = cloud.points_mm[fitted]
-    start = fit_robustly(fit_cylinder, evenly_thinned(points, _TO_START)).fit
-    return _fitted(cloud, fitted, PipeFrame.about(start, points), start.radius_mm, largest_ovality)
+    start = fit_robustly(fit_cylinder, evenly_thinned(points, FORM_RULE.start_points)).fit
+    return _fit_from(cloud, fitted, PipeFrame.about(start, points), start.radius_mm, largest_ovality)
 
 
 def refit_pipe(cloud: PointCloud, form: PipeForm, *, left_out: np.ndarray) -> PipeForm:
-    """The form fitted again without damaged points ``left_out`` (N,) bool, in the frame that it has, moved a little.
+    """Fit the form again without the damaged points ``left_out`` (N,) bool.
 
-    EvaluationError where the points that are left determine no pipe.
+    The frame is only shifted and tilted. EvaluationError if the other points determine no pipe.
     """
-    fitted = evenly_thinned(np.flatnonzero(~left_out), _MOST_POINTS)
-    return _fitted(cloud, fitted, form.frame, form.radius_mm, form.largest_ovality)
+    fitted = evenly_thinned(np.flatnonzero(~left_out), FORM_RULE.most_points)
+    return _fit_from(cloud, fitted, form.frame, form.radius_mm, form.largest_ovality)
 
 
-def _fitted(cloud: PointCloud, fitted: np.ndarray, frame: PipeFrame, radius: float, largest_ovality: float) -> PipeForm:
-    """Form of the ``fitted`` (M,) points, from a frame and a radius that are nearly right."""
-    if len(fitted) < _FEWEST_OF_SECTION:
-        raise EvaluationError(f"only {len(fitted)} of {len(cloud)} points are left for a pipe")
+def _fit_from(
+    cloud: PointCloud, fitted: np.ndarray, frame: PipeFrame, radius: float, largest_ovality: float
+) -> PipeForm:
+    """Fit the form to the ``fitted`` (M,) points, starting from an approximate frame and radius."""
+    if len(fitted) < FORM_RULE.section_points:
+        raise EvaluationError(
+            f"only {len(fitted)} of {len(cloud)} points are undamaged; {FORM_RULE.section_points} are needed for a pipe"
+        )
     points = cloud.points_mm[fitted]
-    scale = max(0.5 * float(np.ptp(frame.places(points)[0])), 1e-9)
+    scale = max(0.5 * float(np.ptp(frame.cylindrical(points)[0])), 1e-9)
     arc, moved, off, terms = 0.0, np.inf, np.zeros(0), ()
     coefficients, weight, design, rows = np.zeros(0), np.zeros(0), np.zeros((0, 0)), np.zeros((0, 0))
-    for number in range(_ROUNDS):
-        along, angle, away = frame.places(points)
+    for number in range(FORM_RULE.rounds):
+        along, angle, away = frame.cylindrical(points)
         off = away - radius
-        near = np.abs(off - np.median(off)) < MOST_OFF_SHARE * radius
+        near = np.abs(off - np.median(off)) < FORM_RULE.off_pipe * radius
         arc = _arc(angle[near])
         terms = _terms(arc)
         design = _design(along, angle, scale, terms)
         rows, weight = fit_biweight(design, off, near)
         coefficients = rows @ off
         known = dict(zip(terms, coefficients, strict=True))
-        # Offset and tilt go into the axis, so that the distances stay linear in them.
+        # Shift and tilt update the frame, so that the distances remain linear in them.
         shift = np.array([known["cos"], known["sin"]])
         slopes = np.array([known["along cos"], known["along sin"]]) / scale
-        frame, radius = frame.moved(shift, slopes), radius + known["1"]
+        frame, radius = frame.shift_and_tilt(shift, slopes), radius + known["1"]
         moved = float(np.linalg.norm(shift) + abs(known["1"]) + scale * np.linalg.norm(slopes))
-        if number and moved < _STILL_MM:
+        if number and moved < FORM_RULE.still_mm:
             break
     counted = weight > 0
     if np.count_nonzero(counted) < 3 * len(terms):
-        raise EvaluationError(f"only {np.count_nonzero(counted)} of {len(cloud)} points lie on one pipe")
+        raise EvaluationError(
+            f"only {np.count_nonzero(counted)} of {len(cloud)} points agree with one pipe; {3 * len(terms)} are needed"
+        )
     scatter = float(np.std((off - design @ coefficients)[counted]))
     if moved > scatter / np.sqrt(np.count_nonzero(counted)):
         raise EvaluationError(
-            f"the pipe's axis does not settle: after {_ROUNDS} rounds it still moves by {moved:.2g} mm, more than a "
-            "mean of all points scatters. Leave out points beside the pipe"
+            f"the fit of the pipe's axis does not converge: after {FORM_RULE.rounds} rounds it still changes by "
+            f"{moved:.2g} mm, more than its standard deviation. Remove points that do not belong to the pipe"
         )
-    # What moved into the axis is no part of the form any more.
+    # These terms are now part of the frame and the radius.
     inside = np.array([term in ("1", "cos", "sin", "along cos", "along sin") for term in terms])
     coefficients = np.where(inside, 0.0, coefficients)
-    along, angle, away = frame.places(cloud.points_mm)
+    along, angle, away = frame.cylindrical(cloud.points_mm)
     distance = away - radius - _design(along, angle, scale, terms) @ coefficients
     used = fitted[counted]
     known = frame, radius, along, angle, distance, used, arc, terms, coefficients, rows[:, counted], scale
@@ -185,20 +251,34 @@ def _fitted(cloud: PointCloud, fitted: np.ndarray, frame: PipeFrame, radius: flo
 def pipe_features(
     cloud: PointCloud, form: PipeForm, *, section_mm: float | None = None
 ) -> tuple[list[Feature], list[str]]:
-    """The pipe and its sections, each ``section_mm`` long, with uncertainty; and notes on sections that are left out.
+    """Return the pipe and its sections with uncertainty, and notes on omitted sections.
 
-    Without a ``section_mm`` the length is divided into up to twelve sections of at least 60 points.
+    By default the pipe has twelve sections. Sections of fewer than 60 points are omitted.
+
+    Parameters
+    ----------
+    cloud
+        Cloud of the pipe.
+    form
+        Form fitted to this cloud.
+    section_mm
+        Length of a section.
+
+    Raises
+    ------
+    EvaluationError
+        `section_mm` is not positive.
     """
     used = form.used
     errors = PointErrors.along(cloud, used, form.outwards[used])
-    whole = _values(form, errors)
+    whole = _whole_values(form, errors)
     extent = np.array([2 * form.radius_mm, 2 * form.radius_mm, np.ptp(form.along_mm[used])])
     features = [Feature(FeatureKind.PIPE, "pipe", whole, form.frame.point_mm, form.frame.axes, extent, used)]
     along = form.along_mm[used]
     low, length = float(along.min()), float(np.ptp(along))
     if section_mm is not None and not 0 < section_mm < np.inf:
         raise EvaluationError(f"section_mm is {section_mm:g}; expected a positive length in mm")
-    count = max(1, int(length / section_mm)) if section_mm else _MOST_SECTIONS
+    count = max(1, int(length / section_mm)) if section_mm else FORM_RULE.most_sections
     edges = low + length * np.arange(count + 1) / count
     terms = _section_terms(form)
     raw = form.distance_mm + _design(form.along_mm, form.angle, form.scale_mm, form.terms) @ form.coefficients
@@ -206,11 +286,11 @@ def pipe_features(
     for start, end in pairwise(edges):
         inside = (along >= start) & ((along < end) | (end == edges[-1]))
         own = used[inside]
-        arc, least = _arc(form.angle[own]), _LEAST_SHARE * min(form.arc, _LEAST_ARC)
-        if len(own) < _FEWEST_OF_SECTION or arc < least:
+        arc, least = _arc(form.angle[own]), FORM_RULE.section_arc * min(form.arc, FORM_RULE.oval_arc)
+        if len(own) < FORM_RULE.section_points or arc < least:
             notes.append(
                 f"no section from {start:.4g} to {end:.4g} mm along the axis: {len(own)} points over "
-                f"{np.degrees(arc):.0f} deg; {_FEWEST_OF_SECTION} over {np.degrees(least):.0f} deg are needed"
+                f"{np.degrees(arc):.0f} deg; {FORM_RULE.section_points} over {np.degrees(least):.0f} deg are needed"
             )
             continue
         design = _design(np.zeros(len(own)), form.angle[own], 1.0, terms)
@@ -223,16 +303,16 @@ def pipe_features(
             left = raw[own] - design @ coefficients
             values = _section_values(form, errors[inside], weights, coefficients, terms, left)
         else:
-            values = (_diameter_of_arc(form, errors, inside, weights[0], float(coefficients[0])),)
+            values = (_arc_diameter(form, errors, inside, weights[0], float(coefficients[0])),)
         size = np.array([extent[0], extent[1], end - start])
         name = f"section {len(features)}"
         features.append(Feature(FeatureKind.SECTION, name, values, middle, form.frame.axes, size, own))
     return features, notes
 
 
-def _values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValue, ...]:
+def _whole_values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValue, ...]:
     kind, used, coefficients, diameter = FeatureKind.PIPE, form.used, form.coefficients, 2 * form.radius_mm
-    random, common = errors.covariances(form.weights, form.distance_mm[used], _groups(form, used))
+    random, common = errors.covariances(form.weights, form.distance_mm[used], _neighbourhoods(form, used))
     if not form.is_seen_round:
         by_ovality = form.weights @ _unseen_ovality(form, used)
         common = by_ovality @ by_ovality.T + (0.0 if common is None else common)
@@ -267,13 +347,15 @@ def _values(form: PipeForm, errors: PointErrors) -> tuple[FeatureValue, ...]:
     for number, term in ((1, "cos"), (2, "sin")):
         across = form.frame.axes[number - 1]
         values.append(plain(f"axis place {number}", float(across @ form.frame.point_mm), term, 1.0))
-        slope = float(np.degrees(np.arctan2(form.frame.axes[2] @ _level(across, stated), form.frame.axes[2, stated])))
+        slope = float(
+            np.degrees(np.arctan2(form.frame.axes[2] @ _square_part(across, stated), form.frame.axes[2, stated]))
+        )
         values.append(plain(f"axis slope {number}", slope, f"along {term}", float(np.degrees(1 / scale))))
     return tuple(values)
 
 
-def _level(across: np.ndarray, stated: int) -> np.ndarray:
-    """The part of a direction square to a coordinate axis, of unit length."""
+def _square_part(across: np.ndarray, stated: int) -> np.ndarray:
+    """Return the unit vector along the part of a direction that is perpendicular to a coordinate axis."""
     level = across.copy()
     level[stated] = 0.0
     return level / max(float(np.linalg.norm(level)), 1e-12)
@@ -305,20 +387,20 @@ def _section_values(
     return tuple(values)
 
 
-def _diameter_of_arc(
+def _arc_diameter(
     form: PipeForm, errors: PointErrors, inside: np.ndarray, weights: np.ndarray, off: float
 ) -> FeatureValue:
-    """Diameter of a section of which an arc was seen, whose middle is where the whole pipe's axis puts it.
+    """Return the diameter of a section whose points do not determine its centre.
 
-    Of the points used (U,) those ``inside`` (U,) bool are the section's, with ``weights`` (K,) in its distance ``off``
-    from the pipe.
+    The centre is taken from the axis of the whole pipe. Of the used points (U,), those ``inside`` (U,) bool belong to
+    the section. Their ``weights`` (K,) give its mean distance ``off`` from the pipe.
     """
     moved = [form.terms.index(term) for term in ("cos", "sin", "along cos", "along sin")]
     own = form.used[inside]
     by_axis = weights @ _design(form.along_mm[own], form.angle[own], form.scale_mm, form.terms)[:, moved]
     whole = -by_axis @ form.weights[moved]
     whole[inside] += weights
-    random, common = errors.covariances(whole[None], form.distance_mm[form.used], _groups(form, form.used))
+    random, common = errors.covariances(whole[None], form.distance_mm[form.used], _neighbourhoods(form, form.used))
     by_ovality = whole @ _unseen_ovality(form, form.used)
     variance = float(by_ovality @ by_ovality) + (0.0 if common is None else float(common[0, 0]))
     std = 2 * float(np.sqrt(random[0, 0])), 2 * float(np.sqrt(variance))
@@ -326,28 +408,30 @@ def _diameter_of_arc(
 
 
 def _unseen_ovality(form: PipeForm, points: np.ndarray) -> np.ndarray:
-    """How the radii of points (N, 2) move by one standard deviation of each part of an ovality that was not seen.
+    """Return the change of the radii of points (N, 2) by one standard deviation of an unknown ovality.
 
-    Up to the largest one all are as likely, and all directions (JCGM 100:2008, 4.3.7).
+    The ovality is uniform up to the largest one, in any direction (JCGM 100:2008, 4.3.7).
     """
-    # A fourth of the ovality is the amplitude; its square has a third of the largest one's, in each part half of it.
+    # The amplitude is a quarter of the ovality. Its mean square is a third of the largest one's, half in each part.
     std = 2 * form.radius_mm * form.largest_ovality / 4 / np.sqrt(6.0)
     return std * np.column_stack([np.cos(2 * form.angle[points]), np.sin(2 * form.angle[points])])
 
 
-def _groups(form: PipeForm, used: np.ndarray) -> np.ndarray:
-    """Neighbourhoods (K,): sectors of 5 deg by twelfths of the length."""
+def _neighbourhoods(form: PipeForm, used: np.ndarray) -> np.ndarray:
+    """Return the neighbourhood (K,) of each point: sectors of 5 deg by twelfths of the length."""
     along = form.along_mm[used]
-    row = np.floor((along - along.min()) / max(float(np.ptp(along)), 1e-9) * 11.999).astype(np.int64)
-    sector = np.floor((form.angle[used] + np.pi) / (2 * np.pi) * (_SECTORS - 1e-6)).astype(np.int64)
-    return row * _SECTORS + sector
+    row = np.floor((along - along.min()) / max(float(np.ptp(along)), 1e-9) * (FORM_RULE.lengths - 1e-3)).astype(
+        np.int64
+    )
+    sector = np.floor((form.angle[used] + np.pi) / (2 * np.pi) * (FORM_RULE.sectors - 1e-6)).astype(np.int64)
+    return row * FORM_RULE.sectors + sector
 
 
 def _terms(arc: float) -> tuple[str, ...]:
     terms = ["1", "cos", "sin", "along", "along cos", "along sin", "along2 cos", "along2 sin"]
-    if arc >= _LEAST_ARC:
+    if arc >= FORM_RULE.oval_arc:
         terms += ["cos 2", "sin 2"]
-    if arc >= _WHOLE_ARC:
+    if arc >= FORM_RULE.whole_arc:
         terms += ["cos 3", "sin 3", "cos 4", "sin 4"]
     return tuple(terms)
 
@@ -357,7 +441,7 @@ def _section_terms(form: PipeForm) -> tuple[str, ...]:
 
 
 def _design(along_mm: np.ndarray, angle: np.ndarray, scale: float, terms: tuple[str, ...]) -> np.ndarray:
-    """Derivatives (N, K) of the radial distance by the terms' coefficients, with places along in units of a scale."""
+    """Return the derivatives (N, K) of the radial distance by the coefficients of the terms."""
     t = np.asarray(along_mm) / scale
     columns = []
     for term in terms:
@@ -376,6 +460,6 @@ def _design(along_mm: np.ndarray, angle: np.ndarray, scale: float, terms: tuple[
 
 
 def _arc(angle: np.ndarray) -> float:
-    """Seen part of the circumference in rad, by sectors of 5 deg."""
-    sector = np.floor((angle + np.pi) / (2 * np.pi) * (_SECTORS - 1e-6)).astype(int)
-    return float(np.count_nonzero(np.bincount(sector, minlength=_SECTORS)) * 2 * np.pi / _SECTORS)
+    """Return the part of the circumference, rad, with points, in sectors of 5 deg."""
+    sector = np.floor((angle + np.pi) / (2 * np.pi) * (FORM_RULE.sectors - 1e-6)).astype(int)
+    return float(np.count_nonzero(np.bincount(sector, minlength=FORM_RULE.sectors)) * 2 * np.pi / FORM_RULE.sectors)

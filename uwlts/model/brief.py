@@ -5,8 +5,10 @@ import html
 from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
-_LONGEST, _MOST = 60, 8
-"""Characters of a value that is shown as it is, and its most items; longer ones are named by their size."""
+_LONGEST = 60
+"""Most characters of a value that is shown as it is; of a longer one the size is shown."""
+_MOST = 8
+"""Most items of a value that is shown as it is."""
 
 
 class Brief:

@@ -19,9 +19,12 @@ from uwlts.runtime.compiled import compiled, compiled_part
 _NODES = (12, 8), (24, 24)
 """Numbers of nodes along lines and places that are tried, one after another."""
 
-_KEPT, _WIDER = 16, 64
-"""Tables that are kept, of the functions asked for last, and to what multiple of lines and pixels these are widened, so
-that the next scan by the same calibration lies within them."""
+_KEPT = 16
+"""Number of cached tables, of the most recently used functions."""
+
+_WIDER = 64
+"""Numbers of lines and pixels of a table are rounded up to multiples of this, so that it covers the next scan with
+the same calibration."""
 
 _WORTH = 5000
 """Places from which a table is worth making: it costs as much as some thousand of them."""

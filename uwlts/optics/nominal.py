@@ -11,8 +11,10 @@ from uwlts.model.placement import camera_from_object, laser_pose, view_of_sheet
 from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics.window import trace_window
 
-# Rays across the fan and depths along them to which the plane is fitted.
-_RAYS, _DEPTHS = 65, 9
+# Rays across the fan to which the plane is fitted.
+_RAYS = 65
+# Depths along each ray.
+_DEPTHS = 9
 
 
 def nominal(sensor: str | Path | Sensor, *, medium: str) -> Calibration:

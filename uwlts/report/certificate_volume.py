@@ -24,8 +24,10 @@ from uwlts.optics.triangulation import points_on_sheet
 LENGTHS_MM = (10.0, 20.0, 50.0, 100.0, 150.0, 200.0, 300.0, 500.0)
 # Places tried along each axis for the largest uncertainty, which changes slowly over the volume.
 _PLACES = 9
-# Mesh of the maps: rows along Z, columns along Y; finer meshes look the same.
-_ROWS, _COLUMNS = 17, 21
+# Rows of the maps' mesh, along Z; finer meshes look the same.
+_ROWS = 17
+# Columns of the maps' mesh, along Y.
+_COLUMNS = 21
 _SHORT_SHARE = 0.25
 """Of the volume's depth and width: a length whose uncertainty is shown where it is measured."""
 

@@ -19,7 +19,10 @@ from uwlts.runtime.workers import Send, work_through
 from uwlts.storage.capture import Capture, picture_of
 from uwlts.stripe import Stripe, stripe_in
 
-_WIDTH_IN, _TALLEST_IN = 11.2, 4.4
+# Width of a picture, inches.
+_WIDTH_IN = 11.2
+# Largest height of a picture, inches.
+_TALLEST_IN = 4.4
 # An image with fewer stripe centres than this shows no stripe to speak of.
 _LEAST_LINES = 8
 

@@ -43,14 +43,22 @@ DEVIATIONS = LinearSegmentedColormap.from_list(
 )
 """Blue below, grey at zero, red above."""
 
-UNKNOWN, PLAIN, ORANGE, PALE = "#555550", "#5d82a8", "#ff7800", "#9dbad6"
-"""Points without a deviation among others that have one; points of a cloud without any; stripe centres; bars."""
+UNKNOWN = "#555550"
+"""Colour of points without a deviation in a cloud with deviations."""
+PLAIN = "#5d82a8"
+"""Colour of points in a cloud without deviations."""
+ORANGE = "#ff7800"
+"""Colour of stripe centres."""
+PALE = "#9dbad6"
+"""Colour of bars."""
 
 LIMIT_STD = 2.0
 """The colours of deviations end at this many standard deviations, as in the thesis."""
 
-AZIMUTH_DEG, ELEVATION_DEG = 28.0, 38.0
-"""Direction in which clouds are looked at: turned from +X towards +Y, and down from there (towards +Z)."""
+AZIMUTH_DEG = 28.0
+"""Viewing direction of clouds: angle from +X towards +Y, deg."""
+ELEVATION_DEG = 38.0
+"""Viewing direction of clouds: angle downwards (towards +Z), deg."""
 
 MOST_POINTS = 15_000
 """An interactive cloud shows at most this many points, with which it still turns smoothly."""
@@ -58,16 +66,24 @@ MOST_POINTS = 15_000
 SHORT_LIST = 3
 """Lists of residuals up to this length are written out in tables; longer ones are drawn."""
 
-# A histogram shows four standard deviations, in which a normal distribution has all but 6 of 100,000 points.
-_BINS, _SHOWN_STD = 81, 4.0
-# Intervals along the stripe, and the points that each needs to have a mean and a scatter.
-_INTERVALS, _LEAST_IN_INTERVAL = 120, 5
+# Bins of a histogram.
+_BINS = 81
+# Standard deviations that a histogram shows: a normal distribution has all but 6 of 100,000 points within 4.
+_SHOWN_STD = 4.0
+# Intervals along the stripe.
+_INTERVALS = 120
+# Fewest points for the mean and scatter of an interval.
+_LEAST_IN_INTERVAL = 5
 # Residuals that differ by less than this share are drawn as dots: bars must start at zero, where all would look alike.
 _FLAT = 1.2
 # Share of a surface's places within the range of its colours.
 _SHOWN_SHARE = 0.995
-# Pixels shown beside a stripe; image lines and pixels beside it in the enlarged part.
-_AROUND_PX, _LINES_ENLARGED, _AROUND_ENLARGED_PX = 24, 44, 7
+# Margin shown on either side of a stripe, px.
+_AROUND_PX = 24
+# Image lines in the enlarged part.
+_LINES_ENLARGED = 44
+# Margin on either side of a stripe in the enlarged part, px.
+_AROUND_ENLARGED_PX = 7
 
 
 class NothingToDrawError(ValueError):

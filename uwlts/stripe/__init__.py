@@ -1,10 +1,11 @@
-"""The laser stripe's sub-pixel centre, one per profile line.
+"""Sub-pixel centre of the laser stripe, one per profile line.
 
-A profile line is an image row when the stripe runs along the image height, an image column when it runs along the
-width. The steps: `block_contrast` finds where on each line a stripe may be, `search` looks at these places by the
-rules about several peaks, `peak_window` measures what stands there, `methods` place the centre, `extract` does all this
-and gives the statuses. `direct` tells the laser's own stripe from its reflections, `capture_stripes` does so for all
-laser images and says why there is no stripe.
+A profile line is an image row if the stripe runs along the image height, an image column if it runs along the width.
+
+The steps: `block_contrast` finds places on each line that may contain a stripe. `search` examines these places by the
+rules for several peaks. `peak_window` measures each peak, `methods` locate its centre, and `extract` combines all steps
+and assigns a status to each line. `direct` separates the laser's own stripe from reflections. `capture_stripes`
+processes all laser images of a capture and explains missing stripes.
 """
 
 from uwlts.model.stripe import CaptureStripes, Stripe, StripeCandidates, StripeStatus

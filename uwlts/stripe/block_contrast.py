@@ -1,9 +1,11 @@
-"""Contrast of blocks of pixels: blocks that stick out of both their surroundings may hold a stripe.
+"""Contrast of blocks of pixels: blocks brighter than both surroundings may contain a stripe.
 
-A frame is reduced to the largest value and the background in blocks of a few pixels along each line, which is the
-only work done on all pixels. A block sticks out by its largest value minus the larger of the background values two
-blocks away on either side. Thus an edge between a dark and a bright region does not stick out, nor does a slope, and
-hot pixels or a second stripe in the surroundings do no harm.
+A frame is reduced to the maximum and the background of blocks of a few pixels along each line. This is the only
+operation on all pixels.
+
+The contrast of a block is its maximum minus the larger background of the two blocks two steps away. Thus neither an
+edge between a dark and a bright region nor a slope has contrast. Hot pixels or a second stripe in the surroundings do
+not reduce the contrast of a stripe.
 """
 
 from __future__ import annotations
@@ -18,15 +20,16 @@ import numpy as np
 from uwlts.runtime.compiled import compiled
 
 _NOISE_SAMPLES = 1024
+"""Number of blocks for the estimate of the noise."""
 
 MEDIAN_SURROUNDINGS = NormalDist().inv_cdf(1.0 - (1.0 - math.sqrt(0.5)) ** 0.5)
-"""Median of the larger of two smaller-of-two of unit Gaussian noise: each stays below x with 1 - (1 - P(x))^2."""
+"""Median of max(min(a, b), min(c, d)) for unit Gaussian noise: each minimum is below x with 1 - (1 - P(x))^2."""
 
 
 def block_extremes(profiles: np.ndarray, block: int) -> tuple[np.ndarray, np.ndarray]:
-    """Largest value and background of each block of profiles (N, L): two arrays (ceil(N / block), L) of the same type.
+    """Return the maximum and the background of each block of profiles (N, L), as two arrays (ceil(N / block), L).
 
-    The largest of all pixels, and the smaller of two pixels half a block apart, which no hot pixel raises. The last
+    The background is the smaller of two pixels half a block apart, which a single hot pixel does not raise. The last
     block of a line may be smaller.
     """
     high, low = np.empty((2, math.ceil(profiles.shape[0] / block), profiles.shape[1]), profiles.dtype)
@@ -36,7 +39,7 @@ def block_extremes(profiles: np.ndarray, block: int) -> tuple[np.ndarray, np.nda
 
 @compiled
 def _fill_extremes(profiles: np.ndarray, block: int, high: np.ndarray, low: np.ndarray) -> None:
-    """Fill the extremes of `block_extremes`, pixel by pixel as they lie in memory, which is what takes the time."""
+    """Fill the extremes of `block_extremes` in the order of the pixels in memory, which limits the speed."""
     count = profiles.shape[0]
     for first in range(0, count, block):
         largest, least = high[first // block], low[first // block]
@@ -55,31 +58,31 @@ def _fill_extremes(profiles: np.ndarray, block: int, high: np.ndarray, low: np.n
 
 
 def block_contrast(high: np.ndarray, low: np.ndarray, *, out: np.ndarray) -> np.ndarray:
-    """Height of each block above its surroundings, grey levels, 0 or more; arrays as of `block_extremes`.
+    """Return the non-negative height of each block above its surroundings, grey levels; arrays as in `block_extremes`.
 
-    At the ends of a line, where there is nothing two blocks away, the other side counts alone.
+    At the ends of a line only one side has surroundings, which are used alone.
     """
     surroundings = np.empty_like(low)
     np.maximum(low[:-4], low[4:], out=surroundings[2:-2])
     surroundings[:2] = low[2:4]
     surroundings[-2:] = low[-4:-2]
-    # OpenCV's difference of unsigned integers stops at 0 by itself.
+    # OpenCV's difference of unsigned integers saturates at 0.
     cv2.subtract(high, surroundings, dst=out)
     return out if out.dtype.kind == "u" else np.maximum(out, 0, out=out)
 
 
 def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
-    """Standard deviation of the background noise per pixel, grey levels.
+    """Estimate the standard deviation of the background noise per pixel, grey levels.
 
-    The median contrast of all blocks, most of which hold no stripe, divided by its value for unit Gaussian noise. A
-    background cut off at black is met better this way than by the deviation of single pixels.
+    The median contrast of all blocks is divided by its value for unit Gaussian noise. Most blocks do not contain a
+    stripe. For a background clipped at black, this estimate is more accurate than the deviation of single pixels.
     """
     sample = contrast.ravel()[:: max(1, contrast.size // _NOISE_SAMPLES)].copy()
     sample.partition(sample.size // 2)
     middle = sample[sample.size // 2]
     median = float(middle)
     if contrast.dtype.kind in "iu":
-        # Whole grey levels make the plain median jump; read it off the cumulative histogram with straight bins.
+        # The median of integers is quantised: interpolate the cumulative histogram linearly.
         below, equal = np.count_nonzero(sample < middle), np.count_nonzero(sample == middle)
         median += (0.5 * sample.size - below) / equal - 0.5
     return max(median, 0.0) / _median_contrast(block)
@@ -87,5 +90,5 @@ def noise_from_contrast(contrast: np.ndarray, block: int) -> float:
 
 @lru_cache
 def _median_contrast(block: int) -> float:
-    """Median contrast of a block of unit Gaussian noise: the largest of its pixels minus the surroundings."""
+    """Return the median contrast of a block of unit Gaussian noise."""
     return NormalDist().inv_cdf(0.5 ** (1.0 / block)) - MEDIAN_SURROUNDINGS

@@ -1,4 +1,4 @@
-"""The stripes of all laser images of a capture, and why images show none."""
+"""Stripes of all laser images of a capture, and reasons for missing stripes."""
 
 from collections.abc import Iterable
 from typing import Literal
@@ -9,44 +9,55 @@ import numpy as np
 from uwlts.errors import CaptureError, ImageError
 from uwlts.model.stripe import CaptureStripes, StripeStatus
 from uwlts.runtime.progress import ProgressListener, unheard
-from uwlts.stripe.exposures import BracketImages, fused_images
+from uwlts.stripe.exposures import BracketImages, fuse_brackets
 from uwlts.stripe.extract import direct_stripe_in, extract_stripe
 from uwlts.stripe.options import StripeOptions, StripeSettings
 
 BLACK = 0.02
-"""Share of the full scale that no pixel of a black image reaches: above offset and noise of a covered lens."""
+"""Largest grey value of a black image, as a fraction of the full scale: above offset and noise of a covered lens."""
 
 WHITE = 0.5
-"""Share of clipped pixels above which an image is white: lit targets and stripes clip in spots only."""
+"""Fraction of clipped pixels above which an image is white: lit targets and stripes clip in small regions only."""
 
 FEWEST_LINES = 20
-"""Profile lines with a stripe from which an image shows one; noise passes for it on single lines."""
+"""Fewest profile lines of a stripe; on single lines noise may resemble a stripe."""
 
-_CLEARLY = 3
-"""A stripe runs across if so many times as many lines show it when the image is read the other way; a right one is
-seen on a fifth of as many, at its steep places."""
+_ACROSS_RATIO = 3
+"""Ratio of lines with a stripe in both reading directions above which the stripe runs across. A stripe along the given
+side has a ratio of about 0.2, from its steep places."""
 
 
 def find_stripes(
     capture: BracketImages, *, options: StripeSettings = None, progress: ProgressListener = unheard
 ) -> CaptureStripes:
-    """Find the stripe in all laser images of a recording, such as an opened `uwlts.storage.capture.Capture`.
+    """Find the stripe in all laser images of a recording, such as an open `uwlts.storage.capture.Capture`.
 
-    Centre lines of a 3D camera are taken as they are, less the lines at their ends (`StripeOptions.end_lines`).
+    Centre lines of a 3D camera are used as they are, except for the lines at their ends (`StripeOptions.end_lines`).
 
-    Images of one place at several exposures are fused (`uwlts.stripe.exposures`); their stripe has the number of the
-    longest exposure, and amplitudes are in its grey levels. Under the rule `PeakRule.DIRECT`, the default, reflections
-    are left out (`uwlts.stripe.direct`).
+    Images of one place at several exposures are fused (`uwlts.stripe.exposures`). Their stripe has the number of the
+    longest exposure, and amplitudes in its grey levels. Under the default rule `PeakRule.DIRECT`, reflections are
+    removed (`uwlts.stripe.direct`).
 
-    ``options`` are as for `StripeOptions.of`. ``progress`` is called after each image with the number of images done
-    and the number in all. CaptureError where the recording holds no laser image, or none of them shows a stripe.
+    Parameters
+    ----------
+    capture
+        Recording with images or centre lines.
+    options
+        Options, see `StripeOptions.of`.
+    progress
+        Called after each image with the number of processed images and the total number.
+
+    Raises
+    ------
+    CaptureError
+        The recording contains no laser image, or no laser image shows a stripe.
     """
     along, full_dn = capture.header.sensor.camera.stripe_along, capture.header.saturation_dn
     chosen = StripeOptions.of(capture.header.sensor, options)
     found: list[tuple[np.ndarray, ...]] = []
     numbers: list[int] = []
 
-    for number, seen, saturation in fused_images(capture):
+    for number, seen, saturation in fuse_brackets(capture):
         stripe = direct_stripe_in(seen, stripe_along=along, options=chosen, saturation=saturation)
         numbers.append(number)
         good = stripe.lines
@@ -55,7 +66,7 @@ def find_stripes(
         progress(number + 1, len(capture))
     if not found:
         raise CaptureError(
-            f"{capture.path.name} holds no image with the laser on among {len(capture)}: nothing to reconstruct"
+            f"{capture.path.name} has {len(capture)} images, none of them with the laser on: nothing to reconstruct"
         )
     status_of_lines, *columns = map(np.concatenate, zip(*found, strict=True))
     statuses = np.bincount(status_of_lines, minlength=len(StripeStatus))
@@ -74,26 +85,26 @@ def find_stripes(
 
 
 def is_black(image: np.ndarray, full_dn: float) -> bool:
-    """Whether nothing in an image (H, W) is above offset and noise; single hot pixels shine in the dark too."""
+    """Return True if nothing in an image (H, W) exceeds offset and noise, except for single hot pixels."""
     return bool(cv2.medianBlur(image, 3).max() < BLACK * full_dn)
 
 
 def white_share(image: np.ndarray, full_dn: float) -> float:
-    """Share of the pixels of an image (H, W) that clip."""
+    """Return the fraction of clipped pixels of an image (H, W)."""
     return float(np.mean(image >= full_dn))
 
 
 def shown_stripe(image: np.ndarray, *, stripe_along: str) -> Literal["along", "across"] | None:
-    """Direction in which an image (H, W) shows a stripe, or several: along the side that is given, or the other one."""
+    """Return the direction of the stripes in an image (H, W): along the given side, across it, or None."""
     along = _lines_with_stripe(image, stripe_along)
     across = _lines_with_stripe(image, "height" if stripe_along == "width" else "width")
-    if across >= FEWEST_LINES and across > _CLEARLY * along:
+    if across >= FEWEST_LINES and across > _ACROSS_RATIO * along:
         return "across"
     return "along" if along >= FEWEST_LINES else None
 
 
 def why_no_stripe(images: Iterable[np.ndarray], *, stripe_along: str, full_dn: int) -> str:
-    """Reason why images (H, W) show no stripe, and what to do about it; ``full_dn`` is where pixels clip."""
+    """Return the reason why images (H, W) show no stripe, and advice; pixels clip at ``full_dn``."""
     count = black = white = across = 0
     for image in images:
         count += 1
@@ -104,32 +115,32 @@ def why_no_stripe(images: Iterable[np.ndarray], *, stripe_along: str, full_dn: i
         else:
             across += shown_stripe(image, stripe_along=stripe_along) == "across"
 
-    def so_many(some: int) -> str:
+    def count_of(some: int) -> str:
         return "all are" if some == count else f"{some} of {count} are"
 
     if black > count / 2:
         return (
-            f"{so_many(black)} black, no pixel reaches {100 * BLACK:g} % of full scale: is the laser on, the "
+            f"{count_of(black)} black, no pixel reaches {100 * BLACK:g} % of full scale: is the laser on, the "
             "exposure long enough, the lens open?"
         )
     if white > count / 2:
-        return f"{so_many(white)} white, saturated over more than half of their pixels: expose shorter"
+        return f"{count_of(white)} white, saturated in more than half of their pixels: reduce the exposure"
     if across:
         return (
-            f"in {across} of {count} one runs across: the images are turned by a quarter turn, or the sensor's "
-            f"stripe_along ('{stripe_along}') is wrong"
+            f"{across} of {count} images show a stripe across the given direction: the images are rotated by 90 deg, "
+            f"or the sensor's stripe_along ('{stripe_along}') is wrong"
         )
     return (
-        "no bright line stands out of their background: are they laser images, is the exposure long enough, the "
-        "object in view?"
+        "no bright line is above the background: are they laser images, is the exposure long enough, is the object "
+        "in view?"
     )
 
 
 def _lines_with_stripe(image: np.ndarray, along: str) -> int:
-    """Number of profile lines with a stripe, or several."""
+    """Count the profile lines with one or more stripes."""
     try:
         status = extract_stripe(image, stripe_along=along).status
     except ImageError:
-        # Too few pixels to tell a stripe from its background.
+        # Lines too short to distinguish stripe and background.
         return 0
     return int(np.count_nonzero((status != StripeStatus.NO_STRIPE) & (status != StripeStatus.SATURATED)))

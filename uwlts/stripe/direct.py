@@ -1,10 +1,11 @@
-"""Which of several stripes on a line is the laser's own on the surface, and which are reflections.
+"""Selection of the laser's own stripe among reflections.
 
-A mirror, or the inside corner of shining faces, shows stripes once more. Neither brightness nor order tells the right
-one: on a clean mirror the reflection of a painted sphere outshines the mirror's own stripe. But the laser's stripe goes
-on from line to line over the whole profile, across corners, while a reflection begins or ends in the void. Of all paths
-through the candidates of an image the one is sought that jumps least and leaves fewest lines out. Where two hardly
-differ, the line stays ambiguous. The costs of paths follow from the min-sum algorithm on a chain, forwards and
+A mirror, or the inner corner of shining faces, shows further stripes. Neither brightness nor order identifies the
+laser's stripe: a clean mirror reflects a painted sphere brighter than the mirror's own stripe. But the laser's stripe
+continues from line to line over the whole profile, across corners, while a reflection begins or ends without a surface.
+
+The method finds the path through the candidates of an image with the fewest jumps and omitted lines. If two paths are
+about equal, the line stays ambiguous. The costs of all paths follow from the min-sum algorithm on a chain, forwards and
 backwards (Bishop, Pattern Recognition and Machine Learning, section 8.4.5).
 """
 
@@ -17,36 +18,40 @@ import numpy as np
 from uwlts.model.stripe import Stripe, StripeCandidates, StripeStatus
 from uwlts.runtime.compiled import compiled, compiled_with_arrays
 
-_TAKEN, _OPEN, _REFUSED = np.int8(1), np.int8(0), np.int8(-1)
-"""States of a candidate."""
+_TAKEN = np.int8(1)
+"""State of a candidate on the direct stripe."""
+_OPEN = np.int8(0)
+"""State of a candidate that may be on the direct stripe."""
+_REFUSED = np.int8(-1)
+"""State of a candidate of a reflection."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DirectRule:
-    """Numbers of the rule. Costs of paths are counted in jumps from one stripe to another.
+    """Numbers of the rule; the unit of path costs is one jump between stripes.
 
-    All were chosen on the scenes `NAMED` of docs/studies/stripe_reflections.py, rendered for a small camera, where
-    0.40 % of the points are wrong. What other numbers give there is stated beside them, found at 0.02 for ``skipped``
-    by a state of the rule that left 0.45 % of the points wrong.
+    All were chosen on the scenes `NAMED` of docs/studies/stripe_reflections.py, rendered for a small camera, with 0.40
+    % wrong points. The effects of other values are stated below. They were determined at 0.02 for ``skipped``, with an
+    earlier version of the rule that gave 0.45 % wrong points.
 
     Attributes
     ----------
     gap_lines : int
-        Lines for which a stripe may be lost and go on: those that noise and speckle hide of a faint one. 20 give
-        0.53 %; 28 and 48 give the same.
+        Largest gap of a stripe, in lines: noise and speckle hide parts of a faint stripe. 20 gives 0.53 %; 28 and 48
+        give the same as 36.
     fewest_lines : int
-        Lines of a stripe at least, beside others: shorter ones are grains of speckle. 4 to 10 give the same.
+        Fewest lines of a stripe next to others; shorter ones are grains of speckle. 4 to 10 give the same.
     skipped : float
-        Cost of a line whose candidates a path leaves out: 80 lines outweigh a jump. Of a stripe that is lost on some of
-        its lines the cost is less by their share. 0.02 and 0.03 give the same and leave fewer lines open, but leave a
-        corner open whose wall is faint, which tests/uwlts/stripe/test_direct.py draws.
+        Cost of a line whose candidates a path omits: 80 lines cost as much as a jump. For a stripe with gaps the cost
+        is multiplied by its fraction of lines with a candidate. 0.02 and 0.03 give the same with fewer ambiguous lines,
+        but make a corner with a faint wall ambiguous (drawn in tests/uwlts/stripe/test_direct.py).
     margin : float
-        Cost by which a path has to be the better one. 0.2 and 0.4 give the same; at 0.4 more lines stay open.
+        Least difference of the costs of the best and the second-best path. 0.2 and 0.4 give the same; 0.4 leaves more
+        lines ambiguous.
     meeting_jumps : float
-        Distance, in jumps' lengths, within which two stripes may run into each other: one window. 3 give 0.48 %, 6 the
-        same.
+        Largest distance of merging stripes, in jump lengths: one window. 3 gives 0.48 %, 6 the same as 4.
     meeting_lines : int
-        Lines that are left out there at most. 12 give 0.66 %, 36 give 0.36 % and lose 1 % more lines.
+        Most lines omitted where stripes merge. 12 gives 0.66 %; 36 gives 0.36 % with 1 % more lines lost.
     """
 
     gap_lines: int = 36
@@ -60,12 +65,21 @@ class DirectRule:
 def direct_stripe(
     stripe: Stripe, rivals: StripeCandidates, *, jump_px: float, rule: DirectRule = DirectRule()
 ) -> Stripe:
-    """Return the stripe of an image without reflections, its ends included.
+    """Return the stripe of an image without reflections, including its ends.
 
-    Lines on which it stays open which stripe is the laser's own are AMBIGUOUS. ``stripe`` is the one that extraction
-    has found, ``rivals`` are all candidates on lines with more than one. Candidates without a width cannot be measured:
-    two stripes that run into each other, or one too wide. The path goes on through them, but their lines have no point.
-    Centres of neighbouring lines more than ``jump_px`` apart are on two stripes.
+    Lines without a unique choice become AMBIGUOUS. Candidates without a width cannot be measured: two merging stripes,
+    or a stripe too wide. The path may use them, but their lines get no point.
+
+    Parameters
+    ----------
+    stripe
+        Stripe found by the extraction.
+    rivals
+        All candidates on lines with more than one.
+    jump_px
+        Distance between centres on neighbouring lines, px, above which they belong to two stripes.
+    rule
+        Numbers of the rule.
     """
     alone = np.setdiff1d(stripe.lines, rivals.line)
     line = np.concatenate([alone, rivals.line])
@@ -74,7 +88,7 @@ def direct_stripe(
     columns = [np.concatenate([getattr(stripe, name)[alone], getattr(rivals, name)])[order] for name in names]
     line, number = line[order], np.empty(len(order), np.intp)
     _number_stripes(line, columns[0], rule.gap_lines, jump_px, number)
-    # Grains are no stripe, unless nothing else is there.
+    # Short stripes are grains of speckle, unless they are alone.
     long = np.bincount(number)[number] >= rule.fewest_lines
     kept = long | ~np.isin(line, line[long])
     line, number, centre, amplitude, width = (each[kept] for each in (line, number, *columns))
@@ -82,8 +96,8 @@ def direct_stripe(
     single, state = np.bincount(line)[line] == 1, np.empty(len(line), np.int8)
     before, after = np.empty((2, len(line)))
     _fit_slopes(line, centre, number, rule.gap_lines, before, after)
-    _take(line, _margins(line, centre, number, before, after, jump_px, rule), single, rule.margin, state)
-    _refuse_alone(number, single, state)
+    _take_best(line, _path_margins(line, centre, number, before, after, jump_px, rule), single, rule.margin, state)
+    _refuse_single_runs(number, single, state)
     reach_px = rule.meeting_jumps * jump_px
     _open_meetings(line, centre, number, before, after, rule.meeting_lines, reach_px, state)
     taken = (state == _TAKEN) & np.isfinite(width)
@@ -93,7 +107,7 @@ def direct_stripe(
     return Stripe.on_lines(*found, status=status, stripe_along=stripe.stripe_along)
 
 
-def _margins(
+def _path_margins(
     line: np.ndarray,
     centre: np.ndarray,
     number: np.ndarray,
@@ -102,26 +116,26 @@ def _margins(
     jump_px: float,
     rule: DirectRule,
 ) -> np.ndarray:
-    """Cost (M,), in jumps beyond the best path, of the best path through each candidate."""
+    """Return the cost (M,) of the best path through each candidate, in jumps more than the best path of all."""
     through, backwards = np.empty((2, len(line)))
-    # Of its lines, a stripe is seen on this share; that of a faint one is missed on others by chance.
+    # A faint stripe has gaps by chance: omitting it costs less, by the fraction of its lines with a candidate.
     first, last = np.full(number.max() + 1, line.max()), np.zeros(number.max() + 1, line.dtype)
     np.minimum.at(first, number, line)
     np.maximum.at(last, number, line)
     missed = rule.skipped * (np.bincount(number) / (last - first + 1))[number]
     gap, skipped = rule.gap_lines, rule.skipped
-    _least_cost(line, centre, before, after, missed, gap, jump_px, skipped, through)
+    _compute_costs(line, centre, before, after, missed, gap, jump_px, skipped, through)
     turned = (values[::-1].copy() for values in (line.max() - line, centre, -after, -before, missed))
-    _least_cost(*turned, gap=gap, jump_px=jump_px, skipped=skipped, result=backwards)
+    _compute_costs(*turned, gap=gap, jump_px=jump_px, skipped=skipped, result=backwards)
     through += backwards[::-1]
     return through - through.min()
 
 
 @compiled_with_arrays
 def _number_stripes(line: np.ndarray, centre: np.ndarray, gap: int, jump_px: float, number: np.ndarray) -> None:
-    """Number (M,) of the stripe of each candidate: that of the nearest one on the last line with one near enough.
+    """Assign each candidate (M,) the stripe of the nearest candidate within a jump on an earlier line.
 
-    Only one goes on from each.
+    The latest line with such a candidate counts. Each candidate has at most one successor.
     """
     first, goes_on = 0, np.zeros(line.size, np.bool_)
     for k in range(line.size):
@@ -142,7 +156,7 @@ def _number_stripes(line: np.ndarray, centre: np.ndarray, gap: int, jump_px: flo
 def _fit_slopes(
     line: np.ndarray, centre: np.ndarray, number: np.ndarray, gap: int, before: np.ndarray, after: np.ndarray
 ) -> None:
-    """Slopes (M,) of the stripe of each candidate on the lines before and after it, by least squares; 0 at its ends."""
+    """Fit slopes (M,) of each candidate's stripe on the lines before and after it by least squares; 0 at its ends."""
     for side, result in ((-1, before), (1, after)):
         for k in range(line.size):
             products, squares, j = 0.0, 0.0, k + side
@@ -155,7 +169,7 @@ def _fit_slopes(
 
 
 @compiled
-def _least_cost(
+def _compute_costs(
     line: np.ndarray,
     centre: np.ndarray,
     before: np.ndarray,
@@ -166,11 +180,12 @@ def _least_cost(
     skipped: float,
     result: np.ndarray,
 ) -> None:
-    """Cost (M,) of the best path that ends in each candidate, from the first line on.
+    """Compute the cost (M,) of the best path from the first line to each candidate.
 
-    A path goes on to a candidate near the last one, or near where the slope of either one's stripe leads, ``before`` of
-    the last one and ``after`` of the next one; else it jumps. Each line with candidates between costs what it does of
-    the stripe that is ``missed`` more often, or ``skipped`` at a jump.
+    A path may continue at a candidate near the last one, or near the linear continuation of either stripe. The slopes
+    are ``before`` for the last and ``after`` for the next candidate. Otherwise it jumps.
+
+    A line with candidates between them costs the smaller ``missed`` of both candidates, or ``skipped`` at a jump.
     """
     elsewhere, best_of_line, first = 0.0, np.inf, 0
     for k in range(line.size):
@@ -194,8 +209,8 @@ def _least_cost(
 
 
 @compiled
-def _take(line: np.ndarray, cost: np.ndarray, alone: np.ndarray, margin: float, state: np.ndarray) -> None:
-    """Take on each line the candidate on the best path, if every path by way of another one is clearly worse.
+def _take_best(line: np.ndarray, cost: np.ndarray, alone: np.ndarray, margin: float, state: np.ndarray) -> None:
+    """Take the candidate on the best path of each line, if other paths cost more by the margin.
 
     Candidates that are alone are taken.
     """
@@ -221,13 +236,13 @@ def _take(line: np.ndarray, cost: np.ndarray, alone: np.ndarray, margin: float, 
 
 
 @compiled_with_arrays
-def _refuse_alone(number: np.ndarray, alone: np.ndarray, state: np.ndarray) -> None:
-    """Refuse runs of candidates that are alone, because noise hides the true one, in a stripe that is not taken.
+def _refuse_single_runs(number: np.ndarray, alone: np.ndarray, state: np.ndarray) -> None:
+    """Refuse runs of candidates that are alone on their lines, if their stripe is not taken elsewhere.
 
-    The stripe is refused somewhere and goes on untaken on both sides of the run, or it is untaken on at least as many
-    lines as the run has.
+    In such a run, noise hides the true stripe. A run is refused if its stripe continues on both sides and is refused at
+    least once. It is also refused if its stripe is refused or open on at least as many lines as the run has.
     """
-    # Of each candidate the next ones of its stripe, -1 for none.
+    # Neighbours of each candidate along its stripe, -1 at its ends.
     before, after, last = np.full(number.size, -1), np.full(number.size, -1), np.full(number.size, -1)
     for k in range(number.size):
         before[k] = last[number[k]]
@@ -240,16 +255,16 @@ def _refuse_alone(number: np.ndarray, alone: np.ndarray, state: np.ndarray) -> N
         end, count = k, 1
         while after[end] >= 0 and alone[after[end]]:
             end, count = after[end], count + 1
-        sides, doubtful, refused, taken = 0, 0, 0, False
+        sides, opened, refused, taken = 0, 0, 0, False
         for beside, onwards in ((before[k], before), (after[end], after)):
             if beside >= 0:
                 taken |= state[beside] == _TAKEN
                 sides += 1
             while beside >= 0 and (alone[beside] or state[beside] != _TAKEN):
                 refused += 1 if state[beside] == _REFUSED else 0
-                doubtful += 1 if state[beside] == _OPEN else 0
+                opened += 1 if state[beside] == _OPEN else 0
                 beside = onwards[beside]
-        if not taken and ((sides == 2 and refused > 0) or count <= refused + doubtful):
+        if not taken and ((sides == 2 and refused > 0) or count <= refused + opened):
             j = k
             while j >= 0 and alone[j]:
                 state[j] = _REFUSED
@@ -267,9 +282,9 @@ def _open_meetings(
     reach_px: float,
     state: np.ndarray,
 ) -> None:
-    """Open what is taken beyond the end of a stripe that is not taken, where another one runs into it.
+    """Open candidates beyond the end of another stripe that may merge with theirs.
 
-    The image may show both as one there. By their slopes they meet within so many lines at ``most``.
+    The image may show both as one stripe. By their slopes they meet within ``most`` lines.
     """
     opened = np.zeros(line.size, np.bool_)
     for k in range(line.size):

@@ -1,9 +1,10 @@
-"""The stripe's centre as a trained network sees it, from a model file in ONNX form.
+"""Stripe centre found by a trained network, from a model file in ONNX format.
 
-A model has one input, ``lines`` (B, P) float32: grey values of B profile lines of P pixels, P a multiple of
-`PIXELS_MULTIPLE`, as shares of the full scale. Its outputs are ``centre_px`` (B,), the place of the stripe on each
-line, and ``visible`` (B,), the probability that there is one stripe, and there. `docs/examples/learned_stripe` trains
-such a model.
+A model has one input, ``lines`` (B, P) float32: grey values of B profile lines divided by the full scale. The number of
+pixels P is a multiple of `PIXELS_MULTIPLE`.
+
+It has two outputs: ``centre_px`` (B,), the stripe's position on each line, and ``visible`` (B,), the probability of a
+single stripe at this position. `docs/examples/learned_stripe` trains such a model.
 """
 
 from __future__ import annotations
@@ -20,25 +21,26 @@ from uwlts.files.reading import require_regular_file
 from uwlts.model.stripe import StripeStatus
 
 PIXELS_MULTIPLE = 16
-"""Networks with four levels halve the line three times, and one more may."""
+"""Lengths of lines are padded to this multiple: four halvings, one more than a network of four levels needs."""
 
 LEAST_VISIBLE = 0.5
-"""Probability from which a line has a stripe."""
+"""Least probability of a line with a stripe."""
 
 _LINES = 256
-"""Lines given to the network at a time: its layers stay in the processor's cache."""
+"""Lines in a batch, small enough for the processor's cache."""
 
 _ABSENT = 0.05
-"""Probability below which nothing is there; between both a line is ambiguous."""
+"""Largest probability of a line without a stripe; from here to `LEAST_VISIBLE` it is ambiguous."""
 
-_INPUTS, _OUTPUTS = {"lines"}, {"centre_px", "visible"}
+_INPUTS = {"lines"}
+_OUTPUTS = {"centre_px", "visible"}
 
 
 def find_learned(profiles: np.ndarray, model: str | Path, *, clip: float) -> tuple[np.ndarray, np.ndarray]:
-    """Status (L,) uint8 and centre (L,) float64, NaN where not OK, on each of the profiles (N, L), by a model file.
+    """Return status (L,) uint8 and centre (L,) float64 on each of the profiles (N, L), from a model file.
 
-    Pixels at the grey value ``clip`` are saturated. DescriptionError where the file is no such model; SetupError
-    where ONNX Runtime is not installed.
+    Centres are NaN unless the status is OK. Pixels at the grey value ``clip`` are saturated. DescriptionError if the
+    file is not such a model; SetupError if ONNX Runtime is not installed.
     """
     session = _session(str(model), _stamp(Path(model)))
     count, lines = profiles.shape
@@ -51,7 +53,7 @@ def find_learned(profiles: np.ndarray, model: str | Path, *, clip: float) -> tup
         if place.shape != (len(part),) or seen.shape != (len(part),):
             raise DescriptionError(
                 f"{model} gives centre_px {place.shape} and visible {seen.shape} for {len(part)} lines; expected one "
-                "value for each line"
+                "value per line"
             )
         centre[first : first + _LINES], visible[first : first + _LINES] = place, seen
     status = np.where(visible < _ABSENT, StripeStatus.NO_STRIPE, StripeStatus.AMBIGUOUS).astype(np.uint8)
@@ -63,7 +65,7 @@ def find_learned(profiles: np.ndarray, model: str | Path, *, clip: float) -> tup
 
 
 def _stamp(model: Path) -> tuple[int, int]:
-    """Time and size of a file, so that a model trained again is read again."""
+    """Return time and size of a file, so that a retrained model is loaded again."""
     require_regular_file(model, called="model of the learned method")
     status = os.stat(model)
     return status.st_mtime_ns, status.st_size
@@ -82,11 +84,11 @@ def _session(model: str, stamp: tuple[int, int]) -> Any:
     try:
         session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     except Exception as error:
-        raise DescriptionError(f"{model} is no ONNX model that ONNX Runtime can read: {error}") from error
+        raise DescriptionError(f"{model} cannot be read as an ONNX model by ONNX Runtime: {error}") from error
     inputs, outputs = ({one.name for one in some} for some in (session.get_inputs(), session.get_outputs()))
     if inputs != _INPUTS or not outputs >= _OUTPUTS:
         raise DescriptionError(
-            f"{model} has the inputs {sorted(inputs)} and outputs {sorted(outputs)}; a model of stripes has the input "
+            f"{model} has the inputs {sorted(inputs)} and outputs {sorted(outputs)}; expected the input "
             f"{sorted(_INPUTS)} and the outputs {sorted(_OUTPUTS)} (docs/examples/learned_stripe)"
         )
     return session

@@ -14,14 +14,14 @@ from uwlts.model.sensor import Sensor
 from uwlts.stripe.methods import method_names
 
 LEARNED = "learned"
-"""The method of a trained network."""
+"""Name of the method that uses a trained network."""
 
 
 class PeakRule(StrEnum):
-    """Which of several stripes on one line counts. First and last are in the order of growing pixel index.
+    """Rule that selects one of several stripes on a line. First and last refer to the order of pixels.
 
-    Direct is, in recordings, the one that the laser itself draws, not a reflection (`uwlts.stripe.direct`); in a single
-    image the strongest.
+    Direct selects, in recordings, the stripe that the laser itself draws, not a reflection (`uwlts.stripe.direct`). In
+    a single image it selects the strongest stripe.
     """
 
     DIRECT = "direct"
@@ -32,44 +32,44 @@ class PeakRule(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class StripeOptions:
-    """Options of `uwlts.stripe.extract_stripe`; RangeError for a number outside the ranges stated below.
+    """Options of `uwlts.stripe.extract_stripe`; RangeError for a number out of range.
 
     Attributes
     ----------
     method : str
-        How the centre is placed once the stripe is found: one of `uwlts.stripe.method_names`; or "learned": the network
-        in ``model`` both finds it and places it.
+        Method that locates the centre of a stripe: one of `uwlts.stripe.method_names`, or "learned". The network in
+        ``model`` both finds and locates the stripe.
     model : str
-        ONNX file of the method "learned" (`uwlts.stripe.learned`).
+        ONNX file for the method "learned" (`uwlts.stripe.learned`).
     peak : PeakRule
-        Which of several stripes on a line counts.
+        Rule for several stripes on a line.
     half_window_px : int
-        Pixels on either side of the centre that may be used: stripe, tails and the background beside them. Stripes
-        whose full width at half maximum is at most this are measured. At least 8.
+        Number of pixels on either side of the centre that may be used: stripe, tails and background beside them.
+        Stripes with a full width at half maximum up to this number are measured. At least 8.
     widest_window_px : int
-        `half_window_px` and `smoothing_px` are doubled, up to this window, while many lines of an image show a stripe
-        that is too wide to be measured, and bright: a quarter of the saturation or more, which no haze reaches.
+        `half_window_px` and `smoothing_px` are doubled, up to this window, while many lines of an image show a bright
+        stripe too wide to be measured. Bright means at least a quarter of the saturation, which haze does not reach.
     smoothing_px : float
-        Sigma of the Gaussian low-pass across the stripe, px, for detection, width and the quadratic fit. The other
-        methods place the centre on the unsmoothed profile.
+        Sigma, px, of the Gaussian low-pass across the stripe for detection, width and the quadratic fit. The other
+        methods use the unsmoothed profile.
     smoothing_lines : int
-        Odd number of neighbouring lines averaged beforehand; 1 averages none. More lines lower the noise of smooth
-        surfaces and blur depth edges.
+        Odd number of neighbouring lines that are averaged first; 1 for no averaging. Averaging reduces the noise on
+        smooth surfaces and blurs depth edges.
     threshold_sigmas : float
         Least height of a stripe in standard deviations of the low-passed background noise.
     threshold_floor : float
-        Least height of a stripe in grey levels, whatever the noise.
+        Least height of a stripe in grey levels, for any noise.
     min_fwhm_px : float
-        Least full width at half maximum, px; narrower things are hot pixels.
+        Least full width at half maximum, px; narrower peaks are hot pixels.
     ambiguous_ratio : float
-        Share of the strongest peak from which another one on the line counts as a stripe too. Under the rules
-        ``strongest``, and ``direct`` in a single image, two such stripes make the line ambiguous; ``first`` and
-        ``last`` choose among them, and the line is ambiguous only if another reaches into the pixels used. Within one
-        window a second peak that is higher than half the first one is separate if the profile falls below that half
-        between them, and a lower one if it falls below half the second one's own height.
+        Ratio of a peak's height to the strongest peak on its line, from this value on it counts as a stripe. Under the
+        rules ``strongest``, and ``direct`` in a single image, two such stripes make a line ambiguous. ``first`` and
+        ``last`` choose among them: the line is ambiguous only if another stripe overlaps the pixels used. Within one
+        window, a peak above half height of the first one is separate if the profile falls below this level between
+        them. A lower peak is separate if the profile falls below half of its own height.
     end_lines : int
-        Lines left out on either side of a place where the stripe ends, or jumps by more than half of `half_window_px`
-        from one line to the next: at an edge or a limb the sheet's width meets the surface only in part. 0 keeps them.
+        Lines omitted on either side of an end of the stripe, or of a jump by more than half of `half_window_px` between
+        lines: at an edge or limb only a part of the sheet's width meets the surface. 0 keeps these lines.
     """
 
     method: str = "profile-fit"
@@ -93,8 +93,8 @@ class StripeOptions:
         object.__setattr__(self, "peak", PeakRule(self.peak))
         if not isinstance(self.model, str) or bool(self.model) != (self.method == LEARNED):
             raise RangeError(
-                f"method is {self.method!r} and model {self.model!r}; the method {LEARNED!r}, and no other, needs the "
-                "ONNX file of its model"
+                f"method is {self.method!r} and model {self.model!r}; only the method {LEARNED!r} takes, and "
+                "needs, the ONNX file of a model"
             )
         for name in ("half_window_px", "widest_window_px", "smoothing_lines", "end_lines"):
             value = getattr(self, name)
@@ -119,7 +119,7 @@ class StripeOptions:
 
     @classmethod
     def of(cls, sensor: Sensor, settings: StripeSettings = None) -> StripeOptions:
-        """Options for a sensor's images: those given, or the sensor's own with the settings given in their place.
+        """Return the options for a sensor's images: the given ones, or the sensor's own with changed settings.
 
         DescriptionError for a setting that is unknown, of the wrong type or out of range.
         """
@@ -136,7 +136,7 @@ class StripeOptions:
 
     @property
     def jump_px(self) -> float:
-        """Distance of neighbouring lines' centres above which they belong to two stripes."""
+        """Distance between centres on neighbouring lines above which they belong to two stripes."""
         return self.half_window_px / 2
 
     def doubled(self) -> StripeOptions:
@@ -145,4 +145,4 @@ class StripeOptions:
 
 
 StripeSettings = StripeOptions | Mapping[str, Any] | None
-"""How the stripe is found: all options; some, in place of the sensor's own; or None, the sensor's own."""
+"""All options; some options that replace the sensor's own; or None for the sensor's own options."""

@@ -1,4 +1,4 @@
-"""A window about a peak of a profile line: height, width and background of what stands in it."""
+"""Window around a peak of a profile line, with the height, width and background of the peak."""
 
 from __future__ import annotations
 
@@ -12,38 +12,66 @@ import numpy as np
 from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
-"""Full width at half maximum of a Gaussian over its standard deviation."""
+"""Full width at half maximum of a Gaussian, divided by its standard deviation."""
 
-LEAST_KERNEL = 1.0
-"""Sigma of the narrowest weight, px. A narrower one rests on too few pixels: for a stripe of sigma 0.7 px the centre
-would err by 0.015 px with the pixel phase instead of 0.005."""
 
-FLANK = 5
-"""Pixels of background taken on either side of a peak: room for two low-passed values three pixels apart."""
+class WindowRule(NamedTuple):
+    """Numbers of the measurement of a peak; a named tuple, which compiled code reads as constants.
 
-TAIL_SIGMAS = 4.0
-"""Sigmas to which Gaussian weights are summed; beyond, each is below 0.0004 of the highest."""
+    They follow from the reasons below; tests/uwlts/stripe/test_unchanged.py keeps the results on drawn stripes.
 
-_PEAK_SIGMAS = 3.0
-"""Sigmas from a peak's middle to its background, where a Gaussian has fallen to 0.011 of its height."""
+    Attributes
+    ----------
+    least_kernel : float
+        Sigma of the narrowest weight, px. A narrower weight covers too few pixels: for a stripe of sigma 0.7 px the
+        error of the centre with the pixel phase would be 0.015 px instead of 0.005 px.
+    flank : int
+        Pixels of background on either side of a peak, for two low-passed values at a distance of three pixels.
+    tail : float
+        Range of sums with Gaussian weights, in sigmas: further weights are below 0.0004 of the largest.
+    background : float
+        Distance of the background from a peak's middle, in sigmas: a Gaussian has fallen to 0.011 of its height.
+    low_pass : float
+        Range of the low-pass, in sigmas: its last weight is below 0.0022 of the largest.
+    """
 
-_LOW_PASS_SIGMAS = 3.5
-"""Sigmas to which the low-pass reaches; its last weight is below 0.0022 of the middle one."""
+    least_kernel: float = 1.0
+    flank: int = 5
+    tail: float = 4.0
+    background: float = 3.0
+    low_pass: float = 3.5
+
+
+WINDOW_RULE = WindowRule()
 
 FIRST = -1
+"""Order of `SearchRules` for the rule `PeakRule.FIRST`."""
 STRONGEST = 0
+"""Order of `SearchRules` for the rules `PeakRule.STRONGEST` and `PeakRule.DIRECT`."""
 LAST = 1
-"""Which of several stripes on a line counts, as `SearchRules` has it for compiled code."""
+"""Order of `SearchRules` for the rule `PeakRule.LAST`."""
 
 
 class SearchRules(NamedTuple):
-    """Options of the search: lengths in px, heights in grey levels.
+    """Options of the search; lengths in px, heights in grey levels.
 
-    A window is ``block`` pixels and ``half`` pixels on either side, ``smoothing`` the sigma of the low-pass. ``order``
-    says which of several stripes counts: `FIRST`, `STRONGEST` or `LAST`. A second peak of ``share`` of the first one's
-    height makes a window crowded; for the strongest it is looked for in the whole window, else only as far as the
-    pixels used reach. A stripe's sigma lies between ``narrowest`` and ``widest``. Blocks lower than ``coarse`` and
-    peaks lower than ``fine`` are noise; what is too wide is noticed from ``bright`` on.
+    Attributes
+    ----------
+    half, block : int
+        A window consists of a block and ``half`` pixels on either side.
+    smoothing : float
+        Sigma of the low-pass.
+    share : float
+        Height of a second peak, as a fraction of the first one's, that makes a window crowded. For the strongest stripe
+        the whole window is searched, otherwise the pixels used.
+    order : int
+        Rule for several stripes: `FIRST`, `STRONGEST` or `LAST`.
+    narrowest, widest : float
+        Range of a stripe's sigma.
+    coarse, fine : float
+        Least height of a block, and of a peak after the low-pass; lower ones are noise.
+    bright : float
+        Least height of a peak that is too wide to be measured and not haze.
     """
 
     half: int
@@ -59,14 +87,27 @@ class SearchRules(NamedTuple):
 
 
 class Peak(NamedTuple):
-    """What stands in a window; positions in px from the window's first pixel, heights in grey levels.
+    """Peak in a window; positions in px from the window's first pixel, heights in grey levels.
 
-    ``top`` is the highest pixel after the low-pass; ``middle`` lies between the half-height crossings; ``sigma`` is the
-    half-height width over 2.355 with the low-pass taken out (variances add); ``reach`` the whole number of pixels from
-    ``middle`` to the first background pixel; ``base`` the background at ``middle`` and ``slope`` its rise per px, from
-    the flanks beyond ``reach``; ``height`` that of the top above ``base``, or above the lowest surroundings where not
-    ``closed``: both half-height crossings lie in the window; ``crowded`` where something outside the crossings rises
-    again to the given share of the peak: above its half height, or out of a valley of half its own height.
+    Attributes
+    ----------
+    top : int
+        Highest pixel after the low-pass.
+    middle : float
+        Midpoint of the half-height crossings.
+    sigma : float
+        Half-height width divided by 2.355, without the low-pass (variances add).
+    reach : int
+        Number of pixels from ``middle`` to the first background pixel.
+    base, slope : float
+        Background at ``middle``, and its slope per px, from the flanks beyond ``reach``.
+    height : float
+        Height of the top above ``base``; above the lowest surroundings unless ``closed``.
+    closed : bool
+        Both half-height crossings are in the window.
+    crowded : bool
+        The profile rises again outside the crossings: above half height, or to the required fraction of the height
+        after a valley of half its own height.
     """
 
     top: int
@@ -81,11 +122,18 @@ class Peak(NamedTuple):
 
 
 class PeakWindow(NamedTuple):
-    """Peaks in M windows of W pixels, as compiled code takes them.
+    """Peaks in M windows of W pixels, in the form for compiled code.
 
-    ``start`` (M,) int is the first pixel's position on its line, ``window`` (M, W) float32 the pixels, with the border
-    pixel repeated beyond the border, ``smoothing`` the sigma of the low-pass, px. All others are (M,) float32; see
-    `Peak`.
+    Attributes
+    ----------
+    start : (M,) int
+        First pixel of each window on its line.
+    window : (M, W) float32
+        Pixels; beyond the image the border pixel is repeated.
+    middle, sigma, reach, base, slope, height : (M,) float32
+        See `Peak`.
+    smoothing : float
+        Sigma of the low-pass, px.
     """
 
     start: np.ndarray
@@ -100,34 +148,34 @@ class PeakWindow(NamedTuple):
 
     @classmethod
     def empty(cls, count: int, size: int, smoothing: float) -> PeakWindow:
-        """Room for so many windows of so many pixels."""
+        """Allocate ``count`` windows of ``size`` pixels."""
         numbers = np.empty((6, count), np.float32)
         window = np.empty((count, size), np.float32)
         return cls(np.empty(count, np.intp), window, *numbers, smoothing=smoothing)
 
-    def keep(self, which: np.ndarray) -> PeakWindow:
-        """The windows chosen by a boolean mask or by their numbers."""
+    def select(self, which: np.ndarray) -> PeakWindow:
+        """Return the windows selected by a boolean mask or by indices."""
         *values, smoothing = self
         return PeakWindow(*(value[which] for value in values), smoothing=smoothing)
 
     def first(self, count: int) -> PeakWindow:
-        """The first windows."""
+        """Return the first ``count`` windows."""
         *values, smoothing = self
         return PeakWindow(*(value[:count] for value in values), smoothing=smoothing)
 
     def smooth(self) -> np.ndarray:
-        """(M, W) float32: the windows after the low-pass."""
+        """Return the windows (M, W) float32 after the low-pass."""
         kernel = low_pass(self.smoothing)
         return cv2.sepFilter2D(self.window, cv2.CV_32F, kernel, np.ones(1, np.float32), borderType=cv2.BORDER_REPLICATE)
 
     def kernel_sigma(self) -> np.ndarray:
-        """(M,) float32: sigma of the Gaussian weight for each peak."""
-        return np.maximum(self.sigma, np.float32(LEAST_KERNEL))
+        """Return the sigma (M,) float32 of the Gaussian weight for each peak."""
+        return np.maximum(self.sigma, np.float32(WINDOW_RULE.least_kernel))
 
 
 @compiled_part
-def cut(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> None:
-    """Pixels of one of the profiles (N, L) from `start` on, the border pixel repeated beyond the border."""
+def cut_window(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> None:
+    """Copy pixels of a line of the profiles (N, L) from `start` on; beyond the image the border pixel is repeated."""
     last = profiles.shape[0] - 1
     if start >= 0 and start + out.size - 1 <= last:
         for k in range(out.size):
@@ -138,10 +186,10 @@ def cut(profiles: np.ndarray, line: int, start: int, out: np.ndarray) -> None:
 
 
 @compiled_part
-def filtered(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
-    """Low-pass of a window with a symmetric kernel of 2 R + 1 weights.
+def filter_window(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
+    """Filter a window with a symmetric low-pass of 2 R + 1 weights.
 
-    ``pixels`` reach R further than the window on either side; what they hold there is replaced by its border pixels.
+    ``pixels`` has R further elements on either side, which are overwritten with the window's border pixels.
     """
     size, reach = out.size, kernel.size // 2
     middle = pixels[reach : reach + size]
@@ -156,28 +204,29 @@ def filtered(pixels: np.ndarray, kernel: np.ndarray, out: np.ndarray) -> None:
 
 
 @compiled_part
-def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> Peak:
-    """What stands in the window `smooth`, which begins at pixel `start` of `count` and may run over the image border.
+def measure_peak(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> Peak:
+    """Measure the peak in the filtered window `smooth`, which starts at pixel `start` of `count`.
 
-    The peak is sought in the block in the middle and half a block on either side.
+    The window may extend beyond the image. The peak is the highest pixel of the central block and half a block on
+    either side.
     """
     half, block = rules.half, rules.block
     size, first = smooth.size, half - block // 2
-    highest = greatest(smooth, first, first + 2 * block)
+    highest = find_greatest(smooth, first, first + 2 * block)
     top = first
     while smooth[top] != highest:
         top += 1
-    # Repeated border pixels may belong to the stripe itself, so that only the other side shows the background.
+    # Repeated border pixels may belong to the stripe: use only sides inside the image.
     ground = np.float32(-np.inf)
     for side in range(2):
         begin = side * (size - block)
         if start + begin >= 0 and start + begin + block <= count:
-            ground = max(ground, _least(smooth, begin, begin + block))
+            ground = max(ground, _find_least(smooth, begin, begin + block))
     rise = highest - ground
     level = ground + np.float32(0.5) * rise
 
     if rise <= 0:
-        # Its surroundings are as high: nothing stands there.
+        # The surroundings are as high: there is no peak.
         zero = np.float32(0.0)
         return Peak(top, np.float32(top), zero, 0, ground, zero, zero, False, rise > 0)
 
@@ -187,24 +236,24 @@ def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> 
     while right < size and smooth[right] >= level:
         right += 1
     closed = left >= 0 and right < size
-    x_left = np.float32(left) + _part(smooth[max(left, 0)], smooth[left + 1], level)
-    x_right = np.float32(right) - _part(smooth[min(right, size - 1)], smooth[right - 1], level)
+    x_left = np.float32(left) + _interpolate_level(smooth[max(left, 0)], smooth[left + 1], level)
+    x_right = np.float32(right) - _interpolate_level(smooth[min(right, size - 1)], smooth[right - 1], level)
     middle = np.float32(0.5) * (x_left + x_right)
     smooth_sigma = (x_right - x_left) * np.float32(1.0 / FWHM_PER_SIGMA)
     sigma = math.sqrt(max(smooth_sigma * smooth_sigma - np.float32(rules.smoothing * rules.smoothing), np.float32(0.0)))
 
-    reach = min(math.ceil(np.float32(_PEAK_SIGMAS) * smooth_sigma), half - FLANK)
+    reach = min(math.ceil(np.float32(WINDOW_RULE.background) * smooth_sigma), half - WINDOW_RULE.flank)
     near = math.floor(middle + np.float32(0.5))
-    before = _flank(smooth, near - reach - FLANK + 1)
+    before = _flank(smooth, near - reach - WINDOW_RULE.flank + 1)
     after = _flank(smooth, near + reach - 1)
-    slope = (after - before) / np.float32(2 * reach + FLANK - 2)
+    slope = (after - before) / np.float32(2 * reach + WINDOW_RULE.flank - 2)
     base = np.float32(0.5) * (before + after) + slope * (middle - np.float32(near))
-    extent = size if rules.order == STRONGEST else reach + FLANK - 1
+    extent = size if rules.order == STRONGEST else reach + WINDOW_RULE.flank - 1
     begin, end = max(near - extent, 0), min(near + extent + 1, size)
-    beside = max(greatest(smooth, begin, left + 1), greatest(smooth, right, end))
+    beside = max(find_greatest(smooth, begin, left + 1), find_greatest(smooth, right, end))
     crowded = beside >= ground + np.float32(rules.share) * rise
     if crowded:
-        # A tail that falls steadily is no second stripe.
+        # A monotonic tail is no second stripe.
         crowded = beside < ground
         for side in (-1, 1):
             first, last = (left, begin - 1) if side < 0 else (right, end)
@@ -213,8 +262,8 @@ def measured(smooth: np.ndarray, start: int, count: int, rules: SearchRules) -> 
 
 
 @compiled_part
-def greatest(values: np.ndarray, first: int, end: int) -> np.float32:
-    """The greatest of some numbers; less than any where there are none."""
+def find_greatest(values: np.ndarray, first: int, end: int) -> np.float32:
+    """Return the maximum of ``values[first:end]``; -inf if empty."""
     result, part = np.float32(-np.inf), values[first:end]
     for k in range(part.size):
         result = max(result, part[k])
@@ -222,8 +271,8 @@ def greatest(values: np.ndarray, first: int, end: int) -> np.float32:
 
 
 @compiled_inline
-def _least(values: np.ndarray, first: int, end: int) -> np.float32:
-    """The least of some numbers; more than any where there are none."""
+def _find_least(values: np.ndarray, first: int, end: int) -> np.float32:
+    """Return the minimum of ``values[first:end]``; inf if empty."""
     result, part = np.float32(np.inf), values[first:end]
     for k in range(part.size):
         result = min(result, part[k])
@@ -234,9 +283,10 @@ def _least(values: np.ndarray, first: int, end: int) -> np.float32:
 def _rises_again(
     values: np.ndarray, first: int, end: int, step: int, ground: np.floating, rise: np.floating, rules: SearchRules
 ) -> np.bool_:
-    """Whether values, from a peak outwards, reach half its height, or the given share of it after a valley.
+    """Return True if the profile outside a peak reaches half height, or the required fraction after a valley.
 
-    The valley is half as high as they are themselves. What rises by less than ``fine`` out of it may be noise.
+    The valley is at most half as high as the values after it. They must exceed it by at least ``fine``, the noise
+    limit.
     """
     level, share, fine = np.float32(0.5) * rise, np.float32(rules.share) * rise, np.float32(rules.fine)
     lowest, found = np.float32(np.inf), rise < 0
@@ -247,42 +297,42 @@ def _rises_again(
 
 
 @compiled_part
-def _part(low: np.floating, high: np.floating, level: np.floating) -> np.float32:
-    """Share of the way from one pixel to the next at which the straight line between them meets a level."""
+def _interpolate_level(low: np.floating, high: np.floating, level: np.floating) -> np.float32:
+    """Return the position, from 0 to 1, of a level on the straight line between two neighbouring pixels."""
     return np.float32(min(max((level - low) / max(high - low, np.float32(1e-6)), np.float32(0.0)), np.float32(1.0)))
 
 
 @compiled_part
 def _flank(smooth: np.ndarray, first: int) -> np.float32:
-    """Background in a flank: the lower of two low-passed values three pixels apart, which no hot pixel raises."""
-    first = min(max(first, 0), smooth.size - FLANK)
-    return min(smooth[first + 1], smooth[first + FLANK - 1])
+    """Return the background in a flank: the lower of two low-passed values, to ignore hot pixels."""
+    first = min(max(first, 0), smooth.size - WINDOW_RULE.flank)
+    return min(smooth[first + 1], smooth[first + WINDOW_RULE.flank - 1])
 
 
 @lru_cache(maxsize=16)
 def low_pass(sigma: float) -> np.ndarray:
-    """Gaussian weights, sum 1."""
-    reach = math.ceil(_LOW_PASS_SIGMAS * sigma)
+    """Return Gaussian weights of sum 1."""
+    reach = math.ceil(WINDOW_RULE.low_pass * sigma)
     weight = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     return (weight / weight.sum()).astype(np.float32)
 
 
 @lru_cache(maxsize=16)
 def noise_gain(sigma: float) -> float:
-    """Standard deviation of white unit noise after the low-pass."""
+    """Return the standard deviation of white unit noise after the low-pass."""
     return float(np.sqrt(np.sum(low_pass(sigma) ** 2)))
 
 
 @compiled
 def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, moments: np.ndarray) -> None:
-    """M0, M1 and M2 (M, 3) of the windows above `base` under a Gaussian weight at `centre`; see `zero_crossing`."""
+    """Compute moments M0, M1, M2 (M, 3) of the windows above `base`, weighted at `centre`; see `zero_crossing`."""
     count, size = peak.window.shape
     for m in range(count):
         pixels, ground, middle, width = peak.window[m], peak.base[m], float(centre[m]), float(sigma[m])
-        reach, sharpness = math.ceil(TAIL_SIGMAS * width), 1.0 / (width * width)
-        # A centre that has left its window has a sum all the same.
+        reach, sharpness = math.ceil(WINDOW_RULE.tail * width), 1.0 / (width * width)
+        # The centre may be outside its window.
         near = min(max(math.floor(middle + 0.5), 0), size - 1)
-        # A Gaussian by recurrence: the ratio of neighbouring values falls by the same factor from pixel to pixel.
+        # Gaussian by recurrence: the ratio of neighbouring values decreases by a constant factor per pixel.
         falling = math.exp(-sharpness)
         highest = math.exp(-0.5 * sharpness * (near - middle) ** 2)
         total, first, second = 0.0, 0.0, 0.0
@@ -299,6 +349,6 @@ def gaussian_moments(peak: PeakWindow, centre: np.ndarray, sigma: np.ndarray, mo
 
 
 @compiled_part
-def part_inside(u: float, half: float) -> float | np.floating:
-    """Share of a pixel, u from the centre, that lies within `half` of it."""
+def covered_fraction(u: float, half: float) -> float | np.floating:
+    """Return the fraction of a pixel at distance u from the centre that is within `half` of the centre."""
     return min(max(half + np.float32(0.5) - abs(u), np.float32(0.0)), np.float32(1.0))

@@ -1,6 +1,8 @@
-"""Search of each profile line for its stripe: blocks that stick out are looked at closely, one after another."""
+"""Search of each profile line for its stripe: blocks of high contrast are examined one after another."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,54 +11,71 @@ from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
 from uwlts.stripe.options import PeakRule, StripeOptions
 from uwlts.stripe.peak_window import (
     FIRST,
-    FLANK,
     FWHM_PER_SIGMA,
     LAST,
     STRONGEST,
+    WINDOW_RULE,
     Peak,
     PeakWindow,
     SearchRules,
-    cut,
-    filtered,
+    cut_window,
+    filter_window,
     low_pass,
-    measured,
+    measure_peak,
 )
 
-_LOOKS = 4
-"""Places looked at per line: hot pixels in front of the stripe and a second stripe after it."""
 
-_MOST = 6
-"""Most stripes on one line: two sheets, each with two reflections."""
+class _SearchRule(NamedTuple):
+    """Numbers of the search that are not options; a named tuple, which compiled code reads as constants.
 
-_COARSE_SLACK = 0.75
-"""Block contrasts of equal stripes differ by this factor through where the pixels fall on them (sigma 0.7 px)."""
+    Chosen by hand with the reasons below; tests/uwlts/stripe/test_unchanged.py keeps the results on drawn stripes. The
+    least height is that of `SearchRules`.
 
-_CLEAR = 3.0
-"""From this multiple of the least height a block is no mere noise."""
+    Attributes
+    ----------
+    looks : int
+        Places examined per line: hot pixels before the stripe, and a second stripe after it.
+    most_stripes : int
+        Most stripes on one line: two sheets, each with two reflections.
+    coarse_slack : float
+        Ratio of the block contrasts of equal stripes that have different pixel phases (sigma 0.7 px).
+    clear : float
+        Contrast of a block, in least heights, that cannot be noise in single pixels.
+    rival : float
+        Contrast of a block, in least heights, that may be a second stripe. Noise reaches it on one line in a hundred,
+        and the least height on every second line.
+    spike : float
+        Least ratio of a stripe's three-pixel mean to the least height; noise may lower the mean a little.
+    bright : float
+        Least height of a bright peak, as a fraction of the saturation. A wide peak that is lower is haze.
+    minor : float
+        Largest height of an ignored stripe, as a fraction of another stripe's; it cannot be measured itself.
+    """
 
-_RIVAL = 1.3
-"""From this multiple of the least height a block may be a second stripe: noise alone gets there on one line in a
-hundred, and to the least height on every second one."""
+    looks: int = 4
+    most_stripes: int = 6
+    coarse_slack: float = 0.75
+    clear: float = 3.0
+    rival: float = 1.3
+    spike: float = 0.85
+    bright: float = 0.25
+    minor: float = 0.5
 
-_SPIKE = 0.85
-"""Share of the least height below which three pixels' mean is noise; noise may lower that of a stripe a little."""
 
-_BRIGHT = 0.25
-"""Height over saturation from which something wide is a stripe rather than haze."""
-
-_MINOR = 0.5
-"""Share of another stripe's height up to which one that cannot be measured is left out."""
+_RULE = _SearchRule()
 
 MARGIN = 2
-"""Blocks on either side of a block's own that one window covers."""
+"""Blocks on either side of its own block that a window covers."""
 
-_OK, _NO_STRIPE = int(StripeStatus.OK), int(StripeStatus.NO_STRIPE)
-_AMBIGUOUS, _BORDER = int(StripeStatus.AMBIGUOUS), int(StripeStatus.BORDER)
+_OK = int(StripeStatus.OK)
+_NO_STRIPE = int(StripeStatus.NO_STRIPE)
+_AMBIGUOUS = int(StripeStatus.AMBIGUOUS)
+_BORDER = int(StripeStatus.BORDER)
 _ORDER = {PeakRule.DIRECT: STRONGEST, PeakRule.STRONGEST: STRONGEST, PeakRule.FIRST: FIRST, PeakRule.LAST: LAST}
 
 
 def search_rules(options: StripeOptions, *, coarse: float, fine: float, clip: float) -> SearchRules:
-    """Rules of the search; blocks lower than ``coarse`` and peaks lower than ``fine`` are noise, and pixels clip."""
+    """Return the rules of the search for thresholds ``coarse`` and ``fine``, and saturation at ``clip``."""
     half = options.half_window_px
     return SearchRules(
         half=half,
@@ -68,39 +87,50 @@ def search_rules(options: StripeOptions, *, coarse: float, fine: float, clip: fl
         widest=half / FWHM_PER_SIGMA,
         coarse=coarse,
         fine=fine,
-        bright=max(fine, _BRIGHT * clip),
+        bright=max(fine, _RULE.bright * clip),
     )
 
 
-def search(
+def search_profiles(
     profiles: np.ndarray, board: np.ndarray, rules: SearchRules
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, PeakWindow]:
-    """Look at the blocks that stick out, in the order of the rule, until each line has its stripe or no block left.
+    """Examine blocks of high contrast in the order of the rule, until each line has a stripe or no such block left.
 
-    ``board`` (L, B + 2 `MARGIN`) holds the contrasts of the B blocks of each of the profiles (N, L), and zeros at
-    either end; blocks that are done with are set to 0 in it. Under rule `strongest` a line with a stripe is searched
-    once more for a second one.
+    Under the rule `strongest`, a line with a stripe is searched again for a second stripe.
 
-    Returns the status (L,) of each line, whether something bright was too wide to be measured (L,), whether more may
-    stand on it than one stripe (L,), and the windows of the lines with a stripe, in their order.
+    Parameters
+    ----------
+    profiles
+        Pixels (N, L) along the L lines.
+    board
+        Contrasts (L, B + 2 `MARGIN`) of the B blocks of each line, with zeros at both ends. Examined blocks are set to
+        0.
+    rules
+        Rules of the search.
+
+    Returns
+    -------
+    tuple
+        Status (L,) of each line; whether a bright peak was too wide (L,); whether the line may contain more than one
+        stripe (L,); and the windows of the lines with a stripe, in their order.
     """
     lines = profiles.shape[1]
-    peaks = _windows(lines, rules)
+    peaks = _allocate_windows(lines, rules)
     status = np.full(lines, _NO_STRIPE, np.uint8)
     wide, several = np.zeros((2, lines), np.bool_)
-    count = _search_lines(profiles, board, *_room(peaks), rules, status, wide, several, peaks)
+    count = _search_lines(profiles, board, *_make_buffers(peaks), rules, status, wide, several, peaks)
     return status, wide, several, peaks.first(count)
 
 
-def _windows(count: int, rules: SearchRules) -> PeakWindow:
-    """Room for so many windows."""
+def _allocate_windows(count: int, rules: SearchRules) -> PeakWindow:
+    """Allocate windows for ``count`` peaks."""
     return PeakWindow.empty(count, 2 * rules.half + rules.block, rules.smoothing)
 
 
-def _room(peaks: PeakWindow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The low-pass, and room for the pixels of a window with its borders and for the window after the low-pass.
+def _make_buffers(peaks: PeakWindow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the low-pass, and buffers for a window with borders and for the filtered window.
 
-    Numba compiles longest for arrays that compiled code makes itself.
+    Compiled code takes its arrays as arguments, because Numba compiles longest for arrays made in compiled code.
     """
     kernel, size = low_pass(peaks.smoothing), peaks.window.shape[1]
     return kernel, np.empty(size + kernel.size - 1, np.float32), np.empty(size, np.float32)
@@ -109,50 +139,51 @@ def _room(peaks: PeakWindow) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def search_all(
     profiles: np.ndarray, board: np.ndarray, lines: np.ndarray, rules: SearchRules, *, fewest: int = 1
 ) -> tuple[np.ndarray, np.ndarray, PeakWindow]:
-    """All stripes on those of some lines (M,) that hold the ``fewest`` or more.
+    """Find all stripes on lines (M,) that contain at least ``fewest`` stripes.
 
-    The line of each, in their order, whether it can be measured, and its window.
+    Returns the line of each stripe, whether it can be measured, and its window, in the order of the lines. ``board``
+    (M, B + 2 `MARGIN`) contains the contrasts on these lines; for other parameters see `search_profiles`.
 
-    ``board`` (M, B + 2 `MARGIN`) are the contrasts on these lines, else as of `search`. Two stripes of which one
-    reaches into the other's pixels cannot be measured, nor one that is bright and too wide, or cut off by the border.
+    A stripe cannot be measured if another one overlaps its pixels, if it is bright and too wide, or if it is cut off by
+    the border.
     """
-    rules, most = rules._replace(order=FIRST), _MOST * len(lines)
-    peaks, found, clear = _windows(most, rules), np.empty(most, np.intp), np.empty(most, np.bool_)
-    count = _search_all(profiles, board, lines, *_room(peaks), rules, found, clear, peaks)
+    rules, most = rules._replace(order=FIRST), _RULE.most_stripes * len(lines)
+    peaks, found, clear = _allocate_windows(most, rules), np.empty(most, np.intp), np.empty(most, np.bool_)
+    count = _search_all(profiles, board, lines, *_make_buffers(peaks), rules, found, clear, peaks)
     kept = np.flatnonzero(found[:count] >= 0)
     if fewest > 1:
         kept = kept[np.bincount(found[kept])[found[kept]] >= fewest]
     if not kept.size:
         return found[:0], clear[:0], peaks.first(0)
-    return found[kept], clear[kept], peaks.keep(kept)
+    return found[kept], clear[kept], peaks.select(kept)
 
 
-def with_rivals(
+def mark_rivals(
     profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, known: np.ndarray, rules: SearchRules
 ) -> np.ndarray:
-    """Mask (M,) of the lines on which something stands out in the board ``left`` by `search` that is no spike.
+    """Return a mask (M,) of the lines that have a block of high contrast left in the board ``left``.
 
-    Lines that are ``known`` (M,) to have it are not searched.
+    Spikes are ignored. Lines with ``known`` (M,) rivals are not examined.
     """
     found = known.copy()
-    _see_rivals(profiles, left, lines, np.empty(rules.block + 2, np.float32), rules, found)
+    _mark_rivals(profiles, left, lines, np.empty(rules.block + 2, np.float32), rules, found)
     return found
 
 
-def look_at(profiles: np.ndarray, lines: np.ndarray, centre: np.ndarray, options: StripeOptions) -> PeakWindow:
-    """Windows about stripes whose centres (M,) on M lines of the profiles (N, L) are known from elsewhere.
+def measure_at(profiles: np.ndarray, lines: np.ndarray, centre: np.ndarray, options: StripeOptions) -> PeakWindow:
+    """Measure peaks at given centres (M,) on M lines of the profiles (N, L).
 
-    Their height is 0 where nothing stands out there.
+    Their height is 0 if there is no peak.
     """
     rules = search_rules(options, coarse=0.0, fine=0.0, clip=np.inf)
-    peaks = _windows(len(lines), rules)
+    peaks = _allocate_windows(len(lines), rules)
     peaks.start[:] = np.rint(centre).astype(np.intp) - rules.half - rules.block // 2
-    _look_at_lines(profiles, lines, *_room(peaks), rules, peaks)
+    _measure_lines(profiles, lines, *_make_buffers(peaks), rules, peaks)
     return peaks
 
 
 @compiled
-def _look_at_lines(
+def _measure_lines(
     profiles: np.ndarray,
     lines: np.ndarray,
     kernel: np.ndarray,
@@ -161,13 +192,13 @@ def _look_at_lines(
     rules: SearchRules,
     peaks: PeakWindow,
 ) -> None:
-    """Fill the windows that begin at ``peaks.start``."""
+    """Fill the windows that start at ``peaks.start``."""
     size, border = smooth.size, kernel.size // 2
     for m in range(lines.size):
         window = pixels[border : border + size]
-        cut(profiles, lines[m], peaks.start[m], window)
-        filtered(pixels, kernel, smooth)
-        peak = measured(smooth, peaks.start[m], profiles.shape[0], rules)
+        cut_window(profiles, lines[m], peaks.start[m], window)
+        filter_window(pixels, kernel, smooth)
+        peak = measure_peak(smooth, peaks.start[m], profiles.shape[0], rules)
         peaks.middle[m], peaks.sigma[m], peaks.reach[m] = peak.middle, peak.sigma, peak.reach
         peaks.base[m], peaks.slope[m] = peak.base, peak.slope
         peaks.height[m] = peak.height if peak.closed else np.float32(0.0)
@@ -188,37 +219,37 @@ def _search_lines(
     several: np.ndarray,
     peaks: PeakWindow,
 ) -> int:
-    """Fill `status`, `wide`, `several` and the windows of the lines with a stripe; returns how many there are."""
-    # A number that is no literal, for which functions would be compiled once more.
+    """Fill `status`, `wide`, `several` and the windows; return the number of lines with a stripe."""
+    # Not a literal, which Numba would compile further specialisations for.
     size, border, count = smooth.size, kernel.size // 2, int(np.intp(0))
     window = pixels[border : border + size]
     near = window[rules.half - 1 : rules.half + rules.block + 1]
     for line in range(profiles.shape[1]):
         blocks, least, rival, of_rival = board[line], np.float32(rules.coarse), np.intp(-1), np.float32(0.0)
-        for _ in range(_LOOKS):
-            highest = _greatest_block(blocks)
-            if status[line] == _OK and highest >= _RIVAL * rules.coarse:
+        for _ in range(_RULE.looks):
+            highest = _find_highest_block(blocks)
+            if status[line] == _OK and highest >= _RULE.rival * rules.coarse:
                 several[line] = True
-            chosen = _next_block(blocks, highest, least, rules)
+            chosen = _choose_block(blocks, highest, least, rules)
             if chosen < 0:
                 break
             there = np.float32(blocks[chosen])
             blocks[chosen] = 0
             start = (chosen - MARGIN) * rules.block - rules.half
-            if there < _CLEAR * rules.fine:
-                cut(profiles, line, start + rules.half - 1, near)
+            if there < _RULE.clear * rules.fine:
+                cut_window(profiles, line, start + rules.half - 1, near)
                 if _is_spike(near, there, rules.fine):
                     continue
-            start, peak = _followed(profiles, line, start, kernel, pixels, window, smooth, rules)
-            verdict = _judged(peak, start, profiles.shape[0], rules)
+            start, peak = _follow_peak(profiles, line, start, kernel, pixels, window, smooth, rules)
+            verdict = _classify_peak(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE:
                 wide[line] |= _is_too_wide(peak, rules)
                 continue
-            # The window has been searched for rivals already.
+            # `measure_peak` has searched this window for rivals.
             for k in range(chosen - MARGIN, chosen + MARGIN + 1):
                 blocks[k] = 0
             if status[line] == _OK:
-                # The flank of a wide stripe may stand out in a block of its own and lead back to the same stripe.
+                # The flank of a wide stripe may have contrast in another block, which leads to the same stripe.
                 away = abs(start + peak.middle - (peaks.start[count] + peaks.middle[count]))
                 if away <= peaks.sigma[count] * np.float32(FWHM_PER_SIGMA):
                     continue
@@ -232,30 +263,30 @@ def _search_lines(
             if verdict != _OK:
                 several[line] = True
                 break
-            _keep(peaks, count, start, peak, window)
+            _store_window(peaks, count, start, peak, window)
             if rules.order != STRONGEST:
                 break
-            least = max(least, there * np.float32(rules.share * _COARSE_SLACK))
+            least = max(least, there * np.float32(rules.share * _RULE.coarse_slack))
         if status[line] == _OK:
             count += 1
         if rival >= 0:
-            # Too dim to make the line ambiguous; whoever looks for all stripes finds it in the board.
+            # Too dim to make the line ambiguous, but left in the board for a search of all stripes.
             blocks[rival] = of_rival
     return count
 
 
 @compiled
-def _see_rivals(
+def _mark_rivals(
     profiles: np.ndarray, left: np.ndarray, lines: np.ndarray, near: np.ndarray, rules: SearchRules, found: np.ndarray
 ) -> None:
-    """Mark the lines on which a block stands out that is no spike."""
+    """Mark the lines with a block of high contrast that is not a spike."""
     for m in range(lines.size):
         blocks = left[lines[m]]
         for k in range(MARGIN, blocks.size - MARGIN):
             if blocks[k] >= rules.coarse and not found[m]:
-                cut(profiles, lines[m], (k - MARGIN) * rules.block - 1, near)
+                cut_window(profiles, lines[m], (k - MARGIN) * rules.block - 1, near)
                 there = np.float32(blocks[k])
-                found[m] = there >= _CLEAR * rules.fine or not _is_spike(near, there, rules.fine)
+                found[m] = there >= _RULE.clear * rules.fine or not _is_spike(near, there, rules.fine)
 
 
 @compiled
@@ -271,26 +302,26 @@ def _search_all(
     clear: np.ndarray,
     peaks: PeakWindow,
 ) -> int:
-    """Fill `found`, `clear` and the windows of all stripes on some lines; returns how many there are."""
-    # A number that is no literal, for which functions would be compiled once more.
+    """Fill `found`, `clear` and the windows of all stripes on the given lines; return the number of stripes."""
+    # Not a literal, which Numba would compile further specialisations for.
     size, border, count = smooth.size, kernel.size // 2, int(np.intp(0))
     window = pixels[border : border + size]
     near = window[rules.half - 1 : rules.half + rules.block + 1]
     for m in range(lines.size):
         line, blocks, first = lines[m], board[m], count
-        for _ in range(2 * _MOST):
-            there = _greatest_block(blocks)
-            if there < rules.coarse or there <= 0 or count == first + _MOST:
+        for _ in range(2 * _RULE.most_stripes):
+            there = _find_highest_block(blocks)
+            if there < rules.coarse or there <= 0 or count == first + _RULE.most_stripes:
                 break
-            chosen = _first_equal(blocks, there)
+            chosen = _find_first_equal(blocks, there)
             blocks[chosen] = 0
             start = (chosen - MARGIN) * rules.block - rules.half
-            if there < _CLEAR * rules.fine:
-                cut(profiles, line, start + rules.half - 1, near)
+            if there < _RULE.clear * rules.fine:
+                cut_window(profiles, line, start + rules.half - 1, near)
                 if _is_spike(near, np.float32(there), rules.fine):
                     continue
-            start, peak = _followed(profiles, line, start, kernel, pixels, window, smooth, rules)
-            verdict = _judged(peak, start, profiles.shape[0], rules)
+            start, peak = _follow_peak(profiles, line, start, kernel, pixels, window, smooth, rules)
+            verdict = _classify_peak(peak, start, profiles.shape[0], rules)
             if verdict == _NO_STRIPE and not _is_too_wide(peak, rules):
                 continue
             place, known = start + peak.middle, False
@@ -300,30 +331,31 @@ def _search_all(
             if known:
                 continue
             found[count], clear[count] = line, verdict == _OK
-            _keep(peaks, count, start, peak, window)
+            _store_window(peaks, count, start, peak, window)
             count += 1
-        _leave_minor_out(first, count, rules, found, clear, peaks)
+        _ignore_minor(first, count, rules, found, clear, peaks)
     return count
 
 
 @compiled_part
-def _leave_minor_out(
+def _ignore_minor(
     first: int, count: int, rules: SearchRules, found: np.ndarray, clear: np.ndarray, peaks: PeakWindow
 ) -> None:
-    """Set `found` to -1 for those of a line that cannot be measured beside a much higher one that can, or in its light.
+    """Set `found` to -1 for stripes that cannot be measured next to a measurable stripe.
 
-    Of what cannot be measured only stripes that might be the line's own matter.
+    They are ignored if the other stripe is close and at least as high, or at least twice as high. Only stripes that
+    might be the line's own matter.
     """
     for k in range(first, count):
         for j in range(first, count):
             apart = abs(peaks.start[j] + peaks.middle[j] - peaks.start[k] - peaks.middle[k])
-            share = 1.0 if apart <= rules.half + rules.block else _MINOR
+            share = 1.0 if apart <= rules.half + rules.block else _RULE.minor
             if clear[j] and not clear[k] and peaks.height[k] <= share * peaks.height[j]:
                 found[k] = -1
 
 
 @compiled_inline
-def _followed(
+def _follow_peak(
     profiles: np.ndarray,
     line: int,
     start: int,
@@ -333,29 +365,29 @@ def _followed(
     smooth: np.ndarray,
     rules: SearchRules,
 ) -> tuple[int, Peak]:
-    """What stands in the window that begins at `start`, moved with its pixels to the peak, and its beginning.
+    """Measure the peak in the window at `start`, moved to the peak if necessary; return its start and the peak.
 
-    ``window`` are the pixels without their borders.
+    ``window`` contains the pixels without their borders.
     """
     offset = 0
     while True:
-        cut(profiles, line, start + offset, window)
-        filtered(pixels, kernel, smooth)
-        peak = measured(smooth, start + offset, profiles.shape[0], rules)
+        cut_window(profiles, line, start + offset, window)
+        filter_window(pixels, kernel, smooth)
+        peak = measure_peak(smooth, start + offset, profiles.shape[0], rules)
         if offset != 0:
             break
-        offset = _offset(peak, smooth.size, rules)
+        offset = _window_offset(peak, smooth.size, rules)
         if offset == 0:
             break
     return start + offset, peak
 
 
 @compiled_inline
-def _offset(peak: Peak, size: int, rules: SearchRules) -> int:
-    """How far a window is to follow a peak of which a half-height crossing or a flank lies outside it."""
+def _window_offset(peak: Peak, size: int, rules: SearchRules) -> int:
+    """Return the shift of a window that does not contain a half-height crossing or a flank of its peak."""
     to_end = np.float32(0.5 * (size - 1))
     offset = peak.middle - to_end
-    outside = abs(offset) + peak.reach > to_end - FLANK + np.float32(0.5)
+    outside = abs(offset) + peak.reach > to_end - WINDOW_RULE.flank + np.float32(0.5)
     if (outside or not peak.closed) and peak.height >= rules.fine:
         return int(np.rint(offset))
     return 0
@@ -363,13 +395,13 @@ def _offset(peak: Peak, size: int, rules: SearchRules) -> int:
 
 @compiled_inline
 def _is_too_wide(peak: Peak, rules: SearchRules) -> bool:
-    """Whether what is no stripe is a bright one all the same that is too wide to be measured."""
+    """Return True for a bright peak that is too wide to be measured."""
     return bool((not peak.closed or peak.sigma > rules.widest) and peak.height >= rules.bright)
 
 
 @compiled_inline
-def _keep(peaks: PeakWindow, number: int, start: int, peak: Peak, window: np.ndarray) -> None:
-    """Keep a peak and its window under a number."""
+def _store_window(peaks: PeakWindow, number: int, start: int, peak: Peak, window: np.ndarray) -> None:
+    """Store a peak and its window at an index."""
     peaks.start[number], peaks.middle[number], peaks.sigma[number] = start, peak.middle, peak.sigma
     peaks.reach[number] = peak.reach
     peaks.base[number], peaks.slope[number], peaks.height[number] = peak.base, peak.slope, peak.height
@@ -378,8 +410,8 @@ def _keep(peaks: PeakWindow, number: int, start: int, peak: Peak, window: np.nda
 
 
 @compiled_part
-def _greatest_block(blocks: np.ndarray) -> np.number:
-    """The highest contrast of a line's blocks."""
+def _find_highest_block(blocks: np.ndarray) -> np.number:
+    """Return the highest contrast of a line's blocks."""
     highest = blocks[0]
     for k in range(blocks.size):
         highest = max(highest, blocks[k])
@@ -387,8 +419,8 @@ def _greatest_block(blocks: np.ndarray) -> np.number:
 
 
 @compiled_part
-def _first_equal(blocks: np.ndarray, height: np.number) -> int:
-    """The first block of a height that one has. All are looked at, many at a time: faster than to stop at the first."""
+def _find_first_equal(blocks: np.ndarray, height: np.number) -> int:
+    """Return the first block of a given height. All blocks are compared, which is faster in vector units."""
     chosen = np.int32(blocks.size)
     for k in range(np.int32(blocks.size)):
         chosen = min(chosen, np.int32(k) if blocks[k] == height else np.int32(blocks.size))
@@ -396,17 +428,17 @@ def _first_equal(blocks: np.ndarray, height: np.number) -> int:
 
 
 @compiled_part
-def _next_block(blocks: np.ndarray, highest: np.number, least: np.float32, rules: SearchRules) -> int:
-    """The block that the rule names among those that reach `least`; -1 where none does.
+def _choose_block(blocks: np.ndarray, highest: np.number, least: np.float32, rules: SearchRules) -> int:
+    """Return the next block by the rule among those of at least `least` contrast; -1 without such blocks.
 
-    First and last are taken among the blocks with a share of the highest contrast on their line.
+    First and last are chosen among the blocks whose contrast is a sufficient fraction of the highest one on their line.
     """
     if highest < least or highest <= 0:
         return -1
     if rules.order == STRONGEST:
-        return _first_equal(blocks, highest)
+        return _find_first_equal(blocks, highest)
     chosen = 0
-    wanted = max(least, np.float32(highest) * np.float32(rules.share * _COARSE_SLACK))
+    wanted = max(least, np.float32(highest) * np.float32(rules.share * _RULE.coarse_slack))
     if rules.order == FIRST:
         while blocks[chosen] < wanted:
             chosen += 1
@@ -419,31 +451,32 @@ def _next_block(blocks: np.ndarray, highest: np.number, least: np.float32, rules
 
 @compiled_part
 def _is_spike(near: np.ndarray, there: np.float32, fine: float) -> bool:
-    """Whether a block sticks out by noise in single pixels: a cheap look that spares most unlit lines a close one.
+    """Return True if the contrast of a block is due to noise in single pixels.
 
-    ``near`` are the pixels of the block and one on either side. The mean of three pixels lowers a stripe less than the
-    low-pass does, after which it must still be ``fine`` high.
+    This cheap test avoids a closer examination of most lines without light. ``near`` contains the pixels of the block
+    and one on either side. The mean of three pixels reduces a stripe less than the low-pass, after which it must still
+    be ``fine`` high.
     """
     single, mean = near[1], np.float32(-np.inf)
     for k in range(1, near.size - 1):
         single = max(single, near[k])
         mean = max(mean, near[k - 1] + near[k] + near[k + 1])
-    return there - (single - mean * np.float32(1.0 / 3.0)) < _SPIKE * fine
+    return there - (single - mean * np.float32(1.0 / 3.0)) < _RULE.spike * fine
 
 
 @compiled_part
-def _judged(peak: Peak, start: int, count: int, rules: SearchRules) -> int:
-    """`StripeStatus`: NO_STRIPE for what is too low, too narrow or too wide, or rises towards the border."""
+def _classify_peak(peak: Peak, start: int, count: int, rules: SearchRules) -> int:
+    """Return the status; NO_STRIPE for a peak too low, narrow or wide, or one that rises towards the border."""
     if peak.height < rules.fine:
         return _NO_STRIPE
     size, highest = 2 * rules.half + rules.block, start + peak.top
     if not peak.closed:
-        # A peak whose far side is not in the image; one on the last pixel itself may be any rise towards the border.
+        # The far side is outside the image; a maximum at the last pixel may be any rise towards the border.
         outside = start < 0 or start + size > count
         return _BORDER if outside and 1 < highest < count - 2 else _NO_STRIPE
     if not rules.narrowest <= peak.sigma <= rules.widest:
         return _NO_STRIPE
-    middle, extent = start + peak.middle, peak.reach + FLANK - 1
+    middle, extent = start + peak.middle, peak.reach + WINDOW_RULE.flank - 1
     if middle - extent < 0 or middle + extent > count - 1:
         return _BORDER
     return _AMBIGUOUS if peak.crowded else _OK

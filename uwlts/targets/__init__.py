@@ -1,7 +1,7 @@
-"""Calibration targets: their descriptions, and how they are found in images.
+"""Calibration targets: their descriptions and their detection in images.
 
-Every module of this package is imported with it, so that the target types defined there are known by their kind. The
-detectors are in the subpackage ``detection``, which is imported when a target is searched for.
+All modules of this package are imported with it, so that the target types in them are known by their kind. The
+detectors are in the subpackage ``detection``, which is imported when a target is detected.
 """
 
 from importlib import import_module

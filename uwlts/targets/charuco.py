@@ -11,7 +11,7 @@ from uwlts.model.sensor import Positive
 from uwlts.targets.target import Patch, Target, TargetView, lattice_indices, rectangle_corners
 
 _MIN_CORNERS = 4
-"""The fewest points that determine a homography."""
+"""Fewest corners of a view: they determine a homography."""
 
 
 class CharucoTarget(Target):
@@ -25,7 +25,7 @@ class CharucoTarget(Target):
     columns, rows : number of squares along X and along Y
     square_mm, marker_mm : sides of a square and of a marker
     dictionary : name of the predefined marker dictionary, such as DICT_4X4_100
-    legacy : whether the board has the pattern of OpenCV before 4.6 (differs where `rows` is even)
+    legacy : True for the pattern of OpenCV before 4.6, which differs for even `rows`
     """
 
     kind: Literal["charuco"] = "charuco"
@@ -50,7 +50,7 @@ class CharucoTarget(Target):
         return self
 
     def board(self) -> cv2.aruco.CharucoBoard:
-        """OpenCV's board object, lengths in mm."""
+        """Return OpenCV's board object, lengths in mm."""
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_mm, self.marker_mm, dictionary)
         board.setLegacyPattern(self.legacy)
@@ -69,7 +69,7 @@ class CharucoTarget(Target):
 
     @property
     def extent_mm(self) -> np.ndarray:
-        """Corners (4, 2), target frame, of the board, which is printed to its rim."""
+        """Corners (4, 2), target frame, of the board, which is printed to its edge."""
         return rectangle_corners(np.zeros(2), self.square_mm * np.array([self.columns, self.rows]))
 
     def patches(self) -> list[Patch]:
@@ -78,7 +78,7 @@ class CharucoTarget(Target):
         white = {tuple(place) for place in np.floor(first_corners / self.square_mm).astype(int).tolist()}
         squares = [place for place in lattice_indices(self.columns, self.rows).tolist() if tuple(place) not in white]
         patches = [Patch(*(np.array([i, j, i + 1, j + 1]) * self.square_mm).tolist()) for i, j in squares]
-        # One pixel for each cell of a marker, its border of one cell included.
+        # Cells of a marker across, with its border of one cell.
         across = dictionary.markerSize + 2
         cell = self.marker_mm / across
         for number, first in zip(np.ravel(board.getIds()).tolist(), first_corners, strict=True):
@@ -88,10 +88,10 @@ class CharucoTarget(Target):
         return patches
 
     def detect(self, image: np.ndarray) -> TargetView:
-        # Imported late: a description alone does not need the detector.
-        from uwlts.targets.detection import corner_quality, eight_bit
+        # Imported late: a description does not need the detector.
+        from uwlts.targets.detection import convert_to_eight_bit, measure_corners
 
-        corners, numbers, _, markers = cv2.aruco.CharucoDetector(self.board()).detectBoard(eight_bit(image))
+        corners, numbers, _, markers = cv2.aruco.CharucoDetector(self.board()).detectBoard(convert_to_eight_bit(image))
         count = 0 if numbers is None else len(numbers)
         if count < _MIN_CORNERS:
             seen = 0 if markers is None else len(markers)
@@ -103,4 +103,4 @@ class CharucoTarget(Target):
         # OpenCV 4 and 5 differ in the singleton dimensions of these arrays.
         pixels = np.asarray(corners, np.float64).reshape(-1, 2)
         indices = self.indices[np.asarray(numbers, np.int64).reshape(-1)]
-        return TargetView(pixels, self.points_at(indices), indices, corner_quality(image, pixels))
+        return TargetView(pixels, self.points_at(indices), indices, measure_corners(image, pixels))

@@ -1,4 +1,4 @@
-"""The chessboard target, seen as a whole or in part."""
+"""The chessboard target, seen completely or in part."""
 
 from collections.abc import Callable
 from functools import partial
@@ -17,11 +17,11 @@ _QUAD_FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 
 
 class ChessboardTarget(Target):
-    """A chessboard, known by its inner corners.
+    """A chessboard, described by its inner corners.
 
     The origin is the top left inner corner. If one of `columns` and `rows` is odd and the other even, the board differs
-    from itself turned by half a turn: the square above and to the left of the origin is dark. Otherwise the turn with X
-    pointing most to the right in the image is taken.
+    from itself rotated by half a turn: the square above and to the left of the origin is dark. Otherwise the
+    orientation with X pointing most to the right in the image is used.
 
     Attributes
     ----------
@@ -56,36 +56,42 @@ class ChessboardTarget(Target):
         return [Patch(*corners) for corners in (np.hstack([dark - 1, dark]) * np.tile(self.sides_mm, 2)).tolist()]
 
     def detect(self, image: np.ndarray) -> TargetView:
-        # Imported late: a description alone does not need the detector.
-        from uwlts.targets.detection import corner_quality, count_seen, eight_bit, refined, why_no_chessboard
+        # Imported late: a description does not need the detector.
+        from uwlts.targets.detection import (
+            convert_to_eight_bit,
+            count_corners,
+            find_chessboard_fault,
+            measure_corners,
+            refine_corners,
+        )
 
-        grey = eight_bit(image)
+        grey = convert_to_eight_bit(image)
         part, reasons = None, []
         for name, find in _DETECTORS.items():
             grid = find(grey, self.columns, self.rows)
             if grid is None:
                 continue
-            grid = refined(image, grid)
-            reason = why_no_chessboard(grey, grid)
+            grid = refine_corners(image, grid)
+            reason = find_chessboard_fault(grey, grid)
             if reason is not None:
                 reasons.append(f"{reason} (as found by {name})")
             elif self.findable(np.isfinite(grid[..., 0]).ravel()) and (
-                part is None or count_seen(grid) > count_seen(part)
+                part is None or count_corners(grid) > count_corners(part)
             ):
                 part = grid
-            if part is not None and count_seen(part) > _NEARLY_WHOLE * self.columns * self.rows:
+            if part is not None and count_corners(part) > _NEARLY_WHOLE * self.columns * self.rows:
                 break
         if part is None:
             raise TargetError(
                 f"found no chessboard of {self.columns} x {self.rows} inner corners"
                 + "".join(f"; {reason}" for reason in reasons)
-                + "; columns and rows count inner corners, not squares; of a board that is partly in view, two sides "
-                "that meet must be in view"
+                + "; columns and rows count inner corners, not squares; of a board partly in view, two adjacent sides "
+                "must be in view"
             )
         pixels = _from_top_left(grey, part).reshape(-1, 2)
         seen = np.isfinite(pixels[:, 0])
         pixels, indices = pixels[seen], self.indices[seen]
-        return TargetView(pixels, self.points_at(indices), indices, corner_quality(image, pixels))
+        return TargetView(pixels, self.points_at(indices), indices, measure_corners(image, pixels))
 
 
 def _by_lattice(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
@@ -97,7 +103,7 @@ def _by_lattice(grey: np.ndarray, columns: int, rows: int) -> np.ndarray | None:
 def _by_opencv(
     find: Callable[..., tuple[bool, np.ndarray]], flags: int, grey: np.ndarray, columns: int, rows: int
 ) -> np.ndarray | None:
-    # What OpenCV draws at random is the same for every image, whatever came before it.
+    # The same random numbers for every image.
     cv2.setRNGSeed(0)
     found, corners = find(grey, (columns, rows), flags=flags)
     return corners.reshape(rows, columns, 2).astype(np.float64) if found else None
@@ -108,12 +114,13 @@ _DETECTORS = {
     "OpenCV's sectors": partial(_by_opencv, cv2.findChessboardCornersSB, _SECTOR_FLAGS),
     "OpenCV's squares": partial(_by_opencv, cv2.findChessboardCorners, _QUAD_FLAGS),
 }
-"""Detectors of corners (rows, columns, 2), NaN where one is not seen; they return None where they find no board."""
-_NEARLY_WHOLE = 0.8  # of the corners; where fewer are seen the next way is tried
+"""Detectors of corners (rows, columns, 2) with NaN for missing corners; they return None if they find no board."""
+_NEARLY_WHOLE = 0.8
+"""Fraction of found corners above which no further detector is tried."""
 
 
 def _from_top_left(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """The grid (rows, columns, 2) turned so that it follows the frame of `ChessboardTarget`."""
+    """Return the grid (rows, columns, 2) rotated to the frame of `ChessboardTarget`."""
     along, across = (np.nanmean(np.diff(grid, axis=axis), axis=(0, 1)) for axis in (1, 0))
     if along[0] * across[1] < along[1] * across[0]:
         grid = grid[:, ::-1]
@@ -125,6 +132,6 @@ def _from_top_left(grey: np.ndarray, grid: np.ndarray) -> np.ndarray:
         even = (np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2 == 0)[known]
         levels = grey[v, u]
         return grid if levels[even].mean() < levels[~even].mean() else grid[::-1, ::-1]
-    # A square board has four turns that look alike, another board two.
+    # A square board has four equal orientations, other boards have two.
     turned = [np.rot90(grid, turn) for turn in (range(4) if rows == columns else (0, 2))]
     return max(turned, key=lambda each: np.nanmean(np.diff(each, axis=1)[..., 0]))

@@ -11,23 +11,24 @@ from uwlts.targets.target import Patch, Target, TargetView, lattice_indices
 
 Place = tuple[int, int]
 
-# Above the median of all circles, which is below zero where blur lowers the ring of a small circle. A sharp dot has the
-# strength 1, dirt and noise rarely more than 0.1; a dot of two pixels under blur keeps 0.4.
 _MIN_MARK_STRENGTH = 0.3
-_MAX_OUTLIERS = 0.02  # share of all circles outside the described lattice that are taken for outliers
-# Quarter turns from the target's axes to those of the numbering. The target is seen from its front: no reflections.
+"""Least strength of a mark above the median of all circles. This median is negative if blur lowers the ring of small
+circles. A sharp dot has strength 1, dirt and noise rarely more than 0.1, a blurred dot of two pixels 0.4."""
+_MAX_OUTLIERS = 0.02
+"""Largest fraction of circles outside the described lattice, which are outliers."""
 _QUARTER_TURNS = [np.array([[c, -s], [s, c]]) for c, s in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+"""Rotations from the target's axes to those of the indices. The target is seen from the front: no reflections."""
 
 
 class CircleTarget(Target):
-    """A lattice of equal circles, three of them with a centred dot of the opposite brightness.
+    """A lattice of equal circles, three of them with a central dot of the opposite brightness.
 
     The origin is the centre of the circle at `origin`. Circles may be bright on dark or dark on bright.
 
     Attributes
     ----------
     spacing_x_mm, spacing_y_mm : distance between the centres of neighbours along X and along Y
-    diameter_mm, marker_diameter_mm : of the circles and of the dots in three of them
+    diameter_mm, marker_diameter_mm : diameter of the circles and of the dots
     columns, rows : number of circles along X and along Y
     origin : place (column, row) of the first dotted circle, counted from the top left circle (0, 0)
     marker_x, marker_y : places of the dotted circles in +X and in +Y direction, counted from `origin`
@@ -49,7 +50,7 @@ class CircleTarget(Target):
         if self.diameter_mm >= min(self.spacing_x_mm, self.spacing_y_mm):
             raise ValueError(
                 f"diameter_mm is {self.diameter_mm}; expected less than the spacing of {self.spacing_x_mm} x "
-                f"{self.spacing_y_mm} mm, or the circles touch"
+                f"{self.spacing_y_mm} mm, otherwise the circles touch"
             )
         if self.marker_diameter_mm >= self.diameter_mm:
             raise ValueError(
@@ -62,8 +63,8 @@ class CircleTarget(Target):
                 )
         if self.marker_x[0] * self.marker_y[1] == self.marker_x[1] * self.marker_y[0]:
             raise ValueError(
-                f"marker_x {self.marker_x} and marker_y {self.marker_y} lie on one line with the origin; "
-                "expected two directions, or the marks do not show how the target is turned"
+                f"marker_x {self.marker_x} and marker_y {self.marker_y} are collinear with the origin; "
+                "expected two directions, which determine the orientation of the target"
             )
         return self
 
@@ -84,7 +85,7 @@ class CircleTarget(Target):
         return self.diameter_mm
 
     def marked(self) -> list[Place]:
-        """Places of the three dotted circles: origin, in +X, in +Y."""
+        """Return the places of the three dotted circles: origin, in +X, in +Y."""
         return [(self.origin[0] + i, self.origin[1] + j) for i, j in ((0, 0), self.marker_x, self.marker_y)]
 
     def findable(self, in_view: np.ndarray) -> bool:
@@ -97,12 +98,12 @@ class CircleTarget(Target):
         ]
 
     def detect(self, image: np.ndarray) -> TargetView:
-        # Imported late: a description alone does not need the detector.
-        from uwlts.targets.detection import detect_lattice, mark_strength
+        # Imported late: a description does not need the detector.
+        from uwlts.targets.detection import detect_lattice, measure_marks
 
         lattice = detect_lattice(image)
         circles, numbers = lattice.circles, lattice.indices
-        strength = mark_strength(image, circles, mark_over_circle=self.marker_diameter_mm / self.diameter_mm)
+        strength = measure_marks(image, circles, mark_over_circle=self.marker_diameter_mm / self.diameter_mm)
         origin, turn = _orientation(numbers, strength - np.median(strength), self, lattice.found)
         indices = (numbers - origin) @ turn + np.array(self.origin)
         places = (self.columns, self.rows)
@@ -142,7 +143,7 @@ def _disc(point: np.ndarray, diameter_mm: float, *, ink: bool = True) -> Patch:
 def _orientation(
     numbers: np.ndarray, strength: np.ndarray, target: CircleTarget, found: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Number (2,) of the origin circle and the quarter turn (2, 2) from target steps to number steps."""
+    """Return the indices (2,) of the origin circle and the rotation (2, 2) from target steps to index steps."""
     marked = {
         tuple(n): value for n, value in zip(numbers.tolist(), strength, strict=True) if value > _MIN_MARK_STRENGTH
     }
@@ -157,9 +158,9 @@ def _orientation(
     seen = f"found {found} circles, {len(numbers)} of them in a lattice"
     if len(marked) < 3:
         raise TargetError(
-            f"{seen}, but only {len(marked)} of 3 marked circles; bring all three into view, sharp and unobstructed"
+            f"{seen}, but only {len(marked)} of 3 marked circles; all three must be in view, sharp and unobstructed"
         )
     raise TargetError(
-        f"{seen}, with {len(marked)} marked circles, which fit the described offsets {target.marker_x} and "
-        f"{target.marker_y} in {len(fits)} ways; expected one: check marker_x, marker_y and dirt on the circles"
+        f"{seen}, with {len(marked)} marked circles, which match the described offsets {target.marker_x} and "
+        f"{target.marker_y} {len(fits)} times; expected once: check marker_x, marker_y and dirt on the circles"
     )

@@ -1,4 +1,4 @@
-"""Base class of calibration targets, and reading of their descriptions."""
+"""Base class of calibration targets, and parsing of their descriptions."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -11,10 +11,10 @@ from pydantic import ValidationError
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Description, NotNegative
 
-# A target seen in part is found from about a dozen points, or from a share of a larger one: fewer are too likely to
-# miss the marks or markers that number them.
 _FEWEST_POINTS = 12
+"""Fewest points of a target seen in part: fewer points often do not include the marks or markers for their numbers."""
 _SMALLEST_SHARE = 0.15
+"""Least fraction of a large target's points, for the same reason."""
 
 
 @dataclass(frozen=True)
@@ -24,13 +24,13 @@ class TargetView:
     Attributes
     ----------
     pixels : (N, 2) float64, px, (u, v), pixel (0, 0) is the centre of the first pixel
-        Centre of the image of a circle (not the image of its centre: see `circle_centre_bias`), or a corner.
+        Corner, or centre of a circle's image (not the image of its centre: see `circle_centre_bias`).
     points_mm : (N, 3) float64, mm, target frame, z = 0
     indices : (N, 2) int64, place (column, row) of the circle or inner corner, counted from the top left one
     quality : name to (N,) float64
-        ``contrast``: grey levels between bright and dark at the point; ``sharpness``: steepest slope over contrast,
-        1/px; for circles also ``residual_px``: rms distance of the edge from its ellipse, and ``radius_px``: geometric
-        mean of the ellipse's semi-axes.
+        ``contrast``: difference of bright and dark grey levels at the point. ``sharpness``: steepest slope divided by
+        the contrast, 1/px. For circles also ``residual_px``: rms distance of the edge from its ellipse, and
+        ``radius_px``: geometric mean of the ellipse's semi-axes.
     """
 
     pixels: np.ndarray
@@ -41,10 +41,9 @@ class TargetView:
 
 @dataclass(frozen=True)
 class Patch:
-    """A piece of a target's print: a rectangle with sides along x and y, or the ellipse that fits into it.
+    """Part of a target's print: a rectangle with sides along x and y of the target frame, or its inscribed ellipse.
 
-    In the target frame. ``round`` patches are the ellipse; those that are not ``ink`` have the brightness of the ground
-    around the pattern.
+    ``round`` patches are ellipses. Patches that are not ``ink`` have the brightness of the ground around the pattern.
     """
 
     x_min_mm: float
@@ -58,16 +57,17 @@ class Patch:
 class Target(Description, ABC):
     """Base of calibration targets: a flat pattern of points that are found and numbered in an image.
 
-    Looking at the target, X points right, Y down and Z away from the viewer into the target; all points have z = 0.
+    For a viewer of the target, X points right, Y down and Z away from the viewer into the target. All points have z =
+    0.
 
-    A target type is a subclass with a field ``kind``, whose default is its name in files. Each module of
-    `uwlts.targets` is imported with the package, so a class in a module of its own there is known without further
-    steps; a class elsewhere is known once its module is imported.
+    A target type is a subclass with a field ``kind``, whose default is its name in files. All modules of
+    `uwlts.targets` are imported with the package, so that classes in them are known. A class elsewhere is known after
+    the import of its module.
 
     Attributes
     ----------
-    margin_mm : how far the flat plate reaches beyond the pattern, where a stripe is of use as well: one number, or
-        [left, top, right, bottom]; half the spacing unless given
+    margin_mm : width of the flat plate beyond the pattern, where a stripe is used as well: one number, or
+        [left, top, right, bottom]; by default half the spacing
     """
 
     margin_mm: NotNegative | tuple[NotNegative, NotNegative, NotNegative, NotNegative] | None = None
@@ -85,16 +85,16 @@ class Target(Description, ABC):
 
     @abstractmethod
     def points_at(self, indices: np.ndarray) -> np.ndarray:
-        """Points (M, 3) in mm, target frame, with these indices (M, 2)."""
+        """Return points (M, 3) in mm, target frame, with these indices (M, 2)."""
 
     @property
     @abstractmethod
     def spacing_mm(self) -> float:
-        """Distance between neighbouring points, the smaller one."""
+        """Distance between neighbouring points; if it differs between directions, the smaller one."""
 
     @abstractmethod
     def patches(self) -> list[Patch]:
-        """The print as seen from the front; a patch covers those before it."""
+        """Return the print as seen from the front; a patch covers earlier patches."""
 
     @abstractmethod
     def detect(self, image: np.ndarray) -> TargetView:
@@ -103,9 +103,9 @@ class Target(Description, ABC):
         Raises
         ------
         ImageError
-            The image is no grey image of 8 or 16 bit.
+            The image is not a grey image of 8 or 16 bit.
         TargetError
-            The target is not found completely enough; the message says what was missing.
+            The target is not found, or in too small a part; the message states the missing part.
         """
 
     @property
@@ -120,21 +120,21 @@ class Target(Description, ABC):
 
     @property
     def extent_mm(self) -> np.ndarray:
-        """Corners (4, 2), target frame, of the rectangle that is covered by the pattern: its outermost points."""
+        """Corners (4, 2), target frame, of the bounding rectangle of all points."""
         points = self.points_mm[:, :2]
         return rectangle_corners(points.min(axis=0), points.max(axis=0))
 
     @property
     def plate_mm(self) -> np.ndarray:
-        """Corners (4, 2), target frame, of the rectangle known to be flat: the pattern and the margin around it."""
+        """Corners (4, 2), target frame, of the flat rectangle: the pattern and the margin around it."""
         margin = np.broadcast_to(self.spacing_mm / 2 if self.margin_mm is None else self.margin_mm, 4)
         corners = self.extent_mm
         return rectangle_corners(corners.min(axis=0) - margin[:2], corners.max(axis=0) + margin[2:])
 
     def on_plate(self, places_mm: np.ndarray, *, beyond: float = 0.0) -> np.ndarray:
-        """Whether (N,) places (N, 2) in the target's plane lie on the flat plate; False for those that are NaN.
+        """Return a mask (N,) of places (N, 2) in the target's plane that are on the flat plate; False for NaN.
 
-        ``beyond`` is the share of the plate's size by which a place may lie outside.
+        ``beyond`` enlarges the plate by this fraction of its size.
         """
         corners = self.plate_mm
         margin = beyond * np.ptp(corners, axis=0)
@@ -142,7 +142,7 @@ class Target(Description, ABC):
         return ((places_mm >= low) & (places_mm <= high)).all(axis=1)
 
     def findable(self, in_view: np.ndarray) -> bool:
-        """Whether `detect` finds the target if these (N,) of its points are in the image, as in `indices`."""
+        """Return True if `detect` finds the target from the points in view (N,), in the order of `indices`."""
         return bool(in_view.sum() >= max(min(_FEWEST_POINTS, len(in_view)), _SMALLEST_SHARE * len(in_view)))
 
 
@@ -150,17 +150,17 @@ _KINDS: dict[str, type[Target]] = {}
 
 
 def lattice_indices(columns: int, rows: int) -> np.ndarray:
-    """Indices (columns * rows, 2) int64 (column, row) of a rectangular lattice, row by row."""
+    """Return indices (columns * rows, 2) int64 (column, row) of a rectangular lattice, row by row."""
     return np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=2).reshape(-1, 2)
 
 
 def rectangle_corners(first: np.ndarray, last: np.ndarray) -> np.ndarray:
-    """Corners (4, 2) of a rectangle between two opposite ones (2,)."""
+    """Return the corners (4, 2) of a rectangle from two opposite corners (2,)."""
     return np.array([first, (last[0], first[1]), last, (first[0], last[1])])
 
 
 def parse_target(mapping: Mapping[str, object]) -> Target:
-    """Make a target description from keys and values, as read from a file; DescriptionError where they are wrong."""
+    """Create a target description from keys and values, as read from a file; DescriptionError if they are wrong."""
     if not isinstance(mapping, Mapping):
         raise DescriptionError(f"the target is a {type(mapping).__name__}; expected a table of keys and values")
     kind = mapping.get("kind")

@@ -1,6 +1,6 @@
-"""Inspections of simulated scans whose shape is known in closed form and whose errors are those that they state.
+"""Inspections of simulated scans with known shape in closed form and errors as stated in the clouds.
 
-Gates on values are 4.5 standard uncertainties, which a normal error exceeds 7 times in a million; gates on counts state
+Gates on values are 4.5 standard uncertainties, exceeded by a normal error 7 times in a million. Gates on counts state
 their probability of a false alarm.
 """
 
@@ -20,10 +20,10 @@ from uwlts.cli import app
 from uwlts.errors import EvaluationError
 from uwlts.inspection.blemish_search import UnrolledSurface, search_blemishes
 from uwlts.inspection.features import DEFINITIONS, FeatureKind
-from uwlts.inspection.flat import _circle
+from uwlts.inspection.flat import _fit_circle
 from uwlts.inspection.inspect import inspected
-from uwlts.inspection.pipe_form import fit_pipe, pipe_features
-from uwlts.inspection.weld import _toes_and_slopes
+from uwlts.inspection.pipe_form import PipeFormRule, fit_pipe, pipe_features
+from uwlts.inspection.weld import _find_toes
 from uwlts.storage.cloud import FOOTPRINT, FOOTPRINT_STD, PAIRS, PointCloud, PointUncertainty
 
 NOISE_MM, IMAGE_MM = 0.02, 0.004
@@ -32,7 +32,7 @@ GATE = 4.5
 
 
 def cloud_of(rng, points, normals, frame, line, *, patterns=(), stated=True, correlated=False):
-    """A cloud with noise along the normals, offsets of images and common patterns (N, 3), all drawn as stated."""
+    """Return a cloud with noise along the normals, offsets of images and common patterns (N, 3), as it states them."""
     count = len(points)
     noise = NOISE_MM * rng.standard_normal(count)
     if correlated:
@@ -50,7 +50,7 @@ def cloud_of(rng, points, normals, frame, line, *, patterns=(), stated=True, cor
 
 
 def pipe_scan(rng, *, half_arc=np.pi, along=(-20, 20.5, 1.0), around_mm=0.8, radius=None, **options):
-    """A pipe along x about the origin, of a radius (N,) as a function of place along and angle from -z towards y."""
+    """Scan a pipe along x about the origin; its radius (N,) is a function of x and of the angle from -z towards y."""
     x = np.arange(*along)
     angle = np.linspace(-half_arc, half_arc, int(2 * half_arc * RADIUS_MM / around_mm), endpoint=False)
     at, turn = (each.ravel() for each in np.meshgrid(x, angle, indexing="ij"))
@@ -60,13 +60,13 @@ def pipe_scan(rng, *, half_arc=np.pi, along=(-20, 20.5, 1.0), around_mm=0.8, rad
     points = size[:, None] * normals
     points[:, 0] = at
     points[:, 2] += 0.002 * np.square(at) * options.pop("bow", 0.0)
-    # Scale, and a shift that depends on the place along the stripe: what a calibration leaves open.
+    # Scale, and a shift that varies along the stripe: typical errors of a calibration.
     patterns = [2e-5 * points, 0.01 * np.sin(turn / 2)[:, None] * normals]
     return cloud_of(rng, points, normals, frame, line, patterns=patterns, **options)
 
 
 def test_fits_that_do_not_settle_are_errors(monkeypatch):
-    """A pipe of 1.5 mm ovality seen from one side, in one round; and a circle through places on a line."""
+    """A pipe of 1.5 mm ovality seen from one side, in one round; and a circle through collinear places."""
     cloud = pipe_scan(
         np.random.default_rng(2),
         radius=lambda x, angle: RADIUS_MM * (1 + 0.0025 * np.cos(2 * angle - 0.6)),
@@ -74,16 +74,16 @@ def test_fits_that_do_not_settle_are_errors(monkeypatch):
         around_mm=3.0,
     )
     assert fit_pipe(cloud).radius_mm == pytest.approx(RADIUS_MM, abs=1.0)
-    monkeypatch.setattr("uwlts.inspection.pipe_form._ROUNDS", 1)
-    with pytest.raises(EvaluationError, match="axis does not settle: after 1 rounds it still moves by"):
+    monkeypatch.setattr("uwlts.inspection.pipe_form.FORM_RULE", PipeFormRule(rounds=1))
+    with pytest.raises(EvaluationError, match="axis does not converge: after 1 rounds it still changes by"):
         fit_pipe(cloud)
     places = np.array([[0.0, 0.0], [1.0, 1e-12], [2.0, -1e-12], [3.0, 0.0]])
     with pytest.raises(EvaluationError, match="no circle fits the 4 places"):
-        _circle(places)
+        _fit_circle(places)
 
 
 def test_the_form_of_a_pipe_is_within_its_intervals():
-    """20 pipes; fewer than 14 of 20 intervals of 95 % hold the truth 3 times in 100,000."""
+    """20 pipes; fewer than 14 of 20 intervals of 95 % contain the truth 3 times in 100,000."""
 
     def oval(x, angle):
         return RADIUS_MM * (1 + 0.0025 * np.cos(2 * (angle - 0.3))) + 0.05 * np.cos(3 * angle)
@@ -105,9 +105,9 @@ def test_the_form_of_a_pipe_is_within_its_intervals():
 
 
 def test_the_diameter_of_an_arc_may_be_that_of_an_oval():
-    """Any ovality up to 2 %; fewer than 14 of 20 intervals of 95 % hold the truth 3 times in 100,000.
+    """Any ovality up to 2 %; fewer than 14 of 20 intervals of 95 % contain the truth 3 times in 100,000.
 
-    Sections of a pipe share its ovality, so that one counts.
+    Sections of a pipe share its ovality, so that one section per pipe is counted.
     """
     rng = np.random.default_rng(14)
     inside = np.zeros(2, int)
@@ -123,14 +123,14 @@ def test_the_diameter_of_an_arc_may_be_that_of_an_oval():
         assert values[0].uncertainty < 4.0
         inside += [value.low <= 300.0 <= value.high for value in values]
     assert inside.min() >= 14, inside
-    # Of a pipe that is known to be round only the points' own uncertainty is left.
+    # For a pipe known to be round only the points' own uncertainty remains.
     round_one = pipe_features(cloud, fit_pipe(cloud, largest_ovality=0.0))[0][0]["diameter"]
     assert round_one.uncertainty < 0.1 * values[0].uncertainty
 
 
 @pytest.mark.slow
 def test_a_round_pipe_may_be_round():
-    """The interval of the ovality reaches down to zero; nine in ten of 20 intervals do (13 or fewer: 3 in 100,000)."""
+    """The ovality's interval contains zero in nine of ten cases (13 or fewer of 20: 3 in 100,000)."""
     rng = np.random.default_rng(2)
     lows = []
     for _ in range(20):
@@ -140,7 +140,7 @@ def test_a_round_pipe_may_be_round():
 
 
 def field(rng, *, side=50.0, step=0.5, heights=None, correlated=True):
-    """An unrolled surface with noise that neighbours along the second axis share."""
+    """Return an unrolled surface whose noise is correlated between neighbours along the second axis."""
     u, v = np.meshgrid(np.arange(0, side, step), np.arange(0, side, 0.25), indexing="ij")
     drawn = rng.standard_normal((u.shape[0], u.shape[1] + 2))
     noise = (drawn[:, :-2] + drawn[:, 1:-1] + drawn[:, 2:]) / np.sqrt(3) if correlated else drawn[:, 2:]
@@ -153,7 +153,7 @@ def field(rng, *, side=50.0, step=0.5, heights=None, correlated=True):
 
 @pytest.mark.slow
 def test_false_alarms_are_as_rare_as_stated():
-    """Of 20 plain surfaces at a probability of 0.2 each, 12 or more indicate something once in 10,000 times."""
+    """20 undamaged surfaces at a probability of 0.2 each give 12 or more indications once in 10,000 times."""
     rng = np.random.default_rng(3)
     alarms = [len(search_blemishes(field(rng, correlated=k % 2 == 0), false_alarm=0.2).indications) for k in range(20)]
     assert np.count_nonzero(alarms) < 12
@@ -172,7 +172,7 @@ def test_outliers_and_holes_are_no_blemishes():
     )
     assert not search.indications
     kept = np.isin(np.flatnonzero(seen), wild)
-    # Two wild neighbours in ten thousand points hide each other now and then.
+    # Among ten thousand points, two neighbouring outliers may hide each other.
     assert search.outliers[kept].mean() > 0.9 and search.outliers[~kept].mean() < 0.02
 
 
@@ -181,7 +181,7 @@ def bell(u, v, at, diameter, depth):
 
 
 def test_pits_are_found_and_measured():
-    """Pits, one beside a much larger one, and a protrusion, on an oval pipe of which a fifth was seen."""
+    """Pits, one next to a much larger one, and a protrusion, on an oval pipe seen over a fifth of its circumference."""
     places = {(-10.0, -40.0): (3.0, 0.3), (0.0, 5.0): (18.0, 3.0), (8.0, -20.0): (8.0, 0.8), (-9.0, 40.0): (6.0, -0.5)}
     places[(-12.0, 9.0)] = (4.0, 0.4)
 
@@ -219,7 +219,7 @@ def test_pits_are_found_and_measured():
 
 
 def test_a_pit_where_a_whole_pipe_is_cut_open_is_found_once():
-    """Pits at eight angles around, so that wherever the cut is one lies near it."""
+    """Pits at eight angles around the pipe, so that one is near any cut."""
     turns = np.linspace(-np.pi, np.pi, 8, endpoint=False)
 
     def radius(x, angle):
@@ -237,7 +237,7 @@ def test_a_pit_where_a_whole_pipe_is_cut_open_is_found_once():
 
 @pytest.mark.slow
 def test_depths_are_within_their_intervals():
-    """36 pits of 1 mm depth; fewer than 27 of 36 intervals of 95 % hold the truth once in 100,000 times."""
+    """36 pits of 1 mm depth; fewer than 27 of 36 intervals of 95 % contain the truth once in 100,000 times."""
     places = list(product(np.arange(-20, 21, 8.0), np.arange(-20, 21, 8.0)))
 
     def radius(x, angle):
@@ -247,12 +247,12 @@ def test_depths_are_within_their_intervals():
     pits = uwlts.inspect_pipe(cloud).of(FeatureKind.PIT)
     assert len(pits) == len(places)
     assert np.count_nonzero([pit["depth"].low <= 1.0 <= pit["depth"].high for pit in pits]) >= 27
-    # What all points share is common to a pit and its surroundings.
+    # Errors common to all points are equal in a pit and its surroundings.
     assert all(pit["depth"].systematic < 0.2 * pit["depth"].random for pit in pits)
 
 
 def test_what_the_footprint_of_points_smooths_is_put_back():
-    """25 pits of 2.5 mm diameter and 0.5 mm depth; as if points had no footprint they are a tenth too shallow."""
+    """25 pits of 2.5 mm diameter and 0.5 mm depth; without the footprint correction they are a tenth too shallow."""
     sizes, places = (0.22, 0.2), list(product(np.arange(-12, 13, 6.0), np.arange(-12, 13, 6.0)))
     nodes, weights = np.polynomial.hermite_e.hermegauss(7)
 
@@ -271,13 +271,13 @@ def test_what_the_footprint_of_points_smooths_is_put_back():
         assert len(pits) == len(places)
         means.append(np.mean([pit["depth"].value for pit in pits]))
     inside = [pit["depth"].low <= 0.5 <= pit["depth"].high for pit in pits]
-    # Fewer than 18 of 25 intervals of 95 % hold the truth once in 10,000 times.
+    # Fewer than 18 of 25 intervals of 95 % contain the truth once in 10,000 times.
     assert np.count_nonzero(inside) >= 18
     assert means[0] < 0.475 < 0.485 < means[1] < 0.515
 
 
 def flat_scan(rng, height, kept, *, along=(-30, 30, 0.5), across=(-60, 60, 900), **options):
-    """A flat thing that faces -z, scanned along x in profiles across it; ``kept`` says where there is something."""
+    """Scan a flat object facing -z along x, in profiles across it; ``kept`` selects places with a surface."""
     x, y = np.arange(*along), np.linspace(*across)
     at, over = np.meshgrid(x, y, indexing="ij")
     frame, line = np.meshgrid(np.arange(len(x)), np.arange(len(y)), indexing="ij")
@@ -294,7 +294,7 @@ def everywhere(x, y):
 
 
 def within(feature, truth):
-    """Whether each value of a feature is within the gate of the truth."""
+    """Assert that each value of a feature is within the gate of the truth."""
     for name, value in truth.items():
         assert feature[name].value == pytest.approx(value, abs=GATE * feature[name].uncertainty), name
 
@@ -302,7 +302,7 @@ def within(feature, truth):
 def test_a_step_is_measured():
     cloud = flat_scan(np.random.default_rng(7), lambda x, y: np.where(y > 10, 12.34, 0.0) + 0.01 * x, everywhere)
     step = uwlts.inspect_step(cloud).features[0]
-    # The height is across the faces, which lean by 0.01.
+    # The height is perpendicular to the faces, which are inclined by 0.01.
     within(step, {"height": 12.34 * np.cos(np.arctan(0.01))})
     assert step["height"].uncertainty < 0.02 and step["parallelism"].low < 0.01
 
@@ -339,13 +339,13 @@ def test_a_gap_is_measured():
 
     cloud = flat_scan(np.random.default_rng(9), lambda x, y: np.where(y > 0, 0.3, 0.0), apart)
     gap = uwlts.inspect_gap(cloud).features[0]
-    # Square to the middle line, which leans by 0.02.
+    # Perpendicular to the middle line, which is inclined by 0.02.
     within(gap, {"width": 3.0 * np.cos(0.02), "parallelism": np.degrees(0.008), "flush": 0.3})
     assert gap["width"].random < 0.03 and gap["width"].uncertainty < 0.2
 
 
 def test_blur_beyond_an_edge_shows_in_the_brightness():
-    """A gap of 3 mm whose edges are blurred, and seen down to a fourth of the brightness: 0.13 mm beyond each."""
+    """A gap of 3 mm with blurred edges, visible down to a quarter of the brightness: 0.13 mm beyond each edge."""
     blur = 0.2
 
     def brightness(y):
@@ -357,12 +357,12 @@ def test_blur_beyond_an_edge_shows_in_the_brightness():
     stripes = replace(cloud, intensity=100 * brightness(cloud.points_mm[:, 1]))
     known = replace(stripes, metadata={FOOTPRINT: [0.15, blur], FOOTPRINT_STD: 0.2})
     narrow, right = (uwlts.inspect_gap(each).features[0]["width"].value for each in (stripes, known))
-    # Half of a line's spacing of 0.12 mm on either side is all that is known without.
+    # Without brightness each edge is known to half a line's spacing of 0.12 mm.
     assert narrow < 2.93 and right == pytest.approx(3.0, abs=0.03)
 
 
 def weld_height(x, y, *, undercut, offset):
-    """A bead (1 - t^2)^2 of 2 mm and 12 mm on plates that are offset, with grooves of 2.4 mm at its toes."""
+    """Return a bead (1 - t^2)^2 of 2 mm and 12 mm on plates with an offset, with grooves of 2.4 mm at its toes."""
     t = np.abs(y) / 6
     bead = 2.0 * np.square(np.maximum(1 - np.square(t), 0))
     groove = undercut * np.square(np.maximum(1 - np.square((t - 1) * 6 / 1.2), 0))
@@ -391,7 +391,7 @@ def test_a_weld_is_measured(undercut, offset):
 def test_a_weld_of_many_even_profiles_is_measured_and_what_is_left_out_is_named():
     """More points on the bead than a square matrix of them would fit in memory, all on the same few lines.
 
-    Beside the bead is a shorter one, and a tenth of the bead is missing.
+    A shorter bead is next to it, and a tenth of the bead is missing.
     """
 
     def height(x, y):
@@ -402,8 +402,8 @@ def test_a_weld_of_many_even_profiles_is_measured_and_what_is_left_out_is_named(
     found = uwlts.inspect_weld(cloud)
     within(found.features[0], {"height": 2.0})
     assert found.features[0].extent_mm[0] > 55
-    assert any(note.startswith("1 more of what stands out") for note in found.notes)
-    number = next(int(note.split()[0]) for note in found.notes if "sections are left out" in note)
+    assert any(note.startswith("1 other beads") for note in found.notes)
+    number = next(int(note.split()[0]) for note in found.notes if "sections are omitted" in note)
     assert number == pytest.approx(10, abs=3)
 
 
@@ -419,7 +419,7 @@ def test_holes_that_are_not_measured_are_named():
     cloud = flat_scan(np.random.default_rng(18), lambda x, y: 0 * x, face, along=(-60, 60, 0.5))
     flange = uwlts.inspect_flange(cloud)
     assert len(flange.of(FeatureKind.HOLE)) == 5
-    left_out = [note for note in flange.notes if "is not listed" in note]
+    left_out = [note for note in flange.notes if "is omitted" in note]
     assert any("its diameter is" in note for note in left_out), flange.notes
     assert any("not round" in note for note in left_out), flange.notes
 
@@ -428,18 +428,16 @@ def test_holes_that_are_not_measured_are_named():
 
     gap = uwlts.inspect_gap(flat_scan(np.random.default_rng(19), lambda x, y: 0 * x, gapped))
     within(gap.features[0], {"width": 3.0})
-    assert sum("profiles cross it, fewer than the gap" in note for note in gap.notes) == 1
+    assert sum("profiles cross it, fewer than the measured gap" in note for note in gap.notes) == 1
 
 
 def test_what_stands_at_the_rim_of_a_section_is_not_its_top():
-    """Few sections: in one of them something higher than the bead stands where the grid of the sections ends."""
+    """Few sections, one of them with a point higher than the bead at the end of its grid."""
     grid = np.linspace(-12.0, 12.0, 97)
     profile = weld_height(0.0, grid, undercut=0.0, offset=0.0)
     profile[-3:] = 5.0
     profiles = SimpleNamespace(across_mm=grid)
-    left, right, *slopes = _toes_and_slopes(
-        SimpleNamespace(profiles=profiles, half_mm=6.0), profile[None], np.array([0])
-    )[0]
+    left, right, *slopes = _find_toes(SimpleNamespace(profiles=profiles, half_mm=6.0), profile[None], np.array([0]))[0]
     assert right == pytest.approx(-left, abs=1e-9) and 4.0 < right < 6.0
     assert slopes[0] == pytest.approx(slopes[1])
 
@@ -455,13 +453,13 @@ def test_clouds_without_covariance_say_so(tmp_path, monkeypatch, capsys):
         result_action="return_value",
     )
     record = json.loads((tmp_path / "pipe.json").read_text())
-    assert any("states no uncertainty" in note for note in record["notes"])
+    assert any("does not contain uncertainties" in note for note in record["notes"])
     pit = next(each for each in record["features"] if each["kind"] == "pit")
     assert pit["values"]["depth"]["systematic"] is None and pit["values"]["depth"]["random"] > 0
     assert pit["values"]["depth"]["source"].startswith("ASME B31G")
     assert "pit 1" in capsys.readouterr().out
     deviation = uwlts.read("c.ply").deviation_mm
-    # As on the page: blue in the pit, red where the surface stands out, and most of it pale.
+    # As on the page: blue in the pit, red on protrusions, pale elsewhere.
     red, _, blue, _ = np.asarray(trimesh.load("c.ply").colors, int).T
     assert (blue > red)[deviation < -0.1].all() and (blue <= red)[deviation > 0.01].all()
     assert len(np.unique(red)) > 50
@@ -486,13 +484,13 @@ def test_wrong_input_is_refused():
     rng = np.random.default_rng(12)
     cloud = flat_scan(rng, lambda x, y: 0 * x, everywhere, along=(-5, 5, 1.0), across=(-20, 20, 100))
     for words, options in (
-        ("a weld has no `wall_mm`", {"kind": "weld", "wall_mm": 9.0}),
-        ("a pipe has no `datum`", {"datum": cloud}),
-        ("a step has no `section_mm`", {"kind": "step", "section_mm": 1.0}),
+        ("a weld does not take `wall_mm`", {"kind": "weld", "wall_mm": 9.0}),
+        ("a pipe does not take `datum`", {"datum": cloud}),
+        ("a step does not take `section_mm`", {"kind": "step", "section_mm": 1.0}),
         ("wall_mm is -1", {"wall_mm": -1.0}),
         ("false_alarm is 2", {"false_alarm": 2.0}),
-        ("no bead stands out", {"kind": "weld"}),
-        ("no gap goes through", {"kind": "gap"}),
+        ("no bead found", {"kind": "weld"}),
+        ("no gap found", {"kind": "gap"}),
     ):
         with pytest.raises(EvaluationError, match=words):
             inspected(cloud, **({"kind": "pipe"} | options))

@@ -1,4 +1,4 @@
-"""Lengths and shapes measured where someone points: exact on drawn points, their uncertainty as of drawn errors."""
+"""Lengths and shapes at picked places: exact on exact points, and uncertainties compared with drawn errors."""
 
 from typing import get_args
 
@@ -27,7 +27,7 @@ def cloud_of(
 
 
 def on_shape(shape: Shape, count: int, *, seed: int = 0) -> np.ndarray:
-    """Points exactly on a cap of a sphere of radius 20, on a plane, or on a cylinder of radius 8, about CENTRE."""
+    """Return exact points on a cap of a sphere of radius 20, on a plane, or on a cylinder of radius 8, about CENTRE."""
     rng = np.random.default_rng(seed)
     if shape == "sphere":
         away = rng.normal(size=(count, 3))
@@ -41,7 +41,7 @@ def on_shape(shape: Shape, count: int, *, seed: int = 0) -> np.ndarray:
 
 
 def disturbed(points: np.ndarray, *, seed: int = 1, patterns_by: float = 1.0) -> PointCloud:
-    """Points off by noise along their rays, with images that stand off and patterns of the calibration."""
+    """Return points with noise along their rays, image offsets and patterns of the calibration."""
     rng = np.random.default_rng(seed)
     image = ((points[:, 0] - points[:, 0].min()) / 1.5).astype(int)
     rays = np.array([0.002, -0.004, 0.012]) * rng.uniform(0.7, 1.3, (len(points), 1))
@@ -50,7 +50,7 @@ def disturbed(points: np.ndarray, *, seed: int = 1, patterns_by: float = 1.0) ->
     about = points - CENTRE
     patterns = [rng.normal(0, 0.01, 3) + about @ rng.normal(0, 4e-4, (3, 3)) + 2e-5 * about**2 * k for k in range(3)]
     return cloud_of(
-        # Evenly drawn, so that none lies so far off that it is left out.
+        # Uniform errors, so that no point is rejected as an outlier.
         points + rng.uniform(-1.7, 1.7, (len(points), 1)) * rays,
         frame=rng.permutation(image.max() + 1)[image],
         known=PointUncertainty(random, position, (patterns_by * np.array(patterns)).astype(np.float32)),
@@ -58,7 +58,7 @@ def disturbed(points: np.ndarray, *, seed: int = 1, patterns_by: float = 1.0) ->
 
 
 class Errors:
-    """Moves (N, 3) of a cloud's points, drawn by the definitions of `PointUncertainty`."""
+    """Displacements (N, 3) of a cloud's points, drawn by the definitions of `PointUncertainty`."""
 
     def __init__(self, cloud: PointCloud):
         self._known, (self._images, self._image) = cloud.uncertainty, np.unique(cloud.frame, return_inverse=True)
@@ -69,20 +69,20 @@ class Errors:
         self._roots = axes * np.sqrt(np.maximum(strengths, 0))[:, None]
 
     def random(self, rng: np.random.Generator) -> np.ndarray:
-        """Noise of each point alone, and the position of each image."""
+        """Draw the noise of each point and the position of each image."""
         noise = np.einsum("nij,nj->ni", self._roots, rng.standard_normal((len(self._roots), 3)))
         return noise + rng.standard_normal(len(self._images))[self._image][:, None] * self._known.position_mm
 
     def systematic(self, rng: np.random.Generator) -> np.ndarray:
-        """All patterns, each by a factor of its own."""
+        """Draw all patterns, each with its own factor."""
         return np.einsum("m,mni->ni", rng.standard_normal(len(self._known.patterns_mm)), self._known.patterns_mm)
 
 
 def agree(ratio: float, freedom: int) -> bool:
-    """Whether a ratio of an estimated variance to the true one is within its chance.
+    """Return True if the ratio of an estimated variance to the true one is within its statistical limits.
 
-    Times its degrees of freedom it is chi-square; the limits are those beyond which it lies with the probability
-    FALSE_ALARM, made wider by what is not linear.
+    The ratio times its degrees of freedom is chi-square distributed. The limits have the probability FALSE_ALARM, and
+    are widened by the nonlinearity.
     """
     low, high = (chi2.ppf(p, freedom) / freedom for p in (FALSE_ALARM / 2, 1 - FALSE_ALARM / 2))
     return low / NOT_LINEAR <= ratio <= high * NOT_LINEAR
@@ -130,7 +130,7 @@ def test_a_lengths_uncertainty_is_that_of_drawn_errors(same_image):
         first, second = np.moveaxis([cloud.points_mm + drawn(rng) for _ in range(DRAWS)], 1, 0)
         lengths = np.linalg.norm(second - first, axis=1)
         assert agree(np.var(lengths, ddof=1) / value**2, DRAWS - 1)
-    # What both points share does not count: a pattern that moves all alike, the position of their common image.
+    # Common errors cancel: a pattern that moves all points equally, the position of their common image.
     alike = PointUncertainty(np.zeros((2, 6)) + 1e-12, np.full((2, 3), 0.5), np.full((4, 2, 3), 0.7))
     together = length_between(cloud_of(points, frame=np.array([3, 3]), known=alike), 0, 1).uncertainty["distance"]
     assert together.systematic_mm == pytest.approx(0, abs=1e-12) and together.random_mm < 1e-5
@@ -179,7 +179,7 @@ def test_of_very_many_points_a_part_is_used():
 
 
 def sphere_figures(points: np.ndarray) -> list[float]:
-    """Diameter and standard deviation of the least-squares sphere, by Gauss and Newton."""
+    """Return diameter and standard deviation of the least-squares sphere, by Gauss-Newton."""
     centre, radius = points.mean(axis=0) + [0, 0, 10.0], 20.0
     for _ in range(12):
         way = points - centre
@@ -192,13 +192,13 @@ def sphere_figures(points: np.ndarray) -> list[float]:
 
 
 def plane_figures(points: np.ndarray) -> list[float]:
-    """Standard deviation from the plane, by the scatter's smallest eigenvalue."""
+    """Return the standard deviation from the plane, by the smallest eigenvalue of the scatter matrix."""
     centred = points - points.mean(axis=0)
     return [float(np.sqrt(np.linalg.eigvalsh(centred.T @ centred)[0] / (len(points) - 3)))]
 
 
 def cylinder_figures(points: np.ndarray) -> list[float]:
-    """Diameter and standard deviation of the least-squares cylinder about nearly the Y axis, by Gauss and Newton."""
+    """Return diameter and standard deviation of the least-squares cylinder about nearly the Y axis, by Gauss-Newton."""
     about = points - CENTRE
     x, z, by_x, by_z, radius = 0.0, 0.0, 0.0, 0.0, 8.0
     for _ in range(12):
@@ -221,7 +221,7 @@ FIGURES = {"sphere": sphere_figures, "plane": plane_figures, "cylinder": cylinde
 
 
 def remeasured(shape: Shape, cloud: PointCloud, kind: str, draws: int) -> np.ndarray:
-    """Variances of a shape's figures with errors of a kind drawn anew."""
+    """Return variances of a shape's figures under repeatedly drawn errors."""
     rng, errors = np.random.default_rng(8), Errors(cloud)
     moved = (cloud.points_mm + getattr(errors, kind)(rng) for _ in range(draws))
     return np.var([FIGURES[shape](points) for points in moved], axis=0, ddof=1)
@@ -238,7 +238,7 @@ def remeasured(shape: Shape, cloud: PointCloud, kind: str, draws: int) -> np.nda
     ],
 )
 def test_what_the_calibration_does_to_a_shape_is_that_of_drawn_patterns(shape, patterns_by, names):
-    """The deviation from the shape follows patterns linearly only where they are small against it."""
+    """The standard deviation is linear in the patterns only if they are small relative to it."""
     cloud, draws = disturbed(on_shape(shape, 120), patterns_by=patterns_by), 1000
     measured = shape_near(cloud, CENTRE, 60.0, shape)
     assert measured.points_used == len(cloud)
@@ -251,7 +251,7 @@ def test_what_the_calibration_does_to_a_shape_is_that_of_drawn_patterns(shape, p
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", get_args(Shape))
 def test_what_noise_does_to_a_shape_is_that_of_drawn_noise(shape):
-    """It is stated from 8 draws, right to 27 %: what is stated of ten clouds is compared together."""
+    """Stated uncertainties from 8 draws have an error of 27 %: those of ten clouds are compared together."""
     ratios = []
     for number in range(10):
         cloud = disturbed(on_shape(shape, 100 + 7 * number, seed=number), seed=50 + number)
@@ -270,7 +270,7 @@ def test_what_moves_a_shape_as_a_whole_leaves_its_figures():
     known = PointUncertainty(np.full((300, 6), 1e-12, np.float32), np.zeros((300, 3), np.float32), shifts)
     stated = shape_near(cloud_of(points, known=known), CENTRE, 60.0, "sphere").uncertainty["diameter"]
     assert stated.systematic_mm < 1e-6 and stated.random_mm < 1e-5
-    # A pattern that makes everything larger by a thousandth does the same to the diameter.
+    # A pattern that scales the cloud by 1.001 scales the diameter by the same factor.
     larger = PointUncertainty(known.random_mm2, known.position_mm, (1e-3 * (points - CENTRE))[None].astype(np.float32))
     stated = shape_near(cloud_of(points, known=larger), CENTRE, 60.0, "sphere").uncertainty["diameter"]
     assert stated.systematic_mm == pytest.approx(0.04, rel=1e-4)

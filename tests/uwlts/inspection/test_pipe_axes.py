@@ -1,7 +1,7 @@
-"""Inspections of pipes along any axis: the same findings, none lost, none twice, none on clean pipes.
+"""Inspections of pipes along any axis: equal findings, none lost, none twice, none on undamaged pipes.
 
-Pipes are those of `tests.oracles.pipes`. Gates on depths are 4.5 standard uncertainties, which a normal error exceeds 7
-times in a million; each search has a false alarm with a probability of 1e-4, all of them together with 2 %.
+Pipes are those of `tests.oracles.pipes`. Gates on depths are 4.5 standard uncertainties, exceeded by a normal error 7
+times in a million. Each search has a false-alarm probability of 1e-4, all of them together 2 %.
 """
 
 from dataclasses import replace
@@ -33,7 +33,7 @@ def inspected(pipe: ScannedPipe) -> Inspection:
 
 
 def matched(pipe: ScannedPipe, found: Inspection, bumps: list[Bump]) -> list[Feature]:
-    """The one feature of each bump, at its place and with its depth, and no others."""
+    """Return the one feature of each bump, with its place and depth, and assert that there are no others."""
     left, own = list(found.of(*BLEMISHES)), []
     for bump in bumps:
         near = [each for each in left if pipe.distance_mm(bump, each.place_mm) < 0.15 * bump.diameter_mm]
@@ -51,7 +51,7 @@ def matched(pipe: ScannedPipe, found: Inspection, bumps: list[Bump]) -> list[Fea
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("axis", AXES.values(), ids=AXES)
 def test_all_pits_are_found_along_any_axis(axis: tuple[float, float, float], seed: int) -> None:
-    """Pits all around, of which one is where the pipe is cut open every few times."""
+    """Pits all around the pipe; in some runs one of them is at the cut."""
     rng = np.random.default_rng([seed, 1])
     turn = 2 * np.pi / len(DEPTHS_MM)
     bumps = [
@@ -66,7 +66,7 @@ def test_all_pits_are_found_along_any_axis(axis: tuple[float, float, float], see
     pipe = scan_pipe(rng, axis=axis, length_mm=90.0, bumps=bumps, holes=[(0.0, 2.5 * turn, 6.0)])
     found = inspected(pipe)
     matched(pipe, found, bumps)
-    assert not any("is not listed" in note for note in found.notes)
+    assert not any("is omitted" in note for note in found.notes)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -75,11 +75,11 @@ def test_clean_pipes_have_no_findings_along_any_axis(axis: tuple[float, float, f
     rng = np.random.default_rng([seed, 2])
     arc = 2 * np.pi if seed % 2 else 0.8 * np.pi
     found = inspected(scan_pipe(rng, axis=axis, arc=arc, spacing_mm=1.5, holes=[(5.0, 1.0, 15.0)]))
-    assert not found.of(*BLEMISHES) and not any("is not listed" in note for note in found.notes)
+    assert not found.of(*BLEMISHES) and not any("is omitted" in note for note in found.notes)
 
 
 def test_a_dent_at_the_cut_is_one_finding() -> None:
-    """Dents wider than both sides overlap, about a gap that decides where the pipe is cut open, at -0.02 rad."""
+    """Dents wider than the overlap of both sides, about a gap that determines the cut, at -0.02 rad."""
     for seed in range(6):
         rng, angle = np.random.default_rng([seed, 3]), -0.02 + 0.005 * (seed - 2.5)
         dent = Bump(along_mm=0.0, angle=float(angle), diameter_mm=70.0, height_mm=-3.0)
@@ -92,7 +92,7 @@ def test_a_dent_at_the_cut_is_one_finding() -> None:
 
 @pytest.mark.parametrize("axis", AXES.values(), ids=AXES)
 def test_noise_turns_no_frame(axis: tuple[float, float, float]) -> None:
-    """Both directions across stay where they are from scan to scan, and from one fit of a pipe to the next."""
+    """Both directions across are equal for all scans, and for successive fits of a pipe."""
     across = []
     for seed in range(20):
         rng = np.random.default_rng([seed, 4])
@@ -102,14 +102,14 @@ def test_noise_turns_no_frame(axis: tuple[float, float, float]) -> None:
         form = fit_pipe(cloud)
         again = refit_pipe(cloud, form, left_out=rng.random(len(cloud)) < 0.3)
         turned = np.angle(np.exp(1j * (again.angle - form.angle)))
-        # The axis moves by its noise: 0.02 mm over the root of a thousand points.
+        # Noise of the axis: 0.02 mm divided by the root of a thousand points.
         assert np.abs(turned).max() < 1e-3
         assert np.abs(again.along_mm - form.along_mm).max() < 0.05
     assert np.ptp(across, axis=0).max() < 1e-3
 
 
 def test_what_is_left_out_is_named() -> None:
-    """Points off the pipe, and sections that were hardly seen."""
+    """Points off the pipe, and sections with few points."""
     rng = np.random.default_rng(5)
     deep = Bump(along_mm=0.0, angle=1.0, diameter_mm=30.0, height_mm=-8.0)
     pipe = scan_pipe(rng, axis=(0, 1, 0), spacing_mm=2.0, bumps=[deep])
@@ -119,7 +119,7 @@ def test_what_is_left_out_is_named() -> None:
     notes = inspected(seen).notes
     off = next(note for note in notes if "off the pipe" in note)
     height = deep.heights(along, angle, pipe.radius_mm)
-    # Those within the noise of the limit may fall on either side.
+    # Points at the limit may be on either side by their noise.
     expected = [np.count_nonzero(kept & (height <= limit)) for limit in (-3.7, -3.5)]
     assert expected[0] <= int(off.split()[0]) <= expected[1] and expected[0] > 10
     assert sum("no section from" in note for note in notes) in (2, 3)

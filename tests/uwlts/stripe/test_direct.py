@@ -1,4 +1,4 @@
-"""The laser's own stripe among reflections, on drawn images; `docs/studies/stripe_reflections.py` has rendered ones."""
+"""The laser's own stripe among reflections, in drawn images. Rendered ones: `docs/studies/stripe_reflections.py`."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +16,7 @@ NOISE = 1.0
 
 
 def drawn(*stripes: tuple[np.ndarray, float], seed: int = 3) -> np.ndarray:
-    """(LENGTH, LINES) uint8: columns with stripes of sigma 2 px at places (LINES,), NaN for none, of some height."""
+    """Draw (LENGTH, LINES) uint8: stripes of sigma 2 px at places (LINES,), NaN for none, of given heights."""
     rows = np.arange(LENGTH)[:, None]
     light = sum(np.nan_to_num(height * np.exp(-0.5 * ((rows - place) / 2.0) ** 2)) for place, height in stripes)
     noise = np.random.default_rng(seed).normal(0, NOISE, (LENGTH, LINES))
@@ -24,13 +24,13 @@ def drawn(*stripes: tuple[np.ndarray, float], seed: int = 3) -> np.ndarray:
 
 
 def on(first: int, last: int, place: np.ndarray) -> np.ndarray:
-    """Places on the lines from one to another, NaN elsewhere."""
+    """Return the places on a range of lines, NaN elsewhere."""
     lines = np.arange(LINES)
     return np.where((lines >= first) & (lines < last), place, np.nan)
 
 
 def found(*images: np.ndarray, options: StripeOptions = StripeOptions(), sensor: str = "thesis"):
-    """What `find_stripes` finds in images of one recording."""
+    """Return the stripes found by `find_stripes` in images of one recording."""
     count = len(images)
     header = SimpleNamespace(sensor=load_sensor(sensor), saturation_dn=255)
     about = {"laser_on": np.ones(count, bool), "has_image": np.ones(count, bool), "stage_mm": np.arange(float(count))}
@@ -50,20 +50,20 @@ TOP, REFLECTED = on(280, LINES, 100 - 0.1 * (X - 280)), on(200, 270, 240 - 0.1 *
 
 
 def test_the_wall_of_a_shining_corner_is_taken_and_the_floor_in_it_is_not():
-    """The wall shows the floor once more, eight times as bright as itself, and going on straight from it."""
+    """The wall reflects the floor, eight times as bright as itself, in continuation of the floor's own stripe."""
     image = drawn((FLOOR, 120), (WALL, 15), (TOP, 100), (REFLECTED, 110))
     true = np.nanmax([FLOOR, WALL, TOP], axis=0)
     stripes, brightest = found(image), found(image, options=BRIGHTEST)
     wrong = np.abs(stripes.centre_px - true[stripes.line]) > 3
     assert not wrong.any()
     assert np.mean(np.abs(brightest.centre_px - true[brightest.line]) > 3) > 0.1
-    # Where both stripes merge nothing is taken: 16 lines on either side of the corner at a slope of 1.4 px a line.
+    # No stripe is taken near the merging point: 16 lines on either side of the corner at a slope of 1.4 px per line.
     assert len(stripes.line) > LINES - 2 * 16 - 12
     assert np.count_nonzero((stripes.line > 220) & (stripes.line < 275)) > 45
 
 
 def test_a_reflection_below_a_mirrors_faint_stripe_is_left_out():
-    """Nothing joins the two: the faint one goes on beyond the bright one, which begins and ends in the void."""
+    """The faint stripe extends beyond the bright one, which begins and ends without a connection to it."""
     mirror, arc = on(0, LINES, 150 + 0.1 * X), on(120, 220, 260 - 0.01 * (X - 170) ** 2)
     stripes = found(drawn((mirror, 10), (arc, 90)))
     assert np.abs(stripes.centre_px - mirror[stripes.line]).max() < 3
@@ -71,7 +71,7 @@ def test_a_reflection_below_a_mirrors_faint_stripe_is_left_out():
 
 
 def test_a_reflection_beside_a_stripe_that_is_too_wide_is_not_taken():
-    """On some lines the stripe is too wide to be measured; something dim and sharp stands elsewhere."""
+    """On some lines the stripe is too wide to be measured, with a dim, sharp peak elsewhere."""
     glare, spot = on(150, 210, 150 + 0 * X), on(155, 205, 260 + 0 * X)
     floor = np.where(np.isnan(glare), 150.0, np.nan)
     rows = np.arange(LENGTH)[:, None]
@@ -83,7 +83,7 @@ def test_a_reflection_beside_a_stripe_that_is_too_wide_is_not_taken():
 
 
 def test_the_rest_of_a_reflection_is_not_taken_where_the_wall_is_too_dark_to_be_seen():
-    """The wall is lost over its last fifth, where the reflected floor goes on alone."""
+    """The wall is invisible over its last fifth, with the reflected floor alone on these lines."""
     wall = on(200, 264, 220 - 1.5 * (X - 200))
     stripes = found(drawn((FLOOR, 120), (wall, 15), (TOP, 100), (on(200, 280, 240 - 0.1 * X), 110)))
     true = np.fmax(np.fmax(FLOOR, wall), TOP)[stripes.line]
@@ -91,7 +91,7 @@ def test_the_rest_of_a_reflection_is_not_taken_where_the_wall_is_too_dark_to_be_
 
 
 def test_the_floor_in_a_wall_that_is_seen_in_pieces_is_not_taken():
-    """A reflection stands before the floor, too, so that the floor's own stripe lies behind on either side."""
+    """Another reflection is in front of the floor, so that the floor's own stripe is behind it on either side."""
     wall = np.where((X > 236) & (X < 254), np.nan, on(200, 264, 220 - 1.5 * (X - 200)))
     ghost, reflected = on(60, 140, 220 - 0.35 * (200 - X)), on(200, 320, 240 - 0.1 * X)
     true = np.fmax(np.fmax(FLOOR, wall), TOP)
@@ -102,7 +102,7 @@ def test_the_floor_in_a_wall_that_is_seen_in_pieces_is_not_taken():
 
 
 def test_a_dimmer_stripe_before_the_floor_that_nothing_joins_is_a_reflection():
-    """A wall that faces the camera shows the floor nearer than it is, and dimmer."""
+    """A wall facing the camera reflects the floor, nearer and dimmer than it is."""
     floor, ghost = on(0, LINES, 200 + 0.05 * X), on(30, 350, 120 + 0.05 * X)
     stripes = found(drawn((floor, 120), (ghost, 45)))
     assert np.abs(stripes.centre_px - floor[stripes.line]).max() < 3
@@ -130,7 +130,7 @@ def test_a_rod_before_a_floor_and_a_groove_in_it_stay():
 
 
 def test_a_block_whose_edges_show_the_floor_beside_it_stays():
-    """On the two lines of its edges both are seen, and either may be the laser's own."""
+    """On the two lines of its edges both stripes are visible, and either may be the laser's own."""
     block, floor = on(150, 260, 120 + 0 * X), np.fmax.reduce([on(0, 151, 200 + 0 * X), on(259, LINES, 200 + 0 * X)])
     stripes = found(drawn((block, 60), (floor, 80)))
     true = np.where(np.isnan(block), floor, block)
@@ -150,7 +150,7 @@ def test_two_sheets_are_split_in_their_order():
         assert np.nanmax(np.abs(stripe.centre_px[:300] - place[:300])) < 0.12
     assert np.isnan(second.centre_px[300:]).all()
     assert (np.diff(candidates.line) >= 0).all()
-    # The brighter one is so much more certain: the squares of the heights.
+    # The likelihoods differ by the ratio of the squared heights.
     likelihood = candidates.log_likelihood[candidates.line == 150]
     assert likelihood[1] / likelihood[0] == pytest.approx((140 / 60) ** 2, rel=0.3)
     with pytest.raises(RangeError, match="sheets is 0"):

@@ -1,4 +1,4 @@
-"""Brackets of exposures: which images belong together, and what their fused image shows."""
+"""Brackets of exposures: grouping of images, and their fused image."""
 
 from types import SimpleNamespace
 
@@ -11,7 +11,7 @@ from uwlts.optics.nominal import nominal
 from uwlts.storage.capture import Capture
 from uwlts.storage.truth import read_truth, truth_path
 from uwlts.stripe import StripeStatus, extract_stripe, find_stripes
-from uwlts.stripe.exposures import brackets, fused
+from uwlts.stripe.exposures import fused, group_brackets
 
 LINES, LENGTH = 300, 120
 OFFSET, FULL = 16.0, 255
@@ -21,7 +21,7 @@ RNG = np.random.default_rng(11)
 
 
 def recording(stage_mm, exposure_ms, laser_on=None, pose=None):
-    """What is known of the images of a recording."""
+    """Return a recording with the metadata of its images."""
     count = len(stage_mm)
     return SimpleNamespace(
         stage_mm=np.asarray(stage_mm, float),
@@ -33,14 +33,14 @@ def recording(stage_mm, exposure_ms, laser_on=None, pose=None):
 
 
 def found(*about, **more):
-    return [each.tolist() for each in brackets(recording(*about, **more))]
+    return [each.tolist() for each in group_brackets(recording(*about, **more))]
 
 
 def test_images_of_one_place_at_growing_exposures_belong_together():
     assert found([0, 0, 1, 1, 2, 2], [1, 4] * 3) == [[0, 1], [2, 3], [4, 5]]
     # In whatever order they were taken, with lamp images between, and with exposures that were shortened on the way.
     assert found([0, 0, 0, 1, 1, 1], [8, 1, 4, 2, 0.5, 1], laser_on=[1, 0, 1, 1, 1, 0]) == [[2, 0], [4, 3]]
-    # A recording that goes on.
+    # A recording in progress.
     assert found([0, 0, 1, 1, 2], [1, 4, 1, 4, 1]) == [[0, 1], [2, 3], [4]]
     poses = np.repeat(np.eye(4)[None], 4, axis=0)
     poses[2:, 0, 3] = 5.0
@@ -64,7 +64,7 @@ def test_other_images_stay_alone(stage_mm, exposure_ms):
 
 @pytest.fixture(scope="module")
 def drawn():
-    """Centres (L,), heights (L,) in grey levels at the longest exposure, and images of stripes from black to steel."""
+    """Draw images of stripes from black to steel; return centres (L,), heights (L,) in the longest exposure, images."""
     lines = np.arange(LINES)
     centre = 60 + 0.05 * lines
     height = np.repeat([20.0, 400.0, 4000.0], LINES // 3)
@@ -101,14 +101,14 @@ def test_ratio_and_offset_where_little_is_well_exposed(drawn):
     _, _, images = drawn
     dark = [np.minimum(image, 40) for image in images]
     image, saturation = fused(dark, STATED_MS, full_dn=FULL)
-    # No pixel tells the ratio: the stated exposures count. The offset follows from the background.
+    # No pixel determines the ratio: the stated exposures are used. The offset follows from the background.
     assert saturation == pytest.approx(OFFSET + (FULL - OFFSET) * 25.0, rel=0.01)
     assert np.median(image) == pytest.approx(OFFSET + 5.0, abs=0.3)
 
 
 @pytest.mark.slow
 def test_rubber_beside_steel_is_measured_in_a_bracket(thesis, tmp_path):
-    """Rendered and judged by the true stripe: the black plate's lines are found, and the bright one's stay measured."""
+    """Rendered: lines on the black plate are found at the true stripe, and those on the bright plate remain."""
     changes = {"camera": {"width_px": 320, "height_px": 256, "pixel_size_um": 21.2}}
     sensor = altered(thesis, changes)
     plates = [
@@ -134,7 +134,7 @@ def test_rubber_beside_steel_is_measured_in_a_bracket(thesis, tmp_path):
 
 
 def test_a_bracket_is_one_profile_of_a_cloud(thesis, tmp_path):
-    """Its place is the stage's, and every profile stands once."""
+    """Its place is the stage's, and each profile occurs once."""
     from uwlts import reconstruct
 
     sensor = altered(thesis, {"camera": {"width_px": 160, "height_px": 128, "pixel_size_um": 42.4}})

@@ -1,4 +1,4 @@
-"""The method of a trained network, with a model whose answers are known: the centroid of what is bright."""
+"""The method of a trained network, with a model of known results: the centroid of bright pixels."""
 
 import sys
 
@@ -15,7 +15,10 @@ DARK, DOUBTFUL = slice(0, 20), slice(20, 40)
 
 
 def centroid_model(path, *, name="lines"):
-    """Centroid of the pixels above a tenth of the full scale; visible is their sum: faint lines are not sure."""
+    """Build a model that returns the centroid of the pixels above a tenth of the full scale.
+
+    Its probability is the sum of these pixels, so that faint lines are uncertain.
+    """
     held = [
         numpy_helper.from_array(np.float32(0.1), "level"),
         numpy_helper.from_array(np.float32(1e-9), "tiny"),
@@ -45,7 +48,7 @@ def model(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def drawn():
-    """Centres (L,) and an image whose first lines are dark and whose next ones are faint."""
+    """Draw centres (L,) and an image whose first lines are dark and whose next ones are faint."""
     centre = 80 + 20 * np.sin(np.arange(LINES) / 40)
     height = np.full(LINES, 200.0)
     height[DARK], height[DOUBTFUL] = 0.0, 34.0
@@ -91,7 +94,7 @@ def test_a_place_where_nothing_stands_out_is_no_stripe(model):
     "settings", [{"method": "learned"}, {"model": "stripe.onnx"}, {"method": "learned", "model": 3}]
 )
 def test_method_and_model_go_together(settings):
-    with pytest.raises(RangeError, match="needs the ONNX file of its model"):
+    with pytest.raises(RangeError, match="needs, the ONNX file of a model"):
         StripeOptions(**settings)
 
 
@@ -101,7 +104,7 @@ def test_other_files_are_refused(tmp_path, drawn):
     text.write_text("not a model")
     cases = (
         (foreign, DescriptionError, r"has the inputs \['photo'\]"),
-        (text, DescriptionError, "no ONNX model"),
+        (text, DescriptionError, "cannot be read as an ONNX model"),
         (tmp_path / "absent.onnx", CaptureError, "absent.onnx"),
     )
     for path, error, message in cases:

@@ -1,4 +1,4 @@
-"""The profile fit: unbiased, near the Cramer-Rao bound in shot and read noise, least noisy of all in speckle."""
+"""The profile fit: unbiased, near the Cramer-Rao bound in shot and read noise, least noisy method in speckle."""
 
 import math
 from typing import get_args
@@ -15,7 +15,7 @@ FIT = "profile-fit"
 
 
 def gaussian(centre, *, sigma, amplitude):
-    """(L, LENGTH) Gaussian stripes integrated over the pixels."""
+    """Return (L, LENGTH) Gaussian stripes integrated over the pixels."""
     x = np.arange(LENGTH) - np.asarray(centre, float)[:, None]
     cumulative = erf((x + 0.5) / (sigma * math.sqrt(2))) - erf((x - 0.5) / (sigma * math.sqrt(2)))
     return amplitude * sigma * math.sqrt(math.pi / 2) * cumulative
@@ -61,13 +61,13 @@ def test_saturation(sigma, over):
     image = grey(gaussian(centre, sigma=sigma, amplitude=255 * over) + 20)
     assert (np.count_nonzero(image == 255, axis=1) >= 2).mean() > 0.5
     error = centres(image) - centre
-    # The flanks tell the place though the plateau is cut off: half of what the zero crossing errs at most (0.06 px).
+    # The flanks determine the position of a clipped stripe: half the largest error of the zero crossing (0.06 px).
     assert np.abs(error).max() < 0.03
     assert abs(error.mean()) < 0.001
 
 
 def position_bound(*, sigma, amplitude, read, gain):
-    """Cramer-Rao bound of the centre, px, in variance read^2 + gain f: place, height and width unknown."""
+    """Return the Cramer-Rao bound of the centre, px, in variance read^2 + gain f: place, height and width unknown."""
     step, variances = 1e-4, []
     for centre in phases(16):
 
@@ -102,7 +102,7 @@ def test_near_the_cramer_rao_bound(sigma, shot, white, amplitude, read, gain):
 
 
 def speckled(centre, *, sigma, contrast, rng):
-    """Grey values with gamma-distributed factors of mean 1 per pixel, shot and read noise."""
+    """Return grey values with gamma-distributed factors of mean 1 per pixel, shot and read noise."""
     profile = gaussian(centre, sigma=sigma, amplitude=120)
     light = profile * rng.gamma(contrast**-2, contrast**2, profile.shape)
     return grey(light + 5 + np.sqrt(0.4 + 0.0255 * light) * rng.standard_normal(light.shape))

@@ -1,4 +1,4 @@
-"""Stripe extraction against profiles whose centre is known in closed form."""
+"""Stripe extraction from profiles whose centre is known in closed form."""
 
 import math
 import subprocess
@@ -18,7 +18,7 @@ METHODS = method_names()
 
 
 def gaussian(centre, *, sigma, amplitude, length=LENGTH):
-    """(L, length) Gaussian stripes integrated over the pixels: one line per centre."""
+    """Return (L, length) Gaussian stripes integrated over the pixels: one line per centre."""
     x = np.arange(length) - np.asarray(centre, float)[:, None]
     cumulative = erf((x + 0.5) / (sigma * math.sqrt(2))) - erf((x - 0.5) / (sigma * math.sqrt(2)))
     return amplitude * sigma * math.sqrt(math.pi / 2) * cumulative
@@ -30,7 +30,7 @@ def grey(values, *, top=255, dtype=np.uint8):
 
 
 def phases(count=64):
-    """Centres that cover the sub-pixel phase evenly."""
+    """Return centres that cover the sub-pixel phase evenly."""
     return LENGTH / 2 + (np.arange(count) + 0.5) / count
 
 
@@ -39,9 +39,10 @@ def rows(image, **settings):
 
 
 def position_bound(*, sigma, amplitude, noise):
-    """Cramer-Rao bound of the centre, px: position, amplitude and width unknown, white noise, pixel-integrated.
+    """Return the Cramer-Rao bound of the centre, px, in white noise: position, amplitude and width unknown.
 
-    Numerical derivatives of the profile; the mean over phases of the inverse Fisher matrix's first element.
+    Numerical derivatives of the pixel-integrated profile; the mean over phases of the inverse Fisher matrix's first
+    element.
     """
     step, variances = 1e-4, []
     for centre in phases(16):
@@ -174,7 +175,7 @@ def test_step_within_the_flanks_moves_less_than_the_step_as_a_slope():
     sigma, amplitude, step = 2.0, 150.0, 10.0
     image = gaussian(centre, sigma=sigma, amplitude=amplitude) + 20 + step * (np.arange(LENGTH) > centre[:, None] + 8)
     error = rows(image.astype(np.float32)).centre_px - centre
-    # Wholly taken for a slope over the 17 px between the flanks: b 2^1.5 sigma^2 / A with b = 10 / 17, 0.044 px.
+    # Completely taken for a slope over the 17 px between the flanks: b 2^1.5 sigma^2 / A with b = 10 / 17, 0.044 px.
     assert np.abs(error).max() < 0.05
     assert np.abs(error).max() > 0.001, "the step lies outside what the extraction looks at"
 
@@ -202,8 +203,8 @@ def test_moderate_saturation_is_unbiased(method, sigma, over):
     found = rows(image, options=StripeOptions(method=method))
     assert (found.status == StripeStatus.OK).all()
     error = found.centre_px - centre
-    # Where a plateau is cut out of pixels only the two pixels on the flanks tell the phase, so that the error swings
-    # with it, by less than half the 0.29 px rms of not knowing the phase, and cancels over the phases.
+    # In a plateau of clipped pixels only the two pixels on the flanks depend on the phase. The error varies with it, by
+    # less than half of 0.29 px rms, the error without any information on the phase. It cancels over all phases.
     assert np.sqrt(np.mean(error**2)) < 0.1
     assert abs(error.mean()) < 0.01
 
@@ -255,7 +256,7 @@ def test_plateau_wider_than_the_window_is_saturated():
 def test_the_window_follows_a_wide_stripe_but_no_haze(height, sigma, found):
     image = grey(gaussian(phases() + 60, sigma=sigma, amplitude=height, length=280) + 12)
     assert (rows(image).status == StripeStatus.OK).all() == found
-    # On one line in ten only it is something else in the image.
+    # On one line in ten it is another object in the image.
     usual = grey(gaussian(phases() + 60, sigma=2, amplitude=100, length=280) + 12)
     few = np.where(np.arange(len(image))[:, None] % 10 == 0, image, usual)
     narrow = np.arange(len(image)) % 10 != 0
@@ -386,7 +387,7 @@ def test_stripe_of_six_times_the_noise_is_found(sigma):
     found = rows(grey(image), options=StripeOptions(end_lines=0))
     ok = found.status == StripeStatus.OK
     assert ok.mean() > 0.95
-    # The bound is 0.22 to 0.31 px; 1 % of the lines may lie on noise instead.
+    # The bound is 0.22 to 0.31 px; 1 % of the lines may be noise instead.
     assert (np.abs(found.centre_px[ok] - centre[ok]) < 5 * 0.35).mean() > 0.99
 
 
@@ -420,8 +421,8 @@ def test_mirrored_and_shifted_images_give_mirrored_and_shifted_centres(centre, s
     assert (found.status == StripeStatus.OK).all()
     # Rounding at 60 levels and sigma 3.5: bound 0.012 px; 5 sigma plus the phase error of 0.008 px.
     assert np.abs(found.centre_px - truth).max() < 0.07
-    # The same pixels through the same sums, in single precision: within 0.001 px. Where the centre lies in the middle
-    # of two pixels, either may be the peak, and a window one pixel aside moves it by up to 0.003 px.
+    # The same pixels through the same sums, in single precision: within 0.001 px. For a centre midway
+    # between two pixels, either may be the peak, and a window shifted by one pixel moves it by up to 0.003 px.
     assert LENGTH - 1 - mirrored.centre_px == pytest.approx(found.centre_px, abs=6e-3)
     assert shifted.centre_px - 3 == pytest.approx(found.centre_px, abs=6e-3)
 
@@ -500,7 +501,7 @@ def test_lines_next_to_an_end_or_a_jump_are_left_out():
     centre = np.where(np.arange(120) < 60, 40.0, 70.0)
     image = grey(gaussian(centre, sigma=2, amplitude=150) + 10)
     image[90:] = 10  # the stripe ends after line 89
-    image[20:22] = 10  # and is lost for two lines, which is no end
+    image[20:22] = 10  # and is missing on two lines, which is no end
     found = rows(image)
     ends = np.flatnonzero(found.status == StripeStatus.END)
     assert ends.tolist() == [58, 59, 60, 61, 88, 89]
@@ -535,7 +536,7 @@ def test_settings_of_the_sensor_and_of_the_call():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_whatever_an_image_shows_a_stripe_that_is_found_has_a_place(seed):
-    """Constant images, noise, stripes beyond the border, single bright columns, all types, methods and options."""
+    """Constant images, noise, stripes beyond the border, single bright columns; all types, methods and options."""
     rng = np.random.default_rng(seed)
     found = 0
     for _ in range(60):
@@ -598,6 +599,6 @@ print({name for name, count in compiled().items() if count != before.get(name)})
 
 
 def test_nothing_is_compiled_after_the_warm_up():
-    """In a process of its own, where nothing else has called compiled code before."""
+    """In a separate process, without earlier calls of compiled code."""
     done = subprocess.run([sys.executable, "-c", _NOTHING_NEW], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

@@ -1,7 +1,7 @@
-"""Stripes of all kinds are found as they were: rules and thresholds for which no theory says what is right.
+"""Stripes of all kinds are found as before: a regression test of rules and thresholds without a theoretical reference.
 
-The images are drawn here; what was found in them lies in tests/data/stripes-found.npz. After a change that is meant,
-write it again: ``python -m tests.uwlts.stripe.test_unchanged``.
+The images are drawn here; the stripes found in them are stored in tests/data/stripes-found.npz. After an intended
+change, write it again: ``python -m tests.uwlts.stripe.test_unchanged``.
 """
 
 from pathlib import Path
@@ -24,12 +24,12 @@ WAYS = {
 
 
 def the_same_rng(seed: int) -> np.random.Generator:
-    """Random numbers that ``--noise`` leaves as they are."""
+    """Return random numbers that do not depend on ``--noise``."""
     return np.random.Generator(np.random.PCG64(seed))
 
 
 def drawn() -> np.ndarray:
-    """(L, N) float: none to two stripes on every line, of all widths and heights, over slopes, edges and hot pixels."""
+    """Draw (L, N) float: up to two stripes per line, of all widths and heights, over slopes, edges and hot pixels."""
     rng, x = the_same_rng(5), np.arange(LENGTH)
 
     def some(share: float) -> np.ndarray:
@@ -49,7 +49,7 @@ def drawn() -> np.ndarray:
 
 
 def a_long_stripe() -> np.ndarray:
-    """(L, N) float: one that goes on from line to line, with jumps and gaps."""
+    """Draw (L, N) float: a stripe that continues from line to line, with jumps and gaps."""
     rng, line = the_same_rng(6), np.arange(LINES)
     centre = 60 + 30 * np.sin(line / 60) + 25 * (line % 190 > 140)
     lit = (line % 83 > 5) & (rng.random(LINES) > 0.03)
@@ -58,7 +58,7 @@ def a_long_stripe() -> np.ndarray:
 
 
 def found(way: str) -> Stripe:
-    """What is found one way; other than the ways of `WAYS`, images of other types and with a background."""
+    """Return the stripe for a key of `ALL`: options of `WAYS`, or images of other types and with a background."""
     lines = a_long_stripe() if way == "ends left out" else drawn()
     options = WAYS.get(way, StripeOptions(end_lines=0))
     grey = np.clip(np.rint(lines), 0, 255).astype(np.uint8)
@@ -79,7 +79,7 @@ ALL = (*WAYS, "ten bits", "floating point", "less a background")
 @pytest.mark.parametrize("way", ALL)
 def test_stripes_are_found_as_before(way):
     stripe, before = found(way), np.load(FOUND)
-    # The last bits of other processors decide differently on some lines in a thousand at most.
+    # Rounding on other processors changes at most some lines in a thousand.
     same = stripe.status == before[f"{way}, status"]
     assert np.mean(same) >= 0.997
     good = np.flatnonzero(same & np.isfinite(stripe.centre_px))
@@ -90,7 +90,7 @@ def test_stripes_are_found_as_before(way):
 
 
 def write() -> None:
-    """Keep what is found now."""
+    """Store the current results."""
     kept = {}
     for way in ALL:
         stripe = found(way)

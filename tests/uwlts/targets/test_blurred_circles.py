@@ -1,4 +1,4 @@
-"""Circles out of focus: found and centred, by a longer reach across the edge where the short one fails."""
+"""Circles out of focus: found and centred, with a longer reach across the edge if the short one fails."""
 
 import math
 
@@ -10,23 +10,23 @@ from uwlts.targets.detection import ellipses, find_circles
 DARK, BRIGHT = 40.0, 200.0
 SPACING, COLUMNS, ROWS = 70, 6, 5
 SHAPE = ((ROWS + 1) * SPACING, (COLUMNS + 1) * SPACING)
-SHORT = ellipses.REACHES_PX[:1]
+SHORT = ellipses.RULE._replace(reaches_px=ellipses.RULE.reaches_px[:1])
 
 
 def places():
-    """True centres (N, 2) of a lattice, each at a sub-pixel phase of its own."""
+    """Return true centres (N, 2) of a lattice, each with its own sub-pixel phase."""
     u, v = np.meshgrid(np.arange(1, COLUMNS + 1) * SPACING, np.arange(1, ROWS + 1) * SPACING)
     lattice = np.column_stack([u.ravel(), v.ravel()])
     return lattice + np.random.default_rng(0).uniform(-0.5, 0.5, lattice.shape)
 
 
 def sharp(radius):
-    """Share of a point (u, v) from the circle's centre that is covered: all or nothing."""
+    """Return the covered fraction of a point (u, v) relative to the circle's centre: 0 or 1."""
     return lambda u, v: (np.hypot(u, v) < radius).astype(float)
 
 
 def blurred(radius, blur):
-    """Share of a disc of radius ``blur`` that a larger disc covers: the area of the lens that both have in common."""
+    """Return the fraction of a disc of radius ``blur`` covered by a larger disc: the area of their intersection."""
 
     def share(u, v):
         d = np.clip(np.hypot(u, v), radius - blur + 1e-9, radius + blur - 1e-9)
@@ -39,7 +39,7 @@ def blurred(radius, blur):
 
 
 def in_steps(radius, blur, count):
-    """The same where light comes through ``count`` points of the pupil only, evenly spread by the golden angle."""
+    """Return the same for light through only ``count`` points of the pupil, evenly spread by the golden angle."""
     turn = np.arange(count) * np.pi * (3 - math.sqrt(5))
     points = blur * np.sqrt((np.arange(count) + 0.5) / count)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
     points -= points.mean(axis=0)
@@ -47,7 +47,7 @@ def in_steps(radius, blur, count):
 
 
 def on_an_inclined_plate(radius, blur, growth, *, count=100):
-    """The same where the radius of the blur grows by ``growth`` per pixel along v; every point keeps its light."""
+    """Return the same for a blur radius that increases by ``growth`` per pixel along v; each point keeps its light."""
     turn = np.arange(count) * np.pi * (3 - math.sqrt(5))
     pupil = np.sqrt((np.arange(count) + 0.5) / count)[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
     pupil -= pupil.mean(axis=0)
@@ -64,7 +64,7 @@ def on_an_inclined_plate(radius, blur, growth, *, count=100):
 
 
 def photograph(share, *, samples, bright=True, noise=0.0, shading=0.0):
-    """Image of the lattice, each pixel the mean of samples x samples points, shaded by ``shading`` per pixel of u."""
+    """Return an image of the lattice: pixels are means of samples x samples points, with ``shading`` per pixel of u."""
     image, side = np.zeros(SHAPE), 2 * (SPACING // 2)
     within = (np.arange(side)[:, None] + (np.arange(samples) + 0.5) / samples - 0.5).ravel()
     for cu, cv in places():
@@ -77,7 +77,7 @@ def photograph(share, *, samples, bright=True, noise=0.0, shading=0.0):
 
 
 def errors_px(found):
-    """Distances (N,) of the found centres from the true ones; each circle must be found once."""
+    """Return distances (N,) of the found centres from the true ones; each circle must be found once."""
     apart = np.linalg.norm(found.centres[:, None] - places(), axis=2)
     assert sorted(apart.argmin(axis=1).tolist()) == list(range(COLUMNS * ROWS))
     return apart.min(axis=1)
@@ -123,10 +123,10 @@ def test_noise_moves_blurred_circles_by_its_share_of_the_contrast():
 @pytest.mark.parametrize(("radius", "count", "blur"), [(14.0, 16, 6.0), (14.0, 8, 4.0), (20.0, 8, 6.0)])
 def test_edges_in_steps_need_the_longer_reach(radius, count, blur, monkeypatch):
     image = photograph(in_steps(radius, blur, count), samples=5)
-    # Steps lie in the image as they do in the pupil, the same on opposite sides: rounding is left, as above.
+    # Steps in the image are symmetric like those in the pupil: the remaining error is rounding, as above.
     assert rms(errors_px(find_circles(image))) < 0.004
-    monkeypatch.setattr(ellipses, "REACHES_PX", SHORT)
-    assert len(find_circles(image)) < (1 - ellipses.MISSED_SHARE) * COLUMNS * ROWS
+    monkeypatch.setattr(ellipses, "RULE", SHORT)
+    assert len(find_circles(image)) < (1 - ellipses.RULE.missed_share) * COLUMNS * ROWS
 
 
 @pytest.mark.parametrize("noise", [0.0, 2.0])
@@ -135,7 +135,7 @@ def test_images_in_focus_are_measured_as_with_the_short_reach_alone(share, noise
     image = photograph(share, samples=6, noise=noise)
     found = find_circles(image)
     assert len(found) == COLUMNS * ROWS
-    monkeypatch.setattr(ellipses, "REACHES_PX", SHORT)
+    monkeypatch.setattr(ellipses, "RULE", SHORT)
     alone = find_circles(image)
     np.testing.assert_array_equal(found.centres, alone.centres)
     np.testing.assert_array_equal(found.shapes, alone.shapes)

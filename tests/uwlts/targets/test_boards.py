@@ -1,4 +1,4 @@
-"""Chessboards and ChArUco boards in photographs of drawn boards, against where their corners were put."""
+"""Chessboards and ChArUco boards in photographs of drawn boards, compared with the true corners."""
 
 import cv2
 import numpy as np
@@ -6,22 +6,22 @@ import pytest
 
 from uwlts.errors import TargetError
 from uwlts.targets import CharucoTarget, ChessboardTarget, parse_target
-from uwlts.targets.detection import refined, why_no_chessboard
+from uwlts.targets.detection import find_chessboard_fault, refine_corners
 
 BOARD = ChessboardTarget(columns=8, rows=5, square_mm=12.0)
 CHARUCO = CharucoTarget(columns=8, rows=6, square_mm=12.0, marker_mm=9.0)
 
 
 def chess_texture(pixels_per_square, margin=1):
-    """A board of BOARD's squares, first square dark, and the texture position (px) of its first inner corner."""
+    """Return a board of BOARD's squares, first square dark, and the texture position (px) of its first inner corner."""
     squares = np.add.outer(np.arange(BOARD.rows + 1), np.arange(BOARD.columns + 1)) % 2 * 255
     board = np.kron(np.pad(squares, margin, constant_values=255), np.ones((pixels_per_square,) * 2)).astype(np.uint8)
-    # The corner lies on the border between two pixels, half a pixel before the centre of the next.
+    # The corner is on the border between two pixels, half a pixel before the centre of the next.
     return board, (margin + 1) * pixels_per_square - 0.5
 
 
 def photograph_texture(texture, homography, *, size=(640, 512), noise=1.5):
-    """The texture through a homography from its pixels to the image's, 4 x 4 samples a pixel."""
+    """Map the texture by a homography from its pixels to those of the image, with 4 x 4 samples per pixel."""
     fine = np.diag([4.0, 4.0, 1.0])
     # Pixel centre x of the image is position 4 x + 1.5 among the finer ones.
     fine[:2, 2] = 1.5
@@ -70,14 +70,14 @@ def test_chessboard_corners_and_their_order(quad):
 
 
 def board_in(quad, *, size=(640, 512)):
-    """BOARD photographed, and the pixels (N, 2) of its inner corners in the order of its indices."""
+    """Return a photograph of BOARD, and the pixels (N, 2) of its inner corners in the order of its indices."""
     texture, first = chess_texture(40)
     homography = texture_pose(texture, quad)
     return photograph_texture(texture, homography, size=size), mapped(homography, first + BOARD.indices * 40.0)
 
 
 def true_places(view, corners):
-    """Distances (N,) of found corners from the true ones (columns * rows, 2) of the same numbers."""
+    """Return distances (N,) of found corners from the true ones (columns * rows, 2) with the same indices."""
     numbers = view.indices[:, 1] * BOARD.columns + view.indices[:, 0]
     return np.linalg.norm(view.pixels - corners[numbers], axis=1)
 
@@ -87,8 +87,8 @@ def true_places(view, corners):
 def test_a_board_partly_outside_the_image_gives_the_corners_in_view(quad, side):
     image, corners = board_in(quad)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    # A quarter of the board is cut off; what is left has one side of the board's length, which tells the rows from the
-    # columns, unless the cut is oblique to the board. Then it may be refused, but never numbered wrongly.
+    # A quarter of the board is cut off. The rest has one complete side, which distinguishes rows and columns, unless
+    # the cut is oblique to the board. Then the board may be refused, but never numbered wrongly.
     near, far = np.rint(0.75 * low + 0.25 * high).astype(int), np.rint(0.25 * low + 0.75 * high).astype(int)
     cut = {
         "left": np.s_[:, near[0] :],
@@ -137,8 +137,8 @@ def test_a_grid_without_neighbours_is_none():
     grid = np.full((BOARD.rows, BOARD.columns, 2), np.nan)
     grid[np.arange(5), np.arange(5)] = 40.0 * np.arange(5)[:, None] + 60.0
     image = np.full((300, 400), 90, np.uint8)
-    assert not np.isfinite(refined(image, grid)).any()
-    assert why_no_chessboard(image, grid) == "too few corners are seen"
+    assert not np.isfinite(refine_corners(image, grid)).any()
+    assert find_chessboard_fault(image, grid) == "too few corners are in view"
 
 
 def test_squares_that_are_not_square_have_two_sides():

@@ -96,9 +96,9 @@ def test_square_on_without_distortion_there_is_no_bias_and_distortion_makes_one(
         ({"diameter_mm": float("nan")}, "positive length"),
         ({"axis_u": (2, 0, 0)}, "orthonormal"),
         ({"axis_v": (1, 0, 0)}, "orthonormal"),
-        ({"centres_mm": [[np.nan, 0, 0]]}, "no finite image"),
+        ({"centres_mm": [[np.nan, 0, 0]]}, "cannot be projected"),
         # The circle spans the plane z = 0 of the camera: its image is a hyperbola.
-        ({"centres_mm": [[0, 0, -300.0]], "axis_v": (0, 0, 1), "diameter_mm": 40.0}, "no ellipses"),
+        ({"centres_mm": [[0, 0, -300.0]], "axis_v": (0, 0, 1), "diameter_mm": 40.0}, "not ellipses"),
     ],
 )
 def test_impossible_requests_are_refused(change, message):

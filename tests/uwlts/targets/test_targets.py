@@ -1,4 +1,4 @@
-"""Calibration targets in rendered images, against the exact projections of their points."""
+"""Calibration targets in rendered images, compared with the exact projections of their points."""
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from uwlts.errors import DescriptionError, ImageError, TargetError
 from uwlts.targets import CharucoTarget, ChessboardTarget, CircleTarget, parse_target
 from uwlts.targets.detection import detect_lattice, find_circles, label_lattice
-from uwlts.targets.detection.blobs import _ellipse_like
+from uwlts.targets.detection.blobs import _select_ellipses
 from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
 PLATE = CircleTarget(
@@ -20,7 +20,7 @@ DARK, BRIGHT = 45.0, 195.0
 
 
 class Camera:
-    """A pinhole with two radial coefficients, written for these tests alone."""
+    """A pinhole with two radial coefficients, for these tests only."""
 
     def __init__(self, turn_deg, shift_mm, *, size=(640, 512), focal=1200.0, k=(0.0, 0.0)):
         self.size, self.focal, self.k = size, focal, k
@@ -38,7 +38,7 @@ class Camera:
         return self.focal * plane * (1 + self.k[0] * square + self.k[1] * square**2) + self.middle
 
     def plate_point(self, pixels):
-        """Where the rays of pixels (..., 2) meet the plane z = 0 of the target, (..., 2) mm."""
+        """Return the intersections (..., 2) mm of the rays of pixels (..., 2) with the plane z = 0 of the target."""
         wanted = (pixels - self.middle) / self.focal
         plane = wanted.copy()
         for _ in range(12 if any(self.k) else 0):
@@ -50,7 +50,7 @@ class Camera:
 
 
 def plate_pattern(place_mm, marks, missing):
-    """Whether points (..., 2) mm of the plate are of the circles' colour."""
+    """Return True for points (..., 2) mm of the plate that have the circles' colour."""
     i, j = np.rint(place_mm[..., 0] / PLATE.spacing_x_mm), np.rint(place_mm[..., 1] / PLATE.spacing_y_mm)
     distance = np.hypot(place_mm[..., 0] - i * PLATE.spacing_x_mm, place_mm[..., 1] - j * PLATE.spacing_y_mm)
     column, row = i + PLATE.origin[0], j + PLATE.origin[1]
@@ -64,7 +64,7 @@ def plate_pattern(place_mm, marks, missing):
 
 
 def render_plate(camera, *, bright=True, marks=MARKS, missing=(), samples=6, blur=0.7):
-    """Grey levels (H, W) of the plate, each pixel of an edge the mean of samples x samples rays."""
+    """Return grey levels (H, W) of the plate, each pixel of an edge the mean of samples x samples rays."""
     pixels = np.stack(np.meshgrid(*(np.arange(n, dtype=float) for n in camera.size)), 2)
     # Within a pixel the map to the plate is taken as linear: its curvature there is 1e-4 px.
     middle = camera.plate_point(pixels)
@@ -89,7 +89,7 @@ def photograph(levels, *, noise=0.0, seed=0):
 
 
 def errors_px(view, camera):
-    """Detected minus true image of each circle's centre, with the perspective bias removed, (N, 2)."""
+    """Return detected minus true image of each circle's centre, with the perspective bias removed, (N, 2)."""
     bias = circle_centre_bias(
         camera.project, view.points_mm, diameter_mm=PLATE.diameter_mm, axis_u=(1, 0, 0), axis_v=(0, 1, 0)
     )
@@ -101,14 +101,14 @@ def rms(errors):
 
 
 def all_places():
-    """Places (column, row) and points (mm) of the whole plate."""
+    """Return places (column, row) and points (mm) of the whole plate."""
     places = np.stack(np.meshgrid(np.arange(PLATE.columns), np.arange(PLATE.rows)), 2).reshape(-1, 2)
     steps = (places - PLATE.origin) * (PLATE.spacing_x_mm, PLATE.spacing_y_mm)
     return places, np.column_stack([steps, np.zeros(len(steps))])
 
 
 def places_in_view(camera):
-    """Places of the plate whose whole circle lies at least 5 px inside the image."""
+    """Return places of the plate whose whole circle is at least 5 px inside the image."""
     places, points = all_places()
     angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     rim = PLATE.diameter_mm / 2 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], 1)
@@ -220,7 +220,7 @@ def test_circles_cut_by_a_stripe_are_left_out(bright):
     # No circle remains that the stripe's two sigma touch: nearer than 0.9 radius plus 3 px.
     assert (distance > 0.9 * view.quality["radius_px"] + 3).all()
     errors = errors_px(view, camera)
-    # A stripe's tail below the noise may lie beside a circle: 2 of 150 grey over a part of the edge.
+    # A stripe's tail below the noise may be next to a circle: 2 of 150 grey levels over a part of the edge.
     assert rms(errors) < 0.02
     assert np.abs(errors).max() < 0.15
 
@@ -394,7 +394,7 @@ def test_descriptions_are_read_with_their_defaults():
         ({"marker_diameter_mm": 5.0}, "less than diameter_mm"),
         ({"origin": [14, 5]}, "marker_x is at"),
         ({"origin": [15, 5]}, "origin is at"),
-        ({"marker_y": [4, 0]}, "on one line"),
+        ({"marker_y": [4, 0]}, "collinear"),
     ],
 )
 def test_impossible_circle_targets_are_refused(change, message):
@@ -420,8 +420,8 @@ def test_impossible_boards_are_refused(mapping, message):
 
 
 def test_a_line_of_pixels_in_the_noise_is_no_blob():
-    # Its outline runs there and back and encloses nothing.
+    # The area within its outline is zero.
     mask = np.zeros((120, 160), np.uint8)
     mask[30, 20:60] = mask[50:90, 100] = mask[np.arange(60, 90), np.arange(20, 50)] = 1
     cv2.circle(mask, (120, 30), 12, 1, -1)
-    assert np.allclose(_ellipse_like(mask, bright=True).centres, [[120, 30]])
+    assert np.allclose(_select_ellipses(mask, bright=True).centres, [[120, 30]])

@@ -1,8 +1,8 @@
-"""Methods that place the centre of a stripe: each module of this package is one, found by its name.
+"""Methods that locate the centre of a stripe: each module of this package is a method, found by its name.
 
-A method ``some-name`` is the module ``some_name`` with a function ``centres(peak)``. It takes a `PeakWindow` of M
-windows, whose linear background between the flanks it takes out, and returns the centres (M,) float32, px from the
-windows' first pixel.
+A method ``some-name`` is the module ``some_name`` with a function ``centres(peak)``. This function takes a `PeakWindow`
+of M windows and subtracts the linear background between the flanks. It returns the centres (M,) float32, px from the
+first pixel of each window.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from importlib import import_module
 import numpy as np
 
 from uwlts.runtime.compiled import compiled
-from uwlts.stripe.peak_window import LEAST_KERNEL, TAIL_SIGMAS, PeakWindow
+from uwlts.stripe.peak_window import WINDOW_RULE, PeakWindow
 
 _ONE_PIXEL = 0.3
-"""Sigma, px, of light within one pixel (1 / sqrt 12, rounded): no stripe is narrower in an image."""
+"""Sigma, px, of light within one pixel (1 / sqrt 12, rounded), the narrowest stripe in an image."""
 
 
 @lru_cache
 def method_names() -> tuple[str, ...]:
-    """Names of all methods, in alphabetical order."""
+    """Return the names of all methods in alphabetical order."""
     return tuple(sorted(module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__)))
 
 
 def place_centre(method: str, peak: PeakWindow) -> tuple[np.ndarray, np.ndarray]:
-    """Centre (M,) float32 of the peak in each window, px from its first pixel, and amplitude as of `amplitudes`."""
+    """Return the centre (M,) float32 of each peak, px from its window's first pixel, and its amplitude."""
     if not peak.start.size:
         return np.empty(0, np.float32), np.empty(0, np.float32)
     centre = _method(method)(peak)
@@ -37,7 +37,7 @@ def place_centre(method: str, peak: PeakWindow) -> tuple[np.ndarray, np.ndarray]
 
 
 def amplitudes(peak: PeakWindow, centre: np.ndarray) -> np.ndarray:
-    """Height (M,) float32, in grey levels, of the best-fitting Gaussian of each peak's sigma at the centre (M,)."""
+    """Return the height (M,) float32, grey levels, of the best-fitting Gaussian at each centre (M,)."""
     result = np.empty(centre.size, np.float32)
     _best_heights(peak, centre, result)
     return result
@@ -45,27 +45,27 @@ def amplitudes(peak: PeakWindow, centre: np.ndarray) -> np.ndarray:
 
 @compiled
 def _best_heights(peak: PeakWindow, centre: np.ndarray, result: np.ndarray) -> None:
-    """Fill the heights (M,); see `amplitudes`."""
+    """Compute the heights (M,); see `amplitudes`."""
     size = peak.window.shape[1]
     for m in range(centre.size):
         pixels, ground, middle = peak.window[m], peak.base[m], centre[m]
         sigma = max(peak.sigma[m], np.float32(_ONE_PIXEL))
-        width = max(peak.sigma[m], np.float32(LEAST_KERNEL))
+        width = max(peak.sigma[m], np.float32(WINDOW_RULE.least_kernel))
         near = min(max(math.floor(middle + np.float32(0.5)), 0), size - 1)
-        # A Gaussian by recurrence on both sides; see `gaussian_moments`.
+        # Gaussian by recurrence on both sides; see `gaussian_moments`.
         sharpness, offset, half = np.float32(1.0) / (width * width), np.float32(near) - middle, np.float32(0.5)
         weight = math.exp(-half * sharpness * offset * offset)
         after, before = math.exp(-sharpness * (half + offset)), math.exp(-sharpness * (half - offset))
         falling = after * before
         total, right, left = weight * (pixels[near] - ground), weight * after, weight * before
-        for k in range(1, math.ceil(np.float32(TAIL_SIGMAS) * width) + 1):
+        for k in range(1, math.ceil(np.float32(WINDOW_RULE.tail) * width) + 1):
             if near + k < size:
                 total += right * (pixels[near + k] - ground)
             if near - k >= 0:
                 total += left * (pixels[near - k] - ground)
             after, before = after * falling, before * falling
             right, left = right * after, left * before
-        # The sum of the product of two Gaussians over the pixels, solved for the height of the first.
+        # Sum over the product of two Gaussians, solved for the height of the first.
         joint = np.float32(0.5 / math.pi) * (np.float32(1.0) / (sigma * sigma) + sharpness)
         result[m] = total * math.sqrt(joint)
 

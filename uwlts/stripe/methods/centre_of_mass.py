@@ -1,4 +1,4 @@
-"""The stripe's centre of mass."""
+"""Stripe centre as the centre of mass."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import math
 import numpy as np
 
 from uwlts.runtime.compiled import compiled
-from uwlts.stripe.peak_window import PeakWindow, part_inside
+from uwlts.stripe.peak_window import PeakWindow, covered_fraction
 
 _ITERATIONS = 6
-"""Passes in which the window follows the centre, as many for each line."""
+"""Number of updates of the window's position."""
 
 _HALF_SIGMAS = 2.25
-"""Sigmas from the centre to the ends of the window: most of the light; further pixels add more noise than light."""
+"""Half width of the window, sigmas: it contains most of the light; further pixels add more noise than light."""
 
 
 def centres(peak: PeakWindow) -> np.ndarray:
-    """Centre of mass in a window symmetric about itself.
+    """Compute the centre of mass in a window symmetric about the centre itself.
 
-    Pixels cut by the window's ends count in part, and it follows the centre until both agree, so that nothing is cut
-    off more on one side than on the other.
+    Pixels at the window's ends count by the covered fraction. The window is moved to the centre repeatedly, so that it
+    cuts off equally much on both sides.
     """
     half = np.float32(_HALF_SIGMAS) * peak.kernel_sigma()
     centre = peak.middle.copy()
@@ -36,7 +36,7 @@ def _follow(peak: PeakWindow, half: np.ndarray, centre: np.ndarray) -> None:
             first, last = math.ceil(centre[m] - half[m] - 0.5), math.floor(centre[m] + half[m] + 0.5)
             for x in range(max(first, 0), min(last + 1, peak.window.shape[1])):
                 u = x - centre[m]
-                share = part_inside(u, half[m]) * (
+                share = covered_fraction(u, half[m]) * (
                     peak.window[m, x] - (peak.base[m] + peak.slope[m] * (x - peak.middle[m]))
                 )
                 total, moment = total + share, moment + share * u

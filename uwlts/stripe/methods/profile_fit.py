@@ -1,7 +1,7 @@
-"""The stripe's centre by maximum likelihood: a Gaussian profile fitted under the noise that laser stripes have.
+"""Stripe centre by maximum likelihood: a Gaussian profile fitted with the noise model of laser stripes.
 
-Speckle multiplies the light, so that a pixel errs in proportion to what it shows. Above the floor of noise the faint
-flanks then locate a stripe better than its bright middle, where the profile is level.
+Speckle multiplies the light, so that the noise of a pixel is proportional to its grey value. Above the noise floor, the
+faint flanks therefore determine the position better than the bright middle, where the profile is flat.
 """
 
 from __future__ import annotations
@@ -13,100 +13,127 @@ import numpy as np
 
 from uwlts.runtime.compiled import compiled, compiled_inline, compiled_part
 from uwlts.stripe.methods import quadratic
-from uwlts.stripe.peak_window import FLANK, FWHM_PER_SIGMA, PeakWindow
+from uwlts.stripe.peak_window import FWHM_PER_SIGMA, WINDOW_RULE, PeakWindow
 
 _STEPS = 5
-"""Steps of the fit in all, as many for each line, so that those fitted side by side end together."""
+"""Number of steps of the fit, equal for all lines, which are fitted in parallel."""
 
 _FIRST_STEPS = 2
-"""Steps before the contrast is taken from what the fit leaves."""
+"""Number of steps before the contrast is estimated from the residuals."""
 
 _UNMODELLED = 0.02
-"""Part of the height by which haze, flare and blur may make a stripe differ from a Gaussian. Pixels count ever less
-where the wings fall below that part over the contrast, 2.5 sigma from the centre at a contrast of one half."""
+"""Deviation of a stripe from a Gaussian by haze, flare and blur, as a fraction of its height. It limits the weight of
+the wings, from 2.5 sigma on for a contrast of one half."""
 
 _LEAST_NOISE = 0.5
-"""Grey levels: values are rounded to whole ones, and cut off at black."""
+"""Least noise, grey levels: values are rounded to integers and clipped at black."""
 
 _USUAL_CONTRAST = 0.3
-"""Speckle contrast assumed before anything is measured; fully developed speckle that a pixel resolves has 1."""
+"""Speckle contrast assumed for the first steps; fully developed speckle resolved by the pixels has contrast 1."""
 
 _PRIOR_PIXELS = 5.0
-"""Number of pixels whose evidence the assumed contrast counts as: less than one stripe has."""
+"""Weight of the assumed contrast as a number of pixels: fewer than one stripe has."""
 
 _NARROWEST = 0.4
-"""Least sigma, px: a stripe within one pixel has 0.29."""
+"""Least sigma, px; a stripe within one pixel has 0.29."""
 
 _WIDENING = 1.5
-"""Largest ratio of the fitted sigma to that of the half-height width."""
+"""Largest ratio of the fitted sigma and the sigma from the half-height width."""
 
 _LONGEST_STEP = 0.5
-"""Largest change at a time of the height's and width's logarithms, and of the centre in sigmas: beyond, the linearised
-model says nothing."""
+"""Largest change per step of the logarithms of height and width, and of the centre in sigmas: the linearised model is
+invalid beyond it."""
 
 _SPECKLED_HALO = 0.023
-"""Noise beside a stripe over its height above which the flanks of a plateau tell less than its middle."""
+"""Ratio of noise and height above which the flanks of a plateau are less informative than its middle."""
 
 _MOSTLY = 0.5
-"""Share of the width that a plateau has above which it is most of the stripe."""
+"""Fraction of the width above which a plateau is most of its stripe."""
 
 _PLATEAU = 5
-"""Pixels of a plateau, at least, and of a stripe with one."""
+"""Fewest pixels of a plateau, and of the width of its stripe."""
 
 _SAMPLED = 256
-"""Lines from which noise and contrast are taken; more would not make the fit better."""
+"""Number of lines for the estimates of noise and contrast; more lines would not improve the fit."""
 
 _LANES = 16
-"""Lines fitted side by side, as many as fill the processor's vector units."""
+"""Number of lines fitted in parallel, which fills the processor's vector units."""
 
 _KNOWN = 8
-_CENTRE, _HEIGHT, _SIGMA, _FIRST, _LAST, _WIDEST, _FLOOR, _REACH = (row * _LANES for row in range(_KNOWN))
-"""Places of what is known of the lines fitted side by side: the fit, its limits, floor of the variance and reach."""
+"""Number of rows of lanes with parameters of the lines, from `_CENTRE` to `_REACH`."""
+_CENTRE = 0 * _LANES
+_HEIGHT = 1 * _LANES
+_SIGMA = 2 * _LANES
+_FIRST = 3 * _LANES
+"""Least centre."""
+_LAST = 4 * _LANES
+"""Largest centre."""
+_WIDEST = 5 * _LANES
+"""Largest sigma."""
+_FLOOR = 6 * _LANES
+"""Floor of the variance."""
+_REACH = 7 * _LANES
+"""Pixels on either side."""
 
-_AFTER, _BEFORE, _RISE_AFTER, _RISE_BEFORE, _FALLING, _INVERSE = (row * _LANES for row in range(8, 14))
-"""Places behind the sums of the model on both sides, its ratios to the next pixels', how these fall, and 1 / sigma."""
+_SUMS = 14
+"""Number of rows of lanes with sums: eight moments, then the rows from `_AFTER` to `_INVERSE`."""
+_AFTER = 8 * _LANES
+"""Model at the pixel after the middle."""
+_BEFORE = 9 * _LANES
+"""Model at the pixel before the middle."""
+_RISE_AFTER = 10 * _LANES
+"""Ratio of the model at the next pixel after."""
+_RISE_BEFORE = 11 * _LANES
+"""Ratio of the model at the next pixel before."""
+_FALLING = 12 * _LANES
+"""Factor of these ratios per pixel."""
+_INVERSE = 13 * _LANES
+"""Inverse of sigma."""
 
 _TINY = np.finfo(np.float32).tiny
 
 _MEDIAN_MEAN_SQUARE = 0.934
-"""Median of the mean square of 2 x 5 unit Gaussian numbers (chi-square of 10 degrees)."""
+"""Median of the mean square of 2 x 5 unit Gaussian numbers (chi-square of 10 degrees of freedom)."""
 
 
 def centres(peak: PeakWindow) -> np.ndarray:
-    """Centre (M,) float32 of the best-fitting Gaussian profile, px from the window's first pixel.
+    """Fit a Gaussian profile and return its centre (M,) float32, px from the window's first pixel.
 
-    The model is f = A exp(-u^2 / 2) with u = (x - c) / s, above the line through the peak's flanks. A pixel's variance
-    is v = r^2 + (C f)^2: r is the floor of detector and surroundings, C the contrast of speckle, which stands for shot
-    noise too. Both are measured on all lines together, r beside the stripes, C on what a first fit leaves.
+    The model is f = A exp(-u^2 / 2) with u = (x - c) / s, above the line through the peak's flanks. The variance of a
+    pixel is v = r^2 + (C f)^2, with the noise floor r of detector and surroundings and the speckle contrast C, which
+    includes shot noise. Both are estimated from all lines together: r beside the stripes, C from the residuals of a
+    first fit.
 
-    Each step solves sum (y - f) df/dp / v = 0, linearised in p = (ln A, c / s, ln s), with v of the step before: Fisher
-    scoring of the quasi-likelihood, which needs no more of the noise than its variance (McCullagh and Nelder,
-    Generalized Linear Models, Ch. 9). As df/dp = f (1, u, u^2), the equations hold moments of f^2 / v up to u^4.
+    Each step solves sum (y - f) df/dp / v = 0, linearised in p = (ln A, c / s, ln s), with v of the previous step. This
+    is Fisher scoring of the quasi-likelihood, which depends on the variance of the noise only (McCullagh and Nelder,
+    Generalized Linear Models, Ch. 9). Because df/dp = f (1, u, u^2), the equations contain moments of f^2 / v up to
+    u^4.
 
-    Saturated pixels get no special care: the contrast gives the top so little weight that it would change little. But
-    where they are most of the stripe, in a halo that has speckle too, the flanks are no Gaussian's: there the parabola
-    of `quadratic` scatters less.
+    Saturated pixels are not treated separately, because the contrast gives the top little weight. If they are most of
+    the stripe, in a halo with speckle, the flanks are not Gaussian: then the parabola of `quadratic` scatters less.
     """
     sampled = np.arange(0, peak.start.size, max(1, peak.start.size // _SAMPLED))
     flanks = np.zeros(sampled.size, np.float32)
-    _flank_noise(peak, sampled, flanks)
-    # The floor: that of the usual line. NumPy's median takes several times as long for a few hundred.
+    _measure_flanks(peak, sampled, flanks)
+    # Floor of the median line. NumPy's median is several times slower for a few hundred values.
     flanks.sort()
     usual = 0.5 * (float(flanks[(sampled.size - 1) // 2]) + float(flanks[sampled.size // 2]))
     noise = max(_LEAST_NOISE, math.sqrt(usual / _MEDIAN_MEAN_SQUARE))
     groups, most = -(-peak.start.size // _LANES), int(peak.reach.max())
-    # Flat rows, of which the compiler knows that their parts do not overlap.
-    signal, known, sums = _aligned((groups, 2 * most + 1), (groups, _KNOWN), (1, 14))
+    # Flat rows: the compiler knows that their parts do not overlap.
+    signal, known, sums = _allocate_aligned((groups, 2 * most + 1), (groups, _KNOWN), (1, _SUMS))
     centre, flat = np.empty(peak.start.size, np.float32), np.empty(peak.start.size, np.bool_)
-    _fit(peak, noise, sampled, signal, known, sums[0], centre, flat)
+    _fit_profiles(peak, noise, sampled, signal, known, sums[0], centre, flat)
     if flat.any():
-        centre[flat] = quadratic.centres(peak.keep(flat))
+        centre[flat] = quadratic.centres(peak.select(flat))
     return centre
 
 
-def _aligned(*shapes: tuple[int, int]) -> Iterator[np.ndarray]:
-    """Arrays (G, K lanes) for shapes (G, K) that begin where vector units read fastest: elsewhere a fit takes a third
-    longer."""
+def _allocate_aligned(*shapes: tuple[int, int]) -> Iterator[np.ndarray]:
+    """Yield arrays (G, K lanes) for shapes (G, K) at addresses aligned for vector units.
+
+    Without alignment a fit takes a third longer.
+    """
     sizes = [groups * count * _LANES for groups, count in shapes]
     room = np.empty(sum(sizes) + _LANES, np.float32)
     first = -(room.__array_interface__["data"][0] // room.itemsize) % _LANES
@@ -116,20 +143,20 @@ def _aligned(*shapes: tuple[int, int]) -> Iterator[np.ndarray]:
 
 
 @compiled
-def _flank_noise(peak: PeakWindow, sampled: np.ndarray, result: np.ndarray) -> None:
-    """Mean square (S,) of the pixels of both flanks about the line through them, of sampled lines."""
+def _measure_flanks(peak: PeakWindow, sampled: np.ndarray, result: np.ndarray) -> None:
+    """Compute the mean square (S,) of the pixels of both flanks about the line through them, for sampled lines."""
     for number in range(sampled.size):
         m = sampled[number]
         near = math.floor(peak.middle[m] + np.float32(0.5))
-        for away in range(-FLANK, FLANK):
+        for away in range(-WINDOW_RULE.flank, WINDOW_RULE.flank):
             x = near + away + (int(peak.reach[m]) if away >= 0 else 1 - int(peak.reach[m]))
             x = min(max(x, 0), peak.window.shape[1] - 1)
             left = peak.window[m, x] - (peak.base[m] + peak.slope[m] * (np.float32(x) - peak.middle[m]))
-            result[number] += left * left / np.float32(2 * FLANK)
+            result[number] += left * left / np.float32(2 * WINDOW_RULE.flank)
 
 
 @compiled
-def _fit(
+def _fit_profiles(
     peak: PeakWindow,
     noise: float,
     sampled: np.ndarray,
@@ -139,15 +166,15 @@ def _fit(
     centre: np.ndarray,
     flat: np.ndarray,
 ) -> None:
-    """Fill the centres (M,), and mark the lines (M,) with a plateau in a halo; all others are room to work in."""
-    _set_side_by_side(peak, noise, signal, known)
+    """Fill the centres (M,), and mark the lines (M,) with a plateau in a halo; other arrays are buffers."""
+    _arrange_lanes(peak, noise, signal, known)
     contrast = _USUAL_CONTRAST
     for step in range(_STEPS):
         if step == _FIRST_STEPS:
-            contrast = _contrast(known, signal, sampled, noise)
+            contrast = _estimate_contrast(known, signal, sampled, noise)
         for group in range(known.shape[0]):
             _sum_moments(known[group], signal[group], np.float32(contrast * contrast), sums)
-            _step(known[group], sums)
+            _update_fit(known[group], sums)
     size = peak.window.shape[1]
     for m in range(centre.size):
         centre[m] = math.floor(peak.middle[m] + np.float32(0.5)) + known[m // _LANES, _CENTRE + m % _LANES]
@@ -162,10 +189,10 @@ def _fit(
 
 
 @compiled_inline
-def _set_side_by_side(peak: PeakWindow, noise: float, signal: np.ndarray, known: np.ndarray) -> None:
-    """Signal above the background (G, (2 R + 1) lanes) and what is known (G, 8 lanes) of G groups of lines.
+def _arrange_lanes(peak: PeakWindow, noise: float, signal: np.ndarray, known: np.ndarray) -> None:
+    """Arrange the signal (G, (2 R + 1) lanes) and the parameters (G, 8 lanes) of G groups of lines.
 
-    Positions count from the pixel nearest to each peak's middle. The last group is filled up with the last line.
+    Positions are relative to the pixel nearest to each peak's middle. The last group is padded with the last line.
     """
     count, size = peak.window.shape
     most = signal.shape[1] // (2 * _LANES)
@@ -191,10 +218,10 @@ def _set_side_by_side(peak: PeakWindow, noise: float, signal: np.ndarray, known:
 
 
 @compiled_inline
-def _contrast(known: np.ndarray, signal: np.ndarray, sampled: np.ndarray, noise: float) -> float:
-    """Contrast of the pixels above half height: what the fit leaves of them over the model, less the floor's share.
+def _estimate_contrast(known: np.ndarray, signal: np.ndarray, sampled: np.ndarray, noise: float) -> float:
+    """Estimate the contrast of pixels above half height: residuals divided by the model, without the noise floor.
 
-    The degrees of freedom of the fit are not accounted for.
+    The degrees of freedom of the fit are not taken into account.
     """
     most = signal.shape[1] // (2 * _LANES)
     total, count = _PRIOR_PIXELS * _USUAL_CONTRAST * _USUAL_CONTRAST, _PRIOR_PIXELS
@@ -213,10 +240,10 @@ def _contrast(known: np.ndarray, signal: np.ndarray, sampled: np.ndarray, noise:
 
 @compiled_part
 def _sum_moments(known: np.ndarray, signal: np.ndarray, squared_contrast: np.float32, sums: np.ndarray) -> None:
-    """Moments of f^2 / v up to u^4, then of (y - f) f / v up to u^2.
+    """Compute moments of f^2 / v up to u^4, then of (y - f) f / v up to u^2.
 
-    From the middle outwards, both sides at a time, the model goes on by the ratio of neighbouring values, which falls
-    by the same factor from pixel to pixel.
+    The model is evaluated from the middle outwards on both sides. The ratio of neighbouring values decreases by a
+    constant factor per pixel.
     """
     most, reach = signal.size // (2 * _LANES), 0
     for k in range(_LANES):
@@ -267,7 +294,10 @@ def _sum_moments(known: np.ndarray, signal: np.ndarray, squared_contrast: np.flo
 
 @compiled_part
 def _exp(x: np.float32) -> np.float32:
-    """e^x as (e^(x / 16))^16, which vector units can do: to 2e-5 of it above -5, and never above e^-12 beyond that."""
+    """Return e^x as (e^(x / 16))^16, which vector units can compute.
+
+    The relative error is below 2e-5 for x > -5; below x = -12 the value of e^-12 is returned.
+    """
     y = max(x, np.float32(-12.0)) * np.float32(1.0 / 16.0)
     rest = np.float32(1 / 6) + y * (np.float32(1 / 24) + y * np.float32(1 / 120))
     power = np.float32(1.0) + y * (np.float32(1.0) + y * (np.float32(0.5) + y * rest))
@@ -278,10 +308,10 @@ def _exp(x: np.float32) -> np.float32:
 
 
 @compiled_part
-def _step(known: np.ndarray, sums: np.ndarray) -> None:
-    """One step of the fit from the normal equations, by Cramer's rule; no change is above the limit.
+def _update_fit(known: np.ndarray, sums: np.ndarray) -> None:
+    """Update the fit from the normal equations by Cramer's rule, with limited changes.
 
-    The matrix is m[i + j]. A thousandth more on its diagonal keeps it regular where two pixels carry all weight.
+    The matrix is m[i + j]. Its diagonal is increased by a thousandth, to be regular if two pixels have all the weight.
     """
     regular, longest = np.float32(1.001), np.float32(_LONGEST_STEP)
     for k in range(_LANES):

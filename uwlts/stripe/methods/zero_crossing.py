@@ -1,4 +1,4 @@
-"""The stripe's centre where the smoothed profile's derivative crosses zero."""
+"""Stripe centre at the zero crossing of the smoothed profile's derivative."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ from uwlts.stripe.peak_window import PeakWindow, gaussian_moments
 
 
 def centres(peak: PeakWindow) -> np.ndarray:
-    """Zero of the profile's correlation with the derivative of a Gaussian as wide as the stripe.
+    """Compute the zero of the profile's correlation with the derivative of a Gaussian as wide as the stripe.
 
-    With t = (x - c) / s and g = exp(-t^2 / 2), F(c) = sum f t g is proportional to the derivative, at c, of the
-    profile f smoothed with g. As wide as the stripe, the kernel is the matched filter: the zero is the least-squares
-    position of a Gaussian, of least variance in white noise. The kernel is evaluated at a real-valued c0, the midpoint
-    of the half-height crossings, instead of interpolating between pixels. With Mk = sum f t^k g the slope of F by c / s
-    is M2 - M0, so that Newton's step is r = M1 / (M0 - M2). For a Gaussian f of sigma s, F(c) is proportional to
-    d exp(-d^2 / 4), d being the step that is sought, and r = d / (1 - d^2 / 2): d is r - r^3 / 2 to fourth order.
+    With t = (x - c) / s and g = exp(-t^2 / 2), F(c) = sum f t g is proportional to the derivative at c of the profile f
+    smoothed with g. A kernel as wide as the stripe is the matched filter. Its zero is the least-squares position of a
+    Gaussian, with the least variance in white noise. The kernel is evaluated at a real-valued c0, the midpoint of the
+    half-height crossings, instead of interpolating between pixels.
 
-    A background of slope b adds b sqrt(2 pi) s^2 to F everywhere, which is taken out.
+    With Mk = sum f t^k g, the derivative of F by c / s is M2 - M0, and Newton's step is r = M1 / (M0 - M2). For a
+    Gaussian f of sigma s, F(c) is proportional to d exp(-d^2 / 4), where d is the required step. Then r = d / (1 - d^2
+    / 2), and d = r - r^3 / 2 to fourth order.
+
+    A background of slope b adds b sqrt(2 pi) s^2 to F everywhere, which is subtracted.
     """
     kernel, moments = peak.kernel_sigma(), np.empty((peak.start.size, 3), np.float32)
     gaussian_moments(peak, peak.middle, kernel, moments)

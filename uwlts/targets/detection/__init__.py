@@ -1,22 +1,22 @@
 """Detection of circles, lattices of circles, and corners in images."""
 
-from uwlts.targets.detection.chessboard_grid import count_seen, refined, why_no_chessboard
+from uwlts.targets.detection.chessboard_grid import count_corners, find_chessboard_fault, refine_corners
 from uwlts.targets.detection.chessboard_lattice import find_board
-from uwlts.targets.detection.corners import corner_quality, eight_bit
-from uwlts.targets.detection.ellipses import Ellipses, find_circles, mark_strength
+from uwlts.targets.detection.corners import convert_to_eight_bit, measure_corners
+from uwlts.targets.detection.ellipses import Ellipses, find_circles, measure_marks
 from uwlts.targets.detection.lattice import Lattice, detect_lattice, label_lattice
 
 __all__ = [
     "Ellipses",
     "Lattice",
-    "corner_quality",
-    "count_seen",
+    "convert_to_eight_bit",
+    "count_corners",
     "detect_lattice",
-    "eight_bit",
     "find_board",
+    "find_chessboard_fault",
     "find_circles",
     "label_lattice",
-    "mark_strength",
-    "refined",
-    "why_no_chessboard",
+    "measure_corners",
+    "measure_marks",
+    "refine_corners",
 ]

@@ -9,19 +9,46 @@ import numpy as np
 from uwlts.errors import ImageError
 from uwlts.runtime.compiled import compiled, compiled_part
 
-# Sides of the square window over which the two local grey levels are taken. A window serves blobs from about a tenth
-# to three quarters of its side, so factors of four cover 4 px to 380 px with overlap.
-WINDOWS_PX = (32, 128, 512)
-# Local grey levels are means of blocks of so many pixels a side, with linear interpolation between their middles.
 BLOCK_PX = 4
-MIN_AREA_PX = 10.0  # a blob of fewer pixels has no measurable shape (a disc of 4 px diameter covers 12.6)
-# Pure noise, which the median filter has more than halved, shows 0.7 of its standard deviation between both levels.
-CONTRAST_OVER_NOISE = 3.0
-SMOOTH_SHARE = 0.2  # of the pixels, in which even a fine pattern leaves no edge
-# Most difference of a blob's area from that of the ellipse with its moments, as a share. Rectangles, at 0.05, pass; the
-# fit to the edge leaves them out.
-ELLIPSE_LIKE = 0.12
-CONTRAST_OVER_RANGE = 0.04  # below this fraction of the image's grey range a contrast is dirt or compression noise
+"""Side of the blocks whose means give local grey levels, interpolated linearly between their middles; `_widen` has the
+weights for this side."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlobRule:
+    """Numbers of the search for blobs.
+
+    Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the drawn
+    plates of tests/uwlts/targets and on real photographs (tests/system/test_real_images.py).
+
+    Attributes
+    ----------
+    windows_px : tuple of int
+        Sides of the square window for the two local grey levels, px. A window serves blobs from a tenth to three
+        quarters of its side, so that factors of four cover 4 to 380 px with overlap.
+    least_area_px : float
+        Least area of a blob, px^2: the shape of smaller blobs is unknown (a disc of 4 px diameter covers 12.6 px^2).
+    contrast_over_noise : float
+        Least contrast in standard deviations of the noise. Noise after the median filter, which more than halves it,
+        gives a contrast of 0.7.
+    contrast_over_range : float
+        Least contrast as a fraction of the image's grey range; less is dirt or compression noise.
+    smooth_share : float
+        Fraction of the pixels that determine the noise: even a fine pattern leaves them without an edge.
+    ellipse_departure : float
+        Largest difference of a blob's area from that of the ellipse with its moments, as a fraction. Rectangles, at
+        0.05, pass; the fit to the edge rejects them.
+    """
+
+    windows_px: tuple[int, ...] = (32, 128, 512)
+    least_area_px: float = 10.0
+    contrast_over_noise: float = 3.0
+    contrast_over_range: float = 0.04
+    smooth_share: float = 0.2
+    ellipse_departure: float = 0.12
+
+
+_RULE = BlobRule()
 
 
 @dataclass(frozen=True)
@@ -32,7 +59,7 @@ class Blobs:
     ----------
     centres : (N, 2) float64, px, (u, v)
     shapes : (N, 2, 2) float64, px, symmetric positive; ``centre + shape @ (cos t, sin t)`` is the ellipse
-    bright : whether the blobs are brighter than their surroundings
+    bright : True if the blobs are brighter than their surroundings
     """
 
     centres: np.ndarray
@@ -43,8 +70,8 @@ class Blobs:
         return len(self.centres)
 
 
-def checked_grey(image):
-    """The image as a read-only array (H, W), `ImageError` if it is not of uint8 or uint16."""
+def check_grey(image):
+    """Return the image (H, W) as a read-only array; raise `ImageError` unless it is uint8 or uint16."""
     if not isinstance(image, np.ndarray):
         raise ImageError(f"the image is a {type(image).__name__}; expected a NumPy array (H, W) of uint8 or uint16")
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16) or min(image.shape) < 16:
@@ -53,27 +80,28 @@ def checked_grey(image):
             f"the image has {size} pixels, {image.ndim} dimensions and the type {image.dtype}; expected one grey "
             "channel (H, W) of uint8 or uint16, at least 16 x 16: convert colour images first"
         )
-    # Compiled code is made once for arrays that can be written and once more for others.
+    # Compiled code is specialised for writable and for read-only arrays: make all read-only.
     grey = np.ascontiguousarray(image).view()
     grey.flags.writeable = False
     return grey
 
 
-def noise_level(image):
-    """Standard deviation of the pixel noise of an image (H, W), in grey levels.
+def estimate_noise(image):
+    """Estimate the standard deviation of the pixel noise of an image (H, W), in grey levels.
 
     The mask of Immerkaer (Fast noise variance estimation, CVIU 64, 1996, eq. 2) cancels linear shading and has norm 6.
-    Its lower fifth is used instead of its mean because a fine pattern puts an edge into most neighbourhoods.
+    The lower fifth of its responses is used instead of their mean, because a fine pattern has edges in most
+    neighbourhoods.
     """
     counts = np.zeros(8 * np.iinfo(image.dtype).max + 1, np.int64)
     _count_responses(image, counts)
-    lower_part = np.searchsorted(np.cumsum(counts), SMOOTH_SHARE * counts.sum())
-    return float(lower_part) / (6 * NormalDist().inv_cdf(0.5 + SMOOTH_SHARE / 2))
+    lower_part = np.searchsorted(np.cumsum(counts), _RULE.smooth_share * counts.sum())
+    return float(lower_part) / (6 * NormalDist().inv_cdf(0.5 + _RULE.smooth_share / 2))
 
 
 @compiled
 def _count_responses(image, counts):
-    """Count how often the mask's response has each size; one row in four is enough for a quantile."""
+    """Count the responses of the mask by size. One row in four is sufficient for a quantile."""
     for v in range(0, image.shape[0] - 2, 4):
         above, middle, below = image[v], image[v + 1], image[v + 2]
         before = np.int64(above[0]) - 2 * np.int64(middle[0]) + np.int64(below[0])
@@ -85,58 +113,62 @@ def _count_responses(image, counts):
 
 
 def find_blobs(image, noise):
-    """Find the most numerous family of ellipse-like blobs, whatever its polarity and size.
+    """Find the largest family of elliptic blobs of any polarity and size.
 
-    Each window of `WINDOWS_PX` gives a threshold half-way between the mean levels of the local bright and dark pixels
-    (one step of Ridler and Calvard's iteration per pass, taken locally, which removes uneven lighting). Holes are
-    filled by keeping outer contours only; blobs at the image border and small ones are left out. The window and
-    polarity with most blobs of about the same size win, of as many the smaller ones: what is bright around each dark
-    circle is a blob too.
+    Each window side in `BlobRule.windows_px` gives a threshold halfway between the mean levels of the local bright and
+    dark pixels. It is one local step of Ridler and Calvard's iteration per pass, and removes uneven lighting. Only
+    outer contours are used, which fills holes. Blobs at the image border and small blobs are removed.
 
-    ``noise`` is the standard deviation of a pixel of the image (H, W); the result may be empty.
+    The window and polarity with most blobs of similar size win; of equally many, the smaller blobs, because the bright
+    region around each dark circle is also a blob.
+
+    ``noise`` is the standard deviation of a pixel of the image (H, W). The result may be empty.
     """
     low, high = np.quantile(image[::4, ::4], (0.001, 0.999))
-    floor = max(CONTRAST_OVER_NOISE * noise, CONTRAST_OVER_RANGE * (high - low))
+    floor = max(_RULE.contrast_over_noise * noise, _RULE.contrast_over_range * (high - low))
     smooth = cv2.medianBlur(image, 3)
     # All pixels are above -1.
-    _, mean = _above(smooth, np.full([-(-size // BLOCK_PX) for size in smooth.shape], -1, np.float32))
+    _, mean = _average_above(smooth, np.full([-(-size // BLOCK_PX) for size in smooth.shape], -1, np.float32))
     best, best_score = Blobs(np.empty((0, 2)), np.empty((0, 2, 2)), True), (0, 0.0)
     sides, wide = np.empty((2, *smooth.shape), np.uint8), np.empty((2, 2, BLOCK_PX * mean.shape[1]), np.float32)
-    for window in WINDOWS_PX:
-        if window > WINDOWS_PX[0] and window > max(image.shape):
+    for window in _RULE.windows_px:
+        if window > _RULE.windows_px[0] and window > max(image.shape):
             break
-        threshold, contrast = _local_levels(smooth, mean, window)
+        threshold, contrast = _estimate_levels(smooth, mean, window)
         _set_sides(smooth, threshold, contrast, np.float32(floor), wide, sides[0], sides[1])
         for bright, side in zip((True, False), sides, strict=True):
-            blobs = _ellipse_like(side, bright=bright, fewest=best_score[0])
+            blobs = _select_ellipses(side, bright=bright, fewest=best_score[0])
             radii = np.sqrt(np.linalg.det(blobs.shapes))
-            score = _largest_family(radii), -float(np.median(radii)) if len(radii) else 0.0
+            score = _count_largest_family(radii), -float(np.median(radii)) if len(radii) else 0.0
             if score > best_score:
                 best, best_score = blobs, score
     return best
 
 
-def _local_levels(smooth, mean, window):
-    """Threshold and contrast between the local bright and dark levels, in grey levels, of the blocks of an image.
+def _estimate_levels(smooth, mean, window):
+    """Return threshold and contrast of the local bright and dark levels, in grey levels, for the blocks of an image.
 
-    ``mean`` is that of the blocks.
+    ``mean`` contains the means of the blocks.
     """
-    threshold = bright = dark = mean = _local_mean(mean, window)
+    threshold = bright = dark = mean = _average_window(mean, window)
     for _ in range(2):
-        share, above = (_local_mean(values, window) for values in _above(smooth, threshold))
+        share, above = (_average_window(values, window) for values in _average_above(smooth, threshold))
         share = np.clip(share, 1e-4, 1 - 1e-4)
         bright, dark = above / share, (mean - above) / (1 - share)
         threshold = (bright + dark) / 2
     return threshold, bright - dark
 
 
-def _local_mean(blocks, window):
+def _average_window(blocks, window):
     side = window // BLOCK_PX + 1
     return cv2.blur(blocks, (side, side), borderType=cv2.BORDER_REFLECT)
 
 
-def _above(smooth, threshold):
-    """Of each block the share of pixels above the threshold, interpolated between blocks, and their sum over all."""
+def _average_above(smooth, threshold):
+    """Return the means per block of a mask of pixels above the interpolated threshold, and of their grey values.
+
+    Other pixels count as zero in both means.
+    """
     share, above = np.empty_like(threshold), np.empty_like(threshold)
     wide, sums = np.empty((2, 2, BLOCK_PX * threshold.shape[1]), np.float32)
     _sum_above(smooth, threshold, wide, sums, share, above)
@@ -144,10 +176,10 @@ def _above(smooth, threshold):
 
 
 @compiled_part
-def _between(blocks, v, wide):
-    """Rows of blocks on either side of a row of pixels, interpolated for each column, and the share of the second one.
+def _interpolate_blocks(blocks, v, wide):
+    """Return two rows of blocks around a row of pixels, interpolated for each column, and the second row's weight.
 
-    To be called for all rows of pixels in turn; ``wide`` keeps both rows of blocks.
+    It has to be called for all rows of pixels in order; ``wide`` keeps both rows of blocks.
     """
     top = (v + BLOCK_PX // 2) // BLOCK_PX - 1
     if v == 0:
@@ -159,7 +191,7 @@ def _between(blocks, v, wide):
 
 @compiled_part
 def _widen(blocks, wide):
-    """Values of a row of blocks, those at its ends repeated beyond them, interpolated for each column of pixels."""
+    """Interpolate a row of blocks for each column of pixels; beyond its ends the last value is repeated."""
     far, near, last = np.float32(0.375), np.float32(0.125), blocks.size - 1
     for c in range(last + 1):
         before, after = blocks[max(c - 1, 0)] - blocks[c], blocks[min(c + 1, last)] - blocks[c]
@@ -176,7 +208,7 @@ def _sum_above(smooth, threshold, wide, sums, share, above):
         for u in range(width):
             number[u], total[u] = np.float32(0.0), np.float32(0.0)
         for v in range(first, last):
-            upper, lower, part = _between(threshold, v, wide)
+            upper, lower, part = _interpolate_blocks(threshold, v, wide)
             pixels = smooth[v]
             for u in range(width):
                 grey = np.float32(pixels[u])
@@ -193,10 +225,10 @@ def _sum_above(smooth, threshold, wide, sums, share, above):
 
 @compiled
 def _set_sides(smooth, threshold, contrast, floor, wide, bright, dark):
-    """Masks (H, W) of what is brighter and of what is darker than the threshold, where there is contrast."""
+    """Set masks (H, W) of pixels above and below the threshold, at sufficient contrast."""
     for v in range(smooth.shape[0]):
-        upper, lower, part = _between(threshold, v, wide[0])
-        above, below, part = _between(contrast, v, wide[1])
+        upper, lower, part = _interpolate_blocks(threshold, v, wide[0])
+        above, below, part = _interpolate_blocks(contrast, v, wide[1])
         pixels, is_bright, is_dark = smooth[v], bright[v], dark[v]
         for u in range(pixels.size):
             level = upper[u] + part * (lower[u] - upper[u])
@@ -205,15 +237,15 @@ def _set_sides(smooth, threshold, contrast, floor, wide, bright, dark):
             is_dark[u] = clear & (np.float32(pixels[u]) < level)
 
 
-def _ellipse_like(mask, *, bright, fewest=0):
-    """Blobs of a 0/1 mask whose outline encloses the area of the ellipse with the same moments.
+def _select_ellipses(mask, *, bright, fewest=0):
+    """Return the blobs of a 0/1 mask whose outline encloses the area of the ellipse with the same moments.
 
-    None where there would be less than the ``fewest``.
+    The result is empty if the mask has fewer than ``fewest`` outlines.
     """
     height, width = mask.shape
     contours, hierarchy = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     lengths = np.fromiter(map(len, contours), int, len(contours))
-    # The outline of the largest circle that fits into the image has less than four times its shorter side.
+    # The outline of the largest circle in the image is shorter than four times its shorter side.
     chosen = np.flatnonzero((lengths >= 8) & (lengths <= 4 * min(height, width)))
     chosen = chosen[hierarchy[0, chosen, 3] < 0] if len(contours) else chosen
     chosen = chosen[: len(chosen) if len(chosen) >= fewest else 0]
@@ -221,13 +253,13 @@ def _ellipse_like(mask, *, bright, fewest=0):
     if len(chosen):
         ends = np.cumsum(lengths[chosen])
         _outline_moments(np.concatenate([contours[k] for k in chosen])[:, 0], ends, width, height, found)
-    # The outline runs through pixel centres: it leaves out half a pixel all around, and all of a line of pixels.
-    found = found[(found[:, 1] > 0) & (found[:, 1] + found[:, 0] / 2 >= MIN_AREA_PX)]
+    # The outline passes through pixel centres: it excludes half a pixel all around, and lines of pixels completely.
+    found = found[(found[:, 1] > 0) & (found[:, 1] + found[:, 0] / 2 >= _RULE.least_area_px)]
     area, covariances = found[:, 1], found[:, 4:] / found[:, 1:2]
     determinant = covariances[:, 0] * covariances[:, 2] - covariances[:, 1] ** 2
     # The uniform disc of radius r has the variance r^2 / 4, so an ellipse has area 4 pi sqrt(det covariance).
     expected = 4 * np.pi * np.sqrt(np.maximum(determinant, 0))
-    like = np.abs(area - expected) <= ELLIPSE_LIKE * expected
+    like = np.abs(area - expected) <= _RULE.ellipse_departure * expected
     centres, shapes = found[like, 2:4] / area[like, None], covariances[like][:, [0, 1, 1, 2]]
     values, vectors = np.linalg.eigh(shapes.reshape(-1, 2, 2))
     semi_axes = 2 * np.sqrt(values) + 0.5
@@ -236,15 +268,15 @@ def _ellipse_like(mask, *, bright, fewest=0):
 
 @compiled
 def _outline_moments(points, ends, width, height, found):
-    """Number of points, area, first moments and central second moments (K, 7) of polygons, by Green's theorem.
+    """Compute number of points, area, first moments and central second moments (K, 7) of polygons, by Green's theorem.
 
-    Those of polygons at the image's border have no area. ``points`` (N, 2) are of one polygon after the other, up to
-    ``ends`` (K,).
+    ``points`` (N, 2) contains the polygons one after another, up to the indices ``ends`` (K,). The area is 0 for
+    polygons at the border of the image.
     """
     first = 0
     for number in range(ends.size):
         end, inside = ends[number], True
-        # From the first point on, so that no digits are lost.
+        # Coordinates relative to the first point reduce rounding errors.
         u0, v0 = points[first, 0], points[first, 1]
         area, mu, mv, uu, uv, vv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         before_u, before_v = float(points[end - 1, 0] - u0), float(points[end - 1, 1] - v0)
@@ -271,8 +303,8 @@ def _outline_moments(points, ends, width, height, found):
         first = end
 
 
-def _largest_family(radii):
-    """Number of radii in the best-filled interval of a factor of two."""
+def _count_largest_family(radii):
+    """Return the largest number of radii within a factor of two."""
     ordered = np.sort(np.log2(radii))
     within = np.searchsorted(ordered, ordered + 1.0, side="right") - np.arange(len(ordered))
     return int(within.max(initial=0))

@@ -5,24 +5,37 @@ import numpy as np
 from uwlts.errors import RangeError
 
 RIM_POINTS = 16
+"""Projected points on the rim of a circle."""
 
 
 def circle_centre_bias(project, centres_mm, *, diameter_mm, axis_u, axis_v):
-    """Offset of the centre of a circle's image from the image of the circle's centre.
+    """Return the offset of the centre of a circle's image from the image of the circle's centre.
 
-    A detected centre minus this offset is the image of the circle's centre; a predicted image of the centre plus this
-    offset is what a detector finds. For a pinhole the image is an ellipse and the offset exact (J. Heikkila and
-    O. Silven, A four-step camera calibration procedure, CVPR 1997, section 3.2); with distortion or refraction the
-    ellipse is the one that best fits the projected rim.
+    A detected centre minus this offset is the image of the circle's centre. For a pinhole camera the image is an
+    ellipse and the offset is exact (J. Heikkila and O. Silven, A four-step camera calibration procedure, CVPR 1997,
+    section 3.2). With distortion or refraction, the ellipse is fitted to the projected rim.
 
-    ``project`` maps points (M, 3) in mm, target frame, to pixels (M, 2); ``centres_mm`` (N, 3) are in the target frame,
-    ``axis_u`` and ``axis_v`` (3,) orthonormal vectors that span the plane of the circles. Returns (N, 2) in px, (u, v).
+    Parameters
+    ----------
+    project : callable
+        Maps points (M, 3) in mm, target frame, to pixels (M, 2).
+    centres_mm : (N, 3) array
+        Centres of the circles, target frame.
+    diameter_mm : float
+        Diameter of the circles.
+    axis_u, axis_v : (3,) array
+        Orthonormal vectors in the plane of the circles.
+
+    Returns
+    -------
+    (N, 2) float64
+        Offsets (u, v), px.
 
     Raises
     ------
     RangeError
-        The diameter is not positive, the axes are not orthonormal, or the image of a circle is no ellipse (it reaches
-        behind the camera or where `project` has no result).
+        The diameter is not positive, the axes are not orthonormal, or the image of a circle is not an ellipse: the
+        circle extends behind the camera, or `project` fails.
     """
     axes = np.array([axis_u, axis_v], float)
     if not np.allclose(axes @ axes.T, np.eye(2), rtol=0, atol=1e-9):
@@ -39,14 +52,14 @@ def circle_centre_bias(project, centres_mm, *, diameter_mm, axis_u, axis_v):
     broken = ~np.isfinite(pixels).all((1, 2))
     if broken.any():
         raise RangeError(
-            f"{broken.sum()} of {len(centres)} circles have no finite image, the first at {centres[broken][0]} mm; "
-            "leave out circles that the camera cannot see"
+            f"{broken.sum()} of {len(centres)} circles cannot be projected, the first at {centres[broken][0]} mm; "
+            "remove circles that the camera cannot see"
         )
     return _ellipse_centres(pixels[:, 1:]) - pixels[:, 0]
 
 
 def _ellipse_centres(points):
-    """Centres (N, 2) of the conics that best fit N sets of points (N, M, 2), M >= 6."""
+    """Return the centres (N, 2) of the conics that best fit N sets of points (N, M, 2), M >= 6."""
     middle = points.mean(1, keepdims=True)
     scale = np.sqrt(((points - middle) ** 2).mean((1, 2), keepdims=True))
     if (scale == 0).any():
@@ -57,8 +70,8 @@ def _ellipse_centres(points):
     determinant = 4 * a * c - b * b
     if not (determinant > 0).all():
         raise RangeError(
-            f"the images of {np.count_nonzero(determinant <= 0)} of {len(points)} circles are no ellipses; leave out "
-            "circles that reach behind the camera"
+            f"the images of {np.count_nonzero(determinant <= 0)} of {len(points)} circles are not ellipses; remove "
+            "circles that extend behind the camera"
         )
     centre = np.stack([b * e - 2 * c * d, b * d - 2 * a * e], 1) / determinant[:, None]
     return middle[:, 0] + scale[:, 0] * centre

@@ -1,58 +1,129 @@
-"""Images of circles: sub-pixel ellipses through their edges, their quality, and which of them carry a mark."""
+"""Images of circles: sub-pixel ellipses fitted to their edges, their quality, and their marks."""
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from uwlts.runtime.compiled import compiled, compiled_part, compiled_with_arrays
-from uwlts.targets.detection.blobs import Blobs, checked_grey, find_blobs, noise_level
+from uwlts.targets.detection.blobs import Blobs, check_grey, estimate_noise, find_blobs
 
-PASSES = 2  # of both fits; the second one measures along the normals of the first
-# The edge of Gaussian blur s has the slope 0.4 / s over its contrast; 1.2 / slope is therefore three s.
-REACH_TIMES_SLOPE = 1.2
-MIN_REACH_PX = 2.5  # three s of a lens in focus
-MAX_REACH_PX = 8.0  # three s of a blur of 2.7 px
-MIN_RELATIVE_CONTRAST = 0.25  # of the middle's, to which the contrast of planes that meet is raised
-NEIGHBOURS = 12  # their levels show the shading
-MAX_LEVEL_DEPARTURE = 0.25  # a neighbour that differs by more differs by its print, or is no circle
-_ON_A_LINE = 1e-3  # ratio of squares across and along a line, below which places lie on it
-MAX_SHIFT_PX = 0.5  # a centroid further from the ellipse's centre has something other than a circle in its band
-PROFILES = 48  # around a blob
-SAMPLES = 11  # on each profile
+PROFILES = 48
+"""Edge profiles around a blob."""
+SAMPLES = 11
+"""Samples on each edge profile."""
+
+
+class EllipseRule(NamedTuple):
+    """Numbers of the ellipse fit; a named tuple, which compiled code reads as constants.
+
+    Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the drawn
+    plates of tests/uwlts/targets and on real photographs (tests/system/test_real_images.py).
+
+    Attributes
+    ----------
+    passes : int
+        Passes of both fits; the second pass samples along the normals of the first one.
+    reaches_px : tuple of float
+        Reaches of an edge profile on either side of the ellipse, px, tried in order. 2.5 px cover the edge of a lens in
+        focus, 6 px that of a lens out of focus.
+    reach_over_minor_axis : float
+        Largest inner reach, in minor semi-axes: beyond it a small blob shows its opposite edge.
+    missed_share : float
+        Fraction of blobs without a sharp edge above which the next reach is tried.
+    residual_over_reach : float
+        Largest rms distance of the edge from its ellipse, as a fraction of the reach: 0.15 px of 2.5 px.
+    residual_over_radius : float
+        The same as a fraction of the mean radius; the larger limit applies.
+    residual_over_noise : float
+        The same, relative to the effect of a pixel's noise on an edge; the larger limit applies.
+    residual_over_median : float
+        The same, relative to the median of all blobs, which have similar noise and blur.
+    residual_floor_px : float
+        Residual that always satisfies the limit relative to the median, px.
+    sharpness_times_reach : float
+        Least slope of an edge divided by its contrast, times the reach: at a reach of 2.5 px, a Gaussian blur of 4 px.
+    contrast_departure : float
+        Largest difference of a profile's contrast from its smooth variation around the blob, as a fraction.
+    contrast_departure_if_small : float
+        The same for small blobs: with blur, their inside level differs between the ends and flanks of the ellipse.
+    reach_times_slope : float
+        Reach of the centroid's band, times the edge's slope divided by its contrast. A Gaussian blur s gives a slope of
+        0.4 / s, so that the reach is three s.
+    least_reach_px, most_reach_px : float
+        Range of this reach, px: three s of a lens in focus, and of a blur of 2.7 px.
+    relative_contrast : float
+        Least contrast between the level planes, as a fraction of that in the middle; planes may intersect.
+    neighbours : int
+        Neighbouring blobs that determine the shading.
+    level_departure : float
+        Largest relative difference of a neighbour's level: others have a different print, or are no circles.
+    on_a_line : float
+        Ratio of squares across and along a line below which places are collinear.
+    shift_px : float
+        Largest distance of a centroid from its ellipse's centre, px; beyond it the band contains other objects.
+    """
+
+    passes: int = 2
+    reaches_px: tuple[float, ...] = (2.5, 6.0)
+    reach_over_minor_axis: float = 0.5
+    missed_share: float = 0.2
+    residual_over_reach: float = 0.06
+    residual_over_radius: float = 0.01
+    residual_over_noise: float = 1.5
+    residual_over_median: float = 2.5
+    residual_floor_px: float = 0.03
+    sharpness_times_reach: float = 0.25
+    contrast_departure: float = 0.2
+    contrast_departure_if_small: float = 0.4
+    reach_times_slope: float = 1.2
+    least_reach_px: float = 2.5
+    most_reach_px: float = 8.0
+    relative_contrast: float = 0.25
+    neighbours: int = 12
+    level_departure: float = 0.25
+    on_a_line: float = 1e-3
+    shift_px: float = 0.5
+
+
+RULE = EllipseRule()
+
 _ANGLES = np.arange(PROFILES) * (2 * np.pi / PROFILES)
 DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], 1)
 """Unit vectors (PROFILES, 2) that an ellipse's shape matrix maps to points of its rim."""
 
 
-def area_centroids(grey, ellipses):
-    """Centroids of the areas that ellipses cover, with the pixels of the edge counted by their share.
+def find_centroids(grey, ellipses):
+    """Return centroids of the areas covered by ellipses, with edge pixels weighted by their covered fraction.
 
-    A pixel in the band around the ellipse counts by (I - outside) / (inside - outside), the share of it that the blob
-    covers; a pixel further in counts whole and one further out not at all. Blur and the pixel's own area spread that
-    share without moving its centroid, which is why this is less biased than an ellipse through points of the edge.
-    Inside and outside levels are planes, so that shading does not pull the centre, and what lies deep inside (a mark)
-    has no influence.
+    A pixel in the band around the ellipse has the weight (I - outside) / (inside - outside), the fraction covered by
+    the blob. Pixels further inside have weight 1, pixels further outside 0. Blur and the pixel's area spread this
+    fraction without moving its centroid. The centroid therefore has less bias than an ellipse through edge points.
 
-    Returns centres (N, 2) in px and whether (N,) the centroid is next to the centre of the ellipse fitted to the edge;
-    where not, the ellipse's centre is given. ``grey`` is the image (H, W).
+    Inside and outside levels are planes, so that shading does not move the centre. Marks deep inside have no influence.
+
+    Returns centres (N, 2) in px, and a mask (N,) of centroids close to the centre of their fitted ellipse. For others
+    the ellipse's centre is returned. ``grey`` is the image (H, W).
     """
     centres, agree = ellipses.centres, np.ones(len(ellipses), bool)
-    reaches = _reaches(grey.shape, ellipses)
-    for _ in range(PASSES):
+    reaches = _band_reaches(grey.shape, ellipses)
+    for _ in range(RULE.passes):
         planes = _level_planes(grey, centres, ellipses.shapes, reaches)
-        moved = _centroids(grey, centres, ellipses.shapes, reaches, planes)
-        agree &= np.linalg.norm(moved - ellipses.centres, axis=1) < MAX_SHIFT_PX
+        moved = _compute_centroids(grey, centres, ellipses.shapes, reaches, planes)
+        agree &= np.linalg.norm(moved - ellipses.centres, axis=1) < RULE.shift_px
         centres = np.where(agree[:, None], moved, ellipses.centres)
     return centres, agree
 
 
-def _reaches(shape, ellipses):
-    """Reach of the band inwards and outwards from each ellipse, twice (N,), px."""
+def _band_reaches(shape, ellipses):
+    """Return the reach of the band inwards and outwards from each ellipse, two arrays (N,), px."""
     semi_axes = np.linalg.eigvalsh(ellipses.shapes)
-    wanted = np.clip(REACH_TIMES_SLOPE / np.maximum(ellipses.sharpness, 0.1), MIN_REACH_PX, MAX_REACH_PX)
-    inner = np.minimum(wanted, REACH_OVER_MINOR_AXIS * semi_axes[:, 0])
+    wanted = np.clip(
+        RULE.reach_times_slope / np.maximum(ellipses.sharpness, 0.1), RULE.least_reach_px, RULE.most_reach_px
+    )
+    inner = np.minimum(wanted, RULE.reach_over_minor_axis * semi_axes[:, 0])
     outer = wanted
     if len(ellipses) > 1:
         distance, index = KDTree(ellipses.centres).query(ellipses.centres, k=2)
@@ -65,23 +136,23 @@ def _reaches(shape, ellipses):
 
 
 def _level_planes(grey, centres, shapes, reaches):
-    """Inside and outside level of each blob: (N, 2, 3), value at the centre and slopes along u and v per px.
+    """Return the inside and outside level of each blob (N, 2, 3): value at the centre, and slopes along u and v per px.
 
-    The slopes are those of the levels of neighbouring blobs: levels read around a single one, close to a blurred edge,
-    slope with the edge's tail, which reaches further on one side where the plate is inclined.
+    The slopes are taken from the levels of neighbouring blobs. Levels around a single blob contain the tail of its
+    blurred edge, which extends further on one side if the plate is inclined.
     """
     planes = np.zeros((len(centres), 2, 3))
     inner, outer = reaches
     _mean_levels(grey, centres, shapes, np.linalg.inv(shapes), inner, outer, DIRECTIONS, planes)
     if len(centres) > 1:
-        near = KDTree(centres).query(centres, k=min(NEIGHBOURS + 1, len(centres)))[1]
+        near = KDTree(centres).query(centres, k=min(RULE.neighbours + 1, len(centres)))[1]
         _fit_slopes(centres, np.asarray(near), planes)
     return planes
 
 
 @compiled
 def _mean_levels(grey, centres, shapes, inverses, inner, outer, directions, planes):
-    """Set the levels (N, 2) along the rims of ellipses, so far inwards and outwards from them."""
+    """Set the mean levels (N, 2) on ellipses displaced inwards and outwards along the normals."""
     around = directions.shape[0]
     for n in range(len(centres)):
         shape, inverse, inside, outside = shapes[n], inverses[n], 0.0, 0.0
@@ -92,16 +163,16 @@ def _mean_levels(grey, centres, shapes, inverses, inner, outer, directions, plan
             n_u, n_v = inverse[0, 0] * e_u + inverse[0, 1] * e_v, inverse[0, 1] * e_u + inverse[1, 1] * e_v
             length = math.sqrt(n_u * n_u + n_v * n_v)
             n_u, n_v = n_u / length, n_v / length
-            inside += _bilinear(grey, at_u - inner[n] * n_u, at_v - inner[n] * n_v)
-            outside += _bilinear(grey, at_u + outer[n] * n_u, at_v + outer[n] * n_v)
+            inside += _sample_bilinear(grey, at_u - inner[n] * n_u, at_v - inner[n] * n_v)
+            outside += _sample_bilinear(grey, at_u + outer[n] * n_u, at_v + outer[n] * n_v)
         planes[n, 0, 0], planes[n, 1, 0] = inside / around, outside / around
 
 
 @compiled
 def _fit_slopes(places, near, planes):
-    """Fill the slopes of planes through the values at each of the places (N, 2) and at those ``near`` it (N, K).
+    """Fit slopes of planes through the values at each place (N, 2) and at the places ``near`` it (N, K).
 
-    Of places on one line the slope along it is all that they tell.
+    Collinear places determine the slope along their line only.
     """
     for n in range(len(places)):
         for side in range(2):
@@ -109,7 +180,7 @@ def _fit_slopes(places, near, planes):
             count, su, sv, sz, uu, uv, vv, uz, vz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
             for k in near[n]:
                 z = planes[k, side, 0] - value
-                if abs(z) <= MAX_LEVEL_DEPARTURE * abs(value):
+                if abs(z) <= RULE.level_departure * abs(value):
                     u, v = places[k, 0] - places[n, 0], places[k, 1] - places[n, 1]
                     count, su, sv, sz = count + 1.0, su + u, sv + v, sz + z
                     uu, uv, vv, uz, vz = uu + u * u, uv + u * v, vv + v * v, uz + u * z, vz + v * z
@@ -117,10 +188,10 @@ def _fit_slopes(places, near, planes):
             uz, vz = uz - su * sz / count, vz - sv * sz / count
             determinant, middle = uu * vv - uv * uv, 0.5 * (uu + vv)
             largest = middle + math.sqrt(max(middle * middle - determinant, 0.0))
-            if determinant > _ON_A_LINE * largest * largest:
+            if determinant > RULE.on_a_line * largest * largest:
                 slope_u, slope_v = (vv * uz - uv * vz) / determinant, (uu * vz - uv * uz) / determinant
             else:
-                # By the direction along which the places lie, whose squares add up to the largest.
+                # Slope along the line of the places, the direction of the largest squares.
                 least = 2.0 * middle - largest
                 scale = 1.0 / (largest * max(largest - least, 1e-300)) if largest > 0.0 else 0.0
                 slope_u = scale * ((uu - least) * uz + uv * vz)
@@ -128,8 +199,8 @@ def _fit_slopes(places, near, planes):
             planes[n, side, 1], planes[n, side, 2] = slope_u, slope_v
 
 
-def _centroids(grey, centres, shapes, reaches, planes):
-    """Centroids (N, 2) of ellipses, whose pixels in the band count by their share."""
+def _compute_centroids(grey, centres, shapes, reaches, planes):
+    """Compute the centroids (N, 2) of ellipses; pixels in the band count by their covered fraction."""
     result = np.empty_like(centres)
     # x' Q x = 1 with Q = shape^-2.
     inner, outer = (np.linalg.inv(shapes + np.eye(2) * reach[:, None, None]) for reach in (-reaches[0], reaches[1]))
@@ -144,13 +215,13 @@ def _sum_shares(grey, centres, inner, outer, planes, result):
         q, (centre_u, centre_v) = outer[n], centres[n]
         (inside, inside_u, inside_v), (outside, outside_u, outside_v) = planes[n]
         area, sum_u, sum_v = 0.0, 0.0, 0.0
-        sign, least = math.copysign(1.0, inside - outside), MIN_RELATIVE_CONTRAST * abs(inside - outside)
+        sign, least = math.copysign(1.0, inside - outside), RULE.relative_contrast * abs(inside - outside)
         half_height = math.sqrt(q[0, 0] / (q[0, 0] * q[1, 1] - q[0, 1] * q[0, 1]))
         top, bottom = math.ceil(centre_v - half_height), math.floor(centre_v + half_height)
         for v in range(max(top, 0), min(bottom + 1, height)):
             dv = v - centre_v
-            first, last = _run(q, centre_u, dv)
-            whole_from, whole_to = _run(inner[n], centre_u, dv)
+            first, last = _row_extent(q, centre_u, dv)
+            whole_from, whole_to = _row_extent(inner[n], centre_u, dv)
             first, last = max(first, 0), min(last, width - 1)
             whole_from, whole_to = max(whole_from, first), min(whole_to, last)
             if whole_from > whole_to:
@@ -163,47 +234,21 @@ def _sum_shares(grey, centres, inner, outer, planes, result):
                 du = u - centre_u
                 dark = outside + outside_u * du + outside_v * dv
                 contrast = sign * (inside + inside_u * du + inside_v * dv - dark)
-                # Planes that meet within the band belong to no circle; their share stays finite, and the centre shows
-                # it.
+                # Planes that intersect in the band belong to no circle, whose centre is then rejected.
                 share = sign * (grey[v, u] - dark) / max(contrast, least)
                 area, sum_u, sum_v = area + share, sum_u + share * du, sum_v + share * dv
         result[n, 0], result[n, 1] = centre_u + sum_u / area, centre_v + sum_v / area
 
 
 @compiled_part
-def _run(q, centre_u, dv):
-    """First and last u within an ellipse in a row; the first is after the last where the row misses it."""
+def _row_extent(q, centre_u, dv):
+    """Return first and last u within an ellipse in a row; first > last if the row does not meet the ellipse."""
     mixed = q[0, 1] * dv
     root = mixed * mixed - q[0, 0] * (q[1, 1] * dv * dv - 1.0)
     if root <= 0.0:
         return 1, 0
     half, middle = math.sqrt(root) / q[0, 0], centre_u - mixed / q[0, 0]
     return math.ceil(middle - half), math.floor(middle + half)
-
-
-# Reaches of an edge profile on either side of the ellipse, tried in turn. Two and a half pixels hold the edge of a lens
-# in focus, six that of one out of focus; inside a small blob half the minor semi-axis is all there is before the
-# opposite edge is felt. The next is tried where this share of the blobs shows no sharp edge.
-REACHES_PX = (2.5, 6.0)
-REACH_OVER_MINOR_AXIS = 0.5
-MISSED_SHARE = 0.2
-
-# Largest rms distance of the edge from its ellipse: as a share of the reach (0.15 px of 2.5 px) and of the mean radius,
-# against what the noise of a single pixel does to an edge, and against the median of all blobs, which have about the
-# same noise and blur.
-MAX_RESIDUAL_OVER_REACH = 0.06
-MAX_RESIDUAL_OVER_RADIUS = 0.01
-MAX_RESIDUAL_OVER_NOISE = 1.5
-MAX_RESIDUAL_OVER_MEDIAN = 2.5
-RESIDUAL_FLOOR_PX = 0.03
-
-# Least slope over contrast of an edge, times the reach; at a reach of 2.5 px it is that under a Gaussian blur of 4 px.
-MIN_SHARPNESS_TIMES_REACH = 0.25
-
-# Largest departure of one profile's contrast from the smooth course around the blob. Where blur fills a small blob, its
-# inside level differs between the ends and the flanks of the ellipse.
-MAX_CONTRAST_DEPARTURE = 0.2
-MAX_CONTRAST_DEPARTURE_IF_SMALL = 0.4
 
 
 @dataclass(frozen=True)
@@ -214,7 +259,7 @@ class Ellipses(Blobs):
     ----------
     residual_px : (N,) float64, rms distance of the edge points from the ellipse
     contrast : (N,) float64, grey levels, inside minus outside
-    sharpness : (N,) float64, 1/px, slope of the edge over its contrast
+    sharpness : (N,) float64, 1/px, slope of the edge divided by its contrast
     """
 
     residual_px: np.ndarray
@@ -229,51 +274,55 @@ class Ellipses(Blobs):
 def fit_ellipses(grey, blobs, noise):
     """Fit ellipses to the edges of blobs and keep those that are ellipses.
 
-    The edge is where the grey level passes half-way between inside and outside, sampled along normals of the current
-    ellipse. Both levels follow a constant and a first harmonic around the blob, so that shading does not shift the
-    centre. The distance along the normal is linear in a small change of centre and shape, which gives the orthogonal
-    least-squares fit after a few passes. Blobs cut by a stripe, a scratch or the target's edge show a large residual or
-    an uneven contrast and are left out; nothing is downweighted. Where the image is out of focus, the edge is sampled
-    over a longer distance.
+    The edge is the place where the grey level is halfway between inside and outside, sampled along normals of the
+    current ellipse. Both levels are a constant and a first harmonic around the blob, so that shading does not shift the
+    centre.
 
-    ``grey`` is the image (H, W), ``noise`` that of a pixel; possibly no ellipse is accepted.
+    The distance along the normal is linear in small changes of centre and shape. A few passes give the orthogonal
+    least-squares fit. Blobs cut by a stripe, a scratch or the target's edge have a large residual or an uneven contrast
+    and are rejected; no point is downweighted. In an image out of focus, the edge is sampled over a longer distance.
+
+    ``grey`` is the image (H, W), ``noise`` the standard deviation of a pixel. The result may be empty.
     """
-    best = _fitted(grey, blobs, REACHES_PX[0], noise)
-    for reach in REACHES_PX[1:]:
-        if len(best) >= (1 - MISSED_SHARE) * len(blobs):
+    best = _fit_at_reach(grey, blobs, RULE.reaches_px[0], noise)
+    for reach in RULE.reaches_px[1:]:
+        if len(best) >= (1 - RULE.missed_share) * len(blobs):
             break
-        best = max(best, _fitted(grey, blobs, reach, noise), key=len)
+        best = max(best, _fit_at_reach(grey, blobs, reach, noise), key=len)
     return best
 
 
-def _fitted(grey, blobs, reach, noise):
-    """Ellipses of an image (H, W) with edges sampled over one reach in px."""
+def _fit_at_reach(grey, blobs, reach, noise):
+    """Fit ellipses in an image (H, W), with edges sampled over one reach in px."""
     found = Ellipses(blobs.centres, blobs.shapes, blobs.bright, *np.zeros((3, len(blobs))))
-    found = found[_inside(grey.shape, found, reach)]
-    for _ in range(PASSES):
-        found, whole = _moved(grey, found, reach, noise)
-        found = found[whole & _inside(grey.shape, found, reach)]
+    found = found[_mask_inside(grey.shape, found, reach)]
+    for _ in range(RULE.passes):
+        found, whole = _update_ellipses(grey, found, reach, noise)
+        found = found[whole & _mask_inside(grey.shape, found, reach)]
     radii = np.sqrt(np.linalg.det(found.shapes))
-    from_noise = noise / (found.contrast * np.maximum(found.sharpness, MIN_SHARPNESS_TIMES_REACH / reach))
-    limit = np.maximum(MAX_RESIDUAL_OVER_REACH * reach, MAX_RESIDUAL_OVER_RADIUS * radii)
-    round_enough = found.residual_px <= np.maximum(limit, MAX_RESIDUAL_OVER_NOISE * from_noise)
+    from_noise = noise / (found.contrast * np.maximum(found.sharpness, RULE.sharpness_times_reach / reach))
+    limit = np.maximum(RULE.residual_over_reach * reach, RULE.residual_over_radius * radii)
+    round_enough = found.residual_px <= np.maximum(limit, RULE.residual_over_noise * from_noise)
     if round_enough.any():
         usual = np.median(found.residual_px[round_enough])
-        round_enough &= found.residual_px <= max(RESIDUAL_FLOOR_PX, MAX_RESIDUAL_OVER_MEDIAN * usual)
+        round_enough &= found.residual_px <= max(RULE.residual_floor_px, RULE.residual_over_median * usual)
     return found[round_enough]
 
 
-def _inside(shape, ellipses, reach):
-    """Whether the profiles of ellipses stay within the image, (N,) bool."""
+def _mask_inside(shape, ellipses, reach):
+    """Return a mask (N,) of ellipses whose profiles are inside the image."""
     half_width = np.sqrt((ellipses.shapes**2).sum(2)) + reach
     limit = np.array([shape[1], shape[0]]) - 1.001
     return (ellipses.centres - half_width >= 0).all(1) & (ellipses.centres + half_width <= limit).all(1)
 
 
-def _moved(grey, ellipses, longest, noise):
-    """Ellipses moved to the edges around them by least squares, and whether (N,) the edges are whole."""
-    count, reach = len(ellipses), np.minimum(longest, REACH_OVER_MINOR_AXIS * np.linalg.eigvalsh(ellipses.shapes)[:, 0])
-    share = np.where(reach < longest, MAX_CONTRAST_DEPARTURE_IF_SMALL, MAX_CONTRAST_DEPARTURE)
+def _update_ellipses(grey, ellipses, longest, noise):
+    """Fit ellipses to the edges around them by least squares, and return them with a mask (N,) of whole edges."""
+    count, reach = (
+        len(ellipses),
+        np.minimum(longest, RULE.reach_over_minor_axis * np.linalg.eigvalsh(ellipses.shapes)[:, 0]),
+    )
+    share = np.where(reach < longest, RULE.contrast_departure_if_small, RULE.contrast_departure)
     normal, right, figures = np.empty((count, 5, 5)), np.empty((count, 5)), np.empty((count, 4))
     sign, room = 1.0 if ellipses.bright else -1.0, np.empty((PROFILES, SAMPLES))
     blobs = ellipses.centres, ellipses.shapes, np.linalg.inv(ellipses.shapes), reach, share
@@ -291,10 +340,10 @@ def _moved(grey, ellipses, longest, noise):
 def _measure_edges(
     grey, centres, shapes, inverses, reaches, shares, directions, sign, disturbed, room, normal, right, figures
 ):
-    """Normal equations (N, 5, 5), (N, 5) of changes of centre (2) and shape (3) that move ellipses to their edges.
+    """Set up normal equations (N, 5, 5), (N, 5) for changes of centre (2) and shape (3) of the ellipses.
 
-    Distances along the normals are linear in small changes. ``figures`` (N, 4) are the squares of all distances, the
-    contrast, the edge's slope, and whether (0 or 1) every profile has the contrast and falls through its middle.
+    Distances along the normals are linear in small changes. ``figures`` (N, 4) are the sum of squared distances, the
+    contrast, the edge's slope, and 1 if every profile has the contrast and falls through its middle, else 0.
     """
     around, samples = room.shape
     middle, apart = samples // 2, 2.0 / (samples - 1)
@@ -311,7 +360,7 @@ def _measure_edges(
             at_v = centres[n, 1] + shape[0, 1] * e_u + shape[1, 1] * e_v
             for s in range(samples):
                 away = step * (apart * s - 1.0)
-                room[p, s] = sign * _bilinear(grey, at_u + away * n_u, at_v + away * n_v)
+                room[p, s] = sign * _sample_bilinear(grey, at_u + away * n_u, at_v + away * n_v)
             slope += room[p, middle - 2] - room[p, middle + 2]
             levels[0, p], levels[1, p] = (
                 (room[p, 0] + room[p, 1]) / 2,
@@ -330,7 +379,7 @@ def _measure_edges(
             departure = abs(levels[0, p] - levels[1, p] - contrast)
             whole &= contrast > 0 and departure <= max(shares[n] * contrast, disturbed)
             contrasts += contrast / around
-            # Where the profile falls through its middle level, nearest to its own middle.
+            # Crossing of the middle level that is nearest to the middle of the profile.
             nearest, crossing = float(samples), 0.0
             for s in range(samples - 1):
                 before, after = room[p, s] - level, room[p, s + 1] - level
@@ -351,21 +400,21 @@ def _measure_edges(
         figures[n, 2] = slope / around * (samples - 1) / (8.0 * reach)
 
 
-def sample(grey, points):
-    """Bilinear grey values (...) at pixel positions (..., 2), which must lie inside the image."""
+def sample_grey(grey, points):
+    """Return bilinear grey values (...) at pixel positions (..., 2) inside the image."""
     values = np.empty(points.shape[:-1], np.float32)
-    _interpolate(grey, points.reshape(-1, 2), values.reshape(-1))
+    _sample_all(grey, points.reshape(-1, 2), values.reshape(-1))
     return values
 
 
 @compiled
-def _interpolate(grey, points, values):
+def _sample_all(grey, points, values):
     for n in range(len(points)):
-        values[n] = _bilinear(grey, points[n, 0], points[n, 1])
+        values[n] = _sample_bilinear(grey, points[n, 0], points[n, 1])
 
 
 @compiled_part
-def _bilinear(grey, u, v):
+def _sample_bilinear(grey, u, v):
     height, width = grey.shape
     left, top = min(max(int(u), 0), width - 2), min(max(int(v), 0), height - 2)
     du, dv = np.float32(u - left), np.float32(v - top)
@@ -377,30 +426,31 @@ def _bilinear(grey, u, v):
 def find_circles(image):
     """Find the images of circles of one polarity and similar size, bright on dark or dark on bright.
 
-    Follows G. S. de Matos (UFSC 2017, section 4.5: median filter, background-corrected threshold, hole filling,
-    removal of border and small particles, ellipse fit) up to the blobs; ellipse and centre come from the grey levels.
+    Blobs are found as by G. S. de Matos (UFSC 2017, section 4.5: median filter, background-corrected threshold, hole
+    filling, removal of border and small particles, ellipse fit). Ellipse and centre are fitted to the grey levels.
 
-    The image is (H, W) of uint8 or uint16, ImageError for others. Centres are centroids of the covered area, in px
-    (u, v); possibly none are found.
+    The image is (H, W) of uint8 or uint16; ImageError for others. Centres are centroids of the covered area, in px (u,
+    v). The result may be empty.
     """
-    grey = checked_grey(image)
-    # Half a grey level covers an image without noise, whose only disturbance is its rounding.
-    noise = max(noise_level(grey), 0.5)
+    grey = check_grey(image)
+    # An image without noise has rounding errors of half a grey level.
+    noise = max(estimate_noise(grey), 0.5)
     ellipses = fit_ellipses(grey, find_blobs(grey, noise), noise)
-    centres, agree = area_centroids(grey, ellipses)
+    centres, agree = find_centroids(grey, ellipses)
     return replace(ellipses, centres=centres)[agree]
 
 
-def mark_strength(image, circles, *, mark_over_circle):
-    """Strength (N,) with which each circle of an image shows a centred dot of the opposite brightness.
+def measure_marks(image, circles, *, mark_over_circle):
+    """Return the strength (N,) of a centred dot of opposite brightness in each circle of an image.
 
-    (ring - dot) / contrast: about 0 without a dot, towards 1 with a sharp one. ``mark_over_circle`` is the diameter of
-    the dot over that of the circle.
+    The strength is (ring - dot) / contrast: about 0 without a dot, nearly 1 for a sharp dot. ``mark_over_circle`` is
+    the diameter of the dot divided by that of the circle.
     """
-    grey = checked_grey(image)
+    grey = check_grey(image)
     rim = DIRECTIONS @ circles.shapes
     dot = np.mean(
-        [sample(grey, circles.centres[:, None] + share * mark_over_circle * rim) for share in (0.0, 0.25, 0.5)], (0, 2)
+        [sample_grey(grey, circles.centres[:, None] + share * mark_over_circle * rim) for share in (0.0, 0.25, 0.5)],
+        (0, 2),
     )
-    ring = sample(grey, circles.centres[:, None] + (1 + mark_over_circle) / 2 * rim).mean(1)
+    ring = sample_grey(grey, circles.centres[:, None] + (1 + mark_over_circle) / 2 * rim).mean(1)
     return (ring - dot) / circles.contrast * (1.0 if circles.bright else -1.0)

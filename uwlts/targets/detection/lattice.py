@@ -8,30 +8,85 @@ from scipy.spatial import KDTree
 from uwlts.errors import TargetError
 from uwlts.targets.detection.ellipses import Ellipses, find_circles
 
-# Half the side of the square of neighbours: 24 of them determine the six terms of a quadratic with room for gaps.
-NEIGHBOURHOOD = 2
-MIN_NEIGHBOURS = 3  # fewer neither support nor contradict a place
-MAX_OVER_SPREAD = 8.0  # of the median distance from predictions: wrong points lie a good part of a step off
-MODEL_ERROR = 0.002  # what a quadratic leaves of perspective and distortion over two steps, as a share of one step
+STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
+"""Steps to the neighbours of a place in a lattice."""
 
 
-def agreeing(points, indices):
+@dataclass(frozen=True, kw_only=True)
+class LatticeRule:
+    """Numbers of the numbering of lattices. A step is the distance between neighbouring points.
+
+    Chosen by hand with the reasons below, not fitted to data. Results with these numbers are checked on the drawn
+    plates and boards of tests/uwlts/targets and on real photographs (tests/system/test_real_images.py).
+
+    Attributes
+    ----------
+    neighbourhood : int
+        Half the side of the square of neighbours: 24 neighbours determine the six terms of a quadratic, even with gaps.
+    fewest_neighbours : int
+        Fewest neighbours for a check of a place.
+    over_median : float
+        Largest distance from the prediction, in median distances; wrong points are off by a large part of a step.
+    model_error : float
+        Error of a quadratic over two steps by perspective and distortion, in steps.
+    affine_error : float
+        Error of an affine prediction, in steps: perspective alone contributes up to 0.1.
+    least_eigenvalue : float
+        Eigenvalue of normal equations, in steps, below which neighbours do not determine the terms.
+    candidates : int
+        Nearest circles that contain the next ones along both axes, for sides of up to 1 : 7.
+    tolerance : float
+        Largest distance of a neighbour from its predicted place, in steps. In strong perspective a step changes by up
+        to 0.1 from one circle to the next; half a step would reach the neighbour's neighbour.
+    size_ratio : float
+        Largest ratio of the radii of neighbouring circles.
+    seed_sine : float
+        Least sine of the angle between the steps of a seed, in the metric of its circle. An ellipse 20 % too round
+        changes a right angle by up to 12 deg (sine 0.98); the diagonal of a lattice with sides 1 : 3 has a sine of
+        0.95.
+    cell_ratio : float
+        Largest ratio of a seed's cell to the median cell, halfway between one and two cells.
+    fewest_labelled : int
+        Fewest circles of a lattice: one cell.
+    most_seeds : int
+        Most seeds that are tried, the most regular ones first.
+    """
+
+    neighbourhood: int = 2
+    fewest_neighbours: int = 3
+    over_median: float = 8.0
+    model_error: float = 0.002
+    affine_error: float = 0.15
+    least_eigenvalue: float = 1e-6
+    candidates: int = 16
+    tolerance: float = 0.25
+    size_ratio: float = 1.5
+    seed_sine: float = 0.95
+    cell_ratio: float = 1.4
+    fewest_labelled: int = 4
+    most_seeds: int = 20
+
+
+LATTICE_RULE = LatticeRule()
+
+
+def select_agreeing(points, indices):
     """Select the points of a lattice that agree with a quadratic through their neighbours.
 
-    The worst point of each neighbourhood goes first and the others are judged again without it, because one wrong
-    point spoils the predictions of all around it.
+    The worst point of each neighbourhood is removed first, and the others are checked again without it, because a wrong
+    point changes the predictions of all its neighbours.
 
-    ``points`` (N, 2) are in px, ``indices`` (N, 2) their distinct places. Returns the numbers (M,) of the points that
-    agree, ascending.
+    ``points`` (N, 2) are in px, ``indices`` (N, 2) their distinct places. Returns the indices (M,) of the points that
+    agree, in ascending order.
     """
     if len(points) == 0:
         return np.empty(0, np.int64)
-    low = indices.min(0) - NEIGHBOURHOOD
-    shape = indices.max(0) - low + NEIGHBOURHOOD + 1
+    low = indices.min(0) - LATTICE_RULE.neighbourhood
+    shape = indices.max(0) - low + LATTICE_RULE.neighbourhood + 1
     member = np.full(shape, -1)
     place = indices - low
     member[tuple(place.T)] = np.arange(len(points))
-    span = np.arange(-NEIGHBOURHOOD, NEIGHBOURHOOD + 1)
+    span = np.arange(-LATTICE_RULE.neighbourhood, LATTICE_RULE.neighbourhood + 1)
     offsets = np.array([(i, j) for i in span for j in span if (i, j) != (0, 0)])
     around = member[place[:, None, 0] + offsets[:, 0], place[:, None, 1] + offsets[:, 1]]
     i, j = offsets.T.astype(float)
@@ -39,11 +94,11 @@ def agreeing(points, indices):
     valid = np.ones(len(points), bool)
     while valid.any():
         present = (around >= 0) & valid[around]
-        alone = valid & (present.sum(1) < MIN_NEIGHBOURS)
+        alone = valid & (present.sum(1) < LATTICE_RULE.fewest_neighbours)
         if alone.any():
             valid &= ~alone
             continue
-        excess = _excess(points, around, present, terms, valid)
+        excess = _relative_errors(points, around, present, terms, valid)
         rivals = np.where(present, excess[around], 0.0).max(1)
         wrong = valid & (excess > 1) & (excess >= rivals)
         if not wrong.any():
@@ -52,57 +107,43 @@ def agreeing(points, indices):
     return np.flatnonzero(valid)
 
 
-def _excess(points, around, present, terms, valid):
-    """Distance of each point from its prediction, over what is allowed there; zero where nothing is predicted."""
+def _relative_errors(points, around, present, terms, valid):
+    """Return each point's distance from its prediction, divided by the allowed one; zero without a prediction."""
     weight = present.astype(float)
     normal = np.einsum("np,pa,pb->nab", weight, terms, terms)
-    # Too few neighbours for a quadratic: keep its second-order terms at zero.
-    spare = np.linalg.eigvalsh(normal)[:, 0] < NO_RANK
+    # With too few neighbours for a quadratic, fix its second-order terms at zero.
+    spare = np.linalg.eigvalsh(normal)[:, 0] < LATTICE_RULE.least_eigenvalue
     normal[spare, 3:, :], normal[spare, :, 3:] = 0.0, 0.0
     normal[spare] += np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
-    line = np.linalg.eigvalsh(normal)[:, 0] < NO_RANK
+    line = np.linalg.eigvalsh(normal)[:, 0] < LATTICE_RULE.least_eigenvalue
     normal[line] = np.eye(6)
     steps = (points[around] - points[:, None]) * weight[:, :, None]
     right = terms.T @ steps
     right[spare, 3:] = 0.0
     solved = np.linalg.solve(normal, right)
-    # Variance of the prediction for unit variance of the neighbours, and the point's own.
+    # Variance of the prediction for unit variance of the neighbours, plus the point's own variance.
     spread = np.sqrt(1 + np.linalg.inv(normal)[:, 0, 0])
     distance = np.linalg.norm(solved[:, 0], axis=1) / spread
     step = np.linalg.norm(solved[:, 1:3], axis=2).min(1)
     judged = valid & ~line & ~spare
     usual = np.median(distance[judged]) if judged.any() else 0.0
-    allowed = MAX_OVER_SPREAD * usual + MODEL_ERROR * step
-    allowed = np.where(spare, allowed + AFFINE_ERROR * step, allowed)
+    allowed = LATTICE_RULE.over_median * usual + LATTICE_RULE.model_error * step
+    allowed = np.where(spare, allowed + LATTICE_RULE.affine_error * step, allowed)
     return np.where(valid & ~line, distance / np.maximum(allowed, 1e-12), 0.0)
-
-
-NEIGHBOURS = 16  # circles among which the next ones along both axes are, for sides of up to 1 : 7
-STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
-
-AFFINE_ERROR = 0.15  # of a step: perspective alone bends an affine prediction by up to a tenth of one
-NO_RANK = 1e-6  # eigenvalue of normal equations in steps, below which neighbours do not determine the terms
-
-# A neighbour is taken where it lies within this share of a step of its predicted place. One step changes by up to a
-# tenth from one circle to the next in strong perspective; half a step would reach the neighbour's neighbour.
-TOLERANCE = 0.25
-MAX_SIZE_RATIO = 1.5  # of the radii of neighbouring circles
-
-# Smallest sine of the angle between the steps of a seed, where the ellipse of its circle is a circle. An ellipse 20 %
-# too round turns a right angle by up to 12 deg (sine 0.98); the diagonal of a lattice of sides 1 : 3 has the sine 0.95.
-MIN_SINE = 0.95
-
-MAX_CELL_RATIO = 1.4  # of the area of a seed's cell to the median, half-way between one and two cells
-MIN_LABELLED = 4  # circles: one cell
-MAX_SEEDS = 20  # pieces of lattice that are tried, the most regular ones first
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """Circles with their places in a lattice, and the number ``found`` in the image, with or without a place.
+    """Circles with their places in a lattice.
 
-    ``indices`` (N, 2) int64 are steps (i, j) from an arbitrary circle; the turn from i to j is the turn from u to v,
-    otherwise the choice of the axes is arbitrary.
+    Attributes
+    ----------
+    circles : Ellipses
+    indices : (N, 2) int64
+        Steps (i, j) from an arbitrary circle. The rotation from i to j has the direction from u to v; otherwise the
+        choice of the axes is arbitrary.
+    found : int
+        Number of circles found in the image, with or without a place.
     """
 
     circles: Ellipses
@@ -113,56 +154,56 @@ class Lattice:
 def detect_lattice(image):
     """Find the circles of a regular rectangular array without marks and number them.
 
-    Returns the largest connected piece of lattice in an image (H, W) of uint8 or uint16; ImageError for other images,
-    TargetError where fewer than four circles form a lattice.
+    Returns the largest connected part of a lattice in an image (H, W) of uint8 or uint16. ImageError for other images;
+    TargetError if fewer than four circles form a lattice.
     """
     circles = find_circles(image)
     indices, labelled = label_lattice(circles.centres, circles.shapes)
-    if labelled.sum() < MIN_LABELLED:
+    if labelled.sum() < LATTICE_RULE.fewest_labelled:
         raise TargetError(
-            f"found {len(circles)} circles, of which {labelled.sum()} form a lattice; expected at least "
-            f"{MIN_LABELLED}: check that the target is in view, sharp and evenly lit"
+            f"found {len(circles)} circles, {labelled.sum()} of them in a lattice; expected at least "
+            f"{LATTICE_RULE.fewest_labelled}: check that the target is in view, sharp and evenly lit"
         )
     return Lattice(circles[labelled], indices[labelled], len(circles))
 
 
 def label_lattice(centres, shapes):
-    """Number the points of a rectangular lattice by growing from a regular neighbourhood.
+    """Assign indices to points of a rectangular lattice, starting from a regular neighbourhood.
 
-    The image of a small circle shows the local affine map, so distances and angles to neighbours are judged in the
-    measure in which the ellipse is a circle: there the lattice is rectangular however oblique the view. From the seed,
-    each next circle is expected one local step further on.
+    The image of a small circle shows the local affine map. Distances and angles to neighbours are measured in the
+    metric that makes the ellipse a circle: there the lattice is rectangular in any oblique view. From the seed on, each
+    next circle is expected one local step further.
 
-    ``centres`` (N, 2) and ``shapes`` (N, 2, 2) are as in `Ellipses`. Returns indices (N, 2), zero where not labelled,
-    and whether (N,) a circle is labelled.
+    ``centres`` (N, 2) and ``shapes`` (N, 2, 2) are described in `Ellipses`. Returns indices (N, 2), zero for unlabelled
+    circles, and a mask (N,) of labelled circles.
     """
     indices, labelled = np.zeros((len(centres), 2), np.int64), np.zeros(len(centres), bool)
-    if len(centres) < MIN_LABELLED:
+    if len(centres) < LATTICE_RULE.fewest_labelled:
         return indices, labelled
     tree = KDTree(centres)
     radii = np.sqrt(np.linalg.det(shapes))
-    bases, sines = _bases(centres, shapes, tree)
+    bases, sines = _find_bases(centres, shapes, tree)
     tried, places = np.zeros(len(centres), bool), {}
-    for seed in _seeds(centres, radii, bases, sines, tree):
+    for seed in _choose_seeds(centres, radii, bases, sines, tree):
         if tried[seed]:
             continue
-        grown = _grown(seed, centres, radii, bases[seed], tree)
+        grown = _grow_lattice(seed, centres, radii, bases[seed], tree)
         tried[list(grown.values())] = True
         places = max(places, grown, key=len)
         if len(places) >= np.count_nonzero(~tried):
             break
     members, steps = np.fromiter(places.values(), int), np.array(list(places), np.int64).reshape(-1, 2)
-    kept = agreeing(centres[members], steps)
+    kept = select_agreeing(centres[members], steps)
     indices[members[kept]], labelled[members[kept]] = steps[kept], True
     return indices, labelled
 
 
-def _bases(centres, shapes, tree):
-    """Steps (N, 2, 2) along i (row 0) and j (row 1) to each circle's nearest neighbours, and the sine between, (N,).
+def _find_bases(centres, shapes, tree):
+    """Return steps (N, 2, 2) along i (row 0) and j (row 1) to each circle's neighbours, and the sine (N,) between them.
 
-    The second step is zero where there is none.
+    The second step is zero if there is no such neighbour.
     """
-    count = min(NEIGHBOURS + 1, len(centres))
+    count = min(LATTICE_RULE.candidates + 1, len(centres))
     _, index = tree.query(centres, k=count)
     steps = centres[index[:, 1:]] - centres[:, None]
     seen = steps @ np.linalg.inv(shapes)
@@ -171,7 +212,7 @@ def _bases(centres, shapes, tree):
     first = length.argmin(1)
     a, seen_a = steps[order, first], seen[order, first]
     across = np.abs(_cross(seen, seen_a[:, None])) / (length * np.linalg.norm(seen_a, axis=1)[:, None])
-    length = np.where(across > MIN_SINE, length, np.inf)
+    length = np.where(across > LATTICE_RULE.seed_sine, length, np.inf)
     second = length.argmin(1)
     b = np.where(np.isfinite(length[order, second])[:, None], steps[order, second], 0.0)
     b *= np.sign(_cross(a, b))[:, None]
@@ -182,28 +223,28 @@ def _cross(p, q):
     return p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
 
 
-def _seeds(centres, radii, bases, sines, tree):
-    """Circles with four alike neighbours where their bases say, best first."""
+def _choose_seeds(centres, radii, bases, sines, tree):
+    """Return circles with four neighbours where their steps predict them, the most regular ones first."""
     expected = centres[:, None] + np.concatenate([bases, -bases], 1)
     distance, index = tree.query(expected)
     step = np.linalg.norm(bases, axis=2)
     miss = (distance / np.maximum(np.tile(step, 2), 1e-9)).max(1)
     ratio = np.abs(np.log(radii[index] / radii[:, None])).max(1)
-    # An edge of a narrow target may have no circle with four neighbours; two at a right angle are then enough.
+    # In a narrow target no circle may have four neighbours; two at a right angle are sufficient.
     partial = np.sort(distance[:, :2] / np.maximum(step, 1e-9), 1)[:, 1]
-    usable = (step > 0).all(1) & (partial < TOLERANCE)
-    # Over the square of the radius the lattice's cell has one size in the whole image, whatever the perspective. Next
-    # to gaps two diagonals may pass for a basis; their cell is twice as large.
+    usable = (step > 0).all(1) & (partial < LATTICE_RULE.tolerance)
+    # A cell's area divided by the squared radius is constant in the image, for any perspective. Next to gaps, two
+    # diagonals may be taken for a basis; their cell is twice as large.
     cell = _cross(bases[:, 0], bases[:, 1]) / radii**2
     if usable.any():
-        usable &= np.abs(np.log(np.maximum(cell, 1e-9) / np.median(cell[usable]))) < np.log(MAX_CELL_RATIO)
-    score = np.where(miss < TOLERANCE, miss, 1.0 + partial) + ratio + (1 - sines)
-    return np.flatnonzero(usable)[np.argsort(score[usable])][:MAX_SEEDS]
+        usable &= np.abs(np.log(np.maximum(cell, 1e-9) / np.median(cell[usable]))) < np.log(LATTICE_RULE.cell_ratio)
+    score = np.where(miss < LATTICE_RULE.tolerance, miss, 1.0 + partial) + ratio + (1 - sines)
+    return np.flatnonzero(usable)[np.argsort(score[usable])][: LATTICE_RULE.most_seeds]
 
 
-def _grown(seed, centres, radii, basis, tree):
-    """Places {(i, j): circle} of the piece of lattice around a seed."""
-    # Complex numbers u + 1j v: the loop handles single points, for which arrays are slow.
+def _grow_lattice(seed, centres, radii, basis, tree):
+    """Return places {(i, j): circle} of the connected part of a lattice around a seed."""
+    # Complex numbers u + 1j v: arrays are slow for the single points of this loop.
     points, sizes = (centres @ (1, 1j)).tolist(), radii.tolist()
     places, where = {(0, 0): seed}, {seed: (0, 0)}
     steps = {seed: tuple((basis @ (1, 1j)).tolist())}
@@ -224,9 +265,10 @@ def _grown(seed, centres, radii, basis, tree):
             distance, index = tree.query(np.column_stack([np.real(nearby), np.imag(nearby)]))
             for ask in np.argsort(distance, kind="stable").tolist():
                 (circle, place, axis), found = asked[ask], int(index[ask])
-                if place in places or found in where or distance[ask] > TOLERANCE * abs(steps[circle][axis]):
+                farthest = LATTICE_RULE.tolerance * abs(steps[circle][axis])
+                if place in places or found in where or distance[ask] > farthest:
                     continue
-                if not 1 / MAX_SIZE_RATIO < sizes[found] / sizes[circle] < MAX_SIZE_RATIO:
+                if not 1 / LATTICE_RULE.size_ratio < sizes[found] / sizes[circle] < LATTICE_RULE.size_ratio:
                     continue
                 places[place], where[found] = found, place
                 steps[found] = steps[circle]
@@ -234,7 +276,7 @@ def _grown(seed, centres, radii, basis, tree):
         if fresh:
             frontier, reach = fresh, 1
         elif reach == 1:
-            # Step over single missing circles once nothing else is left.
+            # Finally skip single missing circles.
             frontier, reach = list(where), 2
         else:
             frontier = []
@@ -242,7 +284,7 @@ def _grown(seed, centres, radii, basis, tree):
 
 
 def _local_steps(place, places, points, inherited):
-    """Steps along i and j at a place: half the way between both neighbours, or the way to one, or as inherited."""
+    """Return the steps along i and j at a place: the mean over both neighbours, one neighbour, or as inherited."""
     i, j = place
     here = points[places[place]]
     steps = list(inherited)
