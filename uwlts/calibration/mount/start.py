@@ -1,4 +1,4 @@
-"""Start values of a mount: in closed form from circles of a sphere, or by search from lines of flat artefacts."""
+"""Start values of a mount: closed form from circles of a sphere, or search from lines of flat artefacts."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,28 +12,28 @@ from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatte
 from uwlts.calibration.mount.profiles import ProfileArc, ProfileLine, Seen, circles_through
 from uwlts.errors import CalibrationError
 
-_SUBSET = 8  # poses of a random choice: 24 linear equations for 12 unknowns
-_SUBSETS = 40  # random choices: with a fifth of the poses wrong one of six has none of these
-_TRIED = 4  # of the linear solutions for a sphere, the best ones that are refined
+_SUBSET = 8  # poses of a random subset: 24 linear equations for 12 unknowns
+_SUBSETS = 40  # random subsets: with a fifth of the poses wrong, one of six subsets contains no wrong pose
+_TRIED = 4  # best linear solutions for a sphere, which are refined
 _THINNED = 9
-"""Points of each profile by which a refined start is judged."""
+"""Points of each profile in the refinement of start values."""
 _TURNS = 5000  # rotations tried for a plane, some 12 deg apart
-_TURNS_TRIED = 10  # of these the best that are refined
+_TURNS_TRIED = 10  # best rotations, which are refined
 _RADII = (1.02, 1.15, 1.5)
-"""Radius of an unknown sphere over that of its largest section."""
+"""Trial radii of an unknown sphere, relative to its largest section."""
 _REWEIGHTED = 10
 _FAR = 4.0
-"""Standard uncertainties within which points of a ring's wall are sought; poses with as many misfits are left out."""
+"""Standard uncertainties within which points of a ring's wall are sought; poses beyond as many misfits are rejected."""
 _CLEAR = 6.0
-"""Least radius over the width within which a circle's points are sought: a smaller one cannot be distinguished."""
-_CIRCLES = 3000  # circles tried: where a fifth of the points are on the wall, 24 of them are
-_JUDGED = 1500  # points by which each is judged
+"""Least ratio of a circle's radius to the search width of its points: smaller circles cannot be distinguished."""
+_CIRCLES = 3000  # circles tried: with a fifth of the points on the wall, 24 of them are right
+_JUDGED = 1500  # points for the score of a circle
 _ROUGH = Scatter(point_mm=0.1, smooth_mm=1e-4, length_mm=1.0, pose_mm=0.3, turn_rad=3e-3)
-"""Scatter for the weights of the search, whose robust loss begins beyond it."""
+"""Scatter for the weights of the search; beyond it the loss is robust."""
 
 
 class NoFit(CalibrationError):
-    """Profiles, poses and what is known of the artefact contradict each other."""
+    """Profiles, poses and the known size of the artefact contradict each other."""
 
 
 def start(
@@ -44,10 +44,10 @@ def start(
     towards: np.ndarray | None,
     rng: np.random.Generator,
 ) -> tuple[MountState, Problem]:
-    """State near the solution from what was seen in the profiles, and the problem with all points that it shows.
+    """Estimate a state near the solution, and return it with the problem of the points that it uses.
 
-    ``whole`` holds all points of the profiles; ``sheet`` (4, 4) maps the sheet's frame to the sensor's. ``towards``
-    (3,) of the sensor's frame is nearest to the axis of a rotary table.
+    ``whole`` contains all points of the profiles; ``sheet`` (4, 4) maps the sheet's frame to the sensor's. ``towards``
+    (3,) is the direction of the sensor's frame nearest to the axis of a rotary table.
 
     Raises
     ------
@@ -72,12 +72,11 @@ def start(
 def _start_of_sphere(
     problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, rng: np.random.Generator
 ) -> MountState:
-    """State near the solution from the arcs found in the profiles; ``sheet`` (4, 4) maps the sheet's frame to the
-    sensor's.
+    """Estimate a state near the solution from the arcs in the profiles; ``sheet`` as in `start`.
 
-    Without its part across the sheet, y = +-sqrt(R2 - r2), the centre of a circle of radius r in the profile is the
-    sphere's centre in the sensor's frame, and R s + t = A^T (c - a) is linear in R's columns, t and c for poses (A, a).
-    The side of the sheet on which the centre lies follows from the solution; both sides are tried where it does not.
+    The centre of a circle of radius r in a profile is the sphere's centre without its coordinate across the sheet, y =
+    +-sqrt(R2 - r2). R s + t = A^T (c - a) is linear in R's columns, t and c for poses (A, a). The sign of y follows
+    from the solution, and both signs are tried otherwise.
     """
     rotations, positions = problem.motion(0.0)
     centres, radii = np.array([arc.centre_mm for arc in arcs]), np.array([arc.radius_mm for arc in arcs])
@@ -97,12 +96,12 @@ def _start_of_sphere(
 
 
 def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, towards: np.ndarray) -> MountState:
-    """State near the solution from the arcs of a sphere on a rotary table; ``sheet`` as in `start`.
+    """Estimate a state near the solution from the arcs of a sphere on a rotary table; ``sheet`` as in `start`.
 
     At angle h the sphere's centre is q + a cos h + b sin h in the sensor's frame, linear in the six coordinates in the
-    sheet. As a and b have the same length and are square to each other, their parts across it are the complex root
-    a_y + i b_y = +-sqrt(|b|^2 - |a|^2 - 2 i a.b), with both lengths and the product those in the sheet. The two
-    solutions mirror each other in the sheet and fit profiles alike: that one is taken whose axis, about which the
+    sheet. Vectors a and b have the same length and are perpendicular. Their coordinates across the sheet are therefore
+    the complex root a_y + i b_y = +-sqrt(|b|^2 - |a|^2 - 2 i a.b), with lengths and product in the sheet. The two
+    solutions are mirror images and fit the profiles equally well. The solution is used whose axis, about which the
     sphere turns by the angles, points along ``towards`` (3,) of the sensor's frame.
     """
     rotations, positions = problem.motion(0.0)
@@ -166,21 +165,21 @@ def _linear_solutions(
 
 
 def _turned_back(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Vectors (P, 3) of the base frame along the axes of the platform."""
+    """Rotate vectors (P, 3) of the base frame into the axes of the platform."""
     return np.einsum("pji,pj->pi", rotations, vectors)
 
 
 def _misfit(
     rotations: np.ndarray, positions: np.ndarray, centres: np.ndarray, depth: np.ndarray, state: MountState
 ) -> float:
-    """Median over the poses of the distance between the centre of the sphere and where the profile says it is."""
+    """Return the median distance over the poses between the sphere's centre and its position from the profile."""
     seen = (_turned_back(rotations, state.artefact[:3] - positions) - state.translation) @ state.rotation
     off = np.hypot(*(seen[:, [0, 2]] - centres).T)
     return float(np.median(np.hypot(off, np.abs(seen[:, 1]) - depth)))
 
 
 def _in_sensor_frame(state: MountState, sheet: np.ndarray) -> MountState:
-    """The state of a sheet's frame as one of the sensor's."""
+    """Convert a state of the sheet's frame to the sensor's frame."""
     rotation = state.rotation @ sheet[:3, :3].T
     return MountState(rotation, state.translation - rotation @ sheet[:3, 3], state.artefact)
 
@@ -188,11 +187,11 @@ def _in_sensor_frame(state: MountState, sheet: np.ndarray) -> MountState:
 def _start_of_plane(
     problem: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
 ) -> MountState:
-    """State near the solution from the lines found in the profiles; ``sheet`` as in `start`.
+    """Estimate a state near the solution from the lines in the profiles; ``sheet`` as in `start`.
 
-    The lines' directions in the base are square to the plane's normal whatever the translation: of many rotations the
-    best are kept by the smallest eigenvalue of the directions' scatter, whose vector is the normal. Translation and
-    distance are linear then.
+    The lines' directions in the base are perpendicular to the plane's normal for any translation. Random rotations are
+    ranked by the smallest eigenvalue of the directions' scatter, whose eigenvector is the normal. Translation and
+    distance are then linear.
     """
     rotations, positions = problem.motion(0.0)
     middles = in_space(np.array([line.middle_mm for line in lines]))
@@ -203,7 +202,7 @@ def _start_of_plane(
     states = []
     for number in np.argsort(values[:, 0])[:_TURNS_TRIED]:
         normal = vectors[number, :, 0]
-        # Half a turn about the sheet's normal leaves the directions as they are.
+        # half a turn about the sheet's normal does not change the directions
         for turn in (turns[number], turns[number] * np.array([-1.0, 1.0, -1.0])):
             places = np.einsum("pij,jk,pk->pi", rotations, turn, middles) + positions
             design = np.column_stack([np.einsum("pji,j->pi", rotations, normal), -np.ones(len(lines))])
@@ -215,7 +214,7 @@ def _start_of_plane(
 def _start_of_step(
     problem: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
 ) -> MountState:
-    """State near the solution from the lines of both faces of a step: as of a plane from the first, then the height."""
+    """Estimate a state from the lines of a step: as for a plane from the first face, then the height."""
     first = [points[part == 0] for points, part in zip(problem.points, problem.part, strict=True)]
     none = [np.zeros(len(points), dtype=int) for points in first]
     state = _start_of_plane(replace(problem, points=first, part=none, shape=PlaneShape()), lines, sheet, rng)
@@ -228,9 +227,9 @@ def _start_of_step(
 def _start_of_ring(
     problem: Problem, whole: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
 ) -> tuple[MountState, Problem]:
-    """State from the lines of the face, as of a plane; then the wall is the circle on which most other points lie.
+    """Estimate a state from the lines of the face, as for a plane, then find the wall as a circle of other points.
 
-    The mount by the face alone places points along the face as well as its covariance says: so wide is the circle.
+    The face gives the mount, with an uncertainty along the face. This uncertainty is the search width of the circle.
     """
     shape, plane = problem.shape, replace(problem, shape=PlaneShape())
     state = _start_of_plane(plane, lines, sheet, rng)
@@ -249,7 +248,7 @@ def _start_of_ring(
     axes = square_to(normal)
     height = base @ normal - distance
     beside = np.flatnonzero(np.abs(height) > reach)
-    # Every height counts alike: a table has many points, and all at one height.
+    # Weight heights equally: a table has many points, all at one height.
     heights = np.sort(height[beside])
     alike = np.searchsorted(heights, height[beside] + reach) - np.searchsorted(heights, height[beside] - reach)
     beside = rng.choice(beside, _JUDGED, p=1 / alike / np.sum(1 / alike)) if len(beside) else beside
@@ -269,7 +268,7 @@ def _start_of_ring(
 
 
 def require_surfaces(problem: Problem) -> None:
-    """CalibrationError where too few profiles show a surface of the artefact; `NoFit` where its size may be wrong."""
+    """Raise CalibrationError if too few profiles show a surface; `NoFit` if the given size may be wrong."""
     if (words := problem.shape.missing(problem.part)) is not None:
         raise CalibrationError(words) if problem.shape.size_mm is None else NoFit(words)
 
@@ -277,7 +276,7 @@ def require_surfaces(problem: Problem) -> None:
 def _circle_of_most(
     points: np.ndarray, radius_mm: float | None, reach_mm: float, rng: np.random.Generator
 ) -> np.ndarray | None:
-    """Centre and radius (3,) of the circle with most of the points (N, 2) near it, beyond those inside and outside."""
+    """Find the circle (3,) (centre, radius) with most points (N, 2) near it, less those inside and outside."""
     if not len(points):
         return None
     tried = points[rng.integers(len(points), size=(_CIRCLES, 3))]
@@ -288,7 +287,7 @@ def _circle_of_most(
     if not proper.any():
         return None
     off = np.abs(np.linalg.norm(points - centres[proper, None], axis=2) - radii[proper, None])
-    # Surfaces that are no wall fill a disc, and have as many points beside the circle.
+    # Surfaces other than walls fill a disc, with as many points beside the circle.
     near, beside = (np.count_nonzero(off < reach, axis=1) for reach in (reach_mm, 3 * reach_mm))
     score = 1.5 * near - 0.5 * beside
     best = int(np.argmax(score))
@@ -296,10 +295,7 @@ def _circle_of_most(
 
 
 def _robust(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Solution (k, m) of linear equations, ``design`` (N, k) and ``wanted`` (N, m), of which some are wrong.
-
-    By Cauchy's weights.
-    """
+    """Solve linear equations, ``design`` (N, k) and ``wanted`` (N, m), robustly with Cauchy weights; return (k, m)."""
     weights, solution = np.ones(len(design)), np.zeros((design.shape[1], wanted.shape[1]))
     for _ in range(_REWEIGHTED):
         solution = np.linalg.lstsq(design * weights[:, None], wanted * weights[:, None], rcond=1e-10)[0]
@@ -309,9 +305,9 @@ def _robust(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
 
 
 def _best(problem: Problem, states: list[MountState], sheet: np.ndarray) -> MountState:
-    """The state, as one of the sensor's frame, of smallest median distance after a robust refinement from each.
+    """Refine states robustly; return the one with the smallest median distance, in the sensor's frame.
 
-    Scale and time are left as they are.
+    Scale and time offset are not refined.
     """
     fixed = replace(problem.thinned(_THINNED), scale=False, time=False)
     refined = [fixed.rough(_in_sensor_frame(state, sheet), _ROUGH) for state in states]

@@ -170,7 +170,7 @@ def test_wrong_evidence_is_refused(thesis, capture_path):
     calibration = nominal(thesis, medium="water")
     with Capture(capture_path) as capture:
         poses = capture.pose[:]
-    with pytest.raises(DescriptionError, match="there are 6 poses for 7 images"):
+    with pytest.raises(DescriptionError, match="found 6 poses for 7 images"):
         uwlts.calibrate_mount(capture_path, poses[:6], calibration=calibration)
     with pytest.raises(CalibrationError, match="T_base_platform"):
         uwlts.calibrate_mount(capture_path, np.linalg.inv(poses), calibration=calibration)

@@ -51,5 +51,7 @@ def test_steps_that_overshoot_are_damped():
 
 def test_an_estimate_that_cannot_settle_is_an_error():
     """A weight that jumps where the number crosses 0.3 leaves no state that is its own solution."""
-    with pytest.raises(NotSettled, match=r"does not settle: after \d+ rounds it still moves by .* Record more poses"):
+    with pytest.raises(
+        NotSettled, match=r"does not converge: after \d+ rounds it still changes by .* Record more poses"
+    ):
         settle(TwoReadings(slope=1e6), [(-0.9, np.ones(1)), (0.9, np.ones(1))])
