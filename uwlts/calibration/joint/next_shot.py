@@ -1,4 +1,4 @@
-"""The further shot that would improve measured lengths most, by the information that it would add."""
+"""Selection of the image that would improve measured lengths most, from the information that it would add."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -26,25 +26,25 @@ from uwlts.model.sensor import Uncertainty
 from uwlts.optics.sheet import sheet_surface
 from uwlts.targets import Target, parse_target
 
-_FEWEST_POINTS = 20  # target points in view: an image with fewer determines its own pose poorly
+_FEWEST_POINTS = 20  # target points in view: fewer determine the pose of an image poorly
 _FEWEST_LINES = 20  # profile lines on a surface in view
-_SAMPLES = 400  # points of a curve: more than its image needs for a point on each of its lines to be interpolated
+_SAMPLES = 400  # points of a curve, enough to interpolate a point on each profile line of its image
 STEP_MM = 20.0
-"""Height of the step standard, as the thesis's."""
+"""Height of the step standard, as in the thesis."""
 _STEP_HALF_MM = 30.0  # half the length of its upper face along the stripe
-_STEP_REACH_MM = 70.0  # how far its lower faces reach from the middle
+_STEP_REACH_MM = 70.0  # extent of its lower faces from the middle
 SPHERES = 2
 SPHERE_MM = 30.0
-"""Diameter of the spheres, as the thesis's."""
-_SPHERES_APART_MM = 60.0  # spacing of their centres, which leaves a diameter between them
-_SPHERE_IMAGES = 29  # images of a scan of them, some 1 mm apart: more say nothing new
+"""Diameter of the spheres, as in the thesis."""
+_SPHERES_APART_MM = 60.0  # spacing of their centres, twice the diameter
+_SPHERE_IMAGES = 29  # images of their scan, some 1 mm apart; more are redundant
 _ON_SPHERES_PX = 0.01
 """Standard uncertainty of stripe centres on matt spheres by blur, for a stripe with a full width of 4 px."""
 
 _SEEN = np.radians(60)
-"""A sphere is seen this far round from the side that faces the sensor."""
+"""Visible angle of a sphere from the side that faces the sensor."""
 
-_TILT_DEG = 20.0  # easily reached by hand, and printed circles stay detectable
+_TILT_DEG = 20.0  # easily reached by hand, and printed circles remain detectable
 _PLACES = {"near": 0.05, "in the middle": 0.5, "far": 0.95}
 _TILTS = {
     "square": (0.0, 0.0),
@@ -53,16 +53,16 @@ _TILTS = {
     "upper edge nearer": (1.0, 0.0),
     "lower edge nearer": (-1.0, 0.0),
 }
-"""Turns about the camera's x and y axes."""
-_HELPFUL = 0.95  # of the uncertainty before: less than a twentieth is not an improvement
+"""Rotations about the camera's x and y axes."""
+_HELPFUL = 0.95  # ratio to the previous uncertainty; less than a twentieth is not an improvement
 
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """A shot in words and what it would do.
+    """Possible image with its description and effect.
 
     ``before_mm`` and ``after_mm`` are the standard uncertainty of lengths over the volume (root mean square) without
-    and with it, ``covariance`` (P, P) is that of the parameters with it, ``pose`` (4, 4) ``T_camera_target`` of a
+    and with it. ``covariance`` (P, P) is that of the parameters with it, ``pose`` (4, 4) the ``T_camera_target`` of a
     target.
     """
 
@@ -74,23 +74,26 @@ class Outlook:
     pose: np.ndarray | None = None
 
     def advice(self) -> str:
-        """The shot as advice, without a full stop."""
+        """Describe the image as advice, without a full stop."""
         if self.after_mm > _HELPFUL * self.before_mm:
-            return "no further shot alone would lower the uncertainty of lengths by a twentieth"
+            return "no single further image would reduce the uncertainty of lengths by a twentieth"
         return (
-            f"{self.words} would lower the standard uncertainty of lengths over the volume from {self.before_mm:.4f} "
+            f"{self.words} would reduce the standard uncertainty of lengths over the volume from {self.before_mm:.4f} "
             f"to {self.after_mm:.4f} mm"
         )
 
 
 _Shot = tuple[StoredEstimate, Evidence, np.ndarray]
-"""The estimate, perhaps with parameters that the shot adds, the shot's evidence, and its local parameters."""
+"""The estimate (with parameters that the image adds), the image's evidence, and its local parameters."""
 
 
 def next_shots(calibration: Calibration) -> list[Outlook]:
-    """Further shots, the most helpful one first; none where the evidence covers no area.
+    """Return possible further images, the most helpful one first; empty if the evidence covers no area.
 
-    Raises CalibrationError: the calibration holds no joint estimate, or a damaged one.
+    Raises
+    ------
+    CalibrationError
+        The calibration contains no joint estimate, or a damaged one.
     """
     region = next(iter(regions(calibration)), None)
     if region is None or not region.has_area():
@@ -103,7 +106,7 @@ def next_shots(calibration: Calibration) -> list[Outlook]:
     for words, shot, pose in _candidates(known, region.name, depths, uncertainty):
         added = None if shot is None else _information(shot, uncertainty)
         if shot is not None and added is not None:
-            # By a root of the covariance, as its inverse may be out of reach of rounding.
+            # Use a root of the covariance: its inverse may be numerically inaccurate.
             root = covariance_root(shot[0].covariance)
             covariance = root @ np.linalg.solve(np.eye(root.shape[1]) + root.T @ added @ root, root.T)
             covariance = covariance[:count, :count]
@@ -113,10 +116,16 @@ def next_shots(calibration: Calibration) -> list[Outlook]:
 
 
 def advice_lines(calibration: Calibration) -> list[str]:
-    """Weak directions and the shot that would help most; CalibrationError where the estimate is missing or damaged."""
+    """Describe weak directions and the most helpful image.
+
+    Raises
+    ------
+    CalibrationError
+        The calibration contains no joint estimate, or a damaged one.
+    """
     region = next(iter(regions(calibration)), None)
     if region is None or not region.has_area():
-        return ["the stripes of the evidence cover no area: the uncertainty of lengths measured by it is not known"]
+        return ["the stripes of the evidence cover no area: the uncertainty of measured lengths is not known"]
     known = estimate_in(calibration, region)
     lines = format_weaknesses(weaknesses(lengths_over(known, region), known.parameters.keys, known.covariance))
     return [*lines, *(f"next: {outlook.advice()}" for outlook in next_shots(calibration)[:1])]
@@ -125,11 +134,11 @@ def advice_lines(calibration: Calibration) -> list[str]:
 def _candidates(
     known: StoredEstimate, medium: str, depths: Mapping[str, float], uncertainty: Uncertainty
 ) -> Iterator[tuple[str, _Shot | None, np.ndarray | None]]:
-    """Shots in words, where they are possible, with the pose of a target."""
+    """Generate descriptions and simulated evidence of images, None if impossible, with the pose of a target."""
     described = known.calibration.origin().target
     if described is not None:
         views = {medium: known.view}
-        # One image in air is of use beside others taken so, whose series determines the camera.
+        # An image in air helps only beside others in air, whose series determines the camera.
         in_air = [other.view for other in regions(known.calibration) if other.view.medium is None]
         if known.view.medium is not None and in_air:
             views["air"] = in_air[0]
@@ -154,14 +163,16 @@ def _targets(
 
 
 def _pose(calibration: Calibration, target: Target, depth_mm: float, turns: tuple[float, float]) -> np.ndarray:
-    """``T_camera_target`` (4, 4) with the target's middle on the OCS's axis, turned from being square to that axis."""
+    """Return ``T_camera_target`` (4, 4) with the target's middle on the OCS's axis, rotated from being perpendicular to
+    it.
+    """
     frame, middle = calibration.object_transform(), np.append(target.extent_mm.mean(axis=0), 0.0)
     turn = Rotation.from_euler("XY", _TILT_DEG * np.array(turns), degrees=True).as_matrix() @ frame[:3, :3]
     return rigid_transform(turn, frame[:3, 3] + depth_mm * frame[:3, 2] - turn @ middle)
 
 
 def _target_shot(known: StoredEstimate, target: Target, pose: np.ndarray) -> _Shot | None:
-    """An image of the target with the stripe on it, at ``T_camera_target`` (4, 4); None where too little is in view."""
+    """Simulate an image of the target with the stripe at ``T_camera_target`` (4, 4); None if too little is in view."""
     points = target.points_mm
     pixels = _in_image(known, known.project(points @ pose[:3, :3].T + pose[:3, 3]))
     inside = np.isfinite(pixels).all(axis=1)
@@ -182,9 +193,9 @@ def _target_shot(known: StoredEstimate, target: Target, pose: np.ndarray) -> _Sh
 
 
 def _step_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Shot | None:
-    """An image of a step standard whose lower face lies at a depth Z, the evidence's own where it has one.
+    """Simulate an image of a step standard with the lower face at a depth Z; None if too little is in view.
 
-    None where too little of it is in view.
+    The standard of the evidence is used if it contains one.
     """
     height = next((key for key in known.parameters.keys if isinstance(key, StepHeight)), None)
     if height is None:
@@ -212,7 +223,7 @@ def _step_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty)
 
 
 def _sphere_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Shot | None:
-    """A scan along X of two spheres of unknown size, their centres at a depth Z; None where they are not in view."""
+    """Simulate a scan along X of two spheres of unknown size at a depth Z; None if they are not in view."""
     stage: dict[ParameterKey, Prior] = {key: Prior(0.0, uncertainty.stage_lean()) for key in SLOPES}
     known = _extended(known, stage | {StageParameter.SCALE: Prior(0.0, uncertainty.stage_scale)})
     frame, radius = known.calibration.object_transform(), SPHERE_MM / 2
@@ -245,7 +256,7 @@ def _sphere_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertaint
 
 
 def _extended(known: StoredEstimate, priors: Mapping[ParameterKey, Prior]) -> StoredEstimate:
-    """The estimate with those of these parameters that it lacks and that are not known exactly, behind its own."""
+    """Append those of these parameters to an estimate that it does not contain and that are not known exactly."""
     added = {key: prior for key, prior in priors.items() if key not in known.parameters.keys and prior.std > 0}
     return replace(
         known,
@@ -256,7 +267,7 @@ def _extended(known: StoredEstimate, priors: Mapping[ParameterKey, Prior]) -> St
 
 
 def _lit(known: StoredEstimate, target: Target, pose: np.ndarray) -> np.ndarray:
-    """Stripe pixels on the target, one for each profile line, by the plane that is nearest to the sheet."""
+    """Return stripe pixels on the target, one for each profile line, from the plane that approximates the sheet."""
     index = known.parameters.medium_index(known.values, known.view)
     sheet = sheet_surface(known.parameters.sheet_model(known.values), medium_index=index)
     facing, along = pose[:3, 2], np.cross(sheet.normal, pose[:3, 2])
@@ -274,7 +285,7 @@ def _lit(known: StoredEstimate, target: Target, pose: np.ndarray) -> np.ndarray:
 
 
 def _on_lines(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
-    """Pixels (N, 2) of a curve Y and Z (K, 2) on the sheet, one for each profile line in the image."""
+    """Return pixels (N, 2) of a curve Y and Z (K, 2) on the sheet, one for each profile line in the image."""
     return _lines_through(known, pixels_at(known, at_mm))
 
 
@@ -290,16 +301,16 @@ def _lines_through(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
 
 
 def _in_image(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
-    """The pixels (N, 2), NaN outside the image."""
+    """Replace pixels (N, 2) outside the image by NaN."""
     camera = known.parameters.camera(known.values)
     inside = np.all((pixels >= 0) & (pixels <= [camera.width_px - 1, camera.height_px - 1]), axis=1)
     return np.where(inside[:, None], pixels, np.nan)
 
 
 def _information(shot: _Shot, uncertainty: Uncertainty) -> np.ndarray | None:
-    """Information (P, P) that a shot adds to the inverse of the covariance; None where a ray meets nothing.
+    """Return the information (P, P) that an image adds to the inverse covariance; None if a ray meets nothing.
 
-    Its residuals are as noisy as those of the same kind; those of a kind new to the evidence as the noisiest stripe's.
+    The noise is that of the same kind of residual, or of the noisiest stripe for a new kind.
     """
     known, evidence, local_values = shot
     parts = evidence.residuals(known.parameters, known.values, local_values)

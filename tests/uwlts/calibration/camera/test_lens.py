@@ -107,7 +107,7 @@ def test_an_image_of_another_board_is_left_out_and_named():
     images = views(5)
     images[7] = replace(images[7], points_mm=images[7].points_mm * [1.04, 1.0, 1.0])
     found = lens(images, distortion=("k1", "k2"), pixels="square")
-    assert list(found.left_out) == [7] and "of its points do not lie where" in found.left_out[7]
+    assert list(found.left_out) == [7] and "of its points are not where" in found.left_out[7]
     assert abs(found.solution.model.fx_px - F) < 5 * found.std()["f"]
 
 

@@ -250,7 +250,7 @@ def test_free_poses_are_refused_where_the_stage_moves_as_in_a_mirror(noise, thes
     rotation, free = camera_from_object(thesis)[:3, :3], replace(OPTIONS, poses="free")
     mirrored = rotation.T @ ([1.0, -1.0, 1.0] * rotation[:, 2])
     solve_jointly(gathered(thesis, [replace(series, directions=[(0.0, 0.0, 1.0)])]), options=free)
-    with pytest.raises(CalibrationError, match="turned by 180 deg or mirrored top to bottom: turn the images back"):
+    with pytest.raises(CalibrationError, match="turned by 180 deg or mirrored top to bottom: correct the images"):
         solve_jointly(gathered(thesis, [replace(series, directions=[tuple(mirrored)])]), options=free)
 
 
@@ -293,7 +293,7 @@ def test_images_that_no_camera_explains_are_refused_and_the_worst_named(thesis):
 
     images = [replace(each, pixels=each.pixels + off(number, each)) for number, each in enumerate(air.found.images)]
     spoilt = replace(air, found=replace(air.found, images=images))
-    with pytest.raises(CalibrationError, match="no camera explains the target images in air: .* in target, frame 3: "):
+    with pytest.raises(CalibrationError, match="no camera fits the target images in air: .* in target, frame 3: "):
         solve_jointly(gathered(thesis, [spoilt]), options=OPTIONS)
 
 
@@ -321,7 +321,7 @@ def test_a_target_of_another_form_is_noticed_and_taken_for_uncertain(thesis, err
         assert key is TargetParameter.STRETCH_X and key.quantity.words in str(refusal)
         return
     (warning,) = (each for each in calibration.origin().warnings if key.quantity.words in each)
-    assert "taken for as uncertain" in warning
+    assert "its uncertainty was enlarged" in warning
     place = list(calibration.joint.parameters).index(key)
     true = {TargetParameter.SADDLE: real.target_saddle_mm, TargetParameter.STRETCH_X: real.stretch[0]}[key]
     assert abs(calibration.joint.values[place] - true) < 4 * calibration.joint.std[place]

@@ -275,10 +275,10 @@ def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
 @pytest.mark.parametrize("wrong", [{"height_mm": 23.4}, {"index": 1.3385}])
 def test_a_step_that_contradicts_its_description_is_refused(earlier, thesis, wrong):
     """A certificate of another step, or sea water said to be fresh."""
-    with pytest.raises(CalibrationError, match="the steps say that the index of water 2 is 1.3") as caught:
+    with pytest.raises(CalibrationError, match="from the steps, the index of water 2 is 1.3") as caught:
         refreshed(earlier, steps(thesis, **wrong))
-    assert "from the 1.33122 +- 0.000" in str(caught.value)
-    assert "described: check the step's height" in str(caught.value)
+    assert "from the described 1.33122 +- 0.000" in str(caught.value)
+    assert ": check the step's height" in str(caught.value)
 
 
 def moved_since(calibration, name, by):
@@ -347,7 +347,7 @@ def test_the_command_refreshes_and_says_what_changed(drawn):
     assert "exists already" in again.stderr
     twice = uwlts("refresh", folder / "calibration.refreshed.json", "--step", capture)
     assert twice.returncode == 2
-    assert "was made from step.h5 already: take a new image" in twice.stderr
+    assert "step.h5 was already used for this calibration: take a new image" in twice.stderr
 
 
 def renamed(sensor, **changes):
@@ -367,7 +367,7 @@ def renamed(sensor, **changes):
         (
             lambda s: {"sensor": renamed(s, laser=renamed(s.laser, wavelength_nm=s.laser.wavelength_nm + 3.0))},
             CalibrationError,
-            "with a laser of 638 nm, the calibration is for 635 nm",
+            "with a laser of 638 nm; the calibration is for 635 nm",
         ),
         (
             lambda s: {"sensor": renamed(s, laser=renamed(s.laser, wavelength_nm=520.0))},
@@ -407,7 +407,7 @@ def test_an_unsuitable_calibration_is_refused(drawn, earlier):
         refresh(nominal_calibration(sensor), [])
     with pytest.raises(CalibrationError, match="has no window"):
         refresh(earlier.model_copy(update={"window": None}), [])
-    with pytest.raises(CalibrationError, match="no capture is given"):
+    with pytest.raises(CalibrationError, match="is empty: give at least one image of a step"):
         refresh(earlier, [])
     with Capture(step_capture(folder, sensor, "again.h5")) as capture, pytest.raises(RangeError, match="be positive"):
         refresh(read_calibration(folder / "calibration.json"), [capture], index_std=0.0)

@@ -345,7 +345,9 @@ def test_a_size_described_a_millimetre_wrong_is_refused_by_its_name(
 
 def test_sizes_that_are_all_off_by_the_same_share_may_be_the_targets_fault(thesis, target_in_water):
     larger = {"diameters_mm": (50.5, 52.52), "spacings_mm": (1.01 * SPACING,)}
-    with pytest.raises(CalibrationError, match=r"all known sizes are off by the same -0\.99 %: check the target's"):
+    with pytest.raises(
+        CalibrationError, match=r"all known sizes are off by the same -0\.99 %: also check the target's"
+    ):
         solved(thesis, target_in_water, scanned("spheres", **larger, **CERTIFIED["spheres"]))
 
 
@@ -413,7 +415,7 @@ def test_scans_along_different_directions_are_refused():
 @pytest.mark.parametrize(
     ("artefact", "pose", "error", "says"),
     [
-        (None, None, DescriptionError, "does not say what it shows"),
+        (None, None, DescriptionError, "does not describe what it shows"),
         ({"kind": "step", "height_mm": 20.0}, None, DescriptionError, "shows a step"),
         ({"kind": "pipe"}, None, DescriptionError, "diameter_mm"),
         ({"kind": "plane"}, None, CaptureError, "no stripe"),

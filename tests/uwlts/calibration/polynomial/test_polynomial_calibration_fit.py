@@ -183,7 +183,7 @@ def test_signs(along, towards, spin):
 
 
 def test_stage_against_the_header(sensor, evidence):
-    with pytest.raises(CalibrationError, match="the other way than the stage's positions say"):
+    with pytest.raises(CalibrationError, match="opposite to the stage positions"):
         fit_polynomials(evidence, header_of(sensor, direction=(0.0, 0.0, -1.0)), degree=6)
 
 
@@ -300,7 +300,7 @@ def test_stripes_that_contradict_each_other(sensor, evidence):
     still = [
         np.where((s[:, :1] % 3 == 0), np.column_stack([s[:, 0], np.full(len(s), 500.0)]), s) for s in evidence.stripes
     ]
-    with pytest.raises(CalibrationError, match="do not lie on the polynomials of the others"):
+    with pytest.raises(CalibrationError, match="are not on the polynomials of the others"):
         fit_polynomials(replace(evidence, stripes=still), header_of(sensor), degree=6)
 
 
@@ -317,7 +317,7 @@ def test_stripe_beside_the_plate(sensor, evidence):
     """A plate seen in one corner only, the stripe elsewhere."""
     corner = [replace(i, points_mm=i.points_mm[:35], pixels=i.pixels[:35]) for i in evidence.images]
     away = [s[s[:, 0] > 1100] for s in evidence.stripes]
-    with pytest.raises(CalibrationError, match="together at 0 stage positions.*does not fall on the target"):
+    with pytest.raises(CalibrationError, match="together at 0 stage positions.*is not on the target"):
         fit_polynomials(replace(evidence, images=corner, stripes=away), header_of(sensor), degree=6)
 
 
@@ -359,7 +359,7 @@ def test_plate_map_needs_points(sensor, evidence):
     few = replace(
         evidence.images[0], points_mm=evidence.images[0].points_mm[:20], pixels=evidence.images[0].pixels[:20]
     )
-    with pytest.raises(CalibrationError, match="only 20 points .* at least 30"):
+    with pytest.raises(CalibrationError, match="20 points .* at least 30"):
         fit_plate_map(few)
 
 
@@ -602,7 +602,7 @@ def test_captures_that_are_refused(files, tmp_path):
     with (
         Capture(files["target"]) as a,
         Capture(wet) as b,
-        pytest.raises(CalibrationError, match="medium is .* against"),
+        pytest.raises(CalibrationError, match="medium is .* instead of"),
     ):
         calibrate_polynomials([a, b])
     with (

@@ -56,9 +56,9 @@ def test_a_turn_about_the_stripe_shows_along_the_stage_and_is_taken_into_account
     for image in images:
         assert image.lengthened == pytest.approx(1 / np.cos(TURN), abs=2 * image.lengthened_std)
         assert image.lengthened_std == pytest.approx(np.tan(TURN) * np.radians(0.58), rel=0.1)
-    assert said.startswith("step.h5: the standard does not face the laser: it is turned by ")
+    assert said.startswith("step.h5: the standard does not face the laser: it is rotated by ")
     assert float(said.split("turned by ")[1].split(" ")[0]) == pytest.approx(6.0, abs=0.5)
-    assert "about the stripe and so seems higher by 0.5" in said
+    assert "about the stripe and so appears higher by 0.5" in said
     assert said.count("taken into account") == 1
 
 
@@ -97,7 +97,7 @@ def test_one_profile_shows_the_other_turn_only(steps):
     """Seen from the slope of the faces; the turn about the stripe is taken to be as large, and doubles nothing else."""
     images, (said,) = labelled(turned_step("step.h5", aside=-0.05, **steps))
     assert "turned by 2.9° about the sheet's normal" in said
-    assert "seems higher by 0.13 % or 0.029 mm" in said
+    assert "appears higher by 0.13 % or 0.029 mm" in said
     assert "let the stage move the sensor across the stripe" in said
     for image in images:
         assert image.lengthened == 1.0
