@@ -321,7 +321,7 @@ def _inliers(solution: CameraSolution) -> list[np.ndarray]:
 
 
 def _fits(inside: np.ndarray) -> bool:
-    """Whether enough points (N,) of an image are inliers."""
+    """Return whether enough points (N,) of an image are inliers."""
     return bool(inside.mean() >= 1 - _LARGEST_REJECTED)
 
 
@@ -381,7 +381,7 @@ def _mean_square_miss(model: CameraModel, image: TargetImage) -> float:
 
 
 def _chosen(candidates: list[LensCandidate], usual: CameraOptions) -> CameraOptions:
-    """Select the model with the fewest parameters of those as good as the best; the usual one if there are none."""
+    """Select the model with the fewest parameters of those as good as the best, else the usual one."""
     good = [each for each in candidates if each.worse <= _WORSE]
     return min(good, key=lambda each: (each.parameters(), each.rms_px)).options if good else usual
 

@@ -42,7 +42,7 @@ class TargetImage:
 
 
 def z_away(image: TargetImage) -> bool:
-    """Whether the target's z axis points away from the camera, from the handedness of x and y in the image."""
+    """Return whether the target's z axis points away from the camera, from the handedness of x and y in the image."""
     flat = np.column_stack([image.points_mm[:, :2], np.ones(len(image.points_mm))])
     linear = np.linalg.lstsq(flat, image.pixels, rcond=None)[0][:2]
     return bool(np.linalg.det(linear) > 0)

@@ -18,7 +18,7 @@ from uwlts.model.calibration import CameraModel
 from uwlts.optics.camera import project
 from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
-# Coordinates are normalised: a direction in which the points' extent is less than this fraction of the largest one, or
+# Coordinates are normalised: a direction with an extent of the points below this fraction of the largest one, or
 # a null vector separated from others by less than this, cannot be distinguished from rounding and lens distortion.
 _FLAT = 1e-4
 _AMBIGUOUS = 1e-9

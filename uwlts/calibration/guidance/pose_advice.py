@@ -198,7 +198,7 @@ def information_of(
 
 
 def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) -> list[CandidatePose]:
-    """Return poses in which the target could be found: three distances, nine places in the image, nine tilts.
+    """Return poses with a detectable target: three distances, nine places in the image, nine tilts.
 
     One tilt is zero; the others move one of eight sides away from the camera. ``spin_rad`` is the target's rotation in
     the image, from its x axis to the image's.
@@ -253,7 +253,7 @@ _SAME_DISTANCE = 0.1  # the same for the distance, relative to it
 
 @dataclass(frozen=True)
 class Wanted:
-    """Limits at which a calibration is complete.
+    """Limits of a complete calibration.
 
     Attributes
     ----------

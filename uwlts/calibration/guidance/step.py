@@ -1,4 +1,4 @@
-"""Quality of laser images of the step standard, and depths at which images are still needed."""
+"""Quality of laser images of the step standard, and depths of images that are still needed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from uwlts.optics.triangulation import points_on_sheet
 from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
 
 PLACES = 3
-"""Number of depths at which the standard is needed: near, middle and far."""
+"""Number of depths of the standard that are needed: near, middle and far."""
 _APART = 1 / 7  # fraction of the volume's depth
 _FEWEST_LINES = 20  # fewer lines are reflections or specks, not the stripe
 _MOST_SATURATED = 0.05  # fraction of the lines; outlier tests tolerate this many wrong centres
@@ -54,7 +54,7 @@ def apart_mm(seen_mm: Sequence[float], sensor: Sensor) -> list[float]:
 
 
 def is_new(depth_mm: float, seen_mm: Sequence[float], sensor: Sensor) -> bool:
-    """Whether a depth differs from all others by more than a seventh of the measuring volume's depth."""
+    """Return whether a depth differs from all others by more than a seventh of the measuring volume's depth."""
     return all(abs(depth_mm - other) >= least_apart_mm(sensor) for other in seen_mm)
 
 

@@ -202,7 +202,7 @@ class Deviation:
     std: float
 
     def wrong(self) -> bool:
-        """Whether it is a contradiction, not only a doubt."""
+        """Return whether it is a contradiction, not only a doubt."""
         return self.sigmas > _WRONG
 
     def words(self) -> str:
@@ -217,7 +217,7 @@ def deviations(result: Estimate, *, least: float = _DOUBTFUL) -> list[Deviation]
 
 
 def understated(result: Estimate) -> float:
-    """Return the factor by which prior uncertainties of sensor, media and stage are too small; 1 if they are not.
+    """Return the factor of too small prior uncertainties of sensor, media and stage, at least 1.
 
     This is Birge's ratio, the RMS of deviations divided by standard uncertainties, if chance exceeds it less than once
     in a thousand calibrations.
@@ -275,11 +275,11 @@ class SizeDeviation:
         return abs(self.off_mm) / self.off_std_mm
 
     def known(self) -> bool:
-        """Whether a standard uncertainty is stated."""
+        """Return whether a standard uncertainty is stated."""
         return bool(np.isfinite(self.std_mm))
 
     def doubtful(self) -> bool:
-        """Whether a warning is due; without a stated uncertainty, only for large deviations."""
+        """Return whether a warning is due; without a stated uncertainty, only for large deviations."""
         return self.sigmas() > _DOUBTFUL and (self.known() or abs(self.off_mm) > _ROUGH_SIZE * self.described_mm)
 
     def words(self) -> str:
@@ -377,9 +377,9 @@ def _of_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) ->
         errors, images = local[8:], piece.images()
         if not len(errors):
             continue
-        # The first position has no error parameter, so all others share its error.
+        # The first position lacks an error parameter, so all others share its error.
         errors = errors - np.median(np.append(errors, 0.0))
-        # A large error of one position distorts the camera parameters and thereby shifts the others.
+        # A large error of one position distorts the camera parameters and so shifts the others.
         wrong = np.abs(errors) > _WRONG * max(std, robust_std(errors))
         rms = float(np.sqrt(np.mean(errors**2)))
         if 0 < wrong.sum() <= max(1, len(errors) // 4):

@@ -61,8 +61,8 @@ class Estimate:
     """Global parameters ``values`` (P,) with ``covariance`` (P, P), and the residuals of the evidence.
 
     ``local`` (b,) with ``local_covariances`` (b, b) and ``residuals`` (with outliers) are those of every piece of
-    evidence. ``noise`` is that of every kind of residual, ``outliers`` the number of rejected residuals, ``rounds`` the
-    number of rounds of all least-squares solutions.
+    evidence. ``noise`` is that of every kind of residual, ``outliers`` the number of rejected residuals. ``rounds``
+    counts all least-squares iterations.
     """
 
     parameters: Parameters

@@ -241,7 +241,7 @@ def _view(capture: Capture, media: dict[str, Medium], name: str | None = None) -
 
 
 def _approaching(captures: Sequence[Capture]) -> bool | None:
-    """Whether the stage moves the sensor towards the target; None if it does not move along the OCS's Z."""
+    """Return whether the stage moves the sensor towards the target; None if it does not move along the OCS's Z."""
     along = {float(capture.header.stage_direction[2]) for capture in captures}
     return min(along) > 0 if min(map(abs, along)) >= 0.9 and min(along) * max(along) > 0 else None
 

@@ -125,8 +125,8 @@ def series_start(
 ) -> SeriesStart:
     """Estimate the camera from the series with the least influence of the window, then all poses and stripes.
 
-    In the paraxial approximation, a window at distance d with thickness t and index g in front of a medium of index n
-    acts like a pinhole at d + t - n (d + t / g) on the axis, with n times the focal length.
+    The window has the distance d, thickness t and index g; the medium has the index n. In the paraxial approximation,
+    they act like a pinhole at d + t - n (d + t / g) on the axis, with n times the focal length.
 
     Raises
     ------
@@ -212,7 +212,7 @@ class _Viewpoint:
         return pose
 
     def on_target(self, pixels: np.ndarray, pose: np.ndarray, moved_mm: np.ndarray) -> np.ndarray:
-        """Intersect rays of pixels with the shifted target; return points (N, 3) in its frame, NaN if there is none."""
+        """Intersect rays of pixels with the shifted target; return points (N, 3) in its frame, else NaN."""
         rays = trace_window(directions(self._camera, pixels), self._window, medium_index=self._index)
         rotation = cv2.Rodrigues(pose[:3])[0]
         start = (rays.origins - pose[3:6]) @ rotation + moved_mm

@@ -163,9 +163,7 @@ def _targets(
 
 
 def _pose(calibration: Calibration, target: Target, depth_mm: float, turns: tuple[float, float]) -> np.ndarray:
-    """Return ``T_camera_target`` (4, 4) with the target's middle on the OCS's axis, rotated from being perpendicular to
-    it.
-    """
+    """Return ``T_camera_target`` (4, 4) with the target's middle on the OCS's axis, tilted by ``turns``."""
     frame, middle = calibration.object_transform(), np.append(target.extent_mm.mean(axis=0), 0.0)
     turn = Rotation.from_euler("XY", _TILT_DEG * np.array(turns), degrees=True).as_matrix() @ frame[:3, :3]
     return rigid_transform(turn, frame[:3, 3] + depth_mm * frame[:3, 2] - turn @ middle)

@@ -34,7 +34,7 @@ class SheetRegion:
     points: int
 
     def has_area(self) -> bool:
-        """Whether the region extends by more than a millimetre in Y and in Z."""
+        """Return whether the region extends by more than a millimetre in Y and in Z."""
         return bool(len(self.outline_mm) > 2 and np.ptp(self.outline_mm, axis=0).min() > _LEAST_MM)
 
     def width_at(self, depth_mm: float) -> tuple[float, float]:
@@ -222,7 +222,7 @@ def weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.nd
 
 
 def format_weaknesses(found: Sequence[Weakness]) -> list[str]:
-    """Describe weaknesses; one sentence if there are none."""
+    """Describe weaknesses; an empty list gives one sentence."""
     if not found:
         return ["no weakly determined parameter changes a length over the volume by more than 0.001 mm"]
     return [weakness.words() for weakness in found]

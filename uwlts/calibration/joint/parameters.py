@@ -261,7 +261,7 @@ class Parameters:
         return SheetPoints(points, by)
 
     def project(self, values: np.ndarray, view: ViewMedium, points: np.ndarray) -> np.ndarray:
-        """Project points (N, 3) of the camera frame through a view; return pixels (N, 2), NaN if there is none."""
+        """Project points (N, 3) of the camera frame through a view; return pixels (N, 2), else NaN."""
         window = self.window_model(values) if view.window else None
         return project_through_window(self.camera(values), window, points, medium_index=self.medium_index(values, view))
 

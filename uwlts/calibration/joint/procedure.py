@@ -161,6 +161,8 @@ def calibrate_jointly(
         Scans of spheres, a plane or a pipe that stand still while the stage moves the sensor.
     options
         Options. ``refractions`` is ignored: windows are glass plates as described.
+    progress
+        Called with the number of images done, the total, and the name of the stage.
 
     Raises
     ------

@@ -293,7 +293,7 @@ def solve_refreshed(
 
 
 def _other_water(problem: JointProblem, earlier: EarlierEstimate) -> str:
-    """Describe the index with which contradicting steps would be consistent; empty if there is none."""
+    """Describe an index that makes contradicting steps consistent, or return an empty text."""
     parameters = problem.parameters
     new = [key for key in parameters.keys[len(earlier.values) :] if isinstance(key, MediumIndex)]
     free = {key: replace(parameters.priors[key], std=_ANY_INDEX) for key in new}

@@ -33,8 +33,8 @@ _TOGETHER = 2000
 class Residuals:
     """Residuals ``values`` (n,) in px of one kind from one image; for target points, x and y alternate.
 
-    ``by_global`` (n, P) are the derivatives by the global parameters, ``by_local`` (n, c) those by the evidence's local
-    parameters with the numbers ``local_columns`` (c,), which affect this image.
+    ``by_global`` (n, P) are the derivatives by the global parameters. ``by_local`` (n, c) are those by the local
+    parameters ``local_columns`` (c,), which affect this image.
     """
 
     kind: str
@@ -384,7 +384,7 @@ class _Poses:
         self._nominal = self.travel = np.zeros(len(image))
         if evidence.staged:
             images, first = np.unique(placement.image, return_index=True)
-            # The first image has no position error.
+            # The first image lacks a position error.
             self._place = np.searchsorted(images, image)
             self._nominal = placement.shifts_mm[first][self._place]
             scale = 1.0 + parameters.value(global_values, StageParameter.SCALE)
@@ -426,10 +426,9 @@ class StepProfileEvidence(StripeEvidence):
     """Stripe pixels on both faces of a step standard in one image; local parameters are the lower face's line.
 
     The faces are planes perpendicular to ``upward + slope * along``. The local parameters (slope, distance in mm) give
-    the lower face. The upper face is higher by the global parameter ``height`` times ``lengthened``, as the sheet cuts
-    the step at an angle to its normal. ``upward`` (from the lower face to the upper one) and ``along`` the stripe are
-    unit vectors (3,), camera frame. ``upper`` (N,) marks the pixels on the upper face. ``image`` counts all step
-    images.
+    the lower face. The upper face is higher by the global parameter ``height`` times ``lengthened``: the sheet cuts the
+    step at an angle to its normal. ``upward`` (from the lower face to the upper one) and ``along`` the stripe are unit
+    vectors (3,), camera frame. ``upper`` (N,) marks the pixels on the upper face. ``image`` counts all step images.
     """
 
     upper: np.ndarray

@@ -45,7 +45,7 @@ class Surface(ABC):
 
     @abstractmethod
     def parameter_count(self) -> int:
-        """Return the number k of its local parameters, which have no prior knowledge except `sizes`."""
+        """Return the number k of its local parameters, known before only by `sizes`."""
 
     @abstractmethod
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:

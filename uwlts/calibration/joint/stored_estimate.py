@@ -142,7 +142,7 @@ class StoredEstimate:
     view: ViewMedium
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Project points (N, 3) of the camera frame; return pixels (N, 2), NaN if there is none."""
+        """Project points (N, 3) of the camera frame; return pixels (N, 2), else NaN."""
         return self.parameters.project(self.values, self.view, points)
 
     def points_by(self, line: np.ndarray, centre_px: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

@@ -90,7 +90,7 @@ class Tally:
         return float(difference.sum() / self._number().sum()), float(drawn.std(ddof=1))
 
     def as_good(self, model: int, other: int) -> bool:
-        """Whether a model is no worse than another, within the standard error of their difference."""
+        """Return whether a model is no worse than another, within the standard error of their difference."""
         difference, std = self.beyond(model, other)
         return difference <= std
 
@@ -151,9 +151,9 @@ DEGREE = 6  # degree of the polynomials (thesis, section 4.7)
 class PolynomialScore:
     """RMS error of polynomial calibration for stripes on the target, inside the calibrated volume, mm.
 
-    Polynomials have no camera model and do not extrapolate: there is no error in px and none outside the volume.
-    ``all_mm`` and ``std_mm`` are the polynomials' error and its standard error. ``model_mm`` and ``model_std_mm`` are
-    those of the compared model in the same images.
+    Polynomials lack a camera model and do not extrapolate: errors in px or outside the volume do not exist. ``all_mm``
+    and ``std_mm`` are the polynomials' error and its standard error. ``model_mm`` and ``model_std_mm`` are those of the
+    compared model in the same images.
     """
 
     medium: str
@@ -201,7 +201,7 @@ def _robust_rms(misses: Sequence[np.ndarray]) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class JudgedModel:
-    """Model with its score for each split, or the reason why it has none."""
+    """Model with its score for each split, or the reason for a missing score."""
 
     candidate: Candidate
     parameters: int | None
@@ -246,7 +246,7 @@ class Choice:
         return list(self.predictions).index(candidate)
 
     def no_worse(self, candidate: Candidate, other: Candidate, where: str, *, wet: bool = False) -> bool:
-        """Whether a model predicts as well as another in a split; ``wet`` restricts it to images in a medium.
+        """Return whether a model predicts as well as another in a split; ``wet`` restricts it to images in a medium.
 
         Held-out images can share errors of the stage and of poses, which favour one model by more than chance. A model
         with fewer free parameters therefore also counts as good if the other's estimate of the additional parameters
@@ -265,7 +265,7 @@ class Choice:
 
 
 Found = dict[Candidate, dict[str, Prediction] | str]
-"""For each model its predictions for each split, or the reason why there are none."""
+"""For each model its predictions for each split, or the reason for their absence."""
 
 
 def choose(problem: JointProblem, *, workers: int | None = None, progress: ProgressListener = unheard) -> Choice:
@@ -314,7 +314,7 @@ def _work(job: tuple[JointProblem, Candidate, frozenset[Image]], send: Send) -> 
 
 
 def choice_of(found: Found, ways: dict[str, frozenset[Image]], in_medium: frozenset[int]) -> Choice:
-    """Score and compare models from their predictions, or the reasons why they have none.
+    """Score and compare models from their predictions, or the reasons for missing ones.
 
     ``in_medium`` contains the numbers of the pieces of evidence in a medium.
     """

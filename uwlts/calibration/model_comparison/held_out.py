@@ -38,9 +38,9 @@ _GLASS = (WindowParameter.THICKNESS, WindowParameter.GLASS_INDEX)
 class Candidate:
     """Sensor model; parameters that are not free keep their described values.
 
-    ``refractions`` is 1 for a window modelled as one interface, 2 for a glass plate. ``window_tilt``, ``bow`` and
-    ``window_turn`` say whether the tilt of the camera's window, the bow of the sheet and the turn of the laser's window
-    are free. Distortion coefficients that are not named are zero.
+    ``refractions`` is 1 for a window modelled as one interface, 2 for a glass plate. The tilt of the camera's window,
+    the bow of the sheet, and the turn of the laser's window can be free. Distortion coefficients that are not named are
+    zero.
     """
 
     refractions: Literal[1, 2] = 2
@@ -221,7 +221,7 @@ class Prediction:
     covariance: np.ndarray
 
     def separates_from(self, smaller: "Prediction") -> bool:
-        """Whether the estimate differs by three sigma from a smaller model's fixed parameters.
+        """Return whether the estimate differs by three sigma from a smaller model's fixed parameters.
 
         True if neither model contains the other.
         """
@@ -275,7 +275,7 @@ def predict(problem: JointProblem, candidate: Candidate, held: frozenset[Image])
 def _posed(
     problem: JointProblem, piece: TargetEvidence, number: int, images: list[int], local: np.ndarray | None
 ) -> list[tuple[Evidence, np.ndarray, tuple[str, ...]]]:
-    """Return held-out images with their local parameters, and the residual kinds to which these must still be fitted.
+    """Return held-out images with their local parameters, and the residual kinds for a fit of these.
 
     ``local`` are the local parameters of the other images, or None. Elements from the ninth on are position errors.
     """

@@ -62,8 +62,8 @@ def mount_by_board(
     Each image gives the target's pose in front of the camera, through window and medium. A closed-form solution (Park
     and Martin, IEEE Trans. Robotics and Automation 10, 1994) starts a least-squares estimate of the mount and the
     target's place. The weights follow from the covariance of each image and the platform's scatter in position and
-    rotation. Restricted maximum likelihood estimates this scatter, and a factor by which image errors exceed the noise
-    of their points (for example if the target is bent). Images that contradict the others are rejected.
+    rotation. Restricted maximum likelihood estimates this scatter, and the ratio of image errors to the noise of their
+    points (for example if the target is bent). Images that contradict the others are rejected.
 
     Parameters
     ----------

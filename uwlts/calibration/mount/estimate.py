@@ -45,7 +45,7 @@ class GroupedEvidence(ABC, Generic[State]):
     @property
     @abstractmethod
     def values(self) -> int:
-        """Number of values, of which the first six are shift and rotation of the mount."""
+        """Number of values; the first six are shift and rotation of the mount."""
 
     @cached_property
     def free(self) -> np.ndarray:

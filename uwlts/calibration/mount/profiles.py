@@ -43,7 +43,7 @@ class Seen:
     std_mm: float
 
     def among(self, chosen: np.ndarray) -> Self:
-        """Return the same points in the profile from which a mask had chosen some."""
+        """Return the same points in the full profile; ``chosen`` is its mask of the points searched."""
         members, part = np.zeros(len(chosen), dtype=bool), np.zeros(len(chosen), dtype=int)
         members[chosen], part[chosen] = self.members, self.part
         return replace(self, members=members, part=part)
@@ -82,7 +82,7 @@ def noise_of(points: np.ndarray) -> float:
 
 
 def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generator) -> ProfileArc | None:
-    """Find the best supported arc of a sphere's section in an ordered profile (N, 2), mm; None if there is none.
+    """Find the best supported arc of a sphere's section in an ordered profile (N, 2), mm, or None.
 
     Circles through three points are scored by the number of points near them (RANSAC). Circles larger than the sphere
     are excluded, or larger than the profile if the radius is unknown.
@@ -191,7 +191,7 @@ def _arc_angle(away: np.ndarray) -> float:
 
 
 def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | None:
-    """Find the best supported straight line in an ordered profile (N, 2), mm; None if there is none."""
+    """Find the best supported straight line in an ordered profile (N, 2), mm, or None."""
     if len(points) < LEAST_POINTS:
         return None
     tolerance = max(_REJECTED_BEYOND * noise_of(points), 1e-4)
@@ -227,10 +227,10 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
 
 
 def find_step(points: np.ndarray, height_mm: float | None, rng: np.random.Generator) -> ProfileLine | None:
-    """Find the two best supported parallel lines in an ordered profile (N, 2), mm; None if there are none.
+    """Find the two best supported parallel lines in an ordered profile (N, 2), mm, or None.
 
-    The first line is at smaller z. For a step of known height, the distance of the lines must agree with the height and
-    an angle of up to 60 deg between the sheet and the step's normal.
+    The first line is at smaller z. For a step of known height, their distance must fit an angle of at most 60 deg
+    between the sheet and the step's normal.
     """
     best: tuple[int, float, np.ndarray, np.ndarray, ProfileLine] | None = None
     for (rows, first), (others, second) in combinations(_lines_of(points, rng), 2):

@@ -51,8 +51,8 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
     """Fit polynomials y(x) of all lines by least squares; coefficients are polynomials of the line number.
 
     The data are lines (N,), x and y (N,). The model is the sum over i, j of ``a_ij P_i(line) P_j(x)`` with Legendre
-    polynomials P on the scaled ranges of the lines and of x, j up to ``degree`` and i up to `MOST_SMOOTH`. Data beyond
-    five robust standard deviations are rejected, and the fit is repeated until convergence.
+    polynomials P on scaled ranges. The index j runs to ``degree``, i to `MOST_SMOOTH`. Data beyond five robust standard
+    deviations are rejected, and the fit is repeated until convergence.
 
     Raises
     ------
@@ -104,8 +104,8 @@ def line_domains(lines: np.ndarray, pose: np.ndarray, centres_px: np.ndarray, *,
     """Return the range (L, 2) of observed stripe positions for each line, from the first to the last line with data.
 
     The stripe points have lines (N,), image numbers (N,) and centres (N,) on the line. In each image, lines without a
-    centre are interpolated from their neighbours on both sides, unless more than ``largest_gap`` successive lines have
-    none. Lines without data get NaN.
+    centre are interpolated from their neighbours on both sides, unless more than ``largest_gap`` successive lines lack
+    one. Lines without data get NaN.
     """
     first, count = int(lines.min()), int(np.ptp(lines)) + 1
     domains = np.tile([np.inf, -np.inf], (count, 1))

@@ -134,6 +134,10 @@ def calibrate_sequentially(
         in focal length and distortion.
     steps
         Captures of a step standard in the medium of use.
+    options
+        Settings of the calibration.
+    progress
+        Called with the number of images done, the total, and the name of the stage.
 
     Raises
     ------
@@ -356,7 +360,7 @@ def common_sensor(captures: Sequence[Capture]) -> Sensor:
 
 
 def _approaching(air: Sequence[Capture]) -> bool:
-    """Whether the stage moves the sensor towards the target, which is perpendicular to the OCS's Z."""
+    """Return whether the stage moves the sensor towards the target, which is perpendicular to the OCS's Z."""
     along = {capture.header.stage_direction[2] / np.linalg.norm(capture.header.stage_direction) for capture in air}
     if min(map(abs, along)) < 0.9 or min(along) * max(along) < 0:
         raise CalibrationError(

@@ -18,7 +18,7 @@ from uwlts.optics.triangulation import points_on_sheet
 _FEWEST_PLACES = 3  # images of a face: fewer do not show that it is a plane
 _LEAST_TRAVEL_MM = 5.0  # travel of the stage across the stripe: less does not show that the face is a plane
 _STOOD_STILL = 2.0
-"""Factor by which points may scatter more about a common plane than about single lines if the standard is at rest."""
+"""Largest ratio of the scatter about a common plane to that about single lines for a standard at rest."""
 _STAGE_MM = 0.05  # additional error of a stage
 _SCALE_STD = 0.05  # relative, of profiles with a window that is only described
 _OF_SQUARE = np.sqrt(3) / 2
@@ -50,14 +50,14 @@ class StepImage(StepEvidence):
 def step_profile(
     calibration: Calibration, window: WindowModel | None, pixels: np.ndarray, *, medium_index: float
 ) -> np.ndarray:
-    """Return points (N, 2) of a profile, Y and Z of the OCS in mm, through a window; NaN if there is none."""
+    """Return points (N, 2) of a profile, Y and Z of the OCS in mm, through a window; else NaN."""
     seen = points_on_sheet(calibration.model_copy(update={"window": window}), pixels, medium_index=medium_index)
     object_from_camera = np.linalg.inv(calibration.object_transform())
     return seen.points_mm @ object_from_camera[1:3, :3].T + object_from_camera[1:3, 3]
 
 
 def label_step(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:
-    """Separate the faces with the window's nominal distance, for which the profile is accurate to a few percent.
+    """Separate the faces with the window's nominal distance: the profile is accurate to a few percent.
 
     Raises
     ------

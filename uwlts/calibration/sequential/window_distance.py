@@ -39,7 +39,7 @@ class WindowSolution:
     per_index : derivative of the distance by the index, if all images are taken in the same medium
     uncertainty_mm : standard uncertainty of the distance, from the remaining errors (or the scatter of a single image),
         the calibrated height and the medium's index, which are common to all images
-    image_distances_mm : (S,); distance from each single image (thesis, Table 4); NaN if there is none within the bounds
+    image_distances_mm : (S,); distance from each single image (thesis, Table 4); NaN outside the bounds
     curve_mm : (C, 2); tested distances and root mean square height error, NaN if a point cannot be reconstructed
     bounds_mm : (2,)
     """
@@ -207,7 +207,7 @@ def _heights(calibration: Calibration, window: WindowModel, steps: Sequence[Step
 def _own_distance(
     calibration: Calibration, window: WindowModel, step: StepImage, tried: np.ndarray, errors: np.ndarray, near: float
 ) -> float:
-    """Return the distance near ``near`` at which one image shows the true height; NaN if there is none.
+    """Return the distance near ``near`` that gives the true height in one image, else NaN.
 
     ``errors`` are the height errors at the tested distances.
     """

@@ -150,7 +150,7 @@ def test_motion_and_sameness_are_reported_in_pixels(small):
     assert way_px(first, again) < 0.1 and judge_motion(first, again) == ()
     assert way_px(first, shifted) == pytest.approx(lens_of(small).fx / 378, rel=0.03)
     assert judge_motion(first, shifted)[0].startswith("moved: the target moved 3.")
-    assert judge_novelty(again, [shifted, first])[0].startswith("too similar to image 2: 0.")
+    assert judge_novelty(again, [shifted, first])[0].startswith("too similar to image 2: differs by 0.")
     moved = PLATE.detect(drawn_lamp(small, PLATE, target_pose(tilt_deg=(20, 0))))
     assert judge_novelty(moved, [first, shifted]) == ()
     none_in_common = replace(first, indices=first.indices + 100)
