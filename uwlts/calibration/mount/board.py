@@ -20,9 +20,9 @@ from uwlts.calibration.mount.estimate import (
     GroupedEvidence,
     RestrictedEstimate,
     settle_agreeing,
-    solved_step,
+    solve_step,
 )
-from uwlts.calibration.mount.next_pose import OPEN_RAD, missing_turns, require_determined, weaknesses
+from uwlts.calibration.mount.next_pose import OPEN_RAD, describe_missing_turns, require_determined, weaknesses
 from uwlts.calibration.mount.sensor import mount_covariance
 from uwlts.errors import CalibrationError, DescriptionError, TargetError
 from uwlts.files.writing import sha256_of
@@ -85,16 +85,16 @@ def mount_by_board(
     """
     header = capture.header
     known = None if calibration.joint is None else stored_estimate(calibration, header.sensor, header.medium)
-    target, images, reasons = board_images(capture, calibration, known, poses)
+    target, images, reasons = detect_boards(capture, calibration, known, poses)
     middle = target.points_mm.mean(axis=0)
     rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in images])
     if axis is not None:
         require_table(np.array([image.base_from_platform for image in images]), axis=axis)
-    elif missing := missing_turns(rotations, least_rad=OPEN_RAD):
+    elif missing := describe_missing_turns(rotations, least_rad=OPEN_RAD):
         raise CalibrationError(f"the poses do not determine the mount: {'; '.join(missing)}")
     problem = BoardEvidence(images, calibration.object_transform(), middle, axis is not None)
-    estimate, kept = agreeing_images(problem)
-    used, state = problem.selected(kept), estimate.state
+    estimate, kept = select_agreeing_images(problem)
+    used, state = problem.select(kept), estimate.state
     _, position_mm, _ = estimate.scatter
     extent = float(np.linalg.norm(np.ptp(target.points_mm, axis=0)))
     left_out = [image for image in images if image not in used.images]
@@ -110,13 +110,13 @@ def mount_by_board(
             f"({', '.join(f'{each:.2f}' for each in state[0][2, :3])}): check the sign of the angles"
         )
     covariance, share, factor = mount_covariance(
-        estimate, used.free, state[0][:3, :3], known, lambda: used.moved(state)
+        estimate, used.free, state[0][:3, :3], known, lambda: used.residual_derivatives(state)
     )
     turns = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in used.images])
     weak = weaknesses(covariance[:6, :6], turns, table=used.table)
     require_determined(covariance, weak)
     found = {image.name: used.offsets_mm(state)[k] for k, image in enumerate(used.images)}
-    others = [used.stepped(state, step) for step, _ in estimate.without_each]
+    others = [used.apply_step(state, step) for step, _ in estimate.without_each]
     held = {image.name: used.offsets_mm(others[k])[k] for k, image in enumerate(used.images)}
     rows = [
         MountPose(
@@ -171,7 +171,7 @@ class BoardImage:
     by_sensor: np.ndarray | None = None
 
 
-def board_images(
+def detect_boards(
     capture: Capture, calibration: Calibration, known: StoredEstimate | None, poses: np.ndarray | None
 ) -> tuple[Target, list[BoardImage], dict[str, str]]:
     """Return the target, its pose in every image that shows it, and the reasons why other images are not used."""
@@ -192,7 +192,7 @@ def board_images(
         if not np.isfinite(pose).all():
             raise DescriptionError(f"{name} has no platform pose: give a table of poses, or import the poses")
         try:
-            images.append(posed_board(name, image, target, calibration, known, window, index, pose))
+            images.append(estimate_board_pose(name, image, target, calibration, known, window, index, pose))
         except (TargetError, CalibrationError) as error:
             reasons[name] = f"no target: {error}"
     if len(images) < FEWEST_IMAGES:
@@ -203,7 +203,7 @@ def board_images(
     return target, images, reasons
 
 
-def posed_board(
+def estimate_board_pose(
     name: str,
     image: np.ndarray,
     target: Target,
@@ -226,7 +226,7 @@ def posed_board(
     start = rigid_transform(cv2.Rodrigues(turn)[0], shift.ravel())
 
     def moved(step: np.ndarray) -> np.ndarray:
-        return moved_about(start, middle, step)
+        return move_about(start, middle, step)
 
     def projected(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
         seen = points @ pose[:3, :3].T + pose[:3, 3]
@@ -258,7 +258,7 @@ def posed_board(
         # Derivative of the pose if the sensor's parameters change and the pixels do not.
         found, where = moved(fit.x), np.zeros(6)
         by_pose = differences(
-            lambda step: projected(moved_about(found, middle, step), view.points_mm), where, POSE_STEPS
+            lambda step: projected(move_about(found, middle, step), view.points_mm), where, POSE_STEPS
         )
         placed = view.points_mm @ found[:3, :3].T + found[:3, 3]
         std = np.sqrt(np.diag(known.covariance))
@@ -279,7 +279,7 @@ def differences(values: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step
     return np.stack(columns, axis=1)
 
 
-def moved_about(pose: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
+def move_about(pose: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
     """Shift a point ``middle`` of a pose (4, 4) by (3,) and rotate the pose about it by (3,)."""
     rotation = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
     place = pose[:3, :3] @ middle + pose[:3, 3] + step[:3]
@@ -319,7 +319,7 @@ class BoardEvidence(GroupedEvidence[_State]):
     def groups(self) -> int:
         return len(self.images)
 
-    def selected(self, kept: np.ndarray) -> Self:
+    def select(self, kept: np.ndarray) -> Self:
         return replace(self, images=[self.images[k] for k in np.arange(len(self.images))[kept]])
 
     def bounds(self) -> np.ndarray:
@@ -351,7 +351,7 @@ class BoardEvidence(GroupedEvidence[_State]):
 
     def residuals(self, state: _State, step: np.ndarray | None = None) -> np.ndarray:
         """Return each image's deviation (K, 6) from the common target pose: shift (mm) and rotation (rad)."""
-        mount, common = state if step is None else self.stepped(state, step)
+        mount, common = state if step is None else self.apply_step(state, step)
         own = self._platforms @ mount @ self._sensor_from_target
         shift = (own - common)[:, :3] @ np.append(self.middle, 1.0)
         return np.hstack([shift, Rotation.from_matrix(own[:, :3, :3] @ common[:3, :3].T).as_rotvec()])
@@ -383,7 +383,7 @@ class BoardEvidence(GroupedEvidence[_State]):
         both[:, :3, :3] = both[:, 3:, 3:] = turn
         return both
 
-    def moved(self, state: _State) -> np.ndarray:
+    def residual_derivatives(self, state: _State) -> np.ndarray:
         """Return derivatives (K, 6, Q) of the residuals by the parameters of the sensor's calibration."""
         return self._by_images(state[0]) @ np.array([image.by_sensor for image in self.images])
 
@@ -395,14 +395,14 @@ class BoardEvidence(GroupedEvidence[_State]):
 
         return differences(residuals, at, np.tile(POSE_STEPS, 2)).reshape(-1, 6, 12) @ self.free
 
-    def stepped(self, state: _State, step: np.ndarray) -> _State:
+    def apply_step(self, state: _State, step: np.ndarray) -> _State:
         return self._moved(state, self.free @ step)
 
     def _moved(self, state: _State, step: np.ndarray) -> _State:
         """Shift and rotate the mount along the platform's axes, then the target about its middle."""
         mount, common = state
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ mount[:3, :3]
-        return rigid_transform(turned, mount[:3, 3] + step[:3]), moved_about(common, self.middle, step[6:])
+        return rigid_transform(turned, mount[:3, 3] + step[:3]), move_about(common, self.middle, step[6:])
 
     def typical_miss(self, state: _State) -> float:
         """Return the median deviation over the images, of the target's middle and of points beside it, mm."""
@@ -415,7 +415,7 @@ class BoardEvidence(GroupedEvidence[_State]):
         return np.linalg.norm(self.residuals(state)[:, :3], axis=1)
 
 
-def agreeing_images(evidence: BoardEvidence) -> tuple[RestrictedEstimate[_State], np.ndarray]:
+def select_agreeing_images(evidence: BoardEvidence) -> tuple[RestrictedEstimate[_State], np.ndarray]:
     """Estimate the mount from the images that agree; return it with their mask.
 
     Raises
@@ -425,13 +425,13 @@ def agreeing_images(evidence: BoardEvidence) -> tuple[RestrictedEstimate[_State]
     """
     rng, count = np.random.default_rng(0), len(evidence.images)
     # A wrong image spoils the closed form, so start from random triples of images too.
-    triples = [evidence.selected(rng.choice(count, 3, replace=False)).start() for _ in range(_TRIPLES)]
+    triples = [evidence.select(rng.choice(count, 3, replace=False)).start() for _ in range(_TRIPLES)]
     state = min([evidence.start(), *triples], key=evidence.typical_miss)
     left = evidence.residuals(state)
     sizes = np.median(np.linalg.norm(left.reshape(count, 2, 3), axis=2), axis=0)
     spread = np.maximum(sizes, (_LEAST_MM, _LEAST_RAD))
     rough = np.tile(np.diag(np.repeat(spread, 3) ** 2), (count, 1, 1))
-    state = evidence.stepped(state, solved_step(evidence, state, rough, loss="cauchy"))
+    state = evidence.apply_step(state, solve_step(evidence, state, rough, loss="cauchy"))
     sizes = (np.abs(evidence.residuals(state)) / np.repeat(spread, 3)).max(axis=1)
     near = np.flatnonzero(sizes < LARGEST_ROUGH * max(float(np.median(sizes)), 1.0))
 
@@ -443,8 +443,8 @@ def agreeing_images(evidence: BoardEvidence) -> tuple[RestrictedEstimate[_State]
                 "are in the order of the images"
             )
 
-    starts = [(each, np.array([1.0, *spread])) for each in (state, evidence.selected(near).start())]
-    found, among = settle_agreeing(evidence.selected(near), starts, require=require)
+    starts = [(each, np.array([1.0, *spread])) for each in (state, evidence.select(near).start())]
+    found, among = settle_agreeing(evidence.select(near), starts, require=require)
     kept = np.zeros(count, dtype=bool)
     kept[near[among]] = True
     return found, kept

@@ -12,7 +12,7 @@ from uwlts.calibration.mount.artefacts import SHAPES
 from uwlts.calibration.mount.board import mount_by_board
 from uwlts.calibration.mount.estimate import LARGEST_ROUGH, NotSettled, RestrictedEstimate, settle, settle_agreeing
 from uwlts.calibration.mount.next_pose import next_pose, require_determined, weaknesses
-from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, in_sheet, in_space
+from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, from_sheet, to_sheet
 from uwlts.calibration.mount.profiles import LEAST_POINTS
 from uwlts.calibration.mount.sensor import CapturedProfiles, mount_covariance, profiles_of
 from uwlts.calibration.mount.start import NoFit, require_surfaces, start
@@ -183,11 +183,11 @@ class _Calibration:
         self.shape = SHAPES[evidence.artefact](evidence.size_mm)
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
-        self.rows = [_thinned(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
+        self.rows = [_thin(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
         chosen = [each[rows] for each, rows in zip(evidence.profiles, self.rows, strict=True)]
-        self.profiles = [each if each.shape[1] == 3 else in_space(each) for each in chosen]
+        self.profiles = [each if each.shape[1] == 3 else from_sheet(each) for each in chosen]
         self.sheet = _sheet_frame(self.profiles)
-        self.flat = in_sheet(self.profiles, self.sheet)
+        self.flat = to_sheet(self.profiles, self.sheet)
         self.reasons: dict[int, str] = {}
 
     def result(self) -> Mount:
@@ -208,10 +208,10 @@ class _Calibration:
             self.evidence.time,
             self.evidence.axis is not None,
         )
-        problem = whole.of_seen(shapes)
+        problem = whole.select_detected(shapes)
         seen = [shape for shape in shapes if shape is not None]
         towards = None if self.evidence.axis is None else SENSOR_AXES[self.evidence.axis]
-        state, problem = start(problem, whole.selected(kept), seen, self.sheet, towards, self.rng)
+        state, problem = start(problem, whole.select(kept), seen, self.sheet, towards, self.rng)
         misfit = problem.rms_mm(state)
         noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
         good = misfit < max(LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
@@ -219,25 +219,25 @@ class _Calibration:
         scatter = Scatter(max(noise, 1e-6), typical, typical, typical, 1e-3)
         # Detect the artefact again, near the place that the other profiles give, to correct errors of the first search.
         for _ in range(2):
-            require_surfaces(problem.selected(good))
-            found = settle(problem.selected(good), [(state, np.array(scatter))])
+            require_surfaces(problem.select(good))
+            found = settle(problem.select(good), [(state, np.array(scatter))])
             scatter = Scatter(*found.scatter)
             reach = 4 * float(np.hypot(np.hypot(scatter.point_mm, scatter.smooth_mm), 2 * scatter.pose_mm))
             state = found.state
-            shapes = whole.seen_again(state, self.flat, reach, self.rng)
+            shapes = whole.detect_again(state, self.flat, reach, self.rng)
             kept = np.array([shape is not None for shape in shapes])
-            problem = whole.of_seen(shapes)
+            problem = whole.select_detected(shapes)
             good = np.ones(len(problem.points), dtype=bool)
             self._require_enough(np.flatnonzero(kept))
 
         def require(good: np.ndarray) -> None:
             self._require_enough(np.flatnonzero(kept)[good])
-            require_surfaces(problem.selected(good))
+            require_surfaces(problem.select(good))
 
         # Select the likelier estimate of two starts: this one, and unweighted least squares of all distances.
-        starts = [(each, np.array(scatter)) for each in (state, problem.plain(state))]
+        starts = [(each, np.array(scatter)) for each in (state, problem.solve_unweighted(state))]
         found, good = settle_agreeing(problem, starts, require=require)
-        used, state = problem.selected(good), found.state
+        used, state = problem.select(good), found.state
         numbers = np.flatnonzero(kept)
         names = self.evidence.names
         for number in range(len(names)):
@@ -277,7 +277,7 @@ class _Calibration:
         free = replace(used, shape=SHAPES[self.evidence.artefact]())
         other = RestrictedEstimate(free, state, estimate.scatter)
         at = free.size - free.scale - free.time - 1
-        step, std = float(other.by(other.residuals[:, :, None])[at, 0]), float(np.sqrt(other.covariance[at, at]))
+        step, std = float(other.propagate(other.residuals[:, :, None])[at, 0]), float(np.sqrt(other.covariance[at, at]))
         if abs(step) > max(_OTHER_SIZE * self.shape.size_mm, _SURE * std):
             raise NoFit(
                 f"no mount fits the profiles of a {self.evidence.artefact} of {self.evidence.size} "
@@ -303,7 +303,7 @@ class _Calibration:
             if self.shape.flat or wrong < 0.2 * _NO_FIT * state.artefact[3]:
                 raise
             raise NoFit(f"no mount fits the profiles: the poses would have errors of {wrong:.3g} mm (rms)") from error
-        moved = [used.stepped(state, step) for step, _ in estimate.without_each]
+        moved = [used.apply_step(state, step) for step, _ in estimate.without_each]
         rms, held = used.rms_mm(state), np.array([used.rms_mm(each)[place] for place, each in enumerate(moved)])
         off = zip(used.counts.tolist(), rms.tolist(), held.tolist(), strict=True)
         poses = []
@@ -321,7 +321,7 @@ class _Calibration:
                 )
             )
         std, at = np.sqrt(np.diag(covariance)), 6 + self.shape.count
-        found = self.shape.found(state.artefact, float(std[at - 1]) if self.shape.size_unknown else None)
+        found = self.shape.to_stored(state.artefact, float(std[at - 1]) if self.shape.size_unknown else None)
         transform = rigid_transform(Rotation.from_matrix(state.rotation).as_matrix(), state.translation)
         weights = used.counts / used.counts.sum()
         return Mount(
@@ -349,11 +349,13 @@ class _Calibration:
         """Return derivatives (P, K, Q) of the residuals by the parameters of the sensor's calibration."""
         assert self.captured is not None
         numbers = [n for n in range(len(members)) if n not in self.reasons]
-        by = np.vstack([self.captured.moved(number, self.rows[number][members[number]]) for number in numbers])
-        return used.means(used.on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
+        by = np.vstack(
+            [self.captured.point_derivatives(number, self.rows[number][members[number]]) for number in numbers]
+        )
+        return used.bin_means(used.project_on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
 
 
-def _thinned(points: np.ndarray, most: int) -> np.ndarray:
+def _thin(points: np.ndarray, most: int) -> np.ndarray:
     if len(points) <= most:
         return points
     return points[np.linspace(0, len(points) - 1, most).astype(int)]
@@ -365,7 +367,7 @@ def _sheet_frame(profiles: list[np.ndarray]) -> np.ndarray:
     if not points[:, 1].any():
         return np.eye(4)
     middle = points.mean(axis=0)
-    extents, axes = np.linalg.svd(_thinned(points - middle, 20_000), full_matrices=False)[1:]
+    extents, axes = np.linalg.svd(_thin(points - middle, 20_000), full_matrices=False)[1:]
     if extents[2] > 0.02 * extents[1]:
         raise CalibrationError(
             "the profiles are not in one plane of the sensor's frame; expected points of a laser sheet, in the "

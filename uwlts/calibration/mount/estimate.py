@@ -63,7 +63,7 @@ class GroupedEvidence(ABC, Generic[State]):
         """Number of groups."""
 
     @abstractmethod
-    def selected(self, kept: np.ndarray) -> Self:
+    def select(self, kept: np.ndarray) -> Self:
         """Return the evidence of some groups, given as a mask or as their numbers."""
 
     @abstractmethod
@@ -71,7 +71,7 @@ class GroupedEvidence(ABC, Generic[State]):
         """Return bounds (Q, 2) of the components; equal for a fixed one."""
 
     @abstractmethod
-    def stepped(self, state: State, step: np.ndarray) -> State:
+    def apply_step(self, state: State, step: np.ndarray) -> State:
         """Return the state after a step (size,) of the parameters."""
 
     @abstractmethod
@@ -86,7 +86,7 @@ class GroupedEvidence(ABC, Generic[State]):
     def covariance(self, state: State) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """Return a function of ``logs`` that gives covariances (G, K, K) and their derivatives (Q, G, K, K)."""
 
-    def repeated(self, state: State) -> tuple[int, float]:
+    def pool_repeats(self, state: State) -> tuple[int, float]:
         """Return degrees of freedom and sum of squares of further residuals that have the first component only."""
         return 0, 0.0
 
@@ -131,9 +131,9 @@ class RestrictedEstimate(Generic[State]):
     @cached_property
     def covariance(self) -> np.ndarray:
         """Covariance (size, size) of the parameters."""
-        return inverse(self.information.sum(axis=0))
+        return invert_information(self.information.sum(axis=0))
 
-    def by(self, moved: np.ndarray) -> np.ndarray:
+    def propagate(self, moved: np.ndarray) -> np.ndarray:
         """Return derivatives (size, M) of the parameters, given those of the residuals, ``moved`` (G, K, M)."""
         return -self.covariance @ np.einsum("gkp,gkm->pm", self._weighted, moved)
 
@@ -143,7 +143,7 @@ class RestrictedEstimate(Generic[State]):
         slopes = np.einsum("gkp,gk->gp", self._weighted, self.residuals)
         total, slope, found = self.information.sum(axis=0), slopes.sum(axis=0), []
         for information, own in zip(self.information, slopes, strict=True):
-            covariance = inverse(total - information)
+            covariance = invert_information(total - information)
             found.append((-covariance @ (slope - own), covariance))
         return found
 
@@ -182,11 +182,11 @@ class RestrictedEstimate(Generic[State]):
                     - 2 * np.sum(self.covariance * twice.T)
                     + np.sum(summed[a] * summed[b].T)
                 )
-        known[0, 0] += 2 * self.evidence.repeated(self.state)[0]
+        known[0, 0] += 2 * self.evidence.pool_repeats(self.state)[0]
         free = np.diag(known) > 0
         variances = np.einsum("rp,pq,rq->r", rows, self.covariance, rows)
         by = np.einsum("rp,qpm,mn,rn->rq", rows, summed, self.covariance, rows)[:, free]
-        uncertain = np.einsum("rq,qs,rs->r", by, inverse(known[free][:, free]), by)
+        uncertain = np.einsum("rq,qs,rs->r", by, invert_information(known[free][:, free]), by)
         freedom = 2 * variances**2 / np.maximum(uncertain * scales**2, 1e-30 * variances**2)
         return float(t.ppf(0.975, max(float(np.median(freedom)), 1.0)))
 
@@ -202,7 +202,7 @@ def settle(evidence: GroupedEvidence[State], starts: Sequence[tuple[State, np.nd
     found, failed = [], None
     for state, scatter in starts:
         try:
-            found.append(_settled(evidence, state, scatter))
+            found.append(_iterate(evidence, state, scatter))
         except NotSettled as error:
             failed = error
     if not found:
@@ -225,7 +225,7 @@ def settle_agreeing(
     kept = np.ones(evidence.groups, dtype=bool)
     while True:
         require(kept)
-        found = settle(evidence.selected(kept), starts)
+        found = settle(evidence.select(kept), starts)
         excess = found.excess(probability=_FALSE_ALARM / len(kept))
         if excess.max() <= 1:
             return found, kept
@@ -237,12 +237,12 @@ class NotSettled(CalibrationError):
     """The iteration has not converged after all rounds."""
 
 
-def _settled(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray) -> RestrictedEstimate[State]:
+def _iterate(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray) -> RestrictedEstimate[State]:
     """Alternate weighted least squares and maximum likelihood of the components; damp oscillating steps."""
     fraction, before, size = 1.0, np.zeros(evidence.size), 0.0
     for _ in range(_MOST_ROUNDS):
         covariances, _ = evidence.covariance(state)(np.log(scatter))
-        step = solved_step(evidence, state, covariances)
+        step = solve_step(evidence, state, covariances)
         by = evidence.jacobian(state)
         information = np.einsum("gkp,gkq->pq", by, np.linalg.solve(covariances, by))
         size, last = (float(np.sqrt(each @ information @ each / evidence.size)) for each in (step, before))
@@ -251,8 +251,8 @@ def _settled(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray
         elif size > _SHRINKING * last:
             fraction = max(fraction / 2, _LEAST_FRACTION)
         before = step
-        state = evidence.stepped(state, fraction * step)
-        scatter, criterion, gain = _likeliest(evidence, state, scatter)
+        state = evidence.apply_step(state, fraction * step)
+        scatter, criterion, gain = _maximise_likelihood(evidence, state, scatter)
         if size < _SETTLED and gain < _SETTLED:
             return RestrictedEstimate(evidence, state, scatter, criterion)
     raise NotSettled(
@@ -262,7 +262,7 @@ def _settled(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray
     )
 
 
-def solved_step(
+def solve_step(
     evidence: GroupedEvidence[State], state: State, covariances: np.ndarray, *, loss: str = "linear"
 ) -> np.ndarray:
     """Return the step (size,) from a state that minimises the weighted squared residuals, with fixed covariances."""
@@ -284,7 +284,9 @@ def solved_step(
     ).x
 
 
-def _likeliest(evidence: GroupedEvidence[State], state: State, start: np.ndarray) -> tuple[np.ndarray, float, float]:
+def _maximise_likelihood(
+    evidence: GroupedEvidence[State], state: State, start: np.ndarray
+) -> tuple[np.ndarray, float, float]:
     """Maximise the restricted likelihood at a state; return the variance components, the criterion and its gain.
 
     The criterion is minus twice the log likelihood of the residuals after projecting out the parameters (Patterson and
@@ -294,7 +296,7 @@ def _likeliest(evidence: GroupedEvidence[State], state: State, start: np.ndarray
     # Every basis of the derivatives has the same likelihood. They are nearly dependent if the base is far away.
     by = evidence.jacobian(state)
     basis = np.linalg.qr(by.reshape(-1, evidence.size))[0].reshape(by.shape)
-    freedom, squares = evidence.repeated(state)
+    freedom, squares = evidence.pool_repeats(state)
 
     def criterion(logs: np.ndarray) -> tuple[float, np.ndarray]:
         covariances, changes = covariance(logs)
@@ -318,7 +320,7 @@ def _likeliest(evidence: GroupedEvidence[State], state: State, start: np.ndarray
     return np.exp(found.x), float(found.fun), criterion(begin)[0] - float(found.fun)
 
 
-def inverse(information: np.ndarray) -> np.ndarray:
+def invert_information(information: np.ndarray) -> np.ndarray:
     """Invert an information matrix; directions without information get huge variances."""
     size = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
     values, vectors = np.linalg.eigh(size[:, None] * information * size)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import SphereShape
 from uwlts.calibration.mount.estimate import RestrictedEstimate
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, in_sheet, point_by_mount
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, point_by_mount, to_sheet
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import rigid_transform
 from uwlts.model.mount import NextPose
@@ -100,7 +100,7 @@ def _one_pose(problem: Problem, points: np.ndarray, rotation: np.ndarray, positi
 
 def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
     """Return candidate views: points (n, 3) of the artefact and its place (3,), sensor frame, and a description."""
-    flat = in_sheet(problem.points, sheet)
+    flat = to_sheet(problem.points, sheet)
     low, high = np.quantile(np.vstack(flat), (0.1, 0.9), axis=0)
     views = []
     if isinstance(problem.shape, SphereShape):
@@ -116,15 +116,19 @@ def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple
         for u, w, y in product((low[0], high[0]), (low[1], high[1]), (depth, -depth)):
             section = np.sqrt(radius**2 - y**2)
             arc = np.column_stack([u + section * np.cos(angle), np.zeros(_POINTS), w + section * np.sin(angle)])
-            views.append((_to_sensor(arc, sheet), _to_sensor(np.array([u, y, w]), sheet), _place(sheet, u, y, w)))
+            views.append(
+                (_to_sensor(arc, sheet), _to_sensor(np.array([u, y, w]), sheet), _describe_place(sheet, u, y, w))
+            )
     else:
         for u, w in product((low[0], high[0]), (low[1], high[1])):
             line = np.column_stack([np.linspace(low[0], high[0], _POINTS), np.zeros(_POINTS), np.full(_POINTS, w)])
-            views.append((_to_sensor(line, sheet), _to_sensor(np.array([u, 0.0, w]), sheet), _place(sheet, u, 0.0, w)))
+            views.append(
+                (_to_sensor(line, sheet), _to_sensor(np.array([u, 0.0, w]), sheet), _describe_place(sheet, u, 0.0, w))
+            )
     return views
 
 
-def _place(sheet: np.ndarray, u: float, y: float, w: float) -> str:
+def _describe_place(sheet: np.ndarray, u: float, y: float, w: float) -> str:
     at = _to_sensor(np.array([u, y, w]), sheet)
     return f"at x = {at[0]:.0f}, y = {at[1]:.0f}, z = {at[2]:.0f} mm of the sensor's frame"
 
@@ -174,11 +178,11 @@ def weaknesses(covariance: np.ndarray, rotations: Rotation, *, table: bool) -> l
         for std, axis in zip(stds, axes.T, strict=True):
             if std > min(_WEAK * stds[int(table)], limit) and std > least:
                 known = f"known to {std * size:.2g} {unit} only" if std < limit else "open"
-                lines.append(f"the {what} {axis_words(axis)} is {known}{why}")
-    return lines if table else lines + missing_turns(rotations)
+                lines.append(f"the {what} {describe_axis(axis)} is {known}{why}")
+    return lines if table else lines + describe_missing_turns(rotations)
 
 
-def axis_words(direction: np.ndarray) -> str:
+def describe_axis(direction: np.ndarray) -> str:
     """Describe a direction of the platform."""
     place = int(np.argmax(np.abs(direction)))
     if abs(direction[place]) > 0.94:  # within 20 deg
@@ -186,7 +190,7 @@ def axis_words(direction: np.ndarray) -> str:
     return f"the platform's direction ({', '.join(f'{each:.2f}' for each in direction)})"
 
 
-def missing_turns(rotations: Rotation, *, least_rad: float = _LEAST_TURN_RAD) -> list[str]:
+def describe_missing_turns(rotations: Rotation, *, least_rad: float = _LEAST_TURN_RAD) -> list[str]:
     """Describe the axes with insufficient rotation of the platform; empty if it rotates about two axes.
 
     Rotations about one axis only leave the shift along this axis undetermined. ``least_rad`` is the minimum RMS
@@ -196,7 +200,7 @@ def missing_turns(rotations: Rotation, *, least_rad: float = _LEAST_TURN_RAD) ->
     if np.linalg.eigvalsh(vectors.T @ vectors / len(vectors))[1] >= least_rad**2:
         return []
     return [
-        f"insufficient rotation about {axis_words(axis)} ({np.degrees(size):.1f} deg rms)"
+        f"insufficient rotation about {describe_axis(axis)} ({np.degrees(size):.1f} deg rms)"
         for size, axis in zip(np.sqrt(np.mean(vectors**2, axis=0)), np.eye(3), strict=True)
         if size < least_rad
     ]

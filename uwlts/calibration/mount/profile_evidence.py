@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import Shape
-from uwlts.calibration.mount.estimate import GroupedEvidence, solved_step
-from uwlts.calibration.mount.profiles import LEAST_POINTS, Seen
+from uwlts.calibration.mount.estimate import GroupedEvidence, solve_step
+from uwlts.calibration.mount.profiles import LEAST_POINTS, Detection
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 """Rotations (P, 3, 3) and positions (P, 3) of the platform in the base frame for a time offset, s."""
@@ -101,7 +101,7 @@ class Problem(GroupedEvidence[MountState]):
     def _parts(self) -> np.ndarray:
         return np.concatenate(self.part)
 
-    def selected(
+    def select(
         self, kept: np.ndarray, points: Sequence[np.ndarray] | None = None, part: Sequence[np.ndarray] | None = None
     ) -> Self:
         """Return the problem of some poses, optionally with other points of all poses."""
@@ -114,23 +114,23 @@ class Problem(GroupedEvidence[MountState]):
             motion=lambda offset: tuple(each[numbers] for each in motion(offset)),
         )
 
-    def of_seen(self, seen: Sequence[Seen | None]) -> "Problem":
+    def select_detected(self, seen: Sequence[Detection | None]) -> "Problem":
         """Return the problem of the points on the artefact; poses with None are removed."""
         pairs = [(n, each) for n, each in enumerate(seen) if each is not None]
         points, part = list(self.points), list(self.part)
         for number, each in pairs:
             points[number], part[number] = self.points[number][each.members], each.part[each.members]
-        return self.selected(np.array([each is not None for each in seen]), points, part)
+        return self.select(np.array([each is not None for each in seen]), points, part)
 
-    def seen_again(
+    def detect_again(
         self, state: MountState, flat: Sequence[np.ndarray], reach_mm: float, rng: np.random.Generator
-    ) -> list[Seen | None]:
+    ) -> list[Detection | None]:
         """Find the artefact again in the profiles (N, 2) of all poses, near its place in a state; else None."""
-        off = np.split(self.shape.off(state.artefact, self.base(state)), np.cumsum(self.counts)[:-1])
+        off = np.split(self.shape.surface_distances(state.artefact, self.to_base(state)), np.cumsum(self.counts)[:-1])
         again = [self.shape.find_again(each, own, reach_mm, rng) for each, own in zip(flat, off, strict=True)]
         return [each if each is not None and each.members.sum() >= LEAST_POINTS else None for each in again]
 
-    def thinned(self, most: int) -> "Problem":
+    def thin(self, most: int) -> "Problem":
         """Return the problem with at most ``most`` evenly chosen points of each pose."""
         rows = [np.unique(np.linspace(0, len(each) - 1, most).astype(int)) for each in self.points]
         points, part = (
@@ -138,11 +138,11 @@ class Problem(GroupedEvidence[MountState]):
         )
         return replace(self, points=points, part=part)
 
-    def stepped(self, state: MountState, step: np.ndarray) -> MountState:
+    def apply_step(self, state: MountState, step: np.ndarray) -> MountState:
         step = self.free @ step
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ state.rotation
         used = 6 + self.shape.count
-        artefact = self.shape.stepped(state.artefact, step[6:used])
+        artefact = self.shape.apply_step(state.artefact, step[6:used])
         return MountState(
             turned,
             state.translation + step[:3],
@@ -153,27 +153,27 @@ class Problem(GroupedEvidence[MountState]):
 
     def distances(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
         """Return signed distances (N,) of all points from the artefact, mm, after a step from a state."""
-        state = state if step is None else self.stepped(state, step)
-        return self.shape.distances(state.artefact, self.base(state), self._parts)
+        state = state if step is None else self.apply_step(state, step)
+        return self.shape.distances(state.artefact, self.to_base(state), self._parts)
 
-    def base(self, state: MountState) -> np.ndarray:
+    def to_base(self, state: MountState) -> np.ndarray:
         """Transform all points to the base frame; return (N, 3), mm."""
         rotations, positions = self.motion(state.offset_s)
         platform = self._all @ state.rotation.T + state.translation
         return np.einsum("nij,nj->ni", rotations[self.poses], platform) + state.scale * positions[self.poses]
 
-    def errors(self, state: MountState) -> np.ndarray:
+    def pose_error_derivatives(self, state: MountState) -> np.ndarray:
         """Return derivatives (N, K) of the distances by the error of their pose.
 
         A pose error is a shift in three directions of the base. For flat artefacts, a rotation about the middle of the
         profile is added. (For a sphere, a rotation is equivalent to a shift of its centre.)
         """
-        normals = self._normals(self.base(state), state)
+        normals = self._normals(self.to_base(state), state)
         if not self.shape.flat:
             return normals
         middles = np.repeat([own.mean(axis=0) for own in self.points], self.counts, axis=0)
         arms = np.einsum("nij,nj->ni", self.motion(state.offset_s)[0][self.poses] @ state.rotation, self._all - middles)
-        return self.on_lines(np.hstack([normals, np.cross(arms, normals)]))
+        return self.project_on_lines(np.hstack([normals, np.cross(arms, normals)]))
 
     def derivatives(self, state: MountState) -> np.ndarray:
         """Return derivatives (N, size) of the distances at a state by the parameters."""
@@ -182,7 +182,9 @@ class Problem(GroupedEvidence[MountState]):
     def normals(self, state: MountState) -> np.ndarray:
         """Return derivatives (N, 3) of the distances by the points, along the axes of the sensor."""
         rotations = self.motion(state.offset_s)[0]
-        return np.einsum("nij,ni->nj", rotations[self.poses], self._normals(self.base(state), state)) @ state.rotation
+        return (
+            np.einsum("nij,ni->nj", rotations[self.poses], self._normals(self.to_base(state), state)) @ state.rotation
+        )
 
     def _normals(self, base: np.ndarray, state: MountState) -> np.ndarray:
         """Return normals (N, 3) of the artefact at points of the base frame."""
@@ -191,7 +193,7 @@ class Problem(GroupedEvidence[MountState]):
     def _derivatives(self, state: MountState) -> np.ndarray:
         """Return derivatives (N, K) by all values."""
         rotations, positions = self.motion(state.offset_s)
-        turned, base = self._all @ state.rotation.T, self.base(state)
+        turned, base = self._all @ state.rotation.T, self.to_base(state)
         normals = self._normals(base, state)
         in_platform = np.einsum("nij,ni->nj", rotations[self.poses], normals)
         columns = [in_platform, np.cross(turned, in_platform)]
@@ -200,10 +202,10 @@ class Problem(GroupedEvidence[MountState]):
             columns.append(np.sum(normals * positions[self.poses], axis=1, keepdims=True))
         if self.time:
             later, earlier = (
-                self.base(replace(state, offset_s=state.offset_s + s)) for s in (_TIME_STEP_S, -_TIME_STEP_S)
+                self.to_base(replace(state, offset_s=state.offset_s + s)) for s in (_TIME_STEP_S, -_TIME_STEP_S)
             )
             columns.append(np.sum(normals * (later - earlier), axis=1, keepdims=True) / (2 * _TIME_STEP_S))
-        return self.on_lines(np.hstack(columns))
+        return self.project_on_lines(np.hstack(columns))
 
     @cached_property
     def _along(self) -> np.ndarray:
@@ -211,7 +213,7 @@ class Problem(GroupedEvidence[MountState]):
         along = []
         for own, part in zip(self.points, self.part, strict=True):
             result = np.zeros(len(own))
-            for rows in self.shape.parallel(part):
+            for rows in self.shape.group_parallel(part):
                 lines = [own[rows & (part == face)] for face in np.unique(part[rows])]
                 centred = np.vstack([line - line.mean(axis=0) for line in lines])
                 direction = np.linalg.svd(centred, full_matrices=False)[2][0]
@@ -223,9 +225,9 @@ class Problem(GroupedEvidence[MountState]):
     def _lines(self) -> list[np.ndarray]:
         """Orthonormal bases (n, K) of the noise-free changes of each profile."""
         along = np.split(self._along, np.cumsum(self.counts)[:-1])
-        return [np.linalg.qr(self.shape.lines(own, part))[0] for own, part in zip(along, self.part, strict=True)]
+        return [np.linalg.qr(self.shape.basis_lines(own, part))[0] for own, part in zip(along, self.part, strict=True)]
 
-    def on_lines(self, values: np.ndarray) -> np.ndarray:
+    def project_on_lines(self, values: np.ndarray) -> np.ndarray:
         """Project values (N, ...) of a flat artefact onto the lines of the profiles; return others unchanged.
 
         Without the projection, a plane far from the true one could fit the points' noise.
@@ -266,7 +268,7 @@ class Problem(GroupedEvidence[MountState]):
                 first += len(run)
         return np.concatenate(order), np.concatenate(starts), np.concatenate(poses), np.concatenate(places)
 
-    def means(self, values: np.ndarray) -> np.ndarray:
+    def bin_means(self, values: np.ndarray) -> np.ndarray:
         """Return means (P, K, ...) of values (N, ...) in bins along the profiles, padded with 0."""
         order, starts, poses, places = self._bins
         counts = np.diff(starts, append=len(order)).reshape(-1, *[1] * (values.ndim - 1))
@@ -278,7 +280,7 @@ class Problem(GroupedEvidence[MountState]):
     def _apart(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Masks (P, K) of the bins with points, their numbers of points (P, K), and distances (P, K, K) of bins, mm."""
         order, starts, poses, places = self._bins
-        middles = self.means(self._all)
+        middles = self.bin_means(self._all)
         counts = np.zeros(middles.shape[:2])
         counts[poses, places] = np.diff(starts, append=len(order))
         return counts > 0, counts, np.linalg.norm(middles[:, :, None] - middles[:, None], axis=3)
@@ -295,19 +297,21 @@ class Problem(GroupedEvidence[MountState]):
     def residuals(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
         """Return mean distances (P, K) of bins after a step; for a flat artefact, noise off the lines is unchanged."""
         here = self.distances(state)
-        return self.means(here if step is None else here + self.on_lines(self.distances(state, step) - here))
+        return self.bin_means(
+            here if step is None else here + self.project_on_lines(self.distances(state, step) - here)
+        )
 
     def jacobian(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
         if step is None:
-            return self.means(self.derivatives(state))
-        derivatives = self._derivatives(self.stepped(state, step))
+            return self.bin_means(self.derivatives(state))
+        derivatives = self._derivatives(self.apply_step(state, step))
         derivatives[:, 3:6] = derivatives[:, 3:6] @ _left_jacobian((self.free @ step)[3:6])
-        return self.means(derivatives @ self.free)
+        return self.bin_means(derivatives @ self.free)
 
     def covariance(self, state: MountState) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
         there, counts, apart = self._apart
-        share = self.means(self.noise_along(state)[:, 0])
-        both, errors = share[:, :, None] * share[:, None], self.means(self.errors(state))
+        share = self.bin_means(self.noise_along(state)[:, 0])
+        both, errors = share[:, :, None] * share[:, None], self.bin_means(self.pose_error_derivatives(state))
         noise = np.eye(there.shape[1]) * (share**2 / np.maximum(counts, 1))[:, :, None]
         filled = np.eye(there.shape[1]) * ~there[:, :, None]
         shifts, turns = (own @ np.swapaxes(own, 1, 2) for own in (errors[:, :, :3], errors[:, :, 3:]))
@@ -325,7 +329,7 @@ class Problem(GroupedEvidence[MountState]):
 
         return covariances
 
-    def repeated(self, state: MountState) -> tuple[int, float]:
+    def pool_repeats(self, state: MountState) -> tuple[int, float]:
         """Return degrees of freedom and sum of squares of the points' noise within the bins."""
         order, starts, _, _ = self._bins
         values = (self.distances(state) / self.noise_along(state)[:, 0])[order]
@@ -336,31 +340,31 @@ class Problem(GroupedEvidence[MountState]):
     def pose_directions(self, state: MountState) -> list[np.ndarray]:
         """Return orthonormal bases (K, q) of all changes of each profile by poses, mount and artefact."""
         bases = []
-        for errors in self.means(self.errors(state)):
+        for errors in self.bin_means(self.pose_error_derivatives(state)):
             sizes = np.linalg.norm(errors, axis=0).clip(1e-30)
             basis, spans, _ = np.linalg.svd(errors / sizes, full_matrices=False)
             bases.append(basis[:, spans > _LEAST_SPAN * spans[0]])
         return bases
 
-    def plain(self, state: MountState) -> MountState:
+    def solve_unweighted(self, state: MountState) -> MountState:
         """Minimise the squares of all distances with equal weights."""
         return self._solved(state, Scatter(1.0, *np.full(4, _POINT_MM[0])), "linear")
 
-    def rough(self, state: MountState, scatter: Scatter) -> MountState:
+    def solve_robustly(self, state: MountState, scatter: Scatter) -> MountState:
         """Minimise the weighted squares with a robust loss (Cauchy)."""
         return self._solved(state, scatter, "cauchy")
 
     def _solved(self, state: MountState, scatter: Scatter, loss: str) -> MountState:
         covariances, _ = self.covariance(state)(np.log(scatter))
-        return self.stepped(state, solved_step(self, state, covariances, loss=loss))
+        return self.apply_step(state, solve_step(self, state, covariances, loss=loss))
 
 
-def in_sheet(points: Sequence[np.ndarray], sheet: np.ndarray) -> list[np.ndarray]:
+def to_sheet(points: Sequence[np.ndarray], sheet: np.ndarray) -> list[np.ndarray]:
     """Return coordinates x and z (n, 2) in the sheet of points (n, 3); ``sheet`` (4, 4) maps to the sensor's frame."""
     return [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in points]
 
 
-def in_space(flat: np.ndarray) -> np.ndarray:
+def from_sheet(flat: np.ndarray) -> np.ndarray:
     """Return points or directions (n, 3) in the frame of the sheet from their x and z (n, 2)."""
     return np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
 

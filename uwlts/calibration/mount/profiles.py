@@ -35,14 +35,14 @@ _LEAST_SEEN_COSINE = 0.5  # cosine of the largest angle between the sheet and a 
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Seen:
+class Detection:
     """Points of a profile on the artefact: mask (N,), surface number (N,) of each (from 0), scatter in mm."""
 
     members: np.ndarray
     part: np.ndarray
     std_mm: float
 
-    def among(self, chosen: np.ndarray) -> Self:
+    def expand(self, chosen: np.ndarray) -> Self:
         """Return the same points in the full profile; ``chosen`` is its mask of the points searched."""
         members, part = np.zeros(len(chosen), dtype=bool), np.zeros(len(chosen), dtype=int)
         members[chosen], part[chosen] = self.members, self.part
@@ -50,7 +50,7 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ProfileArc(Seen):
+class ProfileArc(Detection):
     """Points on a circle: its centre (2,) and radius, mm."""
 
     centre_mm: np.ndarray
@@ -58,7 +58,7 @@ class ProfileArc(Seen):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ProfileLine(Seen):
+class ProfileLine(Detection):
     """Points on a line: middle (2,), direction (2,) and length of the line; for a step or ring, of the first face.
 
     The points are on both faces of a step, or on face and wall of a ring.
@@ -73,7 +73,7 @@ class ProfileLine(Seen):
         return replace(self, members=self.members | (others > 0), part=np.where(others > 0, others, self.part))
 
 
-def noise_of(points: np.ndarray) -> float:
+def estimate_noise(points: np.ndarray) -> float:
     """Estimate the noise of a profile (N, 2) from second differences, robust against edges, mm."""
     depth = points[:, 1] - np.interp(points[:, 0], points[[0, -1], 0], points[[0, -1], 1])
     # variance of a second difference: 1 + 4 + 1 times that of a point
@@ -90,7 +90,7 @@ def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generat
     count = len(points)
     if count < LEAST_POINTS:
         return None
-    tolerance = max(_REJECTED_BEYOND * noise_of(points), 1e-4)
+    tolerance = max(_REJECTED_BEYOND * estimate_noise(points), 1e-4)
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     largest = extent if radius_mm is None else radius_mm + 2 * tolerance
     span = rng.integers(LEAST_POINTS // 2, max(count // 2, LEAST_POINTS // 2 + 1), size=_TRIALS)
@@ -102,17 +102,17 @@ def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generat
         return None
     centres, radii = centres[fits], radii[fits]
     off = np.abs(np.linalg.norm(points - centres[:, None], axis=2) - radii[:, None])
-    tolerance = _widened(off, tolerance)
+    tolerance = _widen_tolerance(off, tolerance)
     if radius_mm is not None:
         largest = radius_mm + 2 * tolerance
     for best in np.argsort(-np.count_nonzero(off < tolerance, axis=1))[:5]:
-        arc = _refined_arc(points, off[best] < tolerance, tolerance)
+        arc = _refine_arc(points, off[best] < tolerance, tolerance)
         if arc is not None and arc.radius_mm < largest:
             return arc
     return None
 
 
-def _widened(off: np.ndarray, tolerance: float) -> float:
+def _widen_tolerance(off: np.ndarray, tolerance: float) -> float:
     """Widen the tolerance until this adds few points; ``off`` (M, N) are distances from the proposed curves.
 
     The smooth error of a profiler shifts points by more than their noise.
@@ -135,7 +135,7 @@ def circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return triples[:, 0] + away, np.linalg.norm(away, axis=1)
 
 
-def _settled(
+def _refit_inliers(
     members: np.ndarray, tolerance: float, off: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, float] | None:
     """Refit a curve and its inliers (N,) until they are stable; return inliers and scatter, or None if too few.
@@ -154,22 +154,22 @@ def _settled(
     return (members, std) if np.count_nonzero(members) >= LEAST_POINTS else None
 
 
-def _refined_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> ProfileArc | None:
+def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> ProfileArc | None:
     def off(some: np.ndarray) -> np.ndarray:
-        centre, radius = _fitted_circle(points[some])
+        centre, radius = _fit_circle(points[some])
         return np.linalg.norm(points - centre, axis=1) - radius
 
-    if (found := _settled(members, tolerance, off)) is None:
+    if (found := _refit_inliers(members, tolerance, off)) is None:
         return None
     members, std = found
-    centre, radius = _fitted_circle(points[members])
+    centre, radius = _fit_circle(points[members])
     if _arc_angle(points[members] - centre) < _LEAST_ARC:
         return None
     part = np.zeros(len(points), dtype=int)
     return ProfileArc(members=members, part=part, std_mm=std, centre_mm=centre, radius_mm=radius)
 
 
-def _fitted_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
+def _fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Fit a circle by least squares of the distances, with Gauss-Newton steps from the algebraic solution."""
     middle = points.mean(axis=0)
     centre, radius = algebraic_centres(points - middle)
@@ -194,14 +194,14 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
     """Find the best supported straight line in an ordered profile (N, 2), mm, or None."""
     if len(points) < LEAST_POINTS:
         return None
-    tolerance = max(_REJECTED_BEYOND * noise_of(points), 1e-4)
+    tolerance = max(_REJECTED_BEYOND * estimate_noise(points), 1e-4)
     first, second = rng.integers(len(points), size=(2, _TRIALS))
     along = points[second] - points[first]
     length = np.linalg.norm(along, axis=1)
     proper = length > 0
     normals = np.column_stack([-along[:, 1], along[:, 0]])[proper] / length[proper, None]
     off = np.abs(points @ normals.T - np.sum(points[first[proper]] * normals, axis=1)).T
-    tolerance = _widened(off, tolerance)
+    tolerance = _widen_tolerance(off, tolerance)
     members = off[np.argmax(np.count_nonzero(off < tolerance, axis=1))] < tolerance
 
     def line(some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -212,7 +212,7 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
         middle, direction = line(some)
         return (points - middle) @ np.array([-direction[1], direction[0]])
 
-    if (found := _settled(members, tolerance, beside)) is None:
+    if (found := _refit_inliers(members, tolerance, beside)) is None:
         return None
     members, std = found
     middle, direction = line(members)
@@ -233,8 +233,8 @@ def find_step(points: np.ndarray, height_mm: float | None, rng: np.random.Genera
     between the sheet and the step's normal.
     """
     best: tuple[int, float, np.ndarray, np.ndarray, ProfileLine] | None = None
-    for (rows, first), (others, second) in combinations(_lines_of(points, rng), 2):
-        apart = _apart(first, second)
+    for (rows, first), (others, second) in combinations(_find_lines(points, rng), 2):
+        apart = _line_distance(first, second)
         if apart is None:
             continue
         if height_mm is not None and not _LEAST_SEEN * height_mm < abs(apart) < height_mm / _LEAST_SEEN_COSINE:
@@ -252,11 +252,11 @@ def find_step(points: np.ndarray, height_mm: float | None, rng: np.random.Genera
 
 def find_face(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | None:
     """Find the best supported line in a profile (N, 2), mm; return it or a parallel one at smaller z."""
-    lines = _lines_of(points, rng)
+    lines = _find_lines(points, rng)
     if not lines:
         return None
     beside = [(0.0, *lines[0])]
-    beside += [(apart, *line) for line in lines[1:] if (apart := _apart(lines[0][1], line[1])) is not None]
+    beside += [(apart, *line) for line in lines[1:] if (apart := _line_distance(lines[0][1], line[1])) is not None]
     _, rows, face = min(beside, key=lambda each: each[0])
     members = np.zeros(len(points), dtype=bool)
     members[rows] = True
@@ -291,7 +291,7 @@ def find_walls(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     return walls
 
 
-def _lines_of(points: np.ndarray, rng: np.random.Generator) -> list[tuple[np.ndarray, ProfileLine]]:
+def _find_lines(points: np.ndarray, rng: np.random.Generator) -> list[tuple[np.ndarray, ProfileLine]]:
     """Return the best supported lines of a profile, each with the rows (n,) of its points."""
     lines: list[tuple[np.ndarray, ProfileLine]] = []
     left = np.arange(len(points))
@@ -304,7 +304,7 @@ def _lines_of(points: np.ndarray, rng: np.random.Generator) -> list[tuple[np.nda
     return lines
 
 
-def _apart(first: ProfileLine, second: ProfileLine) -> float | None:
+def _line_distance(first: ProfileLine, second: ProfileLine) -> float | None:
     """Return the distance of a line beyond another towards larger z, mm; None if not parallel, or identical."""
     normal = np.array([-first.direction[1], first.direction[0]]) * np.sign(first.direction[0] or 1.0)
     apart = float((second.middle_mm - first.middle_mm) @ normal)

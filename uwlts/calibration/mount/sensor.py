@@ -34,13 +34,13 @@ class CapturedProfiles:
     pose_times_s: np.ndarray | None
     known: StoredEstimate | None
 
-    def selected(self, numbers: Sequence[int] | np.ndarray) -> "CapturedProfiles":
+    def select(self, numbers: Sequence[int] | np.ndarray) -> "CapturedProfiles":
         """Return some of the profiles, each with its own pose."""
         profiles, stripes = ([each[number] for number in numbers] for each in (self.profiles, self.stripes))
         times = self.times_s[numbers]
         return replace(self, profiles=profiles, stripes=stripes, times_s=times, poses=self.poses[numbers])
 
-    def moved(self, number: int, rows: np.ndarray) -> np.ndarray:
+    def point_derivatives(self, number: int, rows: np.ndarray) -> np.ndarray:
         """Return derivatives (n, 3, Q) of points of a profile by the parameters of the joint estimate, sensor frame."""
         assert self.known is not None
         found = self.known.points_by(*self.stripes[number][rows].T)
@@ -103,13 +103,13 @@ def mount_covariance(
     own = free @ estimate.covariance @ free.T
     covariance, share = own, None
     if known is not None:
-        covariance, share = _with_sensor(own, free @ estimate.by(moved()), rotation, known)
+        covariance, share = _add_sensor_uncertainty(own, free @ estimate.propagate(moved()), rotation, known)
     estimated = np.flatnonzero(np.diag(own)[:6] > 0)
     shares = (np.diag(own) / np.where(np.diag(covariance) > 0, np.diag(covariance), 1.0))[estimated]
     return (covariance + covariance.T) / 2, share, estimate.coverage_factor(shares, free[estimated])
 
 
-def _with_sensor(
+def _add_sensor_uncertainty(
     own: np.ndarray, by_parameters: np.ndarray, rotation: np.ndarray, known: StoredEstimate
 ) -> tuple[np.ndarray, SensorShare]:
     """Add the uncertainty of the sensor's calibration to the covariance (K, K) of a mount.

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, SphereShape, StepShape, square_to
+from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, SphereShape, StepShape, perpendicular_to
 from uwlts.calibration.mount.estimate import RestrictedEstimate
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, in_sheet, in_space, point_by_mount
-from uwlts.calibration.mount.profiles import ProfileArc, ProfileLine, Seen, circles_through
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, from_sheet, point_by_mount, to_sheet
+from uwlts.calibration.mount.profiles import Detection, ProfileArc, ProfileLine, circles_through
 from uwlts.errors import CalibrationError
 
 _SUBSET = 8  # poses of a random subset: 24 linear equations for 12 unknowns
@@ -39,7 +39,7 @@ class NoFit(CalibrationError):
 def start(
     problem: Problem,
     whole: Problem,
-    seen: Sequence[Seen],
+    seen: Sequence[Detection],
     sheet: np.ndarray,
     towards: np.ndarray | None,
     rng: np.random.Generator,
@@ -92,7 +92,7 @@ def _start_of_sphere(
             for state in _linear_solutions(rotations, positions, centres, depth, subset, radius):
                 found.append((_misfit(rotations, positions, centres, depth, state), state))
     found.sort(key=lambda each: each[0])
-    return _best(problem, [state for _, state in found[:_TRIED]], sheet)
+    return _refine_best(problem, [state for _, state in found[:_TRIED]], sheet)
 
 
 def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, towards: np.ndarray) -> MountState:
@@ -108,7 +108,7 @@ def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray,
     angles = -Rotation.from_matrix(rotations[0].T @ rotations).as_rotvec()[:, 2]
     centres, radii = np.array([arc.centre_mm for arc in arcs]), np.array([arc.radius_mm for arc in arcs])
     design = np.column_stack([np.ones(len(arcs)), np.cos(angles), np.sin(angles)])
-    flat = _robust(design, centres)
+    flat = _solve_robustly(design, centres)
     largest, states = float(np.quantile(radii, 0.9)), []
     root = np.sqrt(complex(flat[2] @ flat[2] - flat[1] @ flat[1], -2 * flat[1] @ flat[2]))
     for radius in [problem.shape.size_mm] if problem.shape.size_mm else [share * largest for share in _RADII]:
@@ -127,7 +127,7 @@ def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray,
             translation = np.array([0.0, 0.0, height]) - rotation @ q
             place = rotations[0] @ np.array([reach, 0.0, height]) + positions[0]
             states.append(MountState(rotation, translation, np.append(place, radius)))
-    return _best(problem, states, sheet)
+    return _refine_best(problem, states, sheet)
 
 
 def _linear_solutions(
@@ -138,7 +138,7 @@ def _linear_solutions(
     subset: np.ndarray,
     radius: float,
 ) -> list[MountState]:
-    back, shift = np.swapaxes(rotations, 1, 2)[subset], _turned_back(rotations, -positions)[subset]
+    back, shift = np.swapaxes(rotations, 1, 2)[subset], _rotate_back(rotations, -positions)[subset]
     states, one = [], np.broadcast_to(np.eye(3), back.shape)
     for side in (0.0, 1.0, -1.0):
         sides = np.full(len(subset), side)
@@ -159,12 +159,12 @@ def _linear_solutions(
             )[0]
             translation, centre = both[:3], both[3:]
             if side == 0.0:
-                sides = np.sign((_turned_back(rotations, centre - positions)[subset] - translation) @ across)
+                sides = np.sign((_rotate_back(rotations, centre - positions)[subset] - translation) @ across)
         states.append(MountState(rotation, translation, np.append(centre, radius)))
     return states
 
 
-def _turned_back(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def _rotate_back(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Rotate vectors (P, 3) of the base frame into the axes of the platform."""
     return np.einsum("pji,pj->pi", rotations, vectors)
 
@@ -173,12 +173,12 @@ def _misfit(
     rotations: np.ndarray, positions: np.ndarray, centres: np.ndarray, depth: np.ndarray, state: MountState
 ) -> float:
     """Return the median distance over the poses between the sphere's centre and its position from the profile."""
-    seen = (_turned_back(rotations, state.artefact[:3] - positions) - state.translation) @ state.rotation
+    seen = (_rotate_back(rotations, state.artefact[:3] - positions) - state.translation) @ state.rotation
     off = np.hypot(*(seen[:, [0, 2]] - centres).T)
     return float(np.median(np.hypot(off, np.abs(seen[:, 1]) - depth)))
 
 
-def _in_sensor_frame(state: MountState, sheet: np.ndarray) -> MountState:
+def _to_sensor_frame(state: MountState, sheet: np.ndarray) -> MountState:
     """Convert a state of the sheet's frame to the sensor's frame."""
     rotation = state.rotation @ sheet[:3, :3].T
     return MountState(rotation, state.translation - rotation @ sheet[:3, 3], state.artefact)
@@ -194,8 +194,8 @@ def _start_of_plane(
     distance are then linear.
     """
     rotations, positions = problem.motion(0.0)
-    middles = in_space(np.array([line.middle_mm for line in lines]))
-    directions = in_space(np.array([line.direction for line in lines]))
+    middles = from_sheet(np.array([line.middle_mm for line in lines]))
+    directions = from_sheet(np.array([line.direction for line in lines]))
     turns = Rotation.random(_TURNS, rng=rng).as_matrix()
     seen = np.einsum("pij,tjk,pk->tpi", rotations, turns, directions)
     values, vectors = np.linalg.eigh(np.einsum("tpi,tpj->tij", seen, seen))
@@ -206,9 +206,9 @@ def _start_of_plane(
         for turn in (turns[number], turns[number] * np.array([-1.0, 1.0, -1.0])):
             places = np.einsum("pij,jk,pk->pi", rotations, turn, middles) + positions
             design = np.column_stack([np.einsum("pji,j->pi", rotations, normal), -np.ones(len(lines))])
-            solution = _robust(design, -(places @ normal)[:, None])[:, 0]
+            solution = _solve_robustly(design, -(places @ normal)[:, None])[:, 0]
             states.append(MountState(turn, solution[:3], np.append(normal, solution[3])))
-    return _best(problem, states, sheet)
+    return _refine_best(problem, states, sheet)
 
 
 def _start_of_step(
@@ -236,44 +236,44 @@ def _start_of_ring(
     off = plane.rms_mm(state)
     noise = float(np.median([line.std_mm for line in lines]))
     scatter = Scatter(max(noise, 1e-6), noise, 1.0, max(float(np.median(off)), noise), 1e-3)
-    used = plane.selected(off < _FAR * np.median(off) + 5 * noise)
-    state = used.rough(state, scatter)
+    used = plane.select(off < _FAR * np.median(off) + 5 * noise)
+    state = used.solve_robustly(state, scatter)
     covariance = RestrictedEstimate(used, state, np.array(scatter)).covariance[:6, :6]
     middle = state.rotation @ np.vstack(used.points).mean(axis=0)
     to_point = point_by_mount(middle)
     known = float(np.sqrt(np.linalg.eigvalsh(to_point @ covariance @ to_point.T)[-1]))
     reach = _FAR * float(np.hypot(known, scatter.pose_mm))
-    base = whole.base(state)
+    base = whole.to_base(state)
     normal, distance = state.artefact[:3], state.artefact[3]
-    axes = square_to(normal)
+    axes = perpendicular_to(normal)
     height = base @ normal - distance
     beside = np.flatnonzero(np.abs(height) > reach)
     # Weight heights equally: a table has many points, all at one height.
     heights = np.sort(height[beside])
     alike = np.searchsorted(heights, height[beside] + reach) - np.searchsorted(heights, height[beside] - reach)
     beside = rng.choice(beside, _JUDGED, p=1 / alike / np.sum(1 / alike)) if len(beside) else beside
-    circle = _circle_of_most(base[beside] @ axes.T, shape.size_mm, reach, rng)
+    circle = _find_circle(base[beside] @ axes.T, shape.size_mm, reach, rng)
     if circle is None:
         require_surfaces(problem)
     assert circle is not None
     state = replace(
         state, artefact=np.concatenate([normal, circle[:2] @ axes + distance * normal, [shape.size_mm or circle[2]]])
     )
-    flat = in_sheet(whole.points, sheet)
+    flat = to_sheet(whole.points, sheet)
     for narrower in (1.0, 3.0, 9.0):
-        problem = whole.of_seen(whole.seen_again(state, flat, max(reach / narrower, 5 * noise), rng))
+        problem = whole.select_detected(whole.detect_again(state, flat, max(reach / narrower, 5 * noise), rng))
         require_surfaces(problem)
-        state = problem.rough(state, scatter)
+        state = problem.solve_robustly(state, scatter)
     return state, problem
 
 
 def require_surfaces(problem: Problem) -> None:
     """Raise CalibrationError if too few profiles show a surface; `NoFit` if the given size may be wrong."""
-    if (words := problem.shape.missing(problem.part)) is not None:
+    if (words := problem.shape.describe_missing(problem.part)) is not None:
         raise CalibrationError(words) if problem.shape.size_mm is None else NoFit(words)
 
 
-def _circle_of_most(
+def _find_circle(
     points: np.ndarray, radius_mm: float | None, reach_mm: float, rng: np.random.Generator
 ) -> np.ndarray | None:
     """Find the circle (3,) (centre, radius) with most points (N, 2) near it, less those inside and outside."""
@@ -294,7 +294,7 @@ def _circle_of_most(
     return np.append(centres[proper][best], radii[proper][best]) if score[best] > 0 else None
 
 
-def _robust(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def _solve_robustly(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Solve linear equations, ``design`` (N, k) and ``wanted`` (N, m), robustly with Cauchy weights; return (k, m)."""
     weights, solution = np.ones(len(design)), np.zeros((design.shape[1], wanted.shape[1]))
     for _ in range(_REWEIGHTED):
@@ -304,11 +304,11 @@ def _robust(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return solution
 
 
-def _best(problem: Problem, states: list[MountState], sheet: np.ndarray) -> MountState:
+def _refine_best(problem: Problem, states: list[MountState], sheet: np.ndarray) -> MountState:
     """Refine states robustly; return the one with the smallest median distance, in the sensor's frame.
 
     Scale and time offset are not refined.
     """
-    fixed = replace(problem.thinned(_THINNED), scale=False, time=False)
-    refined = [fixed.rough(_in_sensor_frame(state, sheet), _ROUGH) for state in states]
+    fixed = replace(problem.thin(_THINNED), scale=False, time=False)
+    refined = [fixed.solve_robustly(_to_sensor_frame(state, sheet), _ROUGH) for state in states]
     return min(refined, key=lambda state: float(np.median(fixed.rms_mm(state))))

@@ -22,7 +22,7 @@ class TwoReadings:
     def bounds(self):
         return np.array([(1.0, 1.0)])
 
-    def stepped(self, state, step):
+    def apply_step(self, state, step):
         return state + float(step[0])
 
     def residuals(self, state, step=None):
@@ -36,7 +36,7 @@ class TwoReadings:
         both = np.array([1 / share, 1 / (1 - share)]).reshape(2, 1, 1)
         return lambda logs: (both, np.zeros((1, 2, 1, 1)))
 
-    def repeated(self, state):
+    def pool_repeats(self, state):
         return 0, 0.0
 
     def pose_directions(self, state):
