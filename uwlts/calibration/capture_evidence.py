@@ -97,7 +97,7 @@ def air_evidence(
     reasons: Counter[str] = Counter()
     for number, capture in enumerate(captures):
         first = len(images)
-        detect = partial(_target_in, capture, targets[0], number)
+        detect = partial(_detect_target, capture, targets[0], number)
         for (frame, _), found in in_threads(detect, capture.frames(laser_on=False)):
             if isinstance(found, str):
                 reasons[found] += 1
@@ -111,7 +111,7 @@ def air_evidence(
                 outliers.append(0)
             done = _report(progress, "target", done, total)
         positions = np.array([image.stage_mm for image in images[first:]])
-        on_target = partial(_stripe_beside, capture, stripe, first, views[first:], positions, targets[0])
+        on_target = partial(_find_target_stripe, capture, stripe, first, views[first:], positions, targets[0])
         for (frame, _), found in in_threads(on_target, _laser_frames(capture)):
             if isinstance(found, str):
                 warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {found}")
@@ -128,10 +128,9 @@ def air_evidence(
                 "of the rest: reflections, a second line, or a plate that is not flat"
             )
     if not images:
-        raise CalibrationError(
-            f"the target was found in no image of {_names(captures)}: {_why_no_target(captures, targets[0], reasons)}"
-        )
-    no_stripe = "" if any(map(len, stripes)) else no_stripe_in(captures)
+        why = _explain_missing_target(captures, targets[0], reasons)
+        raise CalibrationError(f"the target was found in no image of {_names(captures)}: {why}")
+    no_stripe = "" if any(map(len, stripes)) else explain_missing_stripe(captures)
     return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, outliers, _file_names(captures))
 
 
@@ -169,7 +168,7 @@ def step_evidence(
         if index is None:
             index = capture.header.medium.refractive_index(wavelength)
             index_std = capture.header.medium.index_uncertainty(wavelength, known)
-        for (frame, _), pixels in in_threads(partial(_stripe_in, capture, stripe), _laser_frames(capture)):
+        for (frame, _), pixels in in_threads(partial(_find_stripe, capture, stripe), _laser_frames(capture)):
             if isinstance(pixels, str):
                 warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {pixels}")
             else:
@@ -180,13 +179,13 @@ def step_evidence(
     return found, warnings
 
 
-def no_stripe_in(captures: Sequence[Capture]) -> str:
+def explain_missing_stripe(captures: Sequence[Capture]) -> str:
     """Return the reason why no stripe was found in captures; for captures of a target, none on the target."""
     header, count = captures[0].header, sum(int(np.count_nonzero(capture.laser_on)) for capture in captures)
     if not count:
         return f"{_names(captures)}: no image with the laser on; take one at every position"
     along, where = header.sensor.camera.stripe_along, f"laser images of {_names(captures)}"
-    lit = [image for capture in captures for image in _lit(capture, _LOOKED_AT)]
+    lit = [image for capture in captures for image in _laser_images(capture, _LOOKED_AT)]
     if not lit:
         return f"no stripe in any of the {count} centre lines of {_names(captures)}: is the laser on?"
     if any(shown_stripe(image, stripe_along=along) == "along" for image in lit):
@@ -203,11 +202,11 @@ def _names(captures: Sequence[Capture]) -> str:
     return ", ".join(_file_names(captures))
 
 
-def _why_no_target(captures: Sequence[Capture], target: Target, reasons: Counter[str]) -> str:
+def _explain_missing_target(captures: Sequence[Capture], target: Target, reasons: Counter[str]) -> str:
     """Return the reason why no image shows the target; ``reasons`` counts the faults of images with the laser off."""
     if not any(map(len, captures)):
         return "there are no images in it"
-    for image in [image for capture in captures for image in _lit(capture, 3)]:
+    for image in [image for capture in captures for image in _laser_images(capture, 3)]:
         with suppress(TargetError, CalibrationError):
             target.detect(image)
             return (
@@ -220,7 +219,7 @@ def _why_no_target(captures: Sequence[Capture], target: Target, reasons: Counter
     return "; ".join(f"{reason} ({times} of {count} images)" for reason, times in reasons.most_common(2))
 
 
-def _lit(capture: Capture, most: int) -> Iterator[np.ndarray]:
+def _laser_images(capture: Capture, most: int) -> Iterator[np.ndarray]:
     """Yield at most ``most`` images with the laser on, evenly chosen; images of 3D cameras are skipped."""
     lit = np.flatnonzero(capture.laser_on & capture.has_image)
     for place in np.unique(np.linspace(0, len(lit) - 1, most).astype(int)) if len(lit) else ():
@@ -236,7 +235,7 @@ def _laser_frames(capture: Capture) -> Iterator[_Seen]:
         yield frame, capture.seen(frame)
 
 
-def _target_in(
+def _detect_target(
     capture: Capture, target: Target, placement: int, numbered: tuple[int, np.ndarray]
 ) -> tuple[TargetView, TargetImage] | str:
     """Find the target in an image with the laser off, or return the reason for rejection."""
@@ -248,7 +247,7 @@ def _target_in(
         return why_not_found(image, str(error), full_dn=capture.header.saturation_dn)
 
 
-def _stripe_beside(
+def _find_target_stripe(
     capture: Capture,
     settings: StripeSettings,
     first: int,
@@ -263,30 +262,30 @@ def _stripe_beside(
     if not len(here):
         return f"no target was found at {capture.stage_mm[frame]:g} mm"
     place = int(here[0])
-    along, options, clip = _how_to_find(capture, settings)
+    along, options, clip = _stripe_settings(capture, settings)
     try:
         found = stripe_on_target(seen, views[place], target, stripe_along=along, options=options, saturation=clip)
     except ImageError as error:
         return str(error)
-    return _too_short(found.pixels) or (first + place, found)
+    return _explain_short_stripe(found.pixels) or (first + place, found)
 
 
-def _stripe_in(capture: Capture, settings: StripeSettings, numbered: _Seen) -> np.ndarray | str:
+def _find_stripe(capture: Capture, settings: StripeSettings, numbered: _Seen) -> np.ndarray | str:
     """Find the stripe (N, 2) of a laser frame, or return the reason for rejection."""
-    along, options, clip = _how_to_find(capture, settings)
+    along, options, clip = _stripe_settings(capture, settings)
     try:
         pixels = stripe_in(numbered[1], stripe_along=along, options=options, saturation=clip).pixels()
     except ImageError as error:
         return str(error)
-    return _too_short(pixels) or pixels
+    return _explain_short_stripe(pixels) or pixels
 
 
-def _how_to_find(capture: Capture, settings: StripeSettings) -> tuple[str, StripeOptions, float]:
+def _stripe_settings(capture: Capture, settings: StripeSettings) -> tuple[str, StripeOptions, float]:
     sensor = capture.header.sensor
     return sensor.camera.stripe_along, StripeOptions.of(sensor, settings), capture.header.saturation_dn
 
 
-def _too_short(pixels: np.ndarray) -> str:
+def _explain_short_stripe(pixels: np.ndarray) -> str:
     enough = len(pixels) >= _FEWEST_LINES
     return "" if enough else f"found on {len(pixels)} lines only; at least {_FEWEST_LINES} are needed"
 

@@ -72,12 +72,12 @@ def evaluate_campaign(
         kept = CampaignResults.read(path)
         if trials in (0, kept.trials):
             return kept
-        scans = _sphere_scans(folder, _by_rays(calibrations(folder)[PROPOSED, "water"]))
+        scans = _sphere_scans(folder, _require_camera_model(calibrations(folder)[PROPOSED, "water"]))
         intervals = _monte_carlo(folder, scans, trials, workers, progress)
         return kept.model_copy(update={"monte_carlo": intervals, "trials": trials}).keep(path)
     calibrated = calibrations(folder, progress=partial(progress, stage="calibrations"))
-    measurements = _measured(folder, calibrated, workers, progress)
-    proposed, two = (_by_rays(calibrated[method, "water"]) for method in (PROPOSED, TWO))
+    measurements = _measure_scans(folder, calibrated, workers, progress)
+    proposed, two = (_require_camera_model(calibrated[method, "water"]) for method in (PROPOSED, TWO))
     scans = _sphere_scans(folder, proposed)
     choices, profiles = window_choices(folder, proposed, scans)
     return CampaignResults(
@@ -95,13 +95,13 @@ def evaluate_campaign(
     ).keep(path)
 
 
-def _by_rays(calibration: AnyCalibration) -> Calibration:
+def _require_camera_model(calibration: AnyCalibration) -> Calibration:
     if not isinstance(calibration, Calibration):
         raise TypeError("a polynomial calibration has neither camera nor window")
     return calibration
 
 
-def _measured(
+def _measure_scans(
     folder: CampaignFolder,
     calibrated: dict[tuple[str, str], AnyCalibration],
     workers: int | None,

@@ -145,14 +145,14 @@ def _compare(again: bool, folder: CampaignFolder, send: Send) -> JointResults:
             known: dict[Method, AnyCalibration] = {
                 way: sequential[found] for way, found in ways.items() if found in sequential
             }
-            spheres.append(_of_spheres(scan, known | joint))
+            spheres.append(_evaluate_spheres(scan, known | joint))
         else:
-            planes.append(_of_plane(scan, joint["joint_with_scans"]))
+            planes.append(_evaluate_plane(scan, joint["joint_with_scans"]))
         send(None)
     return JointResults(campaign=folder.path.name, solve_s=solve_s, spheres=spheres, planes=planes).keep(path)
 
 
-def _of_spheres(scan: ScanFile, known: Mapping[Method, AnyCalibration]) -> SphereErrors:
+def _evaluate_spheres(scan: ScanFile, known: Mapping[Method, AnyCalibration]) -> SphereErrors:
     errors: dict[Method, dict[str, float]] = {}
     std_mm: dict[JointMethod, dict[str, float]] = {}
     truth = read_truth(truth_path(scan.path))[1]
@@ -171,7 +171,7 @@ def _of_spheres(scan: ScanFile, known: Mapping[Method, AnyCalibration]) -> Spher
     return SphereErrors(scan.placement, scan.medium, errors, std_mm)
 
 
-def _of_plane(scan: ScanFile, joint: Calibration) -> PlaneScatter:
+def _evaluate_plane(scan: ScanFile, joint: Calibration) -> PlaneScatter:
     """Return the plane's residual standard deviation, and its ratio to the speckle limit at that distance."""
     with Capture(scan.path) as capture:
         header = capture.header

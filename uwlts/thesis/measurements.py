@@ -53,11 +53,11 @@ def calibrations(
         The recordings do not determine a calibration.
     """
     made = {
-        (PROPOSED, "water"): lambda: _rays(folder.target("air"), folder.steps(), refractions=1),
-        (TWO, "water"): lambda: _rays(folder.target("bare"), folder.steps(), refractions=2),
-        (SINGLE, "water"): lambda: _rays(folder.target("water"), [], refractions=1),
-        (POLYNOMIALS, "air"): lambda: _polynomials(folder.target("air")),
-        (POLYNOMIALS, "water"): lambda: _polynomials(folder.target("water")),
+        (PROPOSED, "water"): lambda: _calibrate_rays(folder.target("air"), folder.steps(), refractions=1),
+        (TWO, "water"): lambda: _calibrate_rays(folder.target("bare"), folder.steps(), refractions=2),
+        (SINGLE, "water"): lambda: _calibrate_rays(folder.target("water"), [], refractions=1),
+        (POLYNOMIALS, "air"): lambda: _calibrate_polynomials(folder.target("air")),
+        (POLYNOMIALS, "water"): lambda: _calibrate_polynomials(folder.target("water")),
     }
     place = folder.path / "calibrations"
     place.mkdir(exist_ok=True)
@@ -77,14 +77,14 @@ def calibrations(
     return found
 
 
-def _rays(target: Path, steps: list[Path], *, refractions: Literal[1, 2]) -> Calibration:
+def _calibrate_rays(target: Path, steps: list[Path], *, refractions: Literal[1, 2]) -> Calibration:
     with ExitStack() as stack:
         air = [stack.enter_context(Capture(target))]
         opened = [stack.enter_context(Capture(path)) for path in steps]
         return calibrate_sequentially(air, opened, options=CalibrationOptions(refractions=refractions)).calibration
 
 
-def _polynomials(target: Path) -> PolynomialCalibration:
+def _calibrate_polynomials(target: Path) -> PolynomialCalibration:
     with Capture(target) as capture:
         return calibrate_polynomials([capture]).calibration
 
@@ -106,12 +106,12 @@ def thesis_stripes(
     for number in np.unique(found.frame):
         own = found.frame == number
         image = capture.image(int(number))
-        smooth = low_passed(image if along_width else image.T, tolerance=tolerance)
+        smooth = apply_low_pass(image if along_width else image.T, tolerance=tolerance)
         centre[own] = _peaks(smooth, found.line[own], found.centre_px[own], half=fitted_px // 2)
     return replace(found, centre_px=centre)
 
 
-def low_passed(image: np.ndarray, *, tolerance: float) -> np.ndarray:
+def apply_low_pass(image: np.ndarray, *, tolerance: float) -> np.ndarray:
     """Filter an image (H, W) with IMAQ LowPass of 5x5 pixels; return float32."""
     grey = image.astype(np.float32)
     count = _SIZE_PX**2

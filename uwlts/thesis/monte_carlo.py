@@ -136,7 +136,7 @@ def _trial(
         lead, angles = draw.scan(rng)
         errors = []
         for scan in scans:
-            pixels, direction = draw.stripe(scan.pixels, rng), _turned(scan.stage_direction, angles)
+            pixels, direction = draw.stripe(scan.pixels, rng), _rotate_direction(scan.stage_direction, angles)
             drawn = replace(scan, pixels=pixels, stage_mm=scan.stage_mm * (1 + lead), stage_direction=direction)
             errors.append(spacing_error(calibration, drawn, medium_index=index))
         return errors
@@ -234,7 +234,7 @@ def _stripe_noise_px(start: CalibrationResult, across: int) -> float:
     return float(np.sqrt(np.mean(apart[:, across] ** 2)))
 
 
-def _turned(direction: np.ndarray, angles: np.ndarray) -> np.ndarray:
+def _rotate_direction(direction: np.ndarray, angles: np.ndarray) -> np.ndarray:
     """Rotate a unit direction (3,) by two small angles about axes perpendicular to it."""
     first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
     first /= np.linalg.norm(first)

@@ -135,7 +135,7 @@ def differences(rows: Sequence[TableRow]) -> list[str]:
     return [text.format(*(f"{mean:.3f}" for mean in values)) for text, values in found if None not in values]
 
 
-def far_off(rows: Sequence[TableRow]) -> list[TableRow]:
+def select_outlying_rows(rows: Sequence[TableRow]) -> list[TableRow]:
     """Return rows whose mean differs from the published one by more than the expected factor."""
     return [row for row in rows if row.ratio is not None and not 1 / LARGEST_RATIO <= row.ratio <= LARGEST_RATIO]
 
@@ -210,10 +210,10 @@ def report_page(
         published=published.title,
         campaigns=len(results),
         headline=headline,
-        far_off=far_off(headline),
+        far_off=select_outlying_rows(headline),
         far=LARGEST_RATIO,
         tables=[
-            (name, _TEXTS["titles"].get(name, ""), *_folded(list(group)))
+            (name, _TEXTS["titles"].get(name, ""), *_fold_table(list(group)))
             for name, group in groupby(rows, lambda row: row.table)
         ],
         differences=differences(rows),
@@ -226,7 +226,7 @@ def report_page(
     )
 
 
-def _folded(rows: Sequence[TableRow]) -> tuple[list[str], list[tuple[str, list[TableRow | None]]]]:
+def _fold_table(rows: Sequence[TableRow]) -> tuple[list[str], list[tuple[str, list[TableRow | None]]]]:
     """Arrange a table's quantities side by side: their names, and for each row one value for each of them."""
     quantities = list(dict.fromkeys(row.quantity for row in rows))
     if len(quantities) > _MOST_COLUMNS:

@@ -8,7 +8,7 @@ from uwlts.model.sensor import Medium
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import CaptureStripes
-from uwlts.thesis.measurements import low_passed, thesis_stripes
+from uwlts.thesis.measurements import apply_low_pass, thesis_stripes
 
 LINES, LENGTH = 40, 64
 
@@ -31,7 +31,7 @@ def by_definition(image, *, tolerance):
 def test_a_pixel_within_forty_percent_of_its_neighbours_stays(value, kept):
     image = np.full((15, 15), 100, np.uint8)
     image[7, 7] = value
-    smooth = low_passed(image, tolerance=0.4)
+    smooth = apply_low_pass(image, tolerance=0.4)
     assert smooth[7, 7] == pytest.approx(value if kept else 100.0, abs=1e-4)
     # The odd pixel is one of 24 neighbours of those around it, which are within 2 % of their mean.
     image[7, 7] = 100
@@ -45,7 +45,7 @@ def test_a_pixel_within_forty_percent_of_its_neighbours_stays(value, kept):
 def test_the_filter_is_that_of_the_manual(dtype, top, tolerance):
     image = np.random.default_rng(0).integers(1, top, (24, 30), endpoint=True).astype(dtype)
     expected, deviation = by_definition(image, tolerance=tolerance)
-    smooth = low_passed(image, tolerance=tolerance)
+    smooth = apply_low_pass(image, tolerance=tolerance)
     assert smooth.dtype == np.float32
     # Sums of 25 pixels rounded to float32: 6e-8 of 25 times full scale, a few times, over 24.
     inside = np.abs(deviation - tolerance) > 1e-5
@@ -57,7 +57,7 @@ def test_the_filter_is_that_of_the_manual(dtype, top, tolerance):
 
 
 def test_black_stays_black():
-    np.testing.assert_array_equal(low_passed(np.zeros((9, 9), np.uint8), tolerance=0.4), np.zeros((9, 9)))
+    np.testing.assert_array_equal(apply_low_pass(np.zeros((9, 9), np.uint8), tolerance=0.4), np.zeros((9, 9)))
 
 
 def capture(path, images, *, stripe_along):

@@ -24,10 +24,10 @@ from uwlts.thesis.published_tables import TableRow, all_rows, headline_rows, loa
 from uwlts.thesis.report import (
     comparison_figure,
     differences,
-    far_off,
     line_figure,
     markdown,
     polynomials_figures,
+    select_outlying_rows,
     window_distance_figure,
     write_comparison,
 )
@@ -221,8 +221,8 @@ def test_headline_rows_are_the_means_of_four_tables():
     assert counts == {"Table 2": 6, "Table 3": 4, "Table 6": 6, "Table 7": 4}
     assert len(rows) == 20
     assert all(", mean, " in row.row for row in rows)
-    assert not far_off(rows)
-    assert far_off(headline_rows(all_rows([campaign(1.6)], PUBLISHED))) == headline_rows(
+    assert not select_outlying_rows(rows)
+    assert select_outlying_rows(headline_rows(all_rows([campaign(1.6)], PUBLISHED))) == headline_rows(
         all_rows([campaign(1.6)], PUBLISHED)
     )
 

@@ -220,16 +220,16 @@ def calibrate_lens(
 
     candidates: list[LensCandidate] = []
     options, keep = usual, inliers(usual)
-    good = [_without_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _fits(inside)]
+    good = [_remove_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _has_enough_inliers(inside)]
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
-        centred = _centred(good, solved(good, options=usual, circles=True))
+        centred = _correct_circles(good, solved(good, options=usual, circles=True))
         squares: dict[CameraOptions, np.ndarray] = {}
         for further in (tried, _candidates(_RATIONAL, choice, poses)):
             for number, each in enumerate(further):
-                squares[each] = _misses_predicted(centred, partial(solved, options=each, circles=False))
+                squares[each] = _cross_validate(centred, partial(solved, options=each, circles=False))
                 progress(number + 1, len(further))
-            candidates = _compared(squares)
-            options = _chosen(candidates, usual)
+            candidates = _compare_models(squares)
+            options = _select_model(candidates, usual)
             if choice.distortion != "auto" or "k3" not in options.distortion:
                 break
     if options != usual:
@@ -237,10 +237,10 @@ def calibrate_lens(
     left_out = {
         number: f"{100 * (1 - inside.mean()):.0f} % of its points are not where the other images predict them"
         for number, inside in enumerate(keep)
-        if not _fits(inside)
+        if not _has_enough_inliers(inside)
     }
     used = [number for number in range(len(images)) if number not in left_out]
-    cleaned = {number: _without_outliers(images[number], keep[number]) for number in used}
+    cleaned = {number: _remove_outliers(images[number], keep[number]) for number in used}
     full = options
     if (
         choice.distortion == "auto"
@@ -256,10 +256,10 @@ def calibrate_lens(
     while True:
         chosen = [cleaned[number] for number in used]
         solution = solved(chosen, options=full, circles=True)
-        centred = _centred(chosen, solution)
+        centred = _correct_circles(chosen, solution)
         numbers = np.arange(len(used))
         all_but_one = [np.delete(numbers, number) for number in numbers]
-        without = _of_some(centred, solution, all_but_one, solved_again)
+        without = _solve_subsets(centred, solution, all_but_one, solved_again)
         values, none = intrinsics.from_model(solution.model), np.full(len(intrinsics.names), np.nan)
         changes = np.array([none if s is None else intrinsics.from_model(s.model) - values for s in without])
         others_std = np.array([none if s is None else np.sqrt(np.diag(s.covariance)) for s in without])
@@ -285,7 +285,7 @@ def calibrate_lens(
         left_out=left_out,
         moved=moved,
         without=without,
-        halves=_of_some(centred, solution, [numbers[::2], numbers[1::2]], solved_again),
+        halves=_solve_subsets(centred, solution, [numbers[::2], numbers[1::2]], solved_again),
         rejected_share=float(1.0 - np.mean(np.concatenate([keep[number] for number in used]))),
         candidates=candidates,
         options=options,
@@ -320,25 +320,23 @@ def _inliers(solution: CameraSolution) -> list[np.ndarray]:
     return [np.linalg.norm(residuals, axis=1) <= limit for residuals in solution.residuals_px]
 
 
-def _fits(inside: np.ndarray) -> bool:
+def _has_enough_inliers(inside: np.ndarray) -> bool:
     """Return whether enough points (N,) of an image are inliers."""
     return bool(inside.mean() >= 1 - _LARGEST_REJECTED)
 
 
-def _without_outliers(image: TargetImage, keep: np.ndarray) -> TargetImage:
+def _remove_outliers(image: TargetImage, keep: np.ndarray) -> TargetImage:
     return replace(image, points_mm=image.points_mm[keep], pixels=image.pixels[keep])
 
 
-def _centred(images: Sequence[TargetImage], solution: CameraSolution) -> list[TargetImage]:
+def _correct_circles(images: Sequence[TargetImage], solution: CameraSolution) -> list[TargetImage]:
     """Correct images for the offsets of circle centres."""
     if solution.bias_px is None:
         return list(images)
     return [replace(i, pixels=i.pixels - bias) for i, bias in zip(images, solution.bias_px, strict=True)]
 
 
-def _misses_predicted(
-    images: list[TargetImage], solve: Callable[[Sequence[TargetImage]], CameraSolution]
-) -> np.ndarray:
+def _cross_validate(images: list[TargetImage], solve: Callable[[Sequence[TargetImage]], CameraSolution]) -> np.ndarray:
     """Return each image's mean square prediction error (F,) from five-fold calibrations; NaN if one fails."""
     folds = min(_FOLDS, len(images))
     squares = np.full(len(images), np.nan)
@@ -352,7 +350,7 @@ def _misses_predicted(
     return squares
 
 
-def _compared(squares: dict[CameraOptions, np.ndarray]) -> list[LensCandidate]:
+def _compare_models(squares: dict[CameraOptions, np.ndarray]) -> list[LensCandidate]:
     """Compare models by their mean square errors (F,); empty if no model has any."""
     means = {options: float(each.mean()) for options, each in squares.items()}
     least = np.nanmin([*means.values(), np.inf])
@@ -380,13 +378,13 @@ def _mean_square_miss(model: CameraModel, image: TargetImage) -> float:
     return float(np.mean(np.sum((image.pixels - seen) ** 2, axis=1)))
 
 
-def _chosen(candidates: list[LensCandidate], usual: CameraOptions) -> CameraOptions:
+def _select_model(candidates: list[LensCandidate], usual: CameraOptions) -> CameraOptions:
     """Select the model with the fewest parameters of those as good as the best, else the usual one."""
     good = [each for each in candidates if each.worse <= _WORSE]
     return min(good, key=lambda each: (each.parameters(), each.rms_px)).options if good else usual
 
 
-def _of_some(
+def _solve_subsets(
     images: list[TargetImage],
     solution: CameraSolution,
     chosen: Sequence[np.ndarray],

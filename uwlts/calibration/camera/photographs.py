@@ -148,7 +148,7 @@ def calibrate_camera(
     """
     require_coefficients(distortion)
     folder = Path(folder)
-    described = _described_target(folder, target)
+    described = _read_target(folder, target)
     names = image_files(folder)
     try:
         wanted = checked_channel(channel or "grey")
@@ -199,7 +199,7 @@ def calibrate_camera(
     return CameraCalibration(folder, described, lens, photographs, warnings + lens.half_doubts())
 
 
-def _described_target(folder: Path, path: str | Path | None) -> Target:
+def _read_target(folder: Path, path: str | Path | None) -> Target:
     """Read the target from a file, or from one in the folder."""
     if not folder.is_dir():
         raise ImageError(f"no folder at {folder}")

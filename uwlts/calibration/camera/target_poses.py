@@ -38,8 +38,8 @@ def direct_linear(points_mm: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray
     """
     if len(points_mm) < 6:
         raise CalibrationError(f"the linear start needs at least 6 target points; there are {len(points_mm)}")
-    to_unit, unit = _normalised(points_mm)
-    pixel_to_unit, unit_pixels = _normalised(pixels)
+    to_unit, unit = _normalise(points_mm)
+    pixel_to_unit, unit_pixels = _normalise(pixels)
     extents = np.linalg.svd(unit[:, :3], compute_uv=False)
     if extents[2] < _FLAT * extents[0]:
         raise CalibrationError(
@@ -69,7 +69,7 @@ def direct_linear(points_mm: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray
     return matrix / matrix[2, 2], rotation, np.linalg.solve(matrix, projection[:, 3])
 
 
-def _normalised(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _normalise(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a similarity (D + 1, D + 1) to centroid 0 and rms distance sqrt(D), and the result (N, D + 1)."""
     dimension = coordinates.shape[1]
     centroid = coordinates.mean(axis=0)
@@ -255,7 +255,7 @@ def solve_camera(
     intrinsics = Intrinsics(options, width_px=width_px, height_px=height_px)
 
     def solved(images: Sequence[TargetImage], start: CameraSolution | None) -> CameraSolution:
-        views = _accepted(images, poses, approaching, options)
+        views = _group_views(images, poses, approaching, options)
         if start is not None:
             global_values, local = intrinsics.from_model(start.model), [_restart(view, start, poses) for view in views]
         else:
@@ -265,7 +265,7 @@ def solve_camera(
 
         def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Observation | None:
             if group == len(views):
-                return _known_before(intrinsics, global_values)
+                return _prior_observation(intrinsics, global_values)
             return observe(views[group], intrinsics, global_values, local)
 
         if options.tangential is not None:
@@ -293,7 +293,7 @@ def solve_camera(
     )
 
 
-def _known_before(intrinsics: Intrinsics, global_values: np.ndarray) -> Observation:
+def _prior_observation(intrinsics: Intrinsics, global_values: np.ndarray) -> Observation:
     """Return the prior knowledge of p1 and p2 as residuals in px."""
     std, sigma_px = intrinsics.options.tangential or (math.inf, 0.0)
     by_global = np.array([[float(name == own) for name in intrinsics.names] for own in ("p1", "p2")]) * (sigma_px / std)
@@ -320,7 +320,7 @@ def centre_offsets(
     return circle_centre_bias(seen, points_mm, diameter_mm=diameter_mm, axis_u=_X, axis_v=_Y)
 
 
-def _accepted(
+def _group_views(
     images: Sequence[TargetImage], poses: Poses, approaching: bool, options: CameraOptions
 ) -> list[Placement]:
     if poses == "free":

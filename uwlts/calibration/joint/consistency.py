@@ -124,7 +124,7 @@ class Findings:
 
     def all_against(self) -> list[str]:
         """Return all messages except doubts."""
-        return [*self.contradictions, *_some(self.unfit.values()), *self.misfits.values()]
+        return [*self.contradictions, *_shorten_list(self.unfit.values()), *self.misfits.values()]
 
     def refusal(self) -> str:
         """Return an error message with the most severe findings."""
@@ -163,7 +163,7 @@ class _Image:
         return _LARGEST_TARGET_PX if self.kind == TARGET else _LARGEST_STRIPE_PX
 
 
-def findings(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) -> Findings:
+def check_consistency(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) -> Findings:
     """Check an estimate against its evidence and the sensor's description."""
     images = [
         _Image.of(residuals, piece)
@@ -171,11 +171,11 @@ def findings(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) 
         for residuals in parts
         if len(residuals.values) >= _FEWEST_VALUES
     ]
-    known = [*((each.wrong(), each.words()) for each in deviations(result)), *_of_stage(result, evidence, sensor)]
-    lens = [*_of_lens(result, sensor)]
-    earlier = [] if any(wrong for wrong, _ in known + lens) else [*_of_earlier(result)]
-    unfit, noisy = _of_images(images)
-    misfits, waves = _of_kinds(images), [*_of_shapes(result)]
+    known = [*((each.wrong(), each.words()) for each in deviations(result)), *_check_stage(result, evidence, sensor)]
+    lens = [*_check_lens(result, sensor)]
+    earlier = [] if any(wrong for wrong, _ in known + lens) else [*_check_earlier(result)]
+    unfit, noisy = _check_images(images)
+    misfits, waves = _check_kinds(images), [*_check_correlations(result)]
     for wrong, kind, words in waves:
         if wrong:
             misfits[kind] = "; ".join(filter(None, [misfits.get(kind), words]))
@@ -184,7 +184,7 @@ def findings(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) 
     doubts += [words for wrong, _, words in waves if not wrong]
     doubts += [
         f"{100 * share:.0f} % of the {kind} was left out as outliers: look at the images"
-        for kind, share in much_left_out(result).items()
+        for kind, share in find_excess_outliers(result).items()
     ]
     if result.stopped == UNSETTLED:
         doubts.append(f"{UNSETTLED}: some of the evidence contradicts the rest")
@@ -212,11 +212,11 @@ class Deviation:
 
 def deviations(result: Estimate, *, least: float = _DOUBTFUL) -> list[Deviation]:
     """Return parameters that deviate from prior knowledge by more than ``least`` standard uncertainties, sorted."""
-    far = [each for each, _ in _compared(result) if each.sigmas > least]
+    far = [each for each, _ in _compare_with_priors(result) if each.sigmas > least]
     return sorted(far, key=lambda each: each.sigmas, reverse=True)
 
 
-def understated(result: Estimate) -> float:
+def estimate_birge_ratio(result: Estimate) -> float:
     """Return the factor of too small prior uncertainties of sensor, media and stage, at least 1.
 
     This is Birge's ratio, the RMS of deviations divided by standard uncertainties, if chance exceeds it less than once
@@ -225,7 +225,7 @@ def understated(result: Estimate) -> float:
     squares = np.array(
         [
             each.sigmas**2
-            for each, gain in _compared(result)
+            for each, gain in _compare_with_priors(result)
             if gain > _MUCH_GAINED and not isinstance(each.key, TargetParameter)
         ]
     )
@@ -234,7 +234,7 @@ def understated(result: Estimate) -> float:
     return float(np.sqrt(squares.mean()))
 
 
-def _compared(result: Estimate) -> Iterator[tuple[Deviation, float]]:
+def _compare_with_priors(result: Estimate) -> Iterator[tuple[Deviation, float]]:
     """Compare parameters with prior knowledge; return deviation and relative information gain.
 
     The stripe's shift on the target is excluded: images have little information on it, so that small model errors
@@ -293,7 +293,7 @@ class SizeDeviation:
         )
 
 
-def size_deviations(result: Estimate, evidence: Sequence[Evidence]) -> list[SizeDeviation]:
+def compute_size_deviations(result: Estimate, evidence: Sequence[Evidence]) -> list[SizeDeviation]:
     """Compare the described sizes of scanned objects with those of an estimate without known sizes."""
     found = []
     for piece, local, covariance in zip(evidence, result.local, result.local_covariances, strict=True):
@@ -310,7 +310,7 @@ def size_deviations(result: Estimate, evidence: Sequence[Evidence]) -> list[Size
     return found
 
 
-def wrong_sizes(deviations: Sequence[SizeDeviation], *, least: float = _WRONG) -> list[str]:
+def describe_wrong_sizes(deviations: Sequence[SizeDeviation], *, least: float = _WRONG) -> list[str]:
     """Describe known sizes off by more than ``least`` standard uncertainties, largest first.
 
     If all known sizes have the same relative deviation, the scale of the calibration may be wrong instead.
@@ -321,13 +321,13 @@ def wrong_sizes(deviations: Sequence[SizeDeviation], *, least: float = _WRONG) -
         return []
     share, std = np.array([(each.off_mm, each.off_std_mm) for each in known]).T / [each.described_mm for each in known]
     common = float(np.sum(share / std**2) / np.sum(1 / std**2))
-    words = _some(each.words() for each in far)
+    words = _shorten_list(each.words() for each in far)
     if len(known) > 1 and np.all(np.abs(share - common) < _ALIKE * std):
         words.append(f"all known sizes are off by the same {100 * common:+.2f} %: also check the target's spacings")
     return words
 
 
-def _of_earlier(result: Estimate) -> _Found:
+def _check_earlier(result: Estimate) -> _Found:
     """Describe the parameter with the largest change from an earlier calibration; others change with it."""
     earlier = result.parameters.earlier
     if earlier is None:
@@ -348,7 +348,7 @@ def _of_earlier(result: Estimate) -> _Found:
         )
 
 
-def _of_lens(result: Estimate, sensor: Sensor) -> _Found:
+def _check_lens(result: Estimate, sensor: Sensor) -> _Found:
     """Compare the focal length with the lens's: errors of spacing, medium and stage can cancel in residuals."""
     camera, described = result.parameters.camera(result.values), sensor.camera.focal_length_px()
     off = abs(camera.fx_px / described - 1)
@@ -360,7 +360,7 @@ def _of_lens(result: Estimate, sensor: Sensor) -> _Found:
         )
 
 
-def _of_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) -> _Found:
+def _check_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) -> _Found:
     """Compare directions and positions of the stage with its description."""
     alignment, std = sensor.uncertainty.stage_alignment_deg, sensor.uncertainty.stage_position_mm
     for piece, local in zip(evidence, result.local, strict=True):
@@ -385,7 +385,7 @@ def _of_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) ->
         if 0 < wrong.sum() <= max(1, len(errors) // 4):
             stood = zip((piece.sources[image] for image in images[wrong]), errors[wrong], strict=True)
             said = f"mm from its stated position (stated uncertainty {std:g} mm)"
-            for words in _some(f"{source}: the stage was {error:+.3f} {said}" for source, error in stood):
+            for words in _shorten_list(f"{source}: the stage was {error:+.3f} {said}" for source, error in stood):
                 yield True, words
         elif len(errors) >= _FEWEST_POSITIONS and rms > _POSITIONS_WRONG * std:
             yield (
@@ -395,7 +395,7 @@ def _of_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) ->
             )
 
 
-def _of_images(images: Sequence[_Image]) -> tuple[dict[str, str], list[str]]:
+def _check_images(images: Sequence[_Image]) -> tuple[dict[str, str], list[str]]:
     """Find images that fit worse than similar ones: contradictions by source, and doubts for noisy images."""
     unfit: dict[str, str] = {}
     noisy = []
@@ -411,10 +411,10 @@ def _of_images(images: Sequence[_Image]) -> tuple[dict[str, str], list[str]]:
             unfit.setdefault(image.source, words)
         else:
             noisy.append(words)
-    return unfit, _some(noisy)
+    return unfit, _shorten_list(noisy)
 
 
-def _of_kinds(images: Sequence[_Image]) -> dict[str, str]:
+def _check_kinds(images: Sequence[_Image]) -> dict[str, str]:
     """Find kinds of residuals that scatter more than the images' noise."""
     found = {}
     for kind in dict.fromkeys(image.kind for image in images):
@@ -429,7 +429,7 @@ def _of_kinds(images: Sequence[_Image]) -> dict[str, str]:
     return found
 
 
-def _of_shapes(result: Estimate) -> Iterator[tuple[bool, str, str]]:
+def _check_correlations(result: Estimate) -> Iterator[tuple[bool, str, str]]:
     """Find kinds with residuals correlated over many lines or points, as from a wrong lens or height."""
     for kind, noise in result.noise.items():
         if noise.together > _WAVES_DOUBTFUL:
@@ -447,7 +447,7 @@ def _of_shapes(result: Estimate) -> Iterator[tuple[bool, str, str]]:
             )
 
 
-def much_left_out(result: Estimate) -> dict[str, float]:
+def find_excess_outliers(result: Estimate) -> dict[str, float]:
     """Return the fraction of outliers for kinds of residuals with too many."""
     found = {}
     for kind, noise in result.noise.items():
@@ -458,7 +458,7 @@ def much_left_out(result: Estimate) -> dict[str, float]:
     return found
 
 
-def _some(found: Iterable[str]) -> list[str]:
+def _shorten_list(found: Iterable[str]) -> list[str]:
     """Shorten a list of similar messages."""
     every = list(found)
     more = len(every) - _MOST_NAMED

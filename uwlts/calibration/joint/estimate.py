@@ -128,13 +128,13 @@ def estimate(
                     "the joint calibration diverged: an observed ray does not meet the sheet or target"
                 )
             residuals.append(parts)
-        before, known = known, _noise(evidence, residuals, misfits)
+        before, known = known, _estimate_all_noise(evidence, residuals, misfits)
         left_out = [[outliers(r, known[r.kind]) for r in parts] for parts in residuals]
         used, evidence = evidence, []
         for piece, values, parts, masks in zip(found, local, residuals, left_out, strict=True):
             if diameter_mm is not None and isinstance(piece, TargetEvidence):
                 piece = piece.with_centres(parameters, global_values, values, diameter_mm)
-            evidence.append(piece.linearised(parts, [~mask for mask in masks]))
+            evidence.append(piece.linearise(parts, [~mask for mask in masks]))
         changes = [
             float(np.abs(a.placement.pixels - b.placement.pixels).max())
             for a, b in zip(used, evidence, strict=True)
@@ -174,7 +174,7 @@ def _fit(
 
     def model(group: int, global_values: np.ndarray, local: np.ndarray) -> list[Observation] | None:
         if group == len(evidence):
-            return _known_before(parameters, global_values)
+            return _prior_observations(parameters, global_values)
         piece = evidence[group]
         parts = piece.residuals(parameters, global_values, local)
         if parts is None:
@@ -195,7 +195,7 @@ def _fit(
     return schur_least_squares(model, global_values, starts, **first, enough_rounds=_FIRST_ROUNDS)
 
 
-def _known_before(parameters: Parameters, global_values: np.ndarray) -> list[Observation]:
+def _prior_observations(parameters: Parameters, global_values: np.ndarray) -> list[Observation]:
     """Return prior knowledge: of single parameters, and of many jointly from an earlier estimate."""
     std = parameters.prior_std()
     known = np.isfinite(std)
@@ -205,21 +205,21 @@ def _known_before(parameters: Parameters, global_values: np.ndarray) -> list[Obs
     return [Observation(off[:, None], by_global, np.empty((len(off), 0))) for off, by_global in found]
 
 
-def _noise(
+def _estimate_all_noise(
     evidence: Sequence[Evidence], residuals: list[list[Residuals]], misfits: Collection[str]
 ) -> dict[str, Noise]:
     result = {}
     for kind in dict.fromkeys(r.kind for parts in residuals for r in parts):
         points = [e.placement.points_mm for e in evidence if kind == TARGET and isinstance(e, TargetEvidence)]
         of_kind = [r for parts in residuals for r in parts if r.kind == kind]
-        result[kind] = judged(kind, of_kind, points)
+        result[kind] = estimate_noise(kind, of_kind, points)
         if kind in SCANNED:
             scans = [e for e in evidence if isinstance(e, SurfaceScanEvidence) and e.surface.kind == kind]
             common_px, bodies = np.concatenate([e.common_px for e in scans]), sum(e.surface.count for e in scans)
-            result[kind] = with_common_error(result[kind], common_px, bodies=bodies)
+            result[kind] = add_common_error(result[kind], common_px, bodies=bodies)
         if kind in misfits:
             per_image = float(np.mean([len(r.values) for r in of_kind]))
-            result[kind] = with_misfit(result[kind], per_image=per_image)
+            result[kind] = add_misfit(result[kind], per_image=per_image)
     return result
 
 
@@ -236,7 +236,7 @@ def outlier_limit(values: np.ndarray) -> float:
     return _OUTLIER * MAD_TO_STD * float(np.median(np.abs(values)))
 
 
-def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarray]) -> Noise:
+def estimate_noise(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarray]) -> Noise:
     """Estimate the noise of all residuals of a kind; ``points`` (N, 3) of each placement are used for target points."""
     values = np.concatenate([r.values for r in residuals])
     limit = outlier_limit(values)
@@ -246,24 +246,26 @@ def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarra
         return Noise(_FINEST_PX)
     if kind == TARGET:
         places = np.vstack(points)[:, :2]
-        together = max(_of_points(values, places, kept, sigma), _of_images(residuals, places, sigma))
+        together = max(
+            _point_variance_factor(values, places, kept, sigma), _image_variance_factor(residuals, places, sigma)
+        )
     else:
-        together = _of_neighbours(residuals, sigma)
+        together = _neighbour_variance_factor(residuals, sigma)
     return Noise(sigma, max(together, 1.0))
 
 
-def with_common_error(noise: Noise, common_px: np.ndarray, *, bodies: float) -> Noise:
+def add_common_error(noise: Noise, common_px: np.ndarray, *, bodies: float) -> Noise:
     """Add a common error of all points of a scanned body, with standard uncertainties ``common_px`` (N,)."""
     points_per_body, common = len(common_px) / bodies, float(np.mean(common_px**2))
     return Noise(noise.sigma_px, noise.together, points_per_body * common / noise.sigma_px**2)
 
 
-def with_misfit(noise: Noise, *, per_image: float) -> Noise:
+def add_misfit(noise: Noise, *, per_image: float) -> Noise:
     """Return the noise with an incomplete model: the ``per_image`` residuals of an image count as one."""
     return replace(noise, besides=noise.besides + max(per_image - noise.together, 0.0))
 
 
-def _of_points(values: np.ndarray, places: np.ndarray, kept: np.ndarray, sigma: float) -> float:
+def _point_variance_factor(values: np.ndarray, places: np.ndarray, kept: np.ndarray, sigma: float) -> float:
     """Return the variance factor of residuals of the same point in several images, from their correlation."""
     _, point = np.unique(np.round(places, 6), axis=0, return_inverse=True)
     pairs, kept = values.reshape(-1, 2), np.all(kept.reshape(-1, 2), axis=1)
@@ -276,7 +278,7 @@ def _of_points(values: np.ndarray, places: np.ndarray, kept: np.ndarray, sigma: 
     return float(np.mean(sums[:, often] ** 2 / number[often])) / sigma**2
 
 
-def _of_images(residuals: Sequence[Residuals], places: np.ndarray, sigma: float) -> float:
+def _image_variance_factor(residuals: Sequence[Residuals], places: np.ndarray, sigma: float) -> float:
     """Return the variance factor of residuals that vary smoothly across an image, as with a wrong lens or bent target.
 
     Independent residuals have the variance sigma^2 along each orthonormal function of the position; here all products
@@ -296,7 +298,7 @@ def _of_images(residuals: Sequence[Residuals], places: np.ndarray, sigma: float)
     return float(np.median(found)) if found else 1.0
 
 
-def _of_neighbours(residuals: Sequence[Residuals], sigma: float) -> float:
+def _neighbour_variance_factor(residuals: Sequence[Residuals], sigma: float) -> float:
     """Return the variance factor 1 + 2 sum of the autocorrelation along the stripe, over all images."""
     products, counts = np.zeros(_LAGS), np.zeros(_LAGS)
     for part in residuals:

@@ -8,7 +8,13 @@ from pydantic import JsonValue
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.target_images import Placement, placements
-from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence, air_evidence, no_stripe_in, step_evidence
+from uwlts.calibration.capture_evidence import (
+    AirEvidence,
+    StepEvidence,
+    air_evidence,
+    explain_missing_stripe,
+    step_evidence,
+)
 from uwlts.calibration.joint.parameters import SHEET, Prior, ViewMedium, window_values
 from uwlts.calibration.joint.residuals import BENDS, SHIFT, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
@@ -87,7 +93,7 @@ class ScanStripes:
         """Remove images by name; return None if too few would remain."""
         left_out = np.array([name in sources for name in self.image_names()])
         seen = np.unique(self.frame)
-        if not _enough(int(np.sum(~left_out[seen])), len(seen)):
+        if not _remain_enough(int(np.sum(~left_out[seen])), len(seen)):
             return None
         kept, lines = ~left_out[self.frame], ("frame", "line", "centre_px", "width_px", "blur_px", "slopes")
         return replace(self, **{name: getattr(self, name)[kept] for name in lines})
@@ -118,12 +124,12 @@ class Gathered:
         series = []
         for each in self.series:
             kept = [n for n, name in each.sources(np.arange(len(each.found.images))).items() if name not in sources]
-            if not _enough(len(kept), len(each.found.images)):
+            if not _remain_enough(len(kept), len(each.found.images)):
                 return None
             series.append(replace(each, found=each.found.only(np.array(kept), [each.found.images[n] for n in kept])))
         steps = [(step, view) for step, view in self.steps if step.source not in sources]
         scans = [kept for scan in self.scans if (kept := scan.without(sources)) is not None]
-        if not _enough(len(steps), len(self.steps)) or len(scans) < len(self.scans):
+        if not _remain_enough(len(steps), len(self.steps)) or len(scans) < len(self.scans):
             return None
         return replace(self, series=series, steps=steps, scans=scans)
 
@@ -157,7 +163,7 @@ def gather_jointly(
     media: dict[str, Medium] = {}
     views: dict[ViewMedium, list[Capture]] = {}
     for capture in targets:
-        views.setdefault(_view(capture, media), []).append(capture)
+        views.setdefault(_identify_view(capture, media), []).append(capture)
     series, on_steps, on_scans, warnings = [], [], [], []
     for view, captures in views.items():
         found = air_evidence(captures, stripe=options.stripe, progress=progress)
@@ -165,21 +171,21 @@ def gather_jointly(
         directions = [capture.header.stage_direction for capture in captures]
         series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures], directions))
     for capture in steps:
-        view, index = _view(capture, media), options.medium_index
+        view, index = _identify_view(capture, media), options.medium_index
         found_steps, left_out = step_evidence([capture], medium_index=index, stripe=options.stripe, progress=progress)
         on_steps += [(step, view) for step in found_steps]
         warnings += left_out
     if steps and not on_steps:
-        raise CalibrationError(no_stripe_in(steps))
+        raise CalibrationError(explain_missing_stripe(steps))
     for capture in scans:
         name = capture.header.medium_name if options.same_water else f"{capture.header.medium_name} of the scans"
-        on_scans.append(scan_stripes(capture, _view(capture, media, name), stripe=options.stripe))
+        on_scans.append(scan_stripes(capture, _identify_view(capture, media, name), stripe=options.stripe))
     seen = [capture.header.sensor for capture in [*steps, *targets, *scans]]
     sensor = next((each for each in seen if each.camera.window.mounted), sensor)
     return Gathered(sensor, media, series, on_steps, on_scans, provenance, warnings)
 
 
-def _enough(kept: int, images: int) -> bool:
+def _remain_enough(kept: int, images: int) -> bool:
     return kept == images or (kept >= _FEWEST_KEPT and images - kept <= _MOST_LEFT_OUT * images)
 
 
@@ -228,7 +234,7 @@ def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeSettings) 
     )
 
 
-def _view(capture: Capture, media: dict[str, Medium], name: str | None = None) -> ViewMedium:
+def _identify_view(capture: Capture, media: dict[str, Medium], name: str | None = None) -> ViewMedium:
     """Return window state and medium of a capture; ``name`` replaces the medium's name."""
     header = capture.header
     window = header.sensor.camera.window.mounted
@@ -246,7 +252,7 @@ def _approaching(captures: Sequence[Capture]) -> bool | None:
     return min(along) > 0 if min(map(abs, along)) >= 0.9 and min(along) * max(along) > 0 else None
 
 
-def priors_of(
+def build_priors(
     gathered: Gathered,
     window: WindowModel | None,
     turns: np.ndarray,
@@ -282,11 +288,11 @@ def priors_of(
         priors |= dict.fromkeys(BENDS, Prior(0.0, known.target_bow_mm))
         priors |= dict.fromkeys(STRETCH, Prior(0.0, known.target_stretch))
         priors[SHIFT] = Prior(0.0, known.target_stripe_px)
-        priors |= dict.fromkeys(added_tangential(options.camera, known), Prior(0.0, known.tangential))
+        priors |= dict.fromkeys(list_added_tangential(options.camera, known), Prior(0.0, known.tangential))
     return priors | heights
 
 
-def added_tangential(camera: CameraOptions, known: Uncertainty) -> tuple[LensParameter, ...]:
+def list_added_tangential(camera: CameraOptions, known: Uncertainty) -> tuple[LensParameter, ...]:
     """Return tangential distortion parameters that are estimated, with prior knowledge, although not requested."""
     asked = {"p1", "p2"} & {*camera.distortion} or known.tangential == 0
     return () if asked else (LensParameter.P1, LensParameter.P2)

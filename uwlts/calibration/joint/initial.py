@@ -10,7 +10,7 @@ import numpy as np
 from uwlts.calibration.camera.camera_parameters import DISTORTION, Intrinsics
 from uwlts.calibration.camera.target_images import Placement
 from uwlts.calibration.camera.target_poses import placement_pose, refuse_turned_travel, solve_camera, stage_direction
-from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series, added_tangential
+from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series, list_added_tangential
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.residuals import StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import (
@@ -115,7 +115,7 @@ class SeriesStart:
         return described, np.array([*turns, sheet.offset_mm - normal @ middle])
 
 
-def series_start(
+def estimate_series_start(
     series: Sequence[Series],
     sensor: Sensor,
     window: WindowModel | None,
@@ -136,7 +136,7 @@ def series_start(
     """
     width_px, height_px, free = sensor.camera.width_px, sensor.camera.height_px, options.poses == "free"
     camera = options.camera.described(sensor.camera)
-    tangential = tuple(key.text for key in added_tangential(camera, sensor.uncertainty))
+    tangential = tuple(key.text for key in list_added_tangential(camera, sensor.uncertainty))
     extended = replace(camera, distortion=(*camera.distortion, *tangential))
     intrinsics = Intrinsics(extended, width_px=width_px, height_px=height_px)
     base = min(series, key=lambda s: (s.view.medium is not None, s.view.window, -len(s.found.images)))
@@ -159,7 +159,7 @@ def series_start(
             "positions, and that all captures are from the same camera and medium"
         )
     lens = intrinsics.from_model(seen.model)
-    index = _index(base.view, indices)
+    index = _index_behind_window(base.view, indices)
     for place, name in enumerate(intrinsics.names):
         lens[place] /= index if name in ("f", "fx", "fy") else index**2 if name in DISTORTION else 1.0
     start = SeriesStart(sensor, window, indices, intrinsics, lens, [], [])
@@ -168,7 +168,7 @@ def series_start(
         staged = not free and part.approaching is not None
         for placement in part.placements(free=free):
             pose = seen_by.pose(placement)
-            piece = _evidence(part, placement, seen_by, pose, sensor, staged=staged)
+            piece = _build_target_evidence(part, placement, seen_by, pose, sensor, staged=staged)
             start.evidence.append(piece)
             start.local.append(np.append(pose, np.zeros(2 + len(piece.images()) if staged else 0)))
         if free:
@@ -188,7 +188,7 @@ def _refuse_turned_images(series: Series, poses: Sequence[np.ndarray], sensor: S
             refuse_turned_travel(travel, camera_from_object(sensor)[:3, :3] @ direction)
 
 
-def _index(view: ViewMedium, indices: Sequence[float]) -> float:
+def _index_behind_window(view: ViewMedium, indices: Sequence[float]) -> float:
     """Return the index behind the window; without a window the lens model includes the medium."""
     return indices[view.medium] if view.window and view.medium is not None else 1.0
 
@@ -197,7 +197,11 @@ class _Viewpoint:
     """Camera with the window in its view and the index behind it."""
 
     def __init__(self, camera: CameraModel, window: WindowModel | None, indices: Sequence[float], view: ViewMedium):
-        self._camera, self._window, self._index = camera, window if view.window else None, _index(view, indices)
+        self._camera, self._window, self._index = (
+            camera,
+            window if view.window else None,
+            _index_behind_window(view, indices),
+        )
 
     def pose(self, placement: Placement) -> np.ndarray:
         """Estimate rotation vector and shift (6,) of a placement; the window is approximated by a single viewpoint."""
@@ -221,7 +225,7 @@ class _Viewpoint:
             return start - (start[:, 2] / along[:, 2])[:, None] * along
 
 
-def _evidence(
+def _build_target_evidence(
     series: Series, placement: Placement, seen_by: _Viewpoint, pose: np.ndarray, sensor: Sensor, *, staged: bool
 ) -> TargetEvidence:
     found, numbers = series.found, np.unique(placement.image)
@@ -245,7 +249,7 @@ def _evidence(
     return evidence.with_stripes(np.flatnonzero(on_target))
 
 
-def step_profiles(
+def build_step_evidence(
     gathered: Gathered, start: Calibration, window: WindowModel | None
 ) -> tuple[list[StepProfileEvidence], dict[StepHeight, Prior], list[str]]:
     """Return evidence of every step image, priors of the heights, and warnings, from an approximate calibration.
@@ -278,7 +282,7 @@ def step_profiles(
     return found, heights, warnings
 
 
-def line_start(evidence: StepProfileEvidence, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
+def estimate_line_start(evidence: StepProfileEvidence, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
     """Return the lower face's line (2,) at the parameters' start."""
     points = evidence.on_sheet(parameters, global_values).points()
     if points is None:
@@ -290,7 +294,7 @@ def line_start(evidence: StepProfileEvidence, parameters: Parameters, global_val
     return np.array([-slope, offset / np.hypot(1.0, slope)])
 
 
-def surface_scan(
+def build_scan_evidence(
     stripes: ScanStripes, start: Calibration, sensor: Sensor, *, medium_index: float, sizes_known: bool, image: int
 ) -> tuple[SurfaceScanEvidence, np.ndarray]:
     """Return the evidence of a scan and the start of its local parameters, from an approximate calibration.
@@ -322,7 +326,7 @@ def surface_scan(
     there = np.flatnonzero(good)
     there = there[:: -(-len(there) // _MOST_POINTS)]
     transform = start.object_transform()
-    used, surface, local = _surface(stripes.artefact, points[there], transform, sizes_known=sizes_known)
+    used, surface, local = _fit_surface(stripes.artefact, points[there], transform, sizes_known=sizes_known)
     kept = there[used]
     frames, frame = np.unique(stripes.frame[kept], return_inverse=True)
     rotation, position_mm = transform[:3, :3], stripes.stage_mm[frames]
@@ -348,7 +352,7 @@ def surface_scan(
     return evidence, np.append(local, np.zeros(len(frames)))
 
 
-def surface_scans(
+def build_all_scan_evidence(
     scans: Sequence[ScanStripes], start: Calibration, sensor: Sensor, indices: Sequence[float], *, sizes_known: bool
 ) -> tuple[list[tuple[SurfaceScanEvidence, np.ndarray]], list[str]]:
     """Return the evidence of every scan with the start of its local parameters, and warnings about rejected scans.
@@ -365,7 +369,7 @@ def surface_scans(
         index = 1.0 if stripes.view.medium is None else indices[stripes.view.medium]
         through = start if stripes.view.window else start.model_copy(update={"window": None})
         try:
-            evidence, local = surface_scan(
+            evidence, local = build_scan_evidence(
                 stripes, through, sensor, medium_index=index, sizes_known=sizes_known, image=image
             )
         except EvaluationError as error:
@@ -376,7 +380,7 @@ def surface_scans(
     return found, warnings
 
 
-def _surface(
+def _fit_surface(
     artefact: Scanned, points: np.ndarray, transform: np.ndarray, *, sizes_known: bool
 ) -> tuple[np.ndarray, Surface, np.ndarray]:
     """Select the points (N, 3) (OCS) on the surface; return mask (N,), surface in the camera frame, and start (k,).

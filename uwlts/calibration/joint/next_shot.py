@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.camera.target_images import Placement, pose_values
-from uwlts.calibration.joint.estimate import Evidence, Noise, with_common_error
+from uwlts.calibration.joint.estimate import Evidence, Noise, add_common_error
 from uwlts.calibration.joint.observability import (
     estimate_in,
     format_weaknesses,
@@ -19,7 +19,7 @@ from uwlts.calibration.joint.observability import (
 from uwlts.calibration.joint.parameters import Prior, ViewMedium
 from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Spheres, SurfaceScanEvidence
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, with_independent
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, append_independent, covariance_root, require_joint
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight
 from uwlts.model.sensor import Uncertainty
@@ -103,8 +103,8 @@ def next_shots(calibration: Calibration) -> list[Outlook]:
     count, before_mm, found = len(known.values), _rms(lengths.std_mm(known.covariance)), []
     low, high = region.outline_mm[:, 1].min(), region.outline_mm[:, 1].max()
     depths = {words: float(low + share * (high - low)) for words, share in _PLACES.items()}
-    for words, shot, pose in _candidates(known, region.name, depths, uncertainty):
-        added = None if shot is None else _information(shot, uncertainty)
+    for words, shot, pose in _generate_candidates(known, region.name, depths, uncertainty):
+        added = None if shot is None else _compute_information(shot, uncertainty)
         if shot is not None and added is not None:
             # Use a root of the covariance: its inverse may be numerically inaccurate.
             root = covariance_root(shot[0].covariance)
@@ -131,7 +131,7 @@ def advice_lines(calibration: Calibration) -> list[str]:
     return [*lines, *(f"next: {outlook.advice()}" for outlook in next_shots(calibration)[:1])]
 
 
-def _candidates(
+def _generate_candidates(
     known: StoredEstimate, medium: str, depths: Mapping[str, float], uncertainty: Uncertainty
 ) -> Iterator[tuple[str, _Shot | None, np.ndarray | None]]:
     """Generate descriptions and simulated evidence of images, None if impossible, with the pose of a target."""
@@ -143,14 +143,14 @@ def _candidates(
         if known.view.medium is not None and in_air:
             views["air"] = in_air[0]
         for name, view in views.items():
-            yield from _targets(replace(known, view=view), name, parse_target(described), depths)
+            yield from _generate_target_shots(replace(known, view=view), name, parse_target(described), depths)
     for words, depth in depths.items():
         place = f"in {medium}, {words} (Z {depth:+.0f} mm),"
-        yield f"an image of a step {place}", _step_shot(known, depth, uncertainty), None
-        yield f"a scan of two spheres of {SPHERE_MM:g} mm {place}", _sphere_shot(known, depth, uncertainty), None
+        yield f"an image of a step {place}", _simulate_step(known, depth, uncertainty), None
+        yield f"a scan of two spheres of {SPHERE_MM:g} mm {place}", _simulate_spheres(known, depth, uncertainty), None
 
 
-def _targets(
+def _generate_target_shots(
     known: StoredEstimate, medium: str, target: Target, depths: Mapping[str, float]
 ) -> Iterator[tuple[str, _Shot | None, np.ndarray | None]]:
     through = " without the window" if known.calibration.window is not None and not known.view.window else ""
@@ -159,7 +159,7 @@ def _targets(
             pose = _pose(known.calibration, target, depth, turns)
             words = f"an image of the target in {medium}{through}, {where} (Z {depth:+.0f} mm), {tilt}"
             words += "," if tilt == "square" else f" by {_TILT_DEG:g}°,"
-            yield words, _target_shot(known, target, pose), pose
+            yield words, _simulate_target(known, target, pose), pose
 
 
 def _pose(calibration: Calibration, target: Target, depth_mm: float, turns: tuple[float, float]) -> np.ndarray:
@@ -169,12 +169,12 @@ def _pose(calibration: Calibration, target: Target, depth_mm: float, turns: tupl
     return rigid_transform(turn, frame[:3, 3] + depth_mm * frame[:3, 2] - turn @ middle)
 
 
-def _target_shot(known: StoredEstimate, target: Target, pose: np.ndarray) -> _Shot | None:
+def _simulate_target(known: StoredEstimate, target: Target, pose: np.ndarray) -> _Shot | None:
     """Simulate an image of the target with the stripe at ``T_camera_target`` (4, 4); None if too little is in view."""
     points = target.points_mm
-    pixels = _in_image(known, known.project(points @ pose[:3, :3].T + pose[:3, 3]))
+    pixels = _mask_outside(known, known.project(points @ pose[:3, :3].T + pose[:3, 3]))
     inside = np.isfinite(pixels).all(axis=1)
-    count, lit = int(inside.sum()), _lit(known, target, pose)
+    count, lit = int(inside.sum()), _simulate_stripe(known, target, pose)
     if count < _FEWEST_POINTS or len(lit) < _FEWEST_LINES:
         return None
     evidence = TargetEvidence(
@@ -190,7 +190,7 @@ def _target_shot(known: StoredEstimate, target: Target, pose: np.ndarray) -> _Sh
     return known, evidence, pose_values(pose)
 
 
-def _step_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Shot | None:
+def _simulate_step(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Shot | None:
     """Simulate an image of a step standard with the lower face at a depth Z; None if too little is in view.
 
     The standard of the evidence is used if it contains one.
@@ -198,12 +198,12 @@ def _step_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty)
     height = next((key for key in known.parameters.keys if isinstance(key, StepHeight)), None)
     if height is None:
         height = StepHeight(STEP_MM)
-        known = _extended(known, {height: Prior(STEP_MM, uncertainty.step_height_mm)})
+        known = _append_parameters(known, {height: Prior(STEP_MM, uncertainty.step_height_mm)})
     y = np.linspace(-_STEP_REACH_MM, _STEP_REACH_MM, _SAMPLES)
     upper = np.abs(y) < _STEP_HALF_MM
     raised = depth_mm - known.parameters.value(known.values, height)
     faces = ((~upper & (y < 0), depth_mm), (upper, raised), (~upper & (y > 0), depth_mm))
-    kept = [_on_lines(known, np.column_stack([y[face], np.full(face.sum(), z)])) for face, z in faces]
+    kept = [_sample_curve(known, np.column_stack([y[face], np.full(face.sum(), z)])) for face, z in faces]
     if min(map(len, kept)) < _FEWEST_LINES:
         return None
     frame = known.calibration.object_transform()
@@ -220,17 +220,17 @@ def _step_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty)
     return known, evidence, np.array([0.0, -frame[:3, 2] @ (frame[:3, 3] + frame[:3, 2] * depth_mm)])
 
 
-def _sphere_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Shot | None:
+def _simulate_spheres(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Shot | None:
     """Simulate a scan along X of two spheres of unknown size at a depth Z; None if they are not in view."""
     stage: dict[ParameterKey, Prior] = {key: Prior(0.0, uncertainty.stage_lean()) for key in SLOPES}
-    known = _extended(known, stage | {StageParameter.SCALE: Prior(0.0, uncertainty.stage_scale)})
+    known = _append_parameters(known, stage | {StageParameter.SCALE: Prior(0.0, uncertainty.stage_scale)})
     frame, radius = known.calibration.object_transform(), SPHERE_MM / 2
     positions = np.linspace(-0.9, 0.9, _SPHERE_IMAGES) * radius
     centres = np.array([(0.0, side * _SPHERES_APART_MM / 2, depth_mm) for side in (-1, 1)])
     turn = np.linspace(-_SEEN, _SEEN, _SAMPLES)
     arc = np.column_stack([np.sin(turn), -np.cos(turn)])
     chords = np.sqrt(radius**2 - positions**2)
-    pixels = [_on_lines(known, centre[1:] + chord * arc) for chord in chords for centre in centres]
+    pixels = [_sample_curve(known, centre[1:] + chord * arc) for chord in chords for centre in centres]
     counts = [len(found) for found in pixels]
     if min(counts) < _FEWEST_LINES:
         return None
@@ -253,18 +253,18 @@ def _sphere_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertaint
     return known, evidence, np.append(centres @ frame[:3, :3].T + frame[:3, 3], np.zeros(SPHERES + len(positions)))
 
 
-def _extended(known: StoredEstimate, priors: Mapping[ParameterKey, Prior]) -> StoredEstimate:
+def _append_parameters(known: StoredEstimate, priors: Mapping[ParameterKey, Prior]) -> StoredEstimate:
     """Append those of these parameters to an estimate that it does not contain and that are not known exactly."""
     added = {key: prior for key, prior in priors.items() if key not in known.parameters.keys and prior.std > 0}
     return replace(
         known,
         parameters=replace(known.parameters, priors=known.parameters.priors | added),
         values=np.append(known.values, [prior.mean for prior in added.values()]),
-        covariance=with_independent(known.covariance, [prior.std for prior in added.values()]),
+        covariance=append_independent(known.covariance, [prior.std for prior in added.values()]),
     )
 
 
-def _lit(known: StoredEstimate, target: Target, pose: np.ndarray) -> np.ndarray:
+def _simulate_stripe(known: StoredEstimate, target: Target, pose: np.ndarray) -> np.ndarray:
     """Return stripe pixels on the target, one for each profile line, from the plane that approximates the sheet."""
     index = known.parameters.medium_index(known.values, known.view)
     sheet = sheet_surface(known.parameters.sheet_model(known.values), medium_index=index)
@@ -279,16 +279,16 @@ def _lit(known: StoredEstimate, target: Target, pose: np.ndarray) -> np.ndarray:
     reach = float(np.ptp(target.plate_mm, axis=0).sum())
     points = start + np.linspace(-reach, reach, _SAMPLES)[:, None] * along
     at = (points - pose[:3, 3]) @ pose[:3, :3]
-    return _lines_through(known, known.project(points[target.on_plate(at[:, :2])]))
+    return _interpolate_lines(known, known.project(points[target.on_plate(at[:, :2])]))
 
 
-def _on_lines(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
+def _sample_curve(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
     """Return pixels (N, 2) of a curve Y and Z (K, 2) on the sheet, one for each profile line in the image."""
-    return _lines_through(known, pixels_at(known, at_mm))
+    return _interpolate_lines(known, pixels_at(known, at_mm))
 
 
-def _lines_through(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
-    across, pixels = known.across(), _in_image(known, pixels)
+def _interpolate_lines(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
+    across, pixels = known.across(), _mask_outside(known, pixels)
     seen = pixels[np.isfinite(pixels).all(axis=1)]
     if len(seen) < 2:
         return np.empty((0, 2))
@@ -298,14 +298,14 @@ def _lines_through(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
     return np.column_stack([lines, centres] if across else [centres, lines])
 
 
-def _in_image(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
+def _mask_outside(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
     """Replace pixels (N, 2) outside the image by NaN."""
     camera = known.parameters.camera(known.values)
     inside = np.all((pixels >= 0) & (pixels <= [camera.width_px - 1, camera.height_px - 1]), axis=1)
     return np.where(inside[:, None], pixels, np.nan)
 
 
-def _information(shot: _Shot, uncertainty: Uncertainty) -> np.ndarray | None:
+def _compute_information(shot: _Shot, uncertainty: Uncertainty) -> np.ndarray | None:
     """Return the information (P, P) that an image adds to the inverse covariance; None if a ray meets nothing.
 
     The noise is that of the same kind of residual, or of the noisiest stripe for a new kind.
@@ -320,7 +320,7 @@ def _information(shot: _Shot, uncertainty: Uncertainty) -> np.ndarray | None:
     noise = {part.kind: noise.get(part.kind, stripe) for part in parts}
     if isinstance(evidence, SurfaceScanEvidence):
         kind, surface = evidence.surface.kind, evidence.surface
-        noise[kind] = with_common_error(noise[kind], evidence.common_px, bodies=surface.count)
+        noise[kind] = add_common_error(noise[kind], evidence.common_px, bodies=surface.count)
     count, local = len(known.values), len(local_values)
     total = np.zeros((count + local,) * 2)
     _, before = evidence.known_before(local_values, uncertainty)

@@ -204,7 +204,7 @@ def weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.nd
         worst = int(np.argmax(np.abs(changes)))
         if size**2 < _LEAST_SHARE * total or abs(changes[worst]) < _NEGLIGIBLE_MM:
             break
-        named = _named(lengths, direction, std)
+        named = _select_main_parameters(lengths, direction, std)
         start, end = lengths.ends_mm[worst]
         along_y, along_z = np.abs(end - start) / np.linalg.norm(end - start) > _AXIS_COSINE
         correlation = covariance[np.ix_(named, named)] / np.outer(std[named], std[named])
@@ -228,7 +228,7 @@ def format_weaknesses(found: Sequence[Weakness]) -> list[str]:
     return [weakness.words() for weakness in found]
 
 
-def _named(lengths: Lengths, direction: np.ndarray, std: np.ndarray) -> list[int]:
+def _select_main_parameters(lengths: Lengths, direction: np.ndarray, std: np.ndarray) -> list[int]:
     """Return the numbers of at most three main parameters of a direction (P,), the most important first.
 
     The squared correlation of a parameter with the direction is the fraction of its variance that knowledge of the

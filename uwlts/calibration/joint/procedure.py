@@ -11,19 +11,24 @@ from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import BESIDES, RATIONAL_BESIDES
 from uwlts.calibration.joint.consistency import (
     Findings,
+    check_consistency,
+    compute_size_deviations,
+    describe_wrong_sizes,
     deviations,
-    findings,
-    size_deviations,
-    understated,
-    wrong_sizes,
+    estimate_birge_ratio,
 )
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
-from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
-from uwlts.calibration.joint.initial import line_start, series_start, step_profiles, surface_scans
+from uwlts.calibration.joint.gathering import Gathered, build_priors, gather_jointly
+from uwlts.calibration.joint.initial import (
+    build_all_scan_evidence,
+    build_step_evidence,
+    estimate_line_start,
+    estimate_series_start,
+)
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.residuals import BENDS, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import Plane, SurfaceScanEvidence
-from uwlts.calibration.joint.stored_estimate import calibration_of
+from uwlts.calibration.joint.stored_estimate import build_calibration
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownStage, WindowModel
@@ -74,18 +79,18 @@ class JointProblem:
         lens, window and stage, and would be barely visible in residuals. They are reported if there is no other
         contradiction.
         """
-        free = [_of_unknown_size(piece) for piece in self.evidence]
+        free = [_free_sizes(piece) for piece in self.evidence]
         result, against = replace(self, evidence=free)._judged_as_described()
-        sizes, alone = size_deviations(result, self.evidence), not against.all_against() or bool(self.misfits)
+        sizes, alone = compute_size_deviations(result, self.evidence), not against.all_against() or bool(self.misfits)
         doubts = [each.words() for each in sizes if each.doubtful()]
         if not any(each.known() for each in sizes):
             return result, replace(against, doubts=doubts + against.doubts)
-        wrong = wrong_sizes(sizes)
+        wrong = describe_wrong_sizes(sizes)
         if not wrong:
             start = replace(self, global_values=result.values, local=result.local)
             result, with_sizes = start._judged_as_described()
             # Contradictions that appear only with known sizes are caused by these sizes.
-            wrong = wrong_sizes(sizes, least=_NOTICED) if alone and with_sizes.all_against() else []
+            wrong = describe_wrong_sizes(sizes, least=_NOTICED) if alone and with_sizes.all_against() else []
             against = replace(with_sizes, doubts=doubts + with_sizes.doubts)
         if alone:
             against = replace(against, contradictions=wrong + against.contradictions)
@@ -99,14 +104,14 @@ class JointProblem:
         done if a single parameter contradicts prior knowledge.
         """
         result = self.solve()
-        compared, factor = deviations(result, least=0.0), understated(result)
+        compared, factor = deviations(result, least=0.0), estimate_birge_ratio(result)
         of_target = [each for each in compared if isinstance(each.key, TargetParameter)]
         form = [each for each in of_target if each.sigmas > _NOTICED]
         # The largest deviation is taken as the cause: wrong spacings along both sides appear in the stage's scale.
         stretched = compared[0] in form and compared[0].key in STRETCH
         stretch = {each.key: each.alone for each in of_target if stretched and each.key in STRETCH}
         if not (form or factor > 1.0) or any(each.wrong() for each in compared if each not in of_target):
-            return result, replace(findings(result, self.evidence, sensor=self.sensor), stretch=stretch)
+            return result, replace(check_consistency(result, self.evidence, sensor=self.sensor), stretch=stretch)
         off = {each.key: abs(each.alone - each.known) for each in of_target}
         priors = {key: replace(prior, std=factor * prior.std) for key, prior in self.parameters.priors.items()}
         for alike in (BENDS, STRETCH):
@@ -117,7 +122,7 @@ class JointProblem:
         scaled = stated.model_copy(update={name: factor * value for name, value in stated})
         sensor = self.sensor.model_copy(update={"uncertainty": scaled})
         result = replace(self, parameters=replace(self.parameters, priors=priors), sensor=sensor).solve()
-        against = findings(result, self.evidence, sensor=sensor)
+        against = check_consistency(result, self.evidence, sensor=sensor)
         doubts = [f"{each.words()}; its uncertainty was enlarged accordingly" for each in form]
         if factor > 1.0:
             doubts.append(
@@ -127,8 +132,8 @@ class JointProblem:
         return result, replace(against, doubts=doubts + against.doubts, stretch=stretch)
 
 
-def _of_unknown_size(piece: Evidence) -> Evidence:
-    return replace(piece, surface=piece.surface.of_unknown_size()) if isinstance(piece, SurfaceScanEvidence) else piece
+def _free_sizes(piece: Evidence) -> Evidence:
+    return replace(piece, surface=piece.surface.free_sizes()) if isinstance(piece, SurfaceScanEvidence) else piece
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +195,7 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
     if any(view.window for view in views):
         window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm)
     indices = gathered.indices(options)
-    start = series_start(gathered.series, sensor, window, indices, options=options)
+    start = estimate_series_start(gathered.series, sensor, window, indices, options=options)
     found = start.sheet()
     if found is None:
         reasons = [each.found.no_stripe for each in gathered.series if each.found.no_stripe]
@@ -199,12 +204,12 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
         )
     sheet, turns = found
     first = start.calibration(sheet.model(np.append(turns, (0.0, 0.0))))
-    steps, heights, left_out = step_profiles(gathered, first, window)
-    scans, missed = surface_scans(gathered.scans, first, sensor, indices, sizes_known=options.sizes_known)
-    priors = priors_of(gathered, window, turns, heights, options)
+    steps, heights, left_out = build_step_evidence(gathered, first, window)
+    scans, missed = build_all_scan_evidence(gathered.scans, first, sensor, indices, sizes_known=options.sizes_known)
+    priors = build_priors(gathered, window, turns, heights, options)
     parameters = Parameters(start.intrinsics, sheet, window, tuple(gathered.media), priors)
     global_values = parameters.start(start.lens)
-    lines = [line_start(step, parameters, global_values) for step in steps]
+    lines = [estimate_line_start(step, parameters, global_values) for step in steps]
     return JointProblem(
         parameters,
         evidence=[*start.evidence, *steps, *(evidence for evidence, _ in scans)],
@@ -233,7 +238,7 @@ class _Attempt:
         problem = joint_problem(gathered, options=options)
         return cls(gathered, options, problem, *problem.judged(), said)
 
-    def settled(self) -> "_Attempt":
+    def improve(self) -> "_Attempt":
         """Try a richer lens, then remove images that do not fit; contradictions of the description remain.
 
         If images still show systematic deviations, all residuals of an image count as one.
@@ -268,14 +273,14 @@ class _Attempt:
         odd = any(isinstance(each.key, LensParameter) for each in deviations(self.result, least=_NOTICED))
         for further in (BESIDES, RATIONAL_BESIDES) if odd or self.against.all_against() else ():
             tried = [best._with_lens(replace(camera, distortion=(*camera.distortion, *names))) for names in further]
-            best = _explaining_best([best, *filter(None, tried)])
+            best = _select_best([best, *filter(None, tried)])
             if "k3" not in best.options.camera.distortion:
                 break
         free_poses = self.options.poses == "free"
         if choice.pixels == "auto" and (free_poses or best.against.misfits):
             free = best._with_lens(replace(best.options.camera, pixel_aspect=None))
             if free is not None and (free_poses or free._scatter() < _CLEARLY_LESS * best._scatter()):
-                best = _explaining_best([best, free])
+                best = _select_best([best, free])
         if best is not self:
             given = [name for name in best.options.camera.distortion if name not in camera.distortion]
             given += ["free pixels"] if best.options.camera.pixel_aspect != camera.pixel_aspect else []
@@ -356,7 +361,7 @@ class _Attempt:
         return replace(self, problem=problem, result=result, against=against, said=(*self.said, *said))
 
 
-def _explaining_best(tried: Sequence[_Attempt]) -> _Attempt:
+def _select_best(tried: Sequence[_Attempt]) -> _Attempt:
     """Select the attempt that fits the evidence best, by the Bayesian information criterion.
 
     The number of independent residuals is that of the attempt with the least scatter. Attempts that contradict the
@@ -371,7 +376,7 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
     """Calibrate from gathered evidence; errors as `calibrate_jointly`."""
     attempt = _Attempt.at(gathered, options)
     if not options.strict:
-        attempt = attempt.settled()
+        attempt = attempt.improve()
     sensor, problem, result, against = gathered.sensor, attempt.problem, attempt.result, attempt.against
     if against.all_against():
         raise CalibrationError(against.refusal())
@@ -384,10 +389,10 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
         "target": gathered.series[0].found.target.model_dump(mode="json"),
         "warnings": [*warnings],
     }
-    calibration = calibration_of(result, problem.evidence, sensor, list(gathered.media.values()), provenance)
+    calibration = build_calibration(result, problem.evidence, sensor, list(gathered.media.values()), provenance)
     scans = [e for e in problem.evidence if isinstance(e, SurfaceScanEvidence) and not isinstance(e.surface, Plane)]
     if scans:
-        direction = scans[0].moved_direction(problem.parameters, result.values)[0]
+        direction = scans[0].stage_direction(problem.parameters, result.values)[0]
         stage = KnownStage(
             described=gathered.scans[0].stage_direction.tolist(),
             direction=(direction @ calibration.object_transform()[:3, :3]).tolist(),

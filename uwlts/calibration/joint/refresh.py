@@ -9,18 +9,18 @@ import numpy as np
 from pydantic import JsonValue
 
 from uwlts.calibration.joint.estimate import Estimate, Evidence
-from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
-from uwlts.calibration.joint.initial import line_start, step_profiles
+from uwlts.calibration.joint.gathering import Gathered, build_priors, gather_jointly
+from uwlts.calibration.joint.initial import build_step_evidence, estimate_line_start
 from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
 from uwlts.calibration.joint.parameters import SHEET, EarlierEstimate, ViewMedium
 from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.joint.stored_estimate import (
     StoredEstimate,
-    calibration_of,
+    append_independent,
+    build_calibration,
+    convex_outline,
     found_estimate,
-    outline,
     require_joint,
-    with_independent,
 )
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, sources_of
 from uwlts.errors import CalibrationError, RangeError
@@ -78,11 +78,11 @@ class WaterChange:
         return lines
 
 
-def water_changes(calibration: Calibration, result: Estimate, earlier: EarlierEstimate) -> list[WaterChange]:
+def compute_water_changes(calibration: Calibration, result: Estimate, earlier: EarlierEstimate) -> list[WaterChange]:
     """Return the changes of the media that a calibration has in addition to an earlier one, if they were observed."""
     parameters, count = result.parameters, len(earlier.values)
     before = np.append(earlier.values, parameters.prior_mean()[count:])
-    covariance = with_independent(earlier.covariance, parameters.prior_std()[count:].tolist())
+    covariance = append_independent(earlier.covariance, parameters.prior_std()[count:].tolist())
     std_before, std = np.sqrt(np.diag(covariance)), result.std()
     seen = {region.view.medium: region for region in regions(calibration)}
     found = []
@@ -104,7 +104,7 @@ def water_changes(calibration: Calibration, result: Estimate, earlier: EarlierEs
     return found
 
 
-def refreshed_calibration(
+def build_refreshed_calibration(
     earlier: Calibration, gathered: Gathered, result: Estimate, evidence: Sequence[Evidence], *, warnings: list[str]
 ) -> Calibration:
     """Build the calibration of an estimate that used an earlier one as prior knowledge.
@@ -114,7 +114,7 @@ def refreshed_calibration(
     earlier water, as it shows where the camera was calibrated. Stage directions are kept.
     """
     media = [*(known.medium for known in earlier.media), *gathered.media.values()]
-    new = calibration_of(result, evidence, gathered.sensor, media, _provenance(earlier, gathered, warnings))
+    new = build_calibration(result, evidence, gathered.sensor, media, _extend_provenance(earlier, gathered, warnings))
     turned = new.object_transform()[:3, :3].T @ earlier.object_transform()[:3, :3]
     found = ("camera", "window", "sheet", "camera_from_object", "media", "provenance")
     figures = {name: earlier.figures(name) | new.figures(name) for name in new.residuals}
@@ -126,12 +126,12 @@ def refreshed_calibration(
                 for stage in earlier.stages
             ),
             "residuals": earlier.residuals | figures,
-            "joint": _joint(require_joint(earlier), require_joint(new)),
+            "joint": _merge_estimates(require_joint(earlier), require_joint(new)),
         }
     )
 
 
-def _joint(before: JointEstimate, new: JointEstimate) -> JointEstimate:
+def _merge_estimates(before: JointEstimate, new: JointEstimate) -> JointEstimate:
     """Merge the new estimate with the earlier estimate's record of its evidence."""
     fields = {name: getattr(new, name) for name in JointEstimate.model_fields}
     return before.model_copy(
@@ -143,12 +143,12 @@ def _joint(before: JointEstimate, new: JointEstimate) -> JointEstimate:
             "residual_count": before.residual_count + new.residual_count,
             "outlier_count": before.outlier_count + new.outlier_count,
             "images": before.images + new.images,
-            "covered": before.covered + tuple(_with_earlier(region, before.covered) for region in new.covered),
+            "covered": before.covered + tuple(_extend_region(region, before.covered) for region in new.covered),
         }
     )
 
 
-def _with_earlier(region: CoveredRegion, covered: Sequence[CoveredRegion]) -> CoveredRegion:
+def _extend_region(region: CoveredRegion, covered: Sequence[CoveredRegion]) -> CoveredRegion:
     """Extend a region covered in new water by the largest region covered in earlier water through the window."""
     wet = [other for other in covered if other.window and other.medium is not None]
     if not wet:
@@ -159,12 +159,12 @@ def _with_earlier(region: CoveredRegion, covered: Sequence[CoveredRegion]) -> Co
         update={
             "point_count": region.point_count + most.point_count,
             "camera_depth_mm": (min(depths), max(depths)),
-            "outline_mm": tuple(map(tuple, outline(np.array([*region.outline_mm, *most.outline_mm])).tolist())),
+            "outline_mm": tuple(map(tuple, convex_outline(np.array([*region.outline_mm, *most.outline_mm])).tolist())),
         }
     )
 
 
-def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -> dict[str, JsonValue]:
+def _extend_provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -> dict[str, JsonValue]:
     old, new = earlier.provenance, sources_of([], []) | gathered.provenance
     sources = Origin.model_validate(new).captures()
     refreshed = {
@@ -246,7 +246,7 @@ def refresh(
         require_index(index)
     if not isinstance(calibration, Calibration):
         calibration = read_calibration(calibration)
-    _earlier(calibration)
+    _require_earlier(calibration)
     if not step:
         raise CalibrationError("`step` is empty: give at least one image of a step in the new water")
     if index_std is not None and not index_std > 0:
@@ -267,32 +267,32 @@ def solve_refreshed(
     calibration: Calibration, gathered: Gathered, *, options: CalibrationOptions, index_std: float | None = None
 ) -> Refreshed:
     """Refresh a calibration from gathered evidence; errors as `refresh`."""
-    known = _earlier(calibration)
+    known = _require_earlier(calibration)
     old = known.parameters
-    gathered = _after(gathered, old.media)
-    profiles, heights, left_out = step_profiles(gathered, calibration, calibration.window)
+    gathered = _renumber_media(gathered, old.media)
+    profiles, heights, left_out = build_step_evidence(gathered, calibration, calibration.window)
     warnings = [*gathered.warnings, *left_out]
     if not profiles:
         raise CalibrationError("; ".join(warnings))
     turns = known.values[[old.keys.index(key) for key in SHEET[:3]]]
-    described = priors_of(gathered, calibration.window, turns, heights, options)
+    described = build_priors(gathered, calibration.window, turns, heights, options)
     priors = old.priors | {key: prior for key, prior in described.items() if key not in old.keys}
     if index_std is not None:
         priors |= {key: replace(priors[key], std=index_std) for key in map(MediumIndex, gathered.media)}
     earlier = EarlierEstimate(known.values, known.covariance)
     parameters = replace(old, media=(*old.media, *gathered.media), priors=priors, earlier=earlier)
     start = parameters.start(earlier.values[: len(parameters.intrinsics.names)])
-    lines = [line_start(profile, parameters, start) for profile in profiles]
+    lines = [estimate_line_start(profile, parameters, start) for profile in profiles]
     problem = JointProblem(parameters, profiles, start, lines, gathered.sensor, None, warnings)
     result, against = problem.judged()
     if against.all_against():
-        raise CalibrationError(_other_water(problem, earlier) or against.refusal())
+        raise CalibrationError(_explain_contradiction(problem, earlier) or against.refusal())
     warnings += against.doubts
-    refreshed = refreshed_calibration(calibration, gathered, result, profiles, warnings=warnings)
-    return Refreshed(refreshed, water_changes(refreshed, result, earlier), warnings)
+    refreshed = build_refreshed_calibration(calibration, gathered, result, profiles, warnings=warnings)
+    return Refreshed(refreshed, compute_water_changes(refreshed, result, earlier), warnings)
 
 
-def _other_water(problem: JointProblem, earlier: EarlierEstimate) -> str:
+def _explain_contradiction(problem: JointProblem, earlier: EarlierEstimate) -> str:
     """Describe an index that makes contradicting steps consistent, or return an empty text."""
     parameters = problem.parameters
     new = [key for key in parameters.keys[len(earlier.values) :] if isinstance(key, MediumIndex)]
@@ -318,7 +318,7 @@ def _other_water(problem: JointProblem, earlier: EarlierEstimate) -> str:
     return "; ".join(words) + advice if words else ""
 
 
-def _earlier(calibration: Calibration) -> StoredEstimate:
+def _require_earlier(calibration: Calibration) -> StoredEstimate:
     known = found_estimate(calibration, _AIR)
     if calibration.window is None:
         raise CalibrationError(
@@ -343,7 +343,7 @@ def _refuse_unsuitable(capture: Capture, calibration: Calibration) -> None:
     raise CalibrationError(f"{capture.path.name} was taken {reason}")
 
 
-def _after(gathered: Gathered, media: Sequence[str]) -> Gathered:
+def _renumber_media(gathered: Gathered, media: Sequence[str]) -> Gathered:
     """Renumber the media after earlier ones, and rename those with an earlier name."""
     renamed: dict[str, Medium] = {}
     for name, medium in gathered.media.items():

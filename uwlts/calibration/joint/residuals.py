@@ -91,7 +91,7 @@ class StripeEvidence(ABC):
         """Return a mask of the stripe pixels (N,) of an image."""
         return np.ones(len(self.pixels), dtype=bool)
 
-    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
+    def linearise(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
         """Compute rays at the pixels that residuals predict; those that are not ``used`` (n,) stay as detected."""
         predicted = self.pixels.copy()
         for part, kept in zip(residuals, used, strict=True):
@@ -260,19 +260,19 @@ class TargetEvidence(StripeEvidence):
         sheet = self.on_sheet(parameters, global_values, shifted_px=parameters.value(global_values, SHIFT))
         of_stripe = partial(self._of_stripe, sheet)
         for of_kind, image in ((self._of_points, self.placement.image), (of_stripe, self.image)):
-            for here in _batches(image):
+            for here in _split_batches(image):
                 pose = _Poses(self, parameters, global_values, local, image[here])
                 if (parts := of_kind(parameters, global_values, pose, here)) is None:
                     return None
                 found += parts
         return sorted(found, key=lambda part: part.image)
 
-    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
+    def linearise(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
         points = self.placement.pixels.copy()
         for part, kept in zip(residuals, used, strict=True):
             if part.kind == TARGET:
                 points[self.placement.image == part.image] -= np.where(kept, part.values, 0.0).reshape(-1, 2)
-        return replace(super().linearised(residuals, used), predicted_points=points)
+        return replace(super().linearise(residuals, used), predicted_points=points)
 
     def _of_points(
         self, parameters: Parameters, global_values: np.ndarray, pose: "_Poses", here: np.ndarray
@@ -283,7 +283,7 @@ class TargetEvidence(StripeEvidence):
         rays = parameters.rays(global_values, self.view, at_px)
         if rays is None:
             return None
-        start, along = pose.into_target(rays.origins), pose.rotation.T @ rays.directions
+        start, along = pose.to_target_frame(rays.origins), pose.rotation.T @ rays.directions
         known = self.placement.points_mm[here]
         bends = self._bends(known)
         reach = (_values(parameters, global_values, BENDS) @ bends - start[2]) / along[2]
@@ -315,7 +315,7 @@ class TargetEvidence(StripeEvidence):
             parameters.add(by_global[axis], StageParameter.SCALE, by_scale[axis])
         values = (found_px - at_px).ravel() + to_pixels(found[:, :, None]).ravel()
         by_local = to_pixels(flat(pose.by_local(at)).transpose(1, 2, 0))
-        return pose.by_image(TARGET, values, to_pixels(by_global), by_local)
+        return pose.split_by_image(TARGET, values, to_pixels(by_global), by_local)
 
     def _of_stripe(
         self, sheet: SeenSheet, parameters: Parameters, global_values: np.ndarray, pose: "_Poses", here: np.ndarray
@@ -324,7 +324,7 @@ class TargetEvidence(StripeEvidence):
         points = sheet.points(here)
         if points is None:
             return None
-        at = pose.into_target(points.points)
+        at = pose.to_target_frame(points.points)
         bends, (bow, saddle) = self._bends(at.T), _values(parameters, global_values, BENDS)
         # Gradient of the height above the bent target, in the target's frame.
         steep = -2.0 / self.radius_mm**2 * np.array([[bow + saddle], [bow - saddle]])
@@ -342,7 +342,7 @@ class TargetEvidence(StripeEvidence):
         every = self.stripe_residuals(
             parameters, points, off, kind=STRIPE, local_columns=all_columns, image=-1, here=here
         )
-        return pose.by_image(STRIPE, every.values, every.by_global, every.by_local)
+        return pose.split_by_image(STRIPE, every.values, every.by_global, every.by_local)
 
     def _bends(self, points: np.ndarray) -> np.ndarray:
         """Return heights (2, N) of target points (N, 2 or 3) for a unit bow, and for a unit saddle."""
@@ -354,7 +354,7 @@ def _values(parameters: Parameters, global_values: np.ndarray, keys: tuple[Param
     return np.array([parameters.value(global_values, key) for key in keys])
 
 
-def _batches(image: np.ndarray) -> list[np.ndarray]:
+def _split_batches(image: np.ndarray) -> list[np.ndarray]:
     """Split pixel numbers into batches of whole images that fit into the processor's cache."""
     order = np.argsort(image, kind="stable")
     starts = np.flatnonzero(np.diff(image[order], prepend=-1))
@@ -390,7 +390,7 @@ class _Poses:
             scale = 1.0 + parameters.value(global_values, StageParameter.SCALE)
             self.travel = self._nominal * scale + np.append(0.0, local[8:])[self._place]
 
-    def into_target(self, points: np.ndarray) -> np.ndarray:
+    def to_target_frame(self, points: np.ndarray) -> np.ndarray:
         """Transform points (3, n) of the camera frame to the target's frame at the first image."""
         return self.rotation.T @ (points - self.shift[:, None]) + self.direction[:, None] * self.travel
 
@@ -408,7 +408,9 @@ class _Poses:
             result[8] = self.direction[:, None]
         return result
 
-    def by_image(self, kind: str, values: np.ndarray, by_global: np.ndarray, by_local: np.ndarray) -> list[Residuals]:
+    def split_by_image(
+        self, kind: str, values: np.ndarray, by_global: np.ndarray, by_local: np.ndarray
+    ) -> list[Residuals]:
         """Split residuals of pixels with one or two coordinates each by image."""
         images, first = np.unique(self.image, return_index=True)
         rows, found = len(values) // len(self.image), []

@@ -55,7 +55,7 @@ class Surface(ABC):
         """Return its described sizes; empty for a surface without a size."""
         return Sizes((), np.empty(0), np.empty(0), np.empty(0), np.empty((0, len(local))))
 
-    def of_unknown_size(self) -> Self:
+    def free_sizes(self) -> Self:
         """Return the surface with unknown sizes."""
         return self
 
@@ -112,7 +112,7 @@ class Spheres(Surface):
             by_local,
         )
 
-    def of_unknown_size(self) -> Self:
+    def free_sizes(self) -> Self:
         unknown = {name: np.full_like(getattr(self, name), np.inf) for name in ("diameter_std_mm", "spacing_std_mm")}
         return replace(self, **unknown)
 
@@ -168,7 +168,7 @@ class Cylinder(Surface):
         described, std = np.array([self.diameter_mm]), np.array([self.diameter_std_mm])
         return Sizes(("diameter of the pipe",), described, std, local[4:], np.eye(5)[4:])
 
-    def of_unknown_size(self) -> Self:
+    def free_sizes(self) -> Self:
         return replace(self, diameter_std_mm=np.inf)
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
@@ -239,7 +239,7 @@ class SurfaceScanEvidence(StripeEvidence):
         if points is None:
             return None
         count = len(local) - len(self.stage_mm)
-        direction, by_slopes = self.moved_direction(parameters, global_values)
+        direction, by_slopes = self.stage_direction(parameters, global_values)
         nominal = self.stage_mm[self.frame]
         travel = nominal * (1.0 + parameters.value(global_values, StageParameter.SCALE)) + local[count:][self.frame]
         off = self.surface.distances(points.points + self.beside_mm + direction[:, None] * travel, local[:count])
@@ -260,7 +260,7 @@ class SurfaceScanEvidence(StripeEvidence):
             found.append(Residuals(kind, *rows, columns, self.image + int(number)))
         return found
 
-    def moved_direction(self, parameters: Parameters, global_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def stage_direction(self, parameters: Parameters, global_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the stage's direction (3,), camera frame, and its derivatives (2, 3) by the slopes."""
         slopes = np.array([parameters.value(global_values, key) for key in SLOPES])
         return leaning(self.direction, self.across_stage, slopes)

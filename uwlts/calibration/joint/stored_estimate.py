@@ -24,7 +24,7 @@ _FRAME_STEP = 1e-5
 """Step of the sheet's parameters, rad and mm, for central differences; their error is negligible."""
 
 
-def calibration_of(
+def build_calibration(
     result: Estimate,
     evidence: Sequence[Evidence],
     sensor: Sensor,
@@ -47,12 +47,12 @@ def calibration_of(
         camera_from_object=tuple(map(tuple, frame.tolist())),
         media=tuple(KnownMedium(medium=m, index=index) for m, index in zip(media, indices, strict=True)),
         residuals=_lens_and_window(result),
-        joint=_joint_estimate(result, evidence, frame),
+        joint=_build_joint_estimate(result, evidence, frame),
         provenance=provenance,
     )
 
 
-def _joint_estimate(result: Estimate, evidence: Sequence[Evidence], object_frame: np.ndarray) -> JointEstimate:
+def _build_joint_estimate(result: Estimate, evidence: Sequence[Evidence], object_frame: np.ndarray) -> JointEstimate:
     """Build the stored estimate with the fit of each image and the covered regions, with ``T_camera_object`` (4, 4)."""
     images = []
     lit: dict[ViewMedium, list[np.ndarray]] = {}
@@ -86,7 +86,7 @@ def _joint_estimate(result: Estimate, evidence: Sequence[Evidence], object_frame
         stopped=result.stopped,
         images=tuple(images),
         covered=tuple(
-            _covered(result, view, np.vstack(pixels), object_frame, across=evidence[0].across)
+            _build_covered_region(result, view, np.vstack(pixels), object_frame, across=evidence[0].across)
             for view, pixels in lit.items()
         ),
     )
@@ -104,7 +104,7 @@ def _lens_and_window(result: Estimate) -> dict[str, Table]:
     return figures
 
 
-def _covered(
+def _build_covered_region(
     result: Estimate, view: ViewMedium, pixels: np.ndarray, object_frame: np.ndarray, *, across: int
 ) -> CoveredRegion:
     seen = SeenSheet.of(result.parameters, result.values, view, pixels, across=across).places_mm()
@@ -117,11 +117,11 @@ def _covered(
         window=view.window,
         point_count=len(at),
         camera_depth_mm=(float(seen[2].min()), float(seen[2].max())),
-        outline_mm=tuple(map(tuple, np.round(outline(at), 3).tolist())),
+        outline_mm=tuple(map(tuple, np.round(convex_outline(at), 3).tolist())),
     )
 
 
-def outline(at: np.ndarray) -> np.ndarray:
+def convex_outline(at: np.ndarray) -> np.ndarray:
     """Return the corners (K, 2) of the convex hull; for collinear points, the ends."""
     try:
         return at[ConvexHull(at).vertices]
@@ -183,7 +183,7 @@ class StoredEstimate:
         return 1 if self.calibration.stripe_along == "width" else 0
 
 
-def with_independent(covariance: np.ndarray, std: Sequence[float]) -> np.ndarray:
+def append_independent(covariance: np.ndarray, std: Sequence[float]) -> np.ndarray:
     """Extend a covariance (P, P) by independent quantities with these standard uncertainties."""
     return np.pad(covariance, (0, len(std))) + np.diag([*[0.0] * len(covariance), *np.square(std)])
 
@@ -243,7 +243,7 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
     intrinsics = Intrinsics(options, width_px=camera.width_px, height_px=camera.height_px)
     media = [key.medium for key in keys if isinstance(key, MediumIndex)]
     if len(media) != len(calibration.media):
-        raise _damaged(f"it has {len(media)} indices for {len(calibration.media)} media")
+        raise _damage_error(f"it has {len(media)} indices for {len(calibration.media)} media")
     # As in `Calibration.index_of`: the last of equal media.
     known = next((n for n, found in reversed([*enumerate(calibration.media)]) if found.medium == medium), None)
     seen_in = None if medium.kind == "air" else known
@@ -256,10 +256,10 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
         media.append("the scan")
         keys.append(MediumIndex(media[-1]))
         values = np.append(values, calibration.index_of(medium))
-        covariance = with_independent(covariance, [medium.index_uncertainty(calibration.wavelength_nm, uncertainty)])
+        covariance = append_independent(covariance, [medium.index_uncertainty(calibration.wavelength_nm, uncertainty)])
     lens = len(intrinsics.names)
     if tuple(keys[:lens]) != intrinsics.keys:
-        raise _damaged("its parameters are inconsistent with the camera")
+        raise _damage_error("its parameters are inconsistent with the camera")
     # Fixed parameters of window and sheet are read from the calibration's models.
     held = {} if calibration.window is None else window_values(calibration.window)
     if (fan := calibration.sheet.fan) is not None:
@@ -272,5 +272,5 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
     return StoredEstimate(calibration, parameters, values, covariance, view)
 
 
-def _damaged(reason: str) -> CalibrationError:
+def _damage_error(reason: str) -> CalibrationError:
     return CalibrationError(f"the calibration's joint estimate is damaged: {reason}")

@@ -20,9 +20,9 @@ from uwlts.calibration.model_comparison.held_out import (
     Candidate,
     Image,
     Prediction,
-    dimensions_of,
     predict,
-    splits,
+    select_dimensions,
+    split_images,
 )
 from uwlts.calibration.polynomial.polynomial_calibration_fit import fit_line_polynomials
 from uwlts.calibration.polynomial.polynomial_evidence import common_header, object_coordinates, stripes_on_plate
@@ -101,9 +101,9 @@ class Tally:
         return np.sum(list(self.counts.values()), axis=0)
 
 
-def tally(predictions: Sequence[Prediction], *, among: frozenset[Image] | None = None) -> Tally:
+def sum_errors(predictions: Sequence[Prediction], *, among: frozenset[Image] | None = None) -> Tally:
     """Sum the errors of several predictions of the same images; ``among`` selects images."""
-    used, first = _used(predictions), predictions[0].misses
+    used, first = _mask_inliers(predictions), predictions[0].misses
     images = sorted({miss.image for miss in first if among is None or miss.image in among})
     shape = len(predictions), len(images)
     sums = {what: {kind: np.zeros(shape) for kind in (POINTS, STRIPES)} for what in ("px", "mm")}
@@ -119,7 +119,7 @@ def tally(predictions: Sequence[Prediction], *, among: frozenset[Image] | None =
     return Tally(sums["px"], sums["mm"], counts)
 
 
-def _used(predictions: Sequence[Prediction]) -> list[np.ndarray]:
+def _mask_inliers(predictions: Sequence[Prediction]) -> list[np.ndarray]:
     """Return a mask (n,) for each set of errors; it excludes points that are outliers for every model."""
     limits = {
         kind: min(outlier_limit(np.concatenate([m.px for m in p.misses if m.kind == kind])) for p in predictions)
@@ -164,7 +164,7 @@ class PolynomialScore:
     model_std_mm: float
 
 
-def polynomial_score(
+def score_polynomials(
     series: Series, header: CaptureHeader, images: Sequence[Image], model: Prediction
 ) -> PolynomialScore | None:
     """Return the score of polynomials in the held-out images of a series, or None without such an image.
@@ -276,8 +276,8 @@ def choose(problem: JointProblem, *, workers: int | None = None, progress: Progr
     CalibrationError
         There are too few images, or the usual model cannot be calibrated without the held-out images.
     """
-    ways, usual, done = splits(problem), Candidate(), count(1)
-    dimensions = dimensions_of(problem.parameters)
+    ways, usual, done = split_images(problem), Candidate(), count(1)
+    dimensions = select_dimensions(problem.parameters)
     singles = [usual, *(replace(usual, **{name: other}) for name, others in dimensions.items() for other in others)]
     total = len(ways) * (len(singles) + 1)
 
@@ -319,7 +319,7 @@ def choice_of(found: Found, ways: dict[str, frozenset[Image]], in_medium: frozen
     ``in_medium`` contains the numbers of the pieces of evidence in a medium.
     """
     predictions = {candidate: result for candidate, result in found.items() if not isinstance(result, str)}
-    tallies = {where: tally([each[where] for each in predictions.values()]) for where in ways}
+    tallies = {where: sum_errors([each[where] for each in predictions.values()]) for where in ways}
     judged, number = [], count()
     for candidate, result in found.items():
         if isinstance(result, str):
@@ -331,7 +331,7 @@ def choice_of(found: Found, ways: dict[str, frozenset[Image]], in_medium: frozen
     wet = {where: frozenset(image for image in held if image[0] in in_medium) for where, held in ways.items()}
     wet_tallies: dict[str, Tally] = {}
     if min(map(len, wet.values())) >= FEWEST_HELD:
-        wet_tallies = {w: tally([each[w] for each in predictions.values()], among=wet[w]) for w in ways}
+        wet_tallies = {w: sum_errors([each[w] for each in predictions.values()], among=wet[w]) for w in ways}
     return Choice(judged, ways, predictions, tallies, {where: len(held) for where, held in wet.items()}, wet_tallies)
 
 
@@ -409,12 +409,12 @@ def compare_models(
         gathered = gather_jointly(targets, steps, options=options, progress=progress)
         problem = joint_problem(gathered, options=options)
         choice = choose(problem, workers=workers, progress=partial(progress, stage="models"))
-        score, why_none = _polynomials(gathered, problem, choice, targets, free=poses == "free")
+        score, why_none = _score_polynomials(gathered, problem, choice, targets, free=poses == "free")
         captures = [capture.path.name for capture in [*targets, *steps]]
     return Comparison(gathered.sensor.name, captures, choice, score, why_none, problem.warnings)
 
 
-def _polynomials(
+def _score_polynomials(
     gathered: Gathered, problem: JointProblem, choice: Choice, targets: Sequence[Capture], *, free: bool
 ) -> tuple[PolynomialScore | None, str]:
     """Score polynomials on a stage-moved target in a medium, or return the reason why this is not possible."""
@@ -426,6 +426,6 @@ def _polynomials(
     images = [image for image in choice.ways[INSIDE] if image[0] in alike]
     try:
         header = common_header([c for c in targets if c.path.name in part.names and c.header.medium.kind != "air"])
-        return polynomial_score(part, header, images, choice.predictions[choice.simplest()][INSIDE]), ""
+        return score_polynomials(part, header, images, choice.predictions[choice.simplest()][INSIDE]), ""
     except CalibrationError as error:
         return None, f"no polynomials: {error}"

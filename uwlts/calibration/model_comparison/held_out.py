@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from uwlts.calibration.camera.camera_parameters import Intrinsics
 from uwlts.calibration.camera.target_images import pose_values
-from uwlts.calibration.joint.consistency import much_left_out
+from uwlts.calibration.joint.consistency import find_excess_outliers
 from uwlts.calibration.joint.estimate import Estimate, Evidence, outlier_limit
 from uwlts.calibration.joint.parameters import Parameters, ViewMedium
 from uwlts.calibration.joint.procedure import JointProblem
@@ -73,7 +73,7 @@ DIMENSIONS: dict[str, tuple[object, ...]] = {
 """Alternatives to each property of the usual model."""
 
 
-def dimensions_of(parameters: Parameters) -> dict[str, tuple[object, ...]]:
+def select_dimensions(parameters: Parameters) -> dict[str, tuple[object, ...]]:
     """Return the properties that affect the parameters of the evidence, with their alternatives."""
     return {
         name: others
@@ -84,7 +84,7 @@ def dimensions_of(parameters: Parameters) -> dict[str, tuple[object, ...]]:
     }
 
 
-def recast(problem: JointProblem, candidate: Candidate) -> JointProblem:
+def apply_candidate(problem: JointProblem, candidate: Candidate) -> JointProblem:
     """Return the problem with the candidate's parameters and the same start values.
 
     The target may only have a bow: more shape parameters could absorb errors of the model. The distance of a single
@@ -123,7 +123,7 @@ _FEWEST_KEPT = 4  # images for calibration
 FEWEST_HELD = 4  # held-out images: fewer give no standard error
 
 
-def splits(problem: JointProblem) -> dict[str, frozenset[Image]]:
+def split_images(problem: JointProblem) -> dict[str, frozenset[Image]]:
     """Select held-out images inside the volume of the others, and outside of it.
 
     The stripe's position in the image stands for the depth. Inside, every fourth image is held out; outside, all images
@@ -136,7 +136,7 @@ def splits(problem: JointProblem) -> dict[str, frozenset[Image]]:
     """
     inside: set[Image] = set()
     outside: set[Image] = set()
-    for found in _by_depth(problem).values():
+    for found in _sort_by_depth(problem).values():
         images, places = [image for _, image in found], np.array([place for place, _ in found])
         inside |= set(images[1:-1:_EVERY])
         reach = _OUTER * (places[-1] - places[0])
@@ -152,7 +152,7 @@ def splits(problem: JointProblem) -> dict[str, frozenset[Image]]:
     return {INSIDE: frozenset(inside), OUTSIDE: frozenset(outside)}
 
 
-def _by_depth(problem: JointProblem) -> dict[ViewMedium, list[tuple[float, Image]]]:
+def _sort_by_depth(problem: JointProblem) -> dict[ViewMedium, list[tuple[float, Image]]]:
     """Return images with a stripe for each view and medium, sorted by the stripe's position across its lines."""
     found: dict[ViewMedium, list[tuple[float, Image]]] = {}
     for number, piece in enumerate(problem.evidence):
@@ -166,7 +166,7 @@ def _by_depth(problem: JointProblem) -> dict[ViewMedium, list[tuple[float, Image
     return {view: sorted(images) for view, images in found.items()}
 
 
-def without(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem, list[int]]:
+def remove_images(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem, list[int]]:
     """Remove the held-out images; return the problem and the numbers of its remaining pieces of evidence."""
     evidence: list[Evidence] = []
     local, numbers = [], []
@@ -175,7 +175,7 @@ def without(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem
             kept = [image for image in np.unique(piece.placement.image).tolist() if (number, image) not in held]
             if not kept:
                 continue
-            piece = of_images(piece, kept)
+            piece = select_images(piece, kept)
             if piece.staged:
                 start = np.concatenate([start[:8], np.zeros(len(piece.images()))])
         elif (number, piece.image) in held:
@@ -186,7 +186,7 @@ def without(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem
     return replace(problem, evidence=evidence, local=local), numbers
 
 
-def of_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence:
+def select_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence:
     """Return the evidence of some images; stage positions still refer to the first image of all."""
     placement, wanted = evidence.placement, list(images)
     here = np.isin(placement.image, wanted)
@@ -247,10 +247,10 @@ def predict(problem: JointProblem, candidate: Candidate, held: frozenset[Image])
     CalibrationError
         The other images do not determine the model or do not fit it, or a ray of a held-out image hits nothing.
     """
-    whole = recast(problem, candidate)
-    training, numbers = without(whole, held)
+    whole = apply_candidate(problem, candidate)
+    training, numbers = remove_images(whole, held)
     estimate = training.solve()
-    if misfits := much_left_out(estimate):
+    if misfits := find_excess_outliers(estimate):
         kind, share = next(iter(misfits.items()))
         raise CalibrationError(f"{100 * share:.0f} % of the {kind} do not fit the model")
     local = dict(zip(numbers, estimate.local, strict=True))
@@ -259,7 +259,7 @@ def predict(problem: JointProblem, candidate: Candidate, held: frozenset[Image])
         piece, images = whole.evidence[number], sorted(image for at, image in held if at == number)
         match piece:
             case TargetEvidence():
-                posed = _posed(whole, piece, number, images, local.get(number))
+                posed = _pose_held_out(whole, piece, number, images, local.get(number))
             case StepProfileEvidence():
                 posed = [(piece, whole.local[number], (STEP,))]
             case SurfaceScanEvidence():
@@ -267,12 +267,12 @@ def predict(problem: JointProblem, candidate: Candidate, held: frozenset[Image])
             case _:
                 assert_never(piece)
         for evidence, pose, fitted in posed:
-            parts = _residuals(whole, estimate, evidence, pose, fitted=fitted)
-            found += [_misses(number, part) for part in parts if part.image in images]
+            parts = _fit_residuals(whole, estimate, evidence, pose, fitted=fitted)
+            found += [_measure_errors(number, part) for part in parts if part.image in images]
     return Prediction(found, estimate.parameters, estimate.values, estimate.covariance)
 
 
-def _posed(
+def _pose_held_out(
     problem: JointProblem, piece: TargetEvidence, number: int, images: list[int], local: np.ndarray | None
 ) -> list[tuple[Evidence, np.ndarray, tuple[str, ...]]]:
     """Return held-out images with their local parameters, and the residual kinds for a fit of these.
@@ -281,23 +281,23 @@ def _posed(
     """
     if local is not None and piece.staged and len(local) > 8:
         rotation, direction = cv2.Rodrigues(local[:3])[0], piece.placement.direction(local[6:8])
-        held = of_images(piece, images)
+        held = select_images(piece, images)
         shift = local[3:6] - rotation @ direction * np.append(local[8:], 0.0).mean()
         return [(held, np.concatenate([local[:3], shift, local[6:8], np.zeros(len(held.images()))]), ())]
     found = []
     for image in images:
         start = pose_values(piece.pose(problem.parameters, problem.global_values, problem.local[number], image))
-        found.append((replace(of_images(piece, [image]), staged=False), start, (TARGET,)))
+        found.append((replace(select_images(piece, [image]), staged=False), start, (TARGET,)))
     return found
 
 
-def _residuals(
+def _fit_residuals(
     problem: JointProblem, estimate: Estimate, evidence: Evidence, local: np.ndarray, *, fitted: tuple[str, ...]
 ) -> list[Residuals]:
     """Return the residuals of the evidence after fitting the local parameters to the ``fitted`` kinds."""
     near = np.empty(0, dtype=bool)
     for number in range(_ROUNDS):
-        parts = _seen(problem, estimate, evidence, local)
+        parts = _compute_residuals(problem, estimate, evidence, local)
         chosen = [part for part in parts if part.kind in fitted]
         if not chosen:
             return parts
@@ -308,11 +308,13 @@ def _residuals(
         step = -np.linalg.lstsq(by_local[near], values[near], rcond=None)[0]
         local = local + step
         if np.abs(by_local @ step).max() < _SETTLED_PX:
-            return _seen(problem, estimate, evidence, local)
+            return _compute_residuals(problem, estimate, evidence, local)
     raise CalibrationError("the pose of a held-out image does not converge with this model")
 
 
-def _seen(problem: JointProblem, estimate: Estimate, evidence: Evidence, local: np.ndarray) -> list[Residuals]:
+def _compute_residuals(
+    problem: JointProblem, estimate: Estimate, evidence: Evidence, local: np.ndarray
+) -> list[Residuals]:
     parameters, values = estimate.parameters, estimate.values
     if problem.diameter_mm is not None and isinstance(evidence, TargetEvidence):
         evidence = evidence.with_centres(parameters, values, local, problem.diameter_mm)
@@ -322,7 +324,7 @@ def _seen(problem: JointProblem, estimate: Estimate, evidence: Evidence, local: 
     return parts
 
 
-def _misses(number: int, part: Residuals) -> Misses:
+def _measure_errors(number: int, part: Residuals) -> Misses:
     """Convert the residuals of a part to errors in px and mm; for target points, to distances.
 
     A shift m of the target changes the residuals r by J m. The shortest m that cancels r is J^T (J J^T)^-1 r. On a

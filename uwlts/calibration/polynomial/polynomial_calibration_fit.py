@@ -75,7 +75,7 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
         if not (high > low and last > first):
             raise CalibrationError("the stripe is at the same place in all images: move the stage between them")
         design = legendre.legvander2d(
-            _scaled(lines, float(first), float(last)), _scaled(x, low, high), [smooth, degree]
+            _scale_range(lines, float(first), float(last)), _scale_range(x, low, high), [smooth, degree]
         )
         # The triangular factor has the same solution and singular values, and is small.
         triangle = np.asarray(np.linalg.qr(np.column_stack([design, y])[used], mode="r"))
@@ -95,7 +95,7 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
         settled, used = np.array_equal(within, used), within
         if settled or rounds == _ROUNDS:
             break
-    over_lines = legendre.legvander(_scaled(np.arange(first, last + 1), float(first), float(last)), smooth)
+    over_lines = legendre.legvander(_scale_range(np.arange(first, last + 1), float(first), float(last)), smooth)
     coefficients = over_lines @ solution.reshape(smooth + 1, degree + 1)
     return LinePolynomials(first, (low, high), coefficients, residuals, used)
 
@@ -120,7 +120,7 @@ def line_domains(lines: np.ndarray, pose: np.ndarray, centres_px: np.ndarray, *,
     return np.where(np.isfinite(domains), domains, np.nan)
 
 
-def _scaled(x: np.ndarray, low: float, high: float) -> np.ndarray:
+def _scale_range(x: np.ndarray, low: float, high: float) -> np.ndarray:
     return (2 * x - low - high) / (high - low)
 
 

@@ -15,7 +15,13 @@ from uwlts._version import __version__
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import LensCalibration, LensChoice, calibrate_lens, half_doubt, jackknife
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, refuse_turned_travel, solve_camera
-from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence, air_evidence, no_stripe_in, step_evidence
+from uwlts.calibration.capture_evidence import (
+    AirEvidence,
+    StepEvidence,
+    air_evidence,
+    explain_missing_stripe,
+    step_evidence,
+)
 from uwlts.calibration.sequential.sheet_fit import (
     SheetSolution,
     StripePoints,
@@ -178,7 +184,7 @@ def gather(
         )
         warnings += left_out
         if not on_steps:
-            raise CalibrationError(no_stripe_in(steps))
+            raise CalibrationError(explain_missing_stripe(steps))
     return Evidence(
         sensor=sensor,
         medium_kind=air[0].header.medium.kind,
@@ -195,7 +201,7 @@ def gather(
 def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
     """Calibrate from gathered evidence, optionally near ``start``; errors as `calibrate_sequentially`."""
     sensor = evidence.sensor
-    seen = _camera_of(evidence, options, start)
+    seen = _calibrate_camera(evidence, options, start)
     camera, found = seen.camera, seen.air
     if found.no_stripe:
         raise CalibrationError(found.no_stripe)
@@ -207,7 +213,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     figures, apart = {"camera": camera.figures()}, None
     warnings = [*evidence.warnings, *seen.warnings]
     if seen.lens is not None:
-        sheet, apart = _by_images(sheet, seen.lens, found), _halves_apart_rad(sheet, seen.lens, found)
+        sheet, apart = _add_image_uncertainty(sheet, seen.lens, found), _angle_between_halves(sheet, seen.lens, found)
         figures["camera"] |= _lens_figures(seen.lens, found)
         warnings += seen.lens.half_doubts()
         if apart is not None:
@@ -248,7 +254,7 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class _CameraResult:
     """Camera, selected lens or None, used images, and warnings."""
 
     camera: CameraSolution
@@ -257,7 +263,7 @@ class _Seen:
     warnings: list[str]
 
 
-def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSolution | None) -> _Seen:
+def _calibrate_camera(evidence: Evidence, options: CalibrationOptions, start: CameraSolution | None) -> _CameraResult:
     """Calibrate the camera from the images of the target, near ``start`` if given, or with lens selection."""
     air = evidence.air
     width_px, height_px = evidence.sensor.camera.width_px, evidence.sensor.camera.height_px
@@ -268,7 +274,7 @@ def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSol
     )
     if options.lens is None:
         estimated = options.camera.described(evidence.sensor.camera)
-        return _Seen(solved(air.images, poses=options.poses, options=estimated, start=start), None, air, [])
+        return _CameraResult(solved(air.images, poses=options.poses, options=estimated, start=start), None, air, [])
     lens = calibrate_lens(
         air.images,
         width_px=width_px,
@@ -292,8 +298,8 @@ def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSol
         freer = solved(used.images, poses="stage", options=lens.options)
         if freer.stage_tilt_rad is not None and freer.sigma_px <= _CLEARLY_LESS * camera.sigma_px:
             unsquare = solved(used.images, poses=options.poses, options=replace(lens.options, pixel_aspect=None))
-            warnings.append(_leaning(camera, freer, unsquare, tilt_rad=freer.stage_tilt_rad))
-    return _Seen(camera, lens, used, warnings)
+            warnings.append(_describe_stage_tilt(camera, freer, unsquare, tilt_rad=freer.stage_tilt_rad))
+    return _CameraResult(camera, lens, used, warnings)
 
 
 def _lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonValue]:
@@ -387,7 +393,7 @@ def _window_warnings(air: Sequence[Capture], steps: Sequence[Capture], options: 
     return []
 
 
-def _by_images(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> SheetSolution:
+def _add_image_uncertainty(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> SheetSolution:
     """Estimate the uncertainty of the sheet's normal by leaving out one image at a time.
 
     Camera and poses are those without the image, so that errors common to its points are included.
@@ -397,7 +403,8 @@ def _by_images(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) 
         other - normal
         for number, solution in enumerate(lens.without)
         if len(found.stripes[number])
-        and (other := _normal_by(solution, np.delete(np.arange(len(found.stripes)), number), normal, found)) is not None
+        and (other := _estimate_normal(solution, np.delete(np.arange(len(found.stripes)), number), normal, found))
+        is not None
     ]
     if len(changes) < _FEWEST_LEFT_OUT:
         return sheet
@@ -405,7 +412,7 @@ def _by_images(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) 
     return replace(sheet, normal_std_rad=max(sheet.normal_std_rad, std))
 
 
-def _normal_by(
+def _estimate_normal(
     solution: CameraSolution | None, numbers: np.ndarray, near: np.ndarray, found: AirEvidence
 ) -> np.ndarray | None:
     """Return the sheet's normal (3,) with a camera from some of the images; None if they do not determine it."""
@@ -418,14 +425,16 @@ def _normal_by(
     return None
 
 
-def _halves_apart_rad(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> float | None:
+def _angle_between_halves(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> float | None:
     """Return the angle between the sheet normals of two halves of the images, each with its own camera."""
     numbers, near = np.arange(len(found.stripes)), np.array(sheet.model.normal)
-    one, two = (_normal_by(half, numbers[first::2], near, found) for first, half in enumerate(lens.halves))
+    one, two = (_estimate_normal(half, numbers[first::2], near, found) for first, half in enumerate(lens.halves))
     return None if one is None or two is None else float(np.arccos(np.clip(one @ two, -1.0, 1.0)))
 
 
-def _leaning(camera: CameraSolution, freer: CameraSolution, unsquare: CameraSolution, *, tilt_rad: float) -> str:
+def _describe_stage_tilt(
+    camera: CameraSolution, freer: CameraSolution, unsquare: CameraSolution, *, tilt_rad: float
+) -> str:
     """Describe that a free stage direction, or another pixel shape, fits better than motion along the normal.
 
     Images of one pose that is moved by the stage barely distinguish the two.

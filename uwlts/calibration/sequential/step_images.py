@@ -129,7 +129,7 @@ def label_steps(
                 warnings.append(f"{step.source}: left out, {error}")
         seen = [image for image in labelled if image is not None]
         if seen:
-            turn, standard = _turn(calibration, window, seen, uncertainty), seen[0].standard
+            turn, standard = _estimate_turn(calibration, window, seen, uncertainty), seen[0].standard
             stated = standard.height_uncertainty_mm
             std_mm = stated / 2 if stated else uncertainty.step_height_mm
             if doubt := turn.doubt(height_mm=standard.height_mm, std_mm=std_mm):
@@ -142,7 +142,7 @@ def label_steps(
     return found, warnings
 
 
-def _turn(
+def _estimate_turn(
     calibration: Calibration, window: WindowModel | None, images: Sequence[StepImage], uncertainty: Uncertainty
 ) -> StandardTurn:
     """Estimate the rotation of a standard from the lower face in images of one capture: lines, and a common plane."""

@@ -176,7 +176,7 @@ def solve_window(
             scatter_std if std is None else std, per_height * height_std_mm, per_index * index_std
         ),
         image_distances_mm=np.array(
-            [_own_distance(calibration, window, step, tried[usable], scan, distance) for step, scan in own]
+            [_solve_single_distance(calibration, window, step, tried[usable], scan, distance) for step, scan in own]
         ),
         curve_mm=np.column_stack([tried, mean_error]),
         bounds_mm=(low, high),
@@ -204,7 +204,7 @@ def _heights(calibration: Calibration, window: WindowModel, steps: Sequence[Step
     return heights
 
 
-def _own_distance(
+def _solve_single_distance(
     calibration: Calibration, window: WindowModel, step: StepImage, tried: np.ndarray, errors: np.ndarray, near: float
 ) -> float:
     """Return the distance near ``near`` that gives the true height in one image, else NaN.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwlts.calibration.joint.estimate import judged
+from uwlts.calibration.joint.estimate import estimate_noise
 from uwlts.calibration.joint.residuals import TARGET, Residuals
 
 IMAGES = 9
@@ -19,7 +19,7 @@ def together(images):
         Residuals(TARGET, found.ravel(), np.empty((found.size, 0)), np.empty((found.size, 0)), np.arange(0), number)
         for number, (_, found) in enumerate(images)
     ]
-    return judged(TARGET, parts, places).together
+    return estimate_noise(TARGET, parts, places).together
 
 
 def lattice(columns, rows):

@@ -8,7 +8,7 @@ import pytest
 from tests.uwlts.calibration_views import WATER, built_sensor
 from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, lit_points, step_views, target_series
 from tests.uwlts.simulated_campaign import ModelErrors, drawn_reality, evidence
-from uwlts.calibration.joint.initial import series_start
+from uwlts.calibration.joint.initial import estimate_series_start
 from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
@@ -106,7 +106,7 @@ def at_truth(view):
     sheet = DescribedSheet(pose.normal, pose.axis, middle, pose.origin_mm, pose.origin_mm + 36.0 * pose.axis)
     series = target_series(BUILT, medium=view.medium, window=view.window, positions=IN_WATER[:4])
     window = nominal.window
-    start = series_start([series], BUILT, window, [WATER], options=OPTIONS)
+    start = estimate_series_start([series], BUILT, window, [WATER], options=OPTIONS)
     normal = np.array(window.normal) / window.normal[2]
     known = {
         "window_distance": window.distance_mm,

@@ -12,7 +12,7 @@ from tests.uwlts.scan_views import NONE, SLOPE, VIEW, Body, scan_of, square_sens
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.gathering import scan_stripes
-from uwlts.calibration.joint.initial import surface_scan, surface_scans
+from uwlts.calibration.joint.initial import build_all_scan_evidence, build_scan_evidence
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior
 from uwlts.calibration.joint.procedure import JointProblem, solve_jointly
 from uwlts.calibration.joint.residuals import STEP, Residuals
@@ -76,11 +76,11 @@ def parameters(**std):
 
 
 def evidence_of(kind, *, stage_mm=STAGE, sizes_known=True, artefact=None, noise=NONE):
-    """Evidence as `surface_scan` makes it by the sensor as built and the stage as described, and its start."""
+    """Evidence as `build_scan_evidence` makes it by the sensor as built and the stage as described, and its start."""
     bodies, described = KINDS[kind]
     stripes, _ = scan_of(SENSOR, bodies, artefact or described, stage_mm=stage_mm, count=700, noise=noise)
     nominal = nominal_calibration(SENSOR)
-    return surface_scan(stripes, nominal, SENSOR, medium_index=WATER, sizes_known=sizes_known, image=0)
+    return build_scan_evidence(stripes, nominal, SENSOR, medium_index=WATER, sizes_known=sizes_known, image=0)
 
 
 def true_own(kind, evidence):
@@ -138,7 +138,7 @@ def test_known_sizes_are_off_by_their_standard_uncertainties():
         moved = local.copy()
         moved[place] += 1e-4
         assert surface.sizes(moved).residuals()[0] - off == pytest.approx(column * 1e-4, abs=1e-6)
-    assert len(surface.of_unknown_size().sizes(local).residuals()[0]) == 0
+    assert len(surface.free_sizes().sizes(local).residuals()[0]) == 0
 
 
 class _Held:
@@ -395,7 +395,7 @@ def test_scans_that_do_not_show_what_they_say_are_left_out():
     few = replace(
         stripes, **{name: getattr(stripes, name)[::4] for name in ("frame", "line", "centre_px", "width_px", "slopes")}
     )
-    found, warnings = surface_scans(
+    found, warnings = build_all_scan_evidence(
         [wrong, few, stripes], nominal_calibration(SENSOR), SENSOR, [WATER], sizes_known=True
     )
     assert len(found) == 1
@@ -409,7 +409,7 @@ def test_scans_along_different_directions_are_refused():
     stripes, _ = scan_of(SENSOR, bodies, plane, stage_mm=STAGE[:3])
     other = replace(stripes, stage_direction=np.array([0.0, 1.0, 0.0]))
     with pytest.raises(CalibrationError, match="different directions"):
-        surface_scans([stripes, other], nominal_calibration(SENSOR), SENSOR, [WATER], sizes_known=True)
+        build_all_scan_evidence([stripes, other], nominal_calibration(SENSOR), SENSOR, [WATER], sizes_known=True)
 
 
 @pytest.mark.parametrize(
@@ -451,14 +451,14 @@ def test_what_blur_and_the_sheets_thickness_leave_is_common_to_all_points():
     nominal, rng = nominal_calibration(SENSOR), np.random.default_rng(4)
     blur, slopes = rng.normal(0, 0.05, len(stripes.line)), rng.normal(0, 0.05, len(stripes.line))
     given = {"medium_index": WATER, "sizes_known": True, "image": 0}
-    plain, _ = surface_scan(replace(stripes, blur_px=blur, slopes=0 * slopes), nominal, SENSOR, **given)
+    plain, _ = build_scan_evidence(replace(stripes, blur_px=blur, slopes=0 * slopes), nominal, SENSOR, **given)
     kept = np.searchsorted(stripes.frame * 1e6 + stripes.line, plain.frame * 1e6 + plain.pixels[:, 0])
     np.testing.assert_allclose(plain.common_px, np.abs(blur[kept]) / np.sqrt(3), rtol=1e-9)
     common = {}
     for thickness in (0.1, 0.3):
         known = SENSOR.uncertainty.model_copy(update={"sheet_thickness": thickness})
         sensor = SENSOR.model_copy(update={"uncertainty": known})
-        found, _ = surface_scan(replace(stripes, blur_px=0 * blur, slopes=slopes), nominal, sensor, **given)
+        found, _ = build_scan_evidence(replace(stripes, blur_px=0 * blur, slopes=slopes), nominal, sensor, **given)
         common[thickness] = found.common_px
     np.testing.assert_allclose(common[0.3], 3 * common[0.1], rtol=1e-9)
     moved_z = np.abs(nominal.object_transform()[:3, 2] @ found.beside_mm)

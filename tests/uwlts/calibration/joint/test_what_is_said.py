@@ -10,9 +10,15 @@ import pytest
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import target_series
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
-from uwlts.calibration.joint.consistency import Findings, deviations, findings, format_deviation, understated
+from uwlts.calibration.joint.consistency import (
+    Findings,
+    check_consistency,
+    deviations,
+    estimate_birge_ratio,
+    format_deviation,
+)
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Noise
-from uwlts.calibration.joint.initial import series_start
+from uwlts.calibration.joint.initial import estimate_series_start
 from uwlts.calibration.joint.next_shot import Outlook
 from uwlts.calibration.joint.parameters import DescribedSheet, EarlierEstimate, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.refresh import LengthChange, WaterChange
@@ -61,7 +67,7 @@ def estimate_of(known=None, *, images=(), noise=None, lens=LENS, earlier=None, *
 
 
 def found_of(*args, **kwargs):
-    return findings(*estimate_of(*args, **kwargs), sensor=SENSOR)
+    return check_consistency(*estimate_of(*args, **kwargs), sensor=SENSOR)
 
 
 def white(sigma_px, seed, count=600):
@@ -165,7 +171,7 @@ def test_descriptions_that_are_all_too_sure_are_noticed(count, off, factor):
     """Six squares exceed 22.5 once in a thousand times: 13.5 do not, 37.5 do."""
     keys = [*WindowParameter, SheetParameter.BOW][:count]
     known = {key: ((0.0, 1.0), ((-1) ** n * off, 1e-3)) for n, key in enumerate(keys)}
-    assert understated(estimate_of(known)[0]) == pytest.approx(factor, rel=1e-3)
+    assert estimate_birge_ratio(estimate_of(known)[0]) == pytest.approx(factor, rel=1e-3)
 
 
 @pytest.mark.parametrize(("share", "wrong"), [(0.07, None), (0.09, False), (-0.09, False), (-0.21, True), (0.21, True)])
@@ -192,7 +198,9 @@ def test_new_evidence_against_an_earlier_estimate_is_told_by_what_moved_farthest
 def staged():
     """A target on the stage in six images, and the start of its local parameters."""
     series = target_series(SENSOR, window=False, positions=np.arange(6) * 40.0 - 180.0, columns=7)
-    start = series_start([series], SENSOR, None, [], options=CalibrationOptions(poses="stage", correct_circles=False))
+    start = estimate_series_start(
+        [series], SENSOR, None, [], options=CalibrationOptions(poses="stage", correct_circles=False)
+    )
     return start.evidence[0], start.local[0]
 
 
@@ -215,7 +223,7 @@ def test_a_stage_that_does_not_move_as_described_is_told(staged, tilt_deg, error
     piece, local = staged
     local = np.concatenate([local[:6], [np.tan(np.radians(tilt_deg)), 0.0], errors_mm])
     result, other = estimate_of(local=[np.empty(0), local], residuals=[[], []])
-    found = findings(result, [*other, piece], sensor=SENSOR).contradictions
+    found = check_consistency(result, [*other, piece], sensor=SENSOR).contradictions
     assert len(found) == (0 if said is None else 1)
     assert all(words.startswith(said) for words in found)
 

@@ -11,16 +11,16 @@ from tests.uwlts.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.procedure import joint_problem, solve_jointly
 from uwlts.calibration.joint.residuals import STRIPE, TARGET
 from uwlts.calibration.joint.stored_estimate import found_estimate
-from uwlts.calibration.model_comparison.comparison import Comparison, choice_of, choose, tally
+from uwlts.calibration.model_comparison.comparison import Comparison, choice_of, choose, sum_errors
 from uwlts.calibration.model_comparison.held_out import (
     INSIDE,
     OUTSIDE,
     Candidate,
     Misses,
     Prediction,
+    apply_candidate,
     predict,
-    recast,
-    splits,
+    split_images,
 )
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
@@ -65,7 +65,7 @@ def plain_choice(plain):
 @pytest.fixture(scope="module")
 def tilted_choice(thesis):
     problem = problem_of(thesis, sensor_with(window_tilt_deg=0.2, laser_tilt_deg=0.0), bow=0.0, seed=0)
-    ways = splits(problem)
+    ways = split_images(problem)
     models = (Candidate(), Candidate(window_tilt=False), Candidate(bow=False))
     return choice_of(
         {model: {where: predict(problem, model, held) for where, held in ways.items()} for model in models},
@@ -126,7 +126,7 @@ def test_misses_on_the_object_are_those_in_the_image_times_its_distance(plain):
 
 
 def test_the_outermost_images_are_held_out_outside_and_never_inside(plain):
-    ways = splits(plain)
+    ways = split_images(plain)
     assert list(ways) == [INSIDE, OUTSIDE]
     inside, outside = ways.values()
     for number, positions in enumerate((AIR, IN_WATER)):
@@ -141,7 +141,7 @@ def test_the_outermost_images_are_held_out_outside_and_never_inside(plain):
 def test_too_few_images_are_refused(thesis):
     series = target_series(built_sensor(), medium=0, positions=IN_WATER[::3], columns=15)
     with pytest.raises(CalibrationError, match="too few images with a stripe"):
-        splits(joint_problem(gathered(thesis, [series]), options=OPTIONS))
+        split_images(joint_problem(gathered(thesis, [series]), options=OPTIONS))
 
 
 def test_a_target_held_by_hand_is_predicted_from_its_own_points(thesis):
@@ -174,7 +174,7 @@ def test_what_a_model_adds_is_distinguished_from_noise_and_outliers_do_not_count
         ]
         return Prediction(misses, None, None, None)
 
-    found = tally([made(np.zeros(12)), made(more), made(np.full(12, 1e-4))])
+    found = sum_errors([made(np.zeros(12)), made(more), made(np.full(12, 1e-4))])
     assert found.score(0).px["stripes"] == pytest.approx(0.1, rel=0.03)
     assert found.score(0).all_mm == pytest.approx(0.02, rel=0.03)
     difference, std = found.beyond(1, 0)
@@ -206,12 +206,12 @@ def test_every_candidate_has_the_parameters_its_name_says(plain):
     def names_of(problem):
         return {key.text for key in problem.parameters.keys}
 
-    usual = names_of(recast(plain, Candidate()))
+    usual = names_of(apply_candidate(plain, Candidate()))
     usually = {"p1", "p2", "target_saddle", "target_stretch_x", "target_stretch_y", "target_stripe"}
     assert usual == names_of(plain) - usually
 
     def lacking(**changes):
-        names = names_of(recast(plain, Candidate(**changes)))
+        names = names_of(apply_candidate(plain, Candidate(**changes)))
         return usual - names, names - usual
 
     assert lacking(window_tilt=False) == ({"window_slope_x", "window_slope_y"}, set())

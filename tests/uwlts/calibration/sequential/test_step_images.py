@@ -8,7 +8,7 @@ import pytest
 from tests.uwlts.calibration_views import STEP_MM, WATER, built_sensor, step_profile, through_window
 from tests.uwlts.joint_views import gathered
 from uwlts.calibration.capture_evidence import StepEvidence
-from uwlts.calibration.joint.initial import step_profiles
+from uwlts.calibration.joint.initial import build_step_evidence
 from uwlts.calibration.joint.parameters import Prior, ViewMedium
 from uwlts.calibration.sequential.step_images import StandardTurn, label_steps
 from uwlts.calibration.sequential.window_distance import solve_window
@@ -110,7 +110,7 @@ def test_the_joint_estimate_knows_a_height_as_well_as_its_turn():
     steps = [*turned_step("one.h5", about_stripe=TURN), *turned_step("two.h5")]
     described = SENSOR.model_copy(update={"uncertainty": Uncertainty()})
     seen = gathered(described, [], [(step, ViewMedium(True, 0)) for step in steps])
-    evidence, heights, warnings = step_profiles(seen, AIR, DESCRIBED)
+    evidence, heights, warnings = build_step_evidence(seen, AIR, DESCRIBED)
     images, said = labelled(steps)
     assert warnings == said
     assert [piece.lengthened for piece in evidence] == [image.lengthened for image in images]
