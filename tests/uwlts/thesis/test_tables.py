@@ -301,7 +301,7 @@ def test_free_forms_and_experiments():
 
 def test_sentences_give_the_measured_numbers():
     reported = " ".join(differences(all_rows([campaign()], PUBLISHED)))
-    assert "The polynomials in water err by 0.115 mm" in reported
+    assert "The polynomials in water have an error of 0.115 mm" in reported
     assert "single viewpoint" not in reported
 
 
