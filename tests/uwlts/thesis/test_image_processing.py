@@ -108,7 +108,7 @@ VERTICES = np.array([30.0 + np.arange(LINES) / 8, 41.5 - np.arange(LINES) / 8])
 @pytest.mark.parametrize("fitted_px", [3, 5, 7])
 def test_the_vertex_of_a_sampled_parabola_is_exact(tmp_path, stripe_along, fitted_px):
     images = [parabolas(vertices) for vertices in VERTICES]
-    # The place that is known beforehand decides where to look, not what is found.
+    # The approximate position decides where to search, not the result.
     known = found(VERTICES + np.random.default_rng(1).uniform(-5, 5, VERTICES.shape))
     with capture(tmp_path / "stripe.h5", images, stripe_along=stripe_along) as opened:
         measured = thesis_stripes(opened, known, fitted_px=fitted_px)
@@ -129,7 +129,7 @@ def test_the_mean_of_the_neighbours_keeps_a_parabolas_vertex(tmp_path):
 
 
 def test_noise_within_the_tolerance_is_not_smoothed(tmp_path):
-    """What the plain mean takes out reaches the fit through LabVIEW's filter: 25 pixels against a few."""
+    """Noise that the plain mean removes reaches the fit through LabVIEW's filter: 25 pixels against a few."""
     rng, vertices = np.random.default_rng(2), np.full((4, LINES), 30.0)
     images = [
         (parabolas(row, height=40000, curvature=320) + rng.normal(0, 100, (LENGTH, LINES))).astype(np.uint16)
@@ -175,7 +175,7 @@ def test_a_plateau_is_placed_at_the_stripe_known_or_in_its_own_middle(tmp_path):
 
 
 def test_the_vertex_stays_within_the_fit(tmp_path):
-    """A peak at the rim of the searched range, on a slope, has no vertex there."""
+    """A peak at the rim of the searched range, on a slope, without a vertex there."""
     image = np.repeat((np.arange(LENGTH, dtype=np.uint16) ** 2 * 10)[:, None], LINES, axis=1)
     known = np.full((1, LINES), 30.0)
     with capture(tmp_path / "stripe.h5", [image], stripe_along="width") as opened:

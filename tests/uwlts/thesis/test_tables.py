@@ -228,7 +228,7 @@ def test_headline_rows_are_the_means_of_four_tables():
 
 
 def without(results, **what):
-    """Results in which measurements that match have failed."""
+    """Return results with failures of the matching measurements."""
     measurements = [
         replace(m, figures_mm={}, failure="lost") if what.items() <= vars(m).items() else m
         for m in results.measurements
@@ -246,7 +246,7 @@ def test_a_position_that_was_not_measured():
     mean = alone["Table 6", "spheres, mean, water", "PE"]
     assert mean.ours == pytest.approx(((0.69 + 0.66 + 0.51 + 0.51 + 0.48) / 5,))
     assert mean.ratio == pytest.approx(1.0)
-    # A campaign that lacks a position has no mean to stand beside the other's.
+    # A campaign without a position is missing in the mean.
     both = rows_of(campaign(), without(campaign(), **lost))
     assert both["Table 6", "spheres, far, water", "PE"].ours == pytest.approx((0.46,))
     assert ("Table 6", "spheres, mean, water", "PE") not in both

@@ -283,8 +283,8 @@ def test_the_offset_of_circle_images_is_taken_out(monkeypatch):
     biased = solve_camera(images, **SIZE)
     monkeypatch.setattr("uwlts.calibration.camera.target_poses.schur_least_squares", counted)
     unbiased = solve_camera(images, **SIZE, circle_diameter_mm=6.0)
-    # The offsets, up to 0.09 px, pass for a target some micrometres aside. They depend so little on the solution that
-    # the change of less than 1e-4 px which ends the rounds leaves a thousandth of that.
+    # The offsets, up to 0.09 px, act like a shift of the target by micrometres. They depend so little on the solution
+    # that the change of less than 1e-4 px which ends the rounds leaves a thousandth of that.
     shift, left = (s.target_poses[0, :3, 3] - [0, 0, 560.0] for s in (biased, unbiased))
     assert np.abs(shift).max() > 5e-3
     assert np.abs(left).max() < 1e-5

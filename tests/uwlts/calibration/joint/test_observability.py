@@ -1,4 +1,4 @@
-"""What is said of weak directions; what is predicted of a further shot, against calibrations that have that shot."""
+"""Messages on weak directions; predictions for a further image, compared with calibrations that include it."""
 
 from dataclasses import replace
 
@@ -148,7 +148,7 @@ def without(known, key):
     ],
 )
 def test_steps_alone_leave_the_window_open(thesis, height_mm, pair):
-    """A step's height follows from window distance and turned sheet alike; knowing one of the pair really helps."""
+    """A step's height depends on window distance and sheet rotation in the same way; knowing one of them helps."""
     calibration = from_steps(thesis, height_mm=height_mm)
     known, over, found = of_calibration(calibration)
     assert set(found[0].parameters[:2]) == pair
@@ -235,7 +235,7 @@ def shot(sensor, pose, view, spoilt):
 
 @pytest.mark.slow
 def test_the_advised_shot_does_what_was_predicted(from_water, in_water, thesis):
-    """The uncertainty after it within 20 %, as noise, and so the weights, is estimated anew from all residuals."""
+    """Predicted uncertainty within 20 %, as noise, and so the weights, is estimated again from all residuals."""
     outlooks = next_shots(from_water)
     best = outlooks[0]
     assert best.pose is not None

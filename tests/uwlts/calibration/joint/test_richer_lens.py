@@ -49,7 +49,7 @@ def test_a_wrong_spacing_is_not_taken_for_pixels_that_are_not_square(thesis):
 
 
 def target_in_air_and_water(sensor, *, columns_wider=1.0):
-    """Four images each of a target whose columns are described so many times too far apart."""
+    """Four images each of a target whose described column spacing is too large by a factor."""
     noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(8))
     air = target_series(sensor, window=False, positions=np.linspace(-200.0, 60.0, 4), noise=noise, columns=13)
     water = target_series(sensor, medium=0, positions=np.linspace(-120.0, 60.0, 4), noise=noise, columns=13)
@@ -62,7 +62,7 @@ def target_in_air_and_water(sensor, *, columns_wider=1.0):
 @pytest.mark.parametrize(("aspect", "columns_wider"), [(1.003, 1.0), (1.0, 1.003)])
 @pytest.mark.parametrize("alignment_deg", [0.15, 0.4])
 def test_pixels_of_another_shape_look_like_a_stretched_target(thesis, aspect, columns_wider, alignment_deg):
-    """Where the stage does not tell them apart, both are estimated: the focal lengths are within what is stated."""
+    """If the stage cannot separate them, both are estimated: the focal lengths are within the stated uncertainties."""
     built = altered(BUILT, {"camera": {"pixel_aspect": aspect}})
     known = altered(thesis, {"uncertainty": {"stage_alignment_deg": alignment_deg}})
     evidence = gathered(known, list(target_in_air_and_water(built, columns_wider=columns_wider)))

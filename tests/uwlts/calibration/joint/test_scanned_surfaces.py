@@ -108,7 +108,7 @@ def true_own(kind, evidence):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_scans_by_fermat_lie_on_the_surface_and_every_derivative_is_what_differences_say(kind):
-    """Where residuals vanish, the scale of a residual does not matter; see the other evidence's test.
+    """If residuals vanish, the scale of a residual does not matter; see the other evidence's test.
 
     Crossings by Fermat are exact to 1e-9 mm, a hundred-millionth of a pixel's 0.2 mm.
     """
@@ -166,7 +166,7 @@ class _Held:
 
 
 def asked(found, **std):
-    """What scans alone say of the parameters that have a standard uncertainty: errors and stated uncertainties."""
+    """Return errors and stated uncertainties of the parameters with a standard uncertainty, from scans only."""
     model, global_values = parameters(**std)
     lens = len(model.intrinsics.names)
     evidence, local = zip(*found, strict=True)
@@ -195,7 +195,7 @@ def test_round_spheres_tell_the_stage_and_the_water(known):
     errors, std, result = asked([scan], **dict.fromkeys(SLOPE_NAMES, 0.01), index_of_water=2e-3)
     for name, error in errors.items():
         assert abs(error) < 4 * std[name], name
-        # That points on a sphere err together is stated, so that the uncertainty is far from what 0.02 px alone leave.
+        # The stated uncertainty includes errors common to a sphere's points, so it is far above that of 0.02 px noise.
         assert std[name] < 3e-3, name
     assert np.abs(result.local[0][6:8]).max() < (0.01 if known else 0.1)
     assert result.noise[Spheres.kind].besides > 10

@@ -76,7 +76,7 @@ def white(sigma_px, seed, count=600):
 
 
 def images_of(kind, scatter_px, *, others=9, usual_px=0.1):
-    """One image that scatters so much among nine others."""
+    """One image with a given scatter among nine others."""
     return [(kind, "odd", white(scatter_px, 0)), *((kind, f"usual {n}", white(usual_px, 1 + n)) for n in range(others))]
 
 
@@ -218,7 +218,7 @@ def staged():
 def test_a_stage_that_does_not_move_as_described_is_told(staged, tilt_deg, errors_mm, said):
     """0.5 deg and 0.005 mm are stated: six of these are too much, three of the mean square of all positions.
 
-    Also where other evidence, which has no stage, comes first.
+    Also if other evidence, without a stage, comes first.
     """
     piece, local = staged
     local = np.concatenate([local[:6], [np.tan(np.radians(tilt_deg)), 0.0], errors_mm])

@@ -87,10 +87,10 @@ def test_where_nothing_is_tilted_or_bowed_the_simplest_model_is_chosen(plain_cho
 
 
 def test_a_tilted_window_is_found_to_be_needed(tilted_choice):
-    """A tilt t shifts rays by t (n - 1) times the distance to the object: 0.2 deg and 400 mm make 0.46 mm.
+    """A tilt t shifts rays by t (n - 1) times the distance to the object: 0.2 deg and 400 mm give 0.46 mm.
 
-    Poses and principal point take up most of it; what remains is 2 to 6 µm by the noise drawn, of which a dozen
-    images held out tell a quarter to a third.
+    Poses and principal point absorb most of it. The remaining 2 to 6 µm depend on the noise; a dozen held-out images
+    determine them to a quarter or a third.
     """
     assert tilted_choice.simplest().window_tilt
     assert Candidate(window_tilt=False) not in tilted_choice.as_good()
@@ -186,7 +186,7 @@ def test_what_a_model_adds_is_distinguished_from_noise_and_outliers_do_not_count
 
 
 def test_a_parameter_without_uncertainty_is_held_and_read_back(thesis):
-    """With tilts and bow known exactly there is nothing to estimate of them; the file tells them all the same."""
+    """If tilts and bow are known exactly, they are not estimated, but the file contains them."""
     known = thesis.uncertainty.model_copy(update={"window_tilt_deg": 0.0, "bow_deg": 0.0})
     window = thesis.camera.window.model_copy(update={"tilt_x_deg": 0.3})
     camera = thesis.camera.model_copy(update={"window": window})

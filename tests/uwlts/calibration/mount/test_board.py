@@ -45,7 +45,7 @@ def views(count, rng):
 
 
 def simulated(rng, *, count=12, position_mm=0.05, turn_rad=3e-4, wrong=()):
-    """Images whose poses err by their covariance, of a platform whose positions and turns scatter."""
+    """Images with pose errors from their covariance, and a platform with scatter of positions and rotations."""
     images = []
     std = np.array([0.02, 0.02, 0.15, 2e-3, 2e-3, 2e-4])
     for number, seen in enumerate(views(count, rng)):

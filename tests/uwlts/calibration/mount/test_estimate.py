@@ -10,9 +10,9 @@ from uwlts.calibration.mount.estimate import NotSettled, settle
 
 @dataclass(frozen=True)
 class TwoReadings:
-    """Two readings of one number, at -1 and at 1; the first counts with a weight that depends on the number itself.
+    """Two readings of one number, at -1 and at 1; the first has a weight that depends on the number itself.
 
-    Where the weight is ``share`` the solution is 1 - 2 share.
+    For the weight ``share``, the solution is 1 - 2 share.
     """
 
     slope: float

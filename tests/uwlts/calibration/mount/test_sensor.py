@@ -1,4 +1,4 @@
-"""What a sensor's calibration does to a mount and to points along a path, against changed calibrations."""
+"""Effect of a sensor's calibration on a mount and on points along a path, compared with changed calibrations."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -109,7 +109,7 @@ def test_points_do_not_count_the_sensor_twice(known, thesis, captured, mount):
     together = with_platform(shared, base, frame, ride, mount, mount_covariance=apart).std_mm()
     alone = point_uncertainty(table, known.calibration, frame, line, noisy)
     twice = with_platform(alone, base, frame, ride, mount).std_mm()
-    # Where the mount was found it makes good what the calibration does: the sphere stays where it was.
+    # At the place of the mount's calibration, the mount compensates the change of the calibration: the sphere stays.
     assert np.median(together) < 0.5 * np.median(twice)
 
 

@@ -37,11 +37,11 @@ from uwlts.targets import CircleTarget
 
 DEPTHS = np.arange(-60.0, 101.0, 10.0)
 FAR_OFF = 7.0
-"""Stage position at which the plate stands at Z = 0."""
+"""Stage position of the plate at Z = 0."""
 
-# What the thesis's volume demands of a smooth description. Z(position) is nearly A / (pole - position) with a pole five
+# Smoothness in the thesis's volume. Z(position) is nearly A / (pole - position) with a pole five
 # half ranges from the middle: the sixth degree leaves 2 A / rho**7 with A = 3 m and rho = 10, 0.5 um. Lens and window
-# leave 16 mm times (view angle 0.27)**n of the plate's coordinates at degree n: 5 um at the sixth, of which a fit over
+# leave 16 mm times (view angle 0.27)**n of the plate's coordinates at degree n: 5 um at the sixth; a fit over
 # the view leaves a quarter.
 CLOSE_MM = 2e-3
 
@@ -99,9 +99,9 @@ TARGET = CircleTarget(
 
 
 def evidence_of(sensor, *, towards=1.0, spin=0.02, noise_px=0.0, seed=0, without=()):
-    """What captures of the plate show, turned by ``spin`` in its plane, with the stripe on every fourth line.
+    """Evidence from captures of the plate, turned by ``spin`` in its plane, with the stripe on every fourth line.
 
-    Lines in ``without`` have no stripe; those between the fourth ones borrow as dark lines do.
+    Lines in ``without`` lack a stripe; lines between the fourth ones are interpolated, as dark lines are.
     """
     rng = np.random.default_rng(seed)
     images, stripes = [], []
@@ -544,7 +544,7 @@ def test_captures_to_cloud(files, small):
 
 
 def test_commands(files, tmp_path, monkeypatch, capsys):
-    """The file that one command writes serves the next; what is lost is told."""
+    """The file that one command writes is input of the next; losses are reported."""
     out, cloud = tmp_path / "polynomials.json", tmp_path / "scan.ply"
     for line in (
         ["polynomials", "--target", files["target"], "--degree", "4", "--out", out],

@@ -81,7 +81,7 @@ def test_a_stage_beside_the_normal_is_noticed_and_taken_for_no_other_lens():
     (warning,) = normal.warnings
     assert warning.startswith("the stage moves at 0.29 deg to the target's normal: with poses 'stage'")
     assert normal.calibration.figures("camera")["lens_model"] == "k1 k2, square pixels"
-    # What the model lacks widens what it states, though not as far as it is off.
+    # An incomplete model enlarges the stated uncertainty, though less than its error.
     by_points = calibrated(*staged(2), seed=2)
     assert normal.camera.std()["f"] > 3 * by_points.camera.std()["f"]
     freer = calibrated(images, poses, seed=2, poses="stage")

@@ -85,7 +85,7 @@ def test_outliers_are_left_out_and_counted():
     solution = fit_sheet(points, nominal_normal=LASER.normal)
     assert not solution.used[stray].any()
     assert solution.rejected_share == pytest.approx(0.05, abs=2e-3)
-    # 5 % fewer points move the plane by a small share of its standard deviation.
+    # 5 % fewer points move the plane by a small fraction of its standard deviation.
     assert angle(np.array(solution.model.normal), np.array(clean.model.normal)) < clean.normal_std_rad
     assert solution.max_mm < 10 * solution.rms_mm
     assert np.abs(solution.residuals_mm[stray]).min() > solution.max_mm
@@ -110,7 +110,7 @@ def test_undetermined_sheets_are_refused():
     rng = np.random.default_rng(3)
     for noise in (0.0, 0.15):
         single = stripe_points(positions=np.array([50.0]), noise_px=noise, rng=rng).points_mm
-        # Noise moves the points within the target's plane, which they would all lie on.
+        # Noise moves the points within the target's plane, so all are on this plane.
         with pytest.raises(CalibrationError, match="one line|extend only"):
             fit_sheet(single, nominal_normal=LASER.normal)
     points = stripe_points().points_mm
@@ -167,7 +167,7 @@ def test_a_laser_nearly_along_the_camera_shows_mirrored_images_by_its_side():
     points = 80.0 * normal + across * np.array([1.0, 0.0, 0.0]) + (400.0 + reach) * along
     given = {"nominal_normal": normal, "nominal_offset_mm": 80.0}
     assert fit_sheet(points, **given).turn_rad < 1e-6
-    with pytest.raises(CalibrationError, match="at -80.0 mm, .* on the other side: the images are turned"):
+    with pytest.raises(CalibrationError, match="at -80.0 mm; .* on the other side: the images are turned"):
         fit_sheet(points * MIRRORED["top to bottom"], **given)
 
 
