@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
-from tests.bench.coverage import Campaign, estimate_noise, run_campaign, within
+from tests.bench.coverage import Campaign, judged, run_campaign, within
 
 pytestmark = pytest.mark.slow
 
@@ -25,7 +25,7 @@ def outcomes():
 @pytest.fixture(scope="module")
 def measured(outcomes):
     """Errors over stated standard uncertainties, and shares within 95 %, of all scans together, by quantity."""
-    found = estimate_noise(outcomes)
+    found = judged(outcomes)
     return {
         quantity: [m for (_, other), some in found.items() if other == quantity for m in some]
         for quantity in ("spacing", "diameter")
