@@ -240,7 +240,7 @@ def test_the_linear_camera_is_exact_without_distortion():
         direct_linear(points * [1, 1, 0], lens.pixels(camera))
     with pytest.raises(CalibrationError, match="at least 6"):
         direct_linear(points[:5], lens.pixels(camera)[:5])
-    with pytest.raises(CalibrationError, match="one place"):
+    with pytest.raises(CalibrationError, match="same place"):
         direct_linear(points, np.full((40, 2), 7.0))
 
 

@@ -419,7 +419,7 @@ def test_scans_along_different_directions_are_refused():
         ({"kind": "step", "height_mm": 20.0}, None, DescriptionError, "shows a step"),
         ({"kind": "pipe"}, None, DescriptionError, "diameter_mm"),
         ({"kind": "plane"}, None, CaptureError, "no stripe"),
-        ({"kind": "plane"}, np.eye(4), CalibrationError, "carry poses"),
+        ({"kind": "plane"}, np.eye(4), CalibrationError, "contains poses"),
     ],
 )
 def test_captures_that_are_no_scan_of_a_known_surface(tmp_path, artefact, pose, error, says):
