@@ -151,7 +151,7 @@ def main(folder: Path) -> None:
         calibration = uwlts.read(path.parent / "calibration.json")
         assert isinstance(calibration, Calibration)
         robot = captured(path.parent / path.name.replace("pipe-five-sides", "robot-sphere"))
-        mount = uwlts.calibrate_mount(robot.selected(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
+        mount = uwlts.calibrate_mount(robot.select(np.arange(FOR_THE_MOUNT)), radius_mm=RADIUS_MM)
         rows.append(pipe(path, calibration, mount))
         print(f"{path.parent.name}, {path.stem}: diameter, ovality, largest step, largest closure, mm", flush=True)
         print(

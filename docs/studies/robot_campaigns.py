@@ -63,9 +63,7 @@ def main(folder: Path) -> None:
             reported = profiles_of(capture, calibration, None, None)
         ideal = profiles_of_poses(reported, truth.pose @ np.linalg.inv(true))
         for name, captured in {"ideal": ideal, "as reported": reported}.items():
-            first, held = (
-                captured.selected(each) for each in np.split(np.arange(len(captured.poses)), [FOR_THE_MOUNT])
-            )
+            first, held = (captured.select(each) for each in np.split(np.arange(len(captured.poses)), [FOR_THE_MOUNT]))
             mount = uwlts.calibrate_mount(first, radius_mm=RADIUS_MM)
             assert isinstance(mount.artefact, SphereFound) and mount.sensor is not None
             off, centre = errors(mount, true), np.array(mount.artefact.centre_mm)

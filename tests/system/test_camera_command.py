@@ -48,7 +48,7 @@ def test_photographs_give_the_camera_and_name_what_was_left_out(folder: Path, tm
     assert estimated["images"] == [f"board{number}.png" for number in range(8)]
     for name, reason in {
         "nothing.png": "found no chessboard of 9 x 6 inner corners",
-        "a-large.png": f"pixels, most images have {SIZE[0]} x {SIZE[1]}",
+        "a-large.png": f"pixels; most images have {SIZE[0]} x {SIZE[1]}",
         "truncated.png": "truncated or damaged",
     }.items():
         assert reason in estimated["left_out"][name] and f"warning: {name}: " in done.stderr

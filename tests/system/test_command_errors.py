@@ -608,9 +608,11 @@ def test_reproductions_that_cannot_be(fails, folder: Path, monkeypatch, options:
 
 
 def test_theses_that_cannot_be(fails, tmp_path: Path):
-    fails("uwlts", "thesis", tmp_path / "missing", says="missing holds no campaign")
+    fails("uwlts", "thesis", tmp_path / "missing", says="missing contains no campaign")
     (tmp_path / "runs").mkdir()
-    fails("uwlts", "thesis", tmp_path / "runs", says="runs holds no campaign: a folder called campaign-0, campaign-1")
+    fails(
+        "uwlts", "thesis", tmp_path / "runs", says="runs contains no campaign; expected folders campaign-0, campaign-1"
+    )
     place = tmp_path / "runs" / "campaign-0"
     place.mkdir()
     fails("uwlts", "thesis", tmp_path / "runs", says="campaign-0 has no ")
@@ -626,7 +628,7 @@ def test_theses_that_cannot_be(fails, tmp_path: Path):
     fails("uwlts", "thesis", tmp_path / "runs", "--trials", "5", says="trials is 5: take 20 or more, or 0")
     fails("uwlts", "thesis", tmp_path / "runs", "--trials", "-1", says="trials is -1")
     fails("uwlts", "thesis", tmp_path / "runs", "--workers", "0", says="workers is 0; it must be at least 1")
-    fails("uwlts", "thesis", tmp_path / "runs", "--published", "thesis", says="holds no published tables")
+    fails("uwlts", "thesis", tmp_path / "runs", "--published", "thesis", says="contains no published tables")
     (tmp_path / "runs" / "report.html").write_text("precious", encoding="utf-8")
     fails("uwlts", "thesis", tmp_path / "runs", says="report.html exists already")
     assert (tmp_path / "runs" / "report.html").read_text(encoding="utf-8") == "precious"

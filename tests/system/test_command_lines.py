@@ -100,7 +100,7 @@ def test_distortion_is_auto_or_each_coefficient_once(command, tmp_path, monkeypa
     for wrong in ("auto k1", "k1 k1"):
         ended = uwlts(command, *required, "--distortion", *wrong.split())
         assert ended.returncode == 2
-        assert f"--distortion {wrong}: expected auto alone" in ended.stderr
+        assert f"--distortion {wrong}: expected only auto" in ended.stderr
     assert _parsed(uwlts_app, command, "--distortion", ["--distortion", "auto"]) == ("auto",)
     # The coefficients are taken: something else is missed next.
     ended = uwlts(command, *required, "--distortion", "k1", "k2")

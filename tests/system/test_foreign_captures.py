@@ -233,7 +233,7 @@ TARGETS: dict[str, tuple[Damage, str]] = {
     "laser only": (lambda frames: [f for f in frames if f.laser_on], "all of them were taken with the laser on"),
     "elsewhere": (
         lambda frames: [replace(f, stage_mm=f.stage_mm + 5) if f.laser_on else f for f in frames],
-        "with a stripe were taken at other stage positions than those at which the target was found",
+        "with a stripe were taken at other stage positions than the images with the target",
     ),
 }
 
@@ -264,7 +264,7 @@ def test_other_calibrations_say_the_same(says, target_frames, tmp_path: Path, na
 
 def test_polynomials_of_images_upside_down(says, target_frames, tmp_path: Path):
     path = captured(tmp_path / "x.h5", images(upside_down)(target_frames), target=PLATE)
-    says(f"polynomials --degree 3 --target {path} --out {tmp_path / 'x.json'}", "not turned by 180 deg or mirrored")
+    says(f"polynomials --degree 3 --target {path} --out {tmp_path / 'x.json'}", "not rotated by 180 deg or mirrored")
 
 
 # --- Captures of steps and scans
@@ -276,7 +276,7 @@ def test_polynomials_of_images_upside_down(says, target_frames, tmp_path: Path):
         (black, "no stripe in any of the 2 laser images of step.h5: all are black"),
         (white, "no stripe in any of the 2 laser images of step.h5: all are white"),
         (noise, "no stripe in any of the 2 laser images of step.h5: no bright line"),
-        (upside_down, "bound of the searched window distances.*not turned or mirrored|no step image can be used"),
+        (upside_down, "bound of the searched window distances.*not rotated or mirrored|no step image can be used"),
     ],
     ids=["black", "white", "noise", "upside down"],
 )
@@ -290,7 +290,7 @@ def test_captures_of_a_step(says, target_frames, tmp_path: Path, change, words: 
 def test_a_step_with_exchanged_sides(says, target_frames, tmp_path: Path):
     target = captured(tmp_path / "x.h5", images(turned)(target_frames), target=PLATE)
     step = write(tmp_path / "step.h5", [step_image(20.0)], artefact=STEP)
-    words = "image size is 640 x 512 px against 512 x 640 px; the images of one are turned by a quarter turn"
+    words = "image size is 640 x 512 px instead of 512 x 640 px; the images of one are rotated by 90 deg"
     says(f"calibrate --air {target} --step {step} --out {tmp_path / 'x.json'}", words)
 
 

@@ -10,7 +10,7 @@ from tests.system.in_process import uwlts
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ((), "nothing to compare models by: give --air or --water"),
+        ((), "no captures of a target to compare models with: give --air or --water"),
         (("--water", "missing.h5"), "no capture at missing.h5"),
         (("--water", "missing.h5", "--workers", 0), "workers is 0; it must be at least 1"),
         (("--water", "missing.h5", "--index", 0.5), "the refractive index is 0.5"),

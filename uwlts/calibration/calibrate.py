@@ -1,4 +1,4 @@
-"""Calibration of a sensor from its captures, by the method that they need."""
+"""Calibration of a sensor from its captures, with the appropriate method."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -46,68 +46,68 @@ def calibrate(
     Parameters
     ----------
     air : sequence of Capture or path
-        Captures of the target in air: at every stage position one image under the lamp and one with the laser. If all
-        are taken in the medium of use, and without steps, the calibration has a single viewpoint for that medium.
+        Captures of the target in air, with one lamp image and one laser image at every stage position. If all captures
+        are in the medium of use and there are no steps, the result is a single-viewpoint model for this medium.
     water : sequence of Capture or path
-        The same in the medium of use, seen through the window, whose distance is estimated too.
+        Captures of the target in the medium of use through the window, whose distance is then estimated.
     step : sequence of Capture or path
-        Captures of the step standard in the medium of use; without any the calibration is for air only.
+        Captures of the step standard in the medium of use; without them, the calibration is for air only.
     scan : sequence of Capture or path
-        Scans of spheres, a plane or a pipe that stand still: round objects determine the stage's direction and the
-        water's index, better if their size is known; a plane determines what bends it.
+        Scans of spheres, a plane or a pipe at rest. Round objects determine the stage's direction and the water's
+        index, more accurately if their size is known; a plane determines parameters that would bend it.
     joint : bool
-        Estimate all parameters together, as always with ``water`` or ``scan``; the sensor's description states what is
-        known before and how well.
+        Estimate all parameters together, as always with ``water`` or ``scan``. Prior knowledge and its uncertainty are
+        taken from the sensor's description.
     new_water : bool
-        The scans were taken in other water than the target, or on another day: estimate its index too.
+        The scans were taken in other water than the target, or on another day: also estimate its index.
     unknown_sizes : bool
-        Estimate diameters and spacings of what was scanned, even if its description states their uncertainty.
+        Estimate diameters and spacings of scanned objects, even if their descriptions state an uncertainty.
     strict : bool
-        Refuse images that do not fit together. Jointly, single ones are otherwise left out, and what most images show
-        is stated as an error of the model, which makes uncertainties larger; both with a warning.
+        Raise an error if images do not fit together. Otherwise the joint calibration rejects single images with a
+        warning, and enlarges uncertainties with a warning if most images deviate from the model.
     refractions : {1, 2}
         2: window of known thickness, air images taken without it. 1: one interface, air images taken through the
-        window, whose effect goes into the distortion. The joint calibration takes this from the captures.
+        window, with its effect included in the distortion. The joint calibration reads this from the captures.
     poses : {"stage-normal", "stage", "free"}
         stage-normal: one target pose, moved by the stage along the target's normal (the thesis). stage: the same with a
-        free direction, as always in the joint calibration. free: every image has a pose of its own.
+        free direction, as always in the joint calibration. free: every image has its own pose.
     distortion : "auto" or tuple of str
-        Distortion coefficients to estimate; the others stay 0. auto: with the poses stage and free those that predict
-        images left out best; with stage-normal k1 and k2; jointly k1 and k2, p1 and p2 as far as the description leaves
-        them open, and more where the images contradict that.
+        Distortion coefficients to estimate; the others stay 0. auto: with the poses stage and free, those that best
+        predict held-out images; with stage-normal, k1 and k2; jointly, k1 and k2, p1 and p2 within the limits of the
+        description, and more if the images require it.
     pixels : {"auto", "square", "free"}
-        Whether pixels are square, or else as the sensor's description says, or free to be not; auto: as distortion,
-        with free poses; else square.
+        Whether pixels are square (or as the sensor's description says), or have a free shape. auto: as distortion for
+        free poses, else square.
     index : float, optional
-        Refractive index of the medium relative to air, in place of the one that follows from the captures.
+        Refractive index of the medium relative to air. Default: the index that follows from the captures.
     stripe : StripeOptions or dict, optional
         As for `reconstruct`.
     progress : callable, optional
-        Called with the number of images done, the number in all, and the name of the stage.
+        Called with the number of images done, the total, and the name of the stage.
 
     Returns
     -------
     Calibration
-        The warnings about its evidence are those of its `Calibration.origin`.
+        Its `Calibration.origin` contains the warnings about the evidence.
 
     Raises
     ------
     CalibrationError
         The captures do not determine the calibration or contradict it.
     DescriptionError
-        There is no capture of a target, or one does not describe its target, its step standard or what it scans.
+        There is no capture of a target, or a capture does not describe its target, step standard or scanned object.
     CaptureError
         A file is missing or damaged, or a scan shows no stripe.
     RangeError
-        The refractive index is not that of a medium.
+        The refractive index is out of range.
     """
     if index is not None:
         require_index(index)
     require_coefficients(distortion)
     if not (air or water):
-        raise DescriptionError("nothing to calibrate from: give `air` or `water` with captures of a target")
+        raise DescriptionError("no captures of a target to calibrate from: give `air` or `water`")
     if (new_water or unknown_sizes) and not scan:
-        raise DescriptionError("`new_water` and `unknown_sizes` are about scans: give these with `scan`")
+        raise DescriptionError("`new_water` and `unknown_sizes` apply to scans: give `scan`, too")
     options = CalibrationOptions(
         refractions=refractions,
         poses=poses,

@@ -1,4 +1,4 @@
-"""Evidence of captures for a calibration: target points, stripes on the target, stripes on the step standard."""
+"""Evidence in captures for a calibration: target points, stripes on the target, stripes on the step standard."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -22,9 +22,9 @@ from uwlts.stripe.capture_stripes import shown_stripe
 from uwlts.targets import Target, TargetView, parse_target
 
 _SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
-_FEWEST_LINES = 20  # fewer are reflections or specks rather than the stripe
-_MANY_OUTLIERS = 0.05  # share of a capture's stripe points from which those left out are worth a warning
-_LOOKED_AT = 15  # images of a capture in which the reason for a missing stripe is sought
+_FEWEST_LINES = 20  # fewer lines are reflections or specks, not the stripe
+_MANY_OUTLIERS = 0.05  # fraction of a capture's stripe points above which rejected points give a warning
+_LOOKED_AT = 15  # images of a capture that are searched for the reason of a missing stripe
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,20 +32,20 @@ class AirEvidence:
     """Target points and stripes in the captures in air."""
 
     target: Target
-    images: list[TargetImage]  # images in which the target was found, one placement per capture
-    frames: list[tuple[int, int]]  # capture and frame that each of them comes from
-    stripes: list[np.ndarray]  # (N, 2) each; stripe pixels on the target at the position of the image; may be empty
-    warnings: list[str]  # images left out, and why
-    no_stripe: str = ""  # why there is no stripe at all; empty where there is one
-    outliers: list[int] = field(default_factory=list)  # stripe pixels of each that lie beside its curve; left out
+    images: list[TargetImage]  # images with the target, one placement per capture
+    frames: list[tuple[int, int]]  # capture and frame of each of them
+    stripes: list[np.ndarray]  # (N, 2) each; stripe pixels on the target at the position of the image, or empty
+    warnings: list[str]  # rejected images, with the reason
+    no_stripe: str = ""  # reason why there is no stripe at all; else empty
+    outliers: list[int] = field(default_factory=list)  # rejected stripe pixels of each, off the curve
     captures: list[str] = field(default_factory=list)  # their names
 
     def names(self) -> list[str]:
-        """The images, as captures and frames."""
+        """Return capture and frame of each image."""
         return [f"{self.captures[capture]}, frame {frame}" for capture, frame in self.frames]
 
     def only(self, chosen: np.ndarray, images: list[TargetImage]) -> "AirEvidence":
-        """The images of some numbers, with their points replaced."""
+        """Return the chosen images, with their points replaced."""
         some = chosen.tolist()
         return replace(
             self,
@@ -58,10 +58,9 @@ class AirEvidence:
 
 @dataclass(frozen=True, eq=False)
 class StepEvidence:
-    """A stripe (N, 2) on a step standard, with the standard, the medium's index and where it comes from.
+    """Stripe (N, 2) on a step standard, with the standard, the medium's index and the source.
 
-    ``index_std`` is the index's standard uncertainty, ``travel_mm`` where the stage has moved the sensor, along the
-    axes of the OCS.
+    ``index_std`` is the index's standard uncertainty, ``travel_mm`` the displacement of the sensor by the stage, OCS.
     """
 
     pixels: np.ndarray
@@ -72,25 +71,25 @@ class StepEvidence:
     index_std: float = 0.0
 
     def capture(self) -> str:
-        """The capture it comes from."""
+        """Return the name of the capture."""
         return self.source.rsplit(", frame ", 1)[0]
 
 
 def air_evidence(
     captures: Sequence[Capture], *, stripe: StripeSettings = None, progress: ProgressListener = unheard
 ) -> AirEvidence:
-    """Find the target in the images with the laser off, and the stripe in those with it on at the same positions.
+    """Find the target in images with the laser off, and the stripe in images with it on at the same positions.
 
     Raises
     ------
     CalibrationError
-        The captures describe no target, or different ones, or it was found in none of their images.
+        The captures describe no target, or different ones, or no image shows it.
     DescriptionError
         A target's description cannot be read.
     """
     targets = [parse_target(capture.header.target) for capture in captures if capture.header.target is not None]
     if len(targets) < len(captures) or not captures:
-        raise CalibrationError("a capture for the calibration in air must describe its target: its header has none")
+        raise CalibrationError("a capture for the calibration in air must describe its target, but its header does not")
     if any(target != targets[0] for target in targets):
         raise CalibrationError("the captures in air show different targets: calibrate with one target at a time")
     total, done = sum(map(len, captures)), 0
@@ -98,7 +97,7 @@ def air_evidence(
     reasons: Counter[str] = Counter()
     for number, capture in enumerate(captures):
         first = len(images)
-        detect = partial(_target_in, capture, targets[0], number)
+        detect = partial(_detect_target, capture, targets[0], number)
         for (frame, _), found in in_threads(detect, capture.frames(laser_on=False)):
             if isinstance(found, str):
                 reasons[found] += 1
@@ -112,7 +111,7 @@ def air_evidence(
                 outliers.append(0)
             done = _report(progress, "target", done, total)
         positions = np.array([image.stage_mm for image in images[first:]])
-        on_target = partial(_stripe_beside, capture, stripe, first, views[first:], positions, targets[0])
+        on_target = partial(_find_target_stripe, capture, stripe, first, views[first:], positions, targets[0])
         for (frame, _), found in in_threads(on_target, _laser_frames(capture)):
             if isinstance(found, str):
                 warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {found}")
@@ -125,14 +124,13 @@ def air_evidence(
         if rejected > _MANY_OUTLIERS * (rejected + kept):
             share = 100 * rejected / (rejected + kept)
             warnings.append(
-                f"{capture.path.name}: {share:.0f} % of the stripe on the target was left out, for it lies beside the "
-                "curve of the rest: reflections, a second line, or a plate that is not flat"
+                f"{capture.path.name}: {share:.0f} % of the stripe on the target was left out, as it is off the curve "
+                "of the rest: reflections, a second line, or a plate that is not flat"
             )
     if not images:
-        raise CalibrationError(
-            f"the target was found in no image of {_names(captures)}: {_why_no_target(captures, targets[0], reasons)}"
-        )
-    no_stripe = "" if any(map(len, stripes)) else no_stripe_in(captures)
+        why = _explain_missing_target(captures, targets[0], reasons)
+        raise CalibrationError(f"the target was found in no image of {_names(captures)}: {why}")
+    no_stripe = "" if any(map(len, stripes)) else explain_missing_stripe(captures)
     return AirEvidence(targets[0], images, frames, stripes, warnings, no_stripe, outliers, _file_names(captures))
 
 
@@ -143,13 +141,19 @@ def step_evidence(
     stripe: StripeSettings = None,
     progress: ProgressListener = unheard,
 ) -> tuple[list[StepEvidence], list[str]]:
-    """Stripes on the step standard in all images with the laser on, and warnings about images left out.
+    """Find stripes on the step standard in all images with the laser on; return them with warnings.
 
     Parameters
     ----------
-    medium_index : replaces the index of the captures' medium at the laser's wavelength
+    captures, stripe, progress
+        Captures, stripe settings, and progress listener.
+    medium_index
+        Replaces the index of the captures' medium at the laser's wavelength.
 
-    Raises DescriptionError: a capture does not say which step standard it shows.
+    Raises
+    ------
+    DescriptionError
+        A capture does not describe its step standard.
     """
     total, done = sum(int(np.count_nonzero(capture.laser_on)) for capture in captures), 0
     found, warnings = [], []
@@ -164,7 +168,7 @@ def step_evidence(
         if index is None:
             index = capture.header.medium.refractive_index(wavelength)
             index_std = capture.header.medium.index_uncertainty(wavelength, known)
-        for (frame, _), pixels in in_threads(partial(_stripe_in, capture, stripe), _laser_frames(capture)):
+        for (frame, _), pixels in in_threads(partial(_find_stripe, capture, stripe), _laser_frames(capture)):
             if isinstance(pixels, str):
                 warnings.append(f"{capture.path.name}, frame {frame}: stripe left out, {pixels}")
             else:
@@ -175,17 +179,17 @@ def step_evidence(
     return found, warnings
 
 
-def no_stripe_in(captures: Sequence[Capture]) -> str:
-    """Reasons why no stripe was found in captures, in words; of a target, none where it was found."""
+def explain_missing_stripe(captures: Sequence[Capture]) -> str:
+    """Return the reason why no stripe was found in captures; for captures of a target, none on the target."""
     header, count = captures[0].header, sum(int(np.count_nonzero(capture.laser_on)) for capture in captures)
     if not count:
         return f"{_names(captures)}: no image with the laser on; take one at every position"
     along, where = header.sensor.camera.stripe_along, f"laser images of {_names(captures)}"
-    lit = [image for capture in captures for image in _lit(capture, _LOOKED_AT)]
+    lit = [image for capture in captures for image in _laser_images(capture, _LOOKED_AT)]
     if not lit:
         return f"no stripe in any of the {count} centre lines of {_names(captures)}: is the laser on?"
     if any(shown_stripe(image, stripe_along=along) == "along" for image in lit):
-        return f"the {where} with a stripe were taken at other stage positions than those at which the target was found"
+        return f"the {where} with a stripe were taken at other stage positions than the images with the target"
     reason = why_no_stripe(lit, stripe_along=along, full_dn=header.saturation_dn)
     return f"no stripe in any of the {count} {where}: {reason}"
 
@@ -198,32 +202,32 @@ def _names(captures: Sequence[Capture]) -> str:
     return ", ".join(_file_names(captures))
 
 
-def _why_no_target(captures: Sequence[Capture], target: Target, reasons: Counter[str]) -> str:
-    """Reason why none of the images shows the target; ``reasons`` count the faults of those with the laser off."""
+def _explain_missing_target(captures: Sequence[Capture], target: Target, reasons: Counter[str]) -> str:
+    """Return the reason why no image shows the target; ``reasons`` counts the faults of images with the laser off."""
     if not any(map(len, captures)):
         return "there are no images in it"
-    for image in [image for capture in captures for image in _lit(capture, 3)]:
+    for image in [image for capture in captures for image in _laser_images(capture, 3)]:
         with suppress(TargetError, CalibrationError):
             target.detect(image)
             return (
                 "images marked as taken with the laser on show it instead: lamp and laser images are exchanged, or "
-                "none is marked as a lamp image"
+                "no image is marked as a lamp image"
             )
     count = reasons.total()
     if not count:
-        return "all of them were taken with the laser on; take one under the lamp at every position too"
+        return "all of them were taken with the laser on; also take one with the lamp at every position"
     return "; ".join(f"{reason} ({times} of {count} images)" for reason, times in reasons.most_common(2))
 
 
-def _lit(capture: Capture, most: int) -> Iterator[np.ndarray]:
-    """At most so many of the images with the laser on, from the first to the last; no centre lines."""
+def _laser_images(capture: Capture, most: int) -> Iterator[np.ndarray]:
+    """Yield at most ``most`` images with the laser on, evenly chosen; images of 3D cameras are skipped."""
     lit = np.flatnonzero(capture.laser_on & capture.has_image)
     for place in np.unique(np.linspace(0, len(lit) - 1, most).astype(int)) if len(lit) else ():
         yield capture.image(int(lit[place]))
 
 
 _Seen = tuple[int, np.ndarray | Stripe]
-"""A laser frame's number and its image, or its stripe where a 3D camera has found that."""
+"""Number of a laser frame, and its image or the stripe from a 3D camera."""
 
 
 def _laser_frames(capture: Capture) -> Iterator[_Seen]:
@@ -231,10 +235,10 @@ def _laser_frames(capture: Capture) -> Iterator[_Seen]:
         yield frame, capture.seen(frame)
 
 
-def _target_in(
+def _detect_target(
     capture: Capture, target: Target, placement: int, numbered: tuple[int, np.ndarray]
 ) -> tuple[TargetView, TargetImage] | str:
-    """The target in an image with the laser off, or why it is of no use."""
+    """Find the target in an image with the laser off, or return the reason for rejection."""
     frame, image = numbered
     try:
         view = target.detect(image)
@@ -243,7 +247,7 @@ def _target_in(
         return why_not_found(image, str(error), full_dn=capture.header.saturation_dn)
 
 
-def _stripe_beside(
+def _find_target_stripe(
     capture: Capture,
     settings: StripeSettings,
     first: int,
@@ -252,38 +256,38 @@ def _stripe_beside(
     target: Target,
     numbered: _Seen,
 ) -> tuple[int, TargetStripe] | str:
-    """The stripe on the target, and the place from ``first`` on of the target's image at this position, or why none."""
+    """Find the stripe on the target, and the number of the target's image at this position, or return the reason."""
     frame, seen = numbered
     here = np.flatnonzero(np.abs(positions_mm - capture.stage_mm[frame]) <= _SAME_POSITION_MM)
     if not len(here):
         return f"no target was found at {capture.stage_mm[frame]:g} mm"
     place = int(here[0])
-    along, options, clip = _how_to_find(capture, settings)
+    along, options, clip = _stripe_settings(capture, settings)
     try:
         found = stripe_on_target(seen, views[place], target, stripe_along=along, options=options, saturation=clip)
     except ImageError as error:
         return str(error)
-    return _too_short(found.pixels) or (first + place, found)
+    return _explain_short_stripe(found.pixels) or (first + place, found)
 
 
-def _stripe_in(capture: Capture, settings: StripeSettings, numbered: _Seen) -> np.ndarray | str:
-    """The stripe (N, 2) of a laser frame, or why it is of no use."""
-    along, options, clip = _how_to_find(capture, settings)
+def _find_stripe(capture: Capture, settings: StripeSettings, numbered: _Seen) -> np.ndarray | str:
+    """Find the stripe (N, 2) of a laser frame, or return the reason for rejection."""
+    along, options, clip = _stripe_settings(capture, settings)
     try:
         pixels = stripe_in(numbered[1], stripe_along=along, options=options, saturation=clip).pixels()
     except ImageError as error:
         return str(error)
-    return _too_short(pixels) or pixels
+    return _explain_short_stripe(pixels) or pixels
 
 
-def _how_to_find(capture: Capture, settings: StripeSettings) -> tuple[str, StripeOptions, float]:
+def _stripe_settings(capture: Capture, settings: StripeSettings) -> tuple[str, StripeOptions, float]:
     sensor = capture.header.sensor
     return sensor.camera.stripe_along, StripeOptions.of(sensor, settings), capture.header.saturation_dn
 
 
-def _too_short(pixels: np.ndarray) -> str:
+def _explain_short_stripe(pixels: np.ndarray) -> str:
     enough = len(pixels) >= _FEWEST_LINES
-    return "" if enough else f"found on {len(pixels)} lines only, at least {_FEWEST_LINES} are of use"
+    return "" if enough else f"found on {len(pixels)} lines only; at least {_FEWEST_LINES} are needed"
 
 
 def _report(progress: ProgressListener, name: str, done: int, total: int) -> int:

@@ -1,4 +1,4 @@
-"""The stripe on a flat target: one smooth curve in the image, whatever else is bright there."""
+"""Stripe on a flat target: a smooth curve in the image, separated from other bright structures."""
 
 from dataclasses import dataclass
 
@@ -9,18 +9,18 @@ from uwlts.fitting.least_squares import MAD_TO_STD
 from uwlts.stripe import Stripe, StripeOptions, StripeStatus, extract_stripe, stripe_in
 from uwlts.targets import Target, TargetView
 
-_DEGREE = 4  # bends of lens, window, line optics and plate; more would follow outliers
-_TRIALS = 300  # parabolas through three points; with half the points outliers one in eight is free of them
-_BEYOND = 0.025  # of the plate's size; so far beyond it distortion may put its border in the image
-_OUTLIER = 5.0  # robust standard deviations from the curve; of a million normal values one is farther
-_LEAST_LIMIT_PX = 1.0  # within which a point lies on the curve, however little the others scatter
+_DEGREE = 4  # degree for the bends of lens, window, line optics and plate; a higher one would follow outliers
+_TRIALS = 300  # parabolas through three points; with half the points outliers, one in eight contains no outlier
+_BEYOND = 0.025  # fraction of the plate's size by which distortion may shift its border in the image
+_OUTLIER = 5.0  # robust standard deviations from the curve; of a million normal values, one is larger
+_LEAST_LIMIT_PX = 1.0  # smallest inlier limit, independent of the scatter
 _FEWEST = 20  # points of a curve
-_LOST = 0.05  # share of the lines on the plate that may have no point on the curve without a second look
+_LOST = 0.05  # fraction of the lines on the plate that may have no point on the curve without a second search
 
 
 @dataclass(frozen=True, eq=False)
 class TargetStripe:
-    """Stripe pixels (N, 2) on the plate of a target, and the number of those on it that lie beside the curve."""
+    """Stripe pixels (N, 2) on a target's plate, and the number of pixels on it that are off the curve."""
 
     pixels: np.ndarray
     outliers: int
@@ -35,11 +35,11 @@ def stripe_on_target(
     saturation: float,
     options: StripeOptions = StripeOptions(),
 ) -> TargetStripe:
-    """Find the stripe on a flat target whose points were seen at the same place.
+    """Find the stripe on a flat target that was detected at the same position.
 
-    The stripe is where most of the points lie on one smooth curve. Where lines show something else it is looked for a
-    second time, near the curve alone, if it is an image. Points beside the curve, as of reflections, are left out; so
-    are those outside the plate. Parameters and errors as of `extract_stripe`.
+    The stripe is the smooth curve with most points. Lines with another structure are searched a second time near the
+    curve, if an image is given. Points off the curve (such as reflections) and outside the plate are rejected.
+    Parameters and errors are those of `extract_stripe`.
     """
     stripe = stripe_in(seen, stripe_along=stripe_along, saturation=saturation, options=options)
     to_plate, pixels = _to_plate(view), stripe.pixels()
@@ -48,7 +48,7 @@ def stripe_on_target(
     across = stripe.centre_px[lines]
     if len(lines) < _FEWEST:
         return TargetStripe(pixels[on_plate], 0)
-    # A 3D camera may not give the width.
+    # a 3D camera may not provide the width
     width = float(np.nan_to_num(np.median(stripe.width_px[lines])))
     curve = _Curve.through(lines, across, tolerance_px=max(2.0, 0.25 * width))
     if curve is None:
@@ -71,39 +71,39 @@ def stripe_on_target(
 
 
 def _pixels(lines: np.ndarray, across: np.ndarray, stripe_along: str) -> np.ndarray:
-    """Image coordinates (N, 2) of places on profile lines."""
+    """Return image coordinates (N, 2) of positions on profile lines."""
     return np.column_stack((across, lines) if stripe_along == "height" else (lines, across)).astype(np.float64)
 
 
 def _to_plate(view: TargetView) -> np.ndarray:
-    """Homography (3, 3) from pixels to the target's plane; its third coordinate is positive where the plate is seen."""
+    """Return the homography (3, 3) from pixels to the target's plane; its third coordinate is positive on the plate."""
     inverse = np.linalg.inv(cv2.findHomography(view.points_mm[:, :2], view.pixels)[0])
     return inverse * np.sign(inverse[2] @ [*view.pixels[0], 1.0])
 
 
 def _on_plate(pixels: np.ndarray, to_plate: np.ndarray, target: Target) -> np.ndarray:
-    """Whether (N,) pixels (N, 2) see a target's plate, or a little beyond it."""
+    """Return a mask (N,) of pixels (N, 2) on a target's plate, or slightly outside."""
     seen = np.column_stack([pixels, np.ones(len(pixels))]) @ to_plate.T
     with np.errstate(divide="ignore", invalid="ignore"):
         places = seen[:, :2] / seen[:, 2:]
-    # Beyond the plane's horizon the third coordinate is negative.
+    # Beyond the plane's horizon, the third coordinate is negative.
     return (seen[:, 2] > 0) & target.on_plate(places, beyond=_BEYOND)
 
 
 @dataclass(frozen=True, eq=False)
 class _Curve:
-    """A polynomial of a place across the stripe over the line's number, and how far off its points lie at most."""
+    """Polynomial of the position across the stripe as a function of the line number, with an inlier limit."""
 
     polynomial: np.polynomial.Polynomial
     limit_px: float
 
     @classmethod
     def through(cls, lines: np.ndarray, across: np.ndarray, *, tolerance_px: float) -> "_Curve | None":
-        """The curve on which most points lie; None where too few do."""
+        """Find the curve with most points near it; None if there are too few."""
         middle, half = 0.5 * (lines.max() + lines.min()), max(0.5 * np.ptp(lines), 1.0)
         powers = ((lines - middle) / half)[:, None] ** np.arange(3)
         chosen = np.sort(np.random.default_rng(0).integers(len(lines), size=(_TRIALS, 3)), axis=1)
-        # Through three different lines there is one parabola.
+        # Three different lines determine one parabola.
         apart = np.diff(lines[chosen], axis=1)
         chosen = chosen[(apart != 0).all(axis=1) & (np.ptp(lines[chosen], axis=1) >= 0.1 * half)]
         if not len(chosen):
@@ -117,7 +117,7 @@ class _Curve:
         return cls(parabola, tolerance_px).refined(lines, across)
 
     def refined(self, lines: np.ndarray, across: np.ndarray) -> "_Curve":
-        """The curve of full degree through the points near this one, found anew until they stay the same."""
+        """Fit the curve with full degree to the points near this one, repeated until they are stable."""
         curve, near = self, self.holds(lines, across)
         for _ in range(10):
             polynomial = np.polynomial.Polynomial.fit(lines[near], across[near], _DEGREE)
@@ -130,11 +130,11 @@ class _Curve:
         return curve
 
     def at(self, lines: np.ndarray) -> np.ndarray:
-        """Places across the stripe."""
+        """Return positions across the stripe."""
         return self.polynomial(lines)
 
     def holds(self, lines: np.ndarray, across: np.ndarray) -> np.ndarray:
-        """Whether points lie on it."""
+        """Return a mask of the points on the curve."""
         return np.abs(across - self.at(lines)) <= self.limit_px
 
 
@@ -147,7 +147,7 @@ def _near_curve(
     options: StripeOptions,
     width_px: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lines among ``lines`` (M,) with a stripe in a band about the curve, and the place of its centre."""
+    """Return those ``lines`` (M,) with a stripe in a band around the curve, and its centres."""
     while options.half_window_px < min(width_px, options.widest_window_px):
         options = options.doubled()
     profiles = image if stripe_along == "height" else image.T

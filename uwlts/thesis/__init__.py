@@ -1,1 +1,1 @@
-"""The evaluation of G. S. de Matos's thesis (UFSC 2017) on recorded campaigns, its tables beside the measured ones."""
+"""Evaluation of recorded campaigns as in G. S. de Matos's thesis (UFSC 2017), compared with its tables."""

@@ -1,6 +1,6 @@
-"""A campaign's folder: its recordings by their names.
+"""Folder of a campaign: its recordings by name.
 
-Scans are called OBJECT-PLACEMENT-MEDIUM.h5, such as spheres-near-2-water.h5. The calibration has target-air.h5 (through
+Scans are named OBJECT-PLACEMENT-MEDIUM.h5, such as spheres-near-2-water.h5. The calibration has target-air.h5 (through
 the camera's window), target-bare.h5 (without it), target-water.h5, and step-PLACEMENT-water.h5; line-width.h5 and
 line-height.h5 show the stripe on the pipe for either orientation of the camera.
 """
@@ -17,7 +17,7 @@ STEP_PLACES = ("near", "standoff", "far")
 
 @dataclass(frozen=True)
 class ScanFile:
-    """A recording of one object at a placement in a medium."""
+    """Recording of one object at a placement in a medium."""
 
     path: Path
     thing: str
@@ -27,25 +27,25 @@ class ScanFile:
 
 @dataclass(frozen=True)
 class CampaignFolder:
-    """The recordings of one campaign."""
+    """Recordings of one campaign."""
 
     path: Path
 
     def target(self, kind: str) -> Path:
-        """The recording of the target: in "air", "bare" or "water"; CaptureError where it is missing."""
+        """Return the recording of the target "air", "bare" or "water"; CaptureError if it is missing."""
         return self._needed(f"target-{kind}.h5")
 
     def steps(self) -> list[Path]:
-        """The recordings of the step standard, nearest first."""
+        """Return the recordings of the step standard, nearest first."""
         return [self._needed(f"step-{place}-water.h5") for place in STEP_PLACES]
 
     def line(self, side: str) -> Path | None:
-        """The recording of the stripe on the pipe along an image side, if there is one."""
+        """Return the recording of the stripe on the pipe along an image side, or None."""
         path = self.path / f"line-{side}.h5"
         return path if path.is_file() else None
 
     def scans(self) -> list[ScanFile]:
-        """All scans of objects, by name."""
+        """Return all scans of objects, sorted by name."""
         found = []
         for path in sorted(self.path.glob("*.h5")):
             thing, *placement, medium = path.stem.split("-")
@@ -61,14 +61,14 @@ class CampaignFolder:
 
 
 def campaign_folders(folder: Path) -> list[CampaignFolder]:
-    """The folders campaign-0, campaign-1, ... of a reproduction; CaptureError where there is none."""
+    """Return the folders campaign-0, campaign-1, ... of a reproduction; CaptureError without any."""
     found = [path for path in folder.glob("campaign-*") if path.is_dir()]
     if not found:
-        raise CaptureError(f"{folder} holds no campaign: a folder called campaign-0, campaign-1, ... is expected")
+        raise CaptureError(f"{folder} contains no campaign; expected folders campaign-0, campaign-1, ...")
     return [CampaignFolder(path) for path in sorted(found, key=lambda path: (len(path.name), path.name))]
 
 
 def up_to_date(path: Path) -> bool:
-    """Whether there are results and no recording of the campaign is newer."""
+    """Return whether there are results and no recording of the campaign is newer."""
     recordings = path.parent.glob("*.h5")
     return path.is_file() and all(each.stat().st_mtime_ns <= path.stat().st_mtime_ns for each in recordings)

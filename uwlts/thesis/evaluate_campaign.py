@@ -1,4 +1,4 @@
-"""Evaluates one campaign: calibrates by every method, measures every scan, and studies what the results rest on."""
+"""Evaluation of one campaign: calibration by every method, measurement of every scan, and studies of the inputs."""
 
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -39,7 +39,7 @@ TRIALS = 100
 
 
 class _Known(BaseModel):
-    """The part of a campaign's plan that says how well its inputs were known."""
+    """Part of a campaign's plan with the uncertainties of its inputs."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
     imperfections: dict[str, float]
@@ -56,14 +56,14 @@ def evaluate_campaign(
     overwrite: bool = False,
     progress: ProgressListener = unheard,
 ) -> CampaignResults:
-    """Results of a campaign, kept in its file results.json; read from there if no recording is newer.
+    """Evaluate a campaign and save the results in results.json; read them from there if no recording is newer.
 
-    Kept results without the Monte-Carlo propagation, or with another number of trials, are completed.
+    Saved results without the Monte-Carlo propagation, or with another number of trials, are completed.
 
     Raises
     ------
     CaptureError
-        A recording that the calibration needs is missing, or a file is damaged.
+        A recording for the calibration is missing, or a file is damaged.
     CalibrationError
         The recordings do not determine a calibration.
     """
@@ -72,12 +72,12 @@ def evaluate_campaign(
         kept = CampaignResults.read(path)
         if trials in (0, kept.trials):
             return kept
-        scans = _sphere_scans(folder, _by_rays(calibrations(folder)[PROPOSED, "water"]))
+        scans = _sphere_scans(folder, _require_camera_model(calibrations(folder)[PROPOSED, "water"]))
         intervals = _monte_carlo(folder, scans, trials, workers, progress)
         return kept.model_copy(update={"monte_carlo": intervals, "trials": trials}).keep(path)
     calibrated = calibrations(folder, progress=partial(progress, stage="calibrations"))
-    measurements = _measured(folder, calibrated, workers, progress)
-    proposed, two = (_by_rays(calibrated[method, "water"]) for method in (PROPOSED, TWO))
+    measurements = _measure_scans(folder, calibrated, workers, progress)
+    proposed, two = (_require_camera_model(calibrated[method, "water"]) for method in (PROPOSED, TWO))
     scans = _sphere_scans(folder, proposed)
     choices, profiles = window_choices(folder, proposed, scans)
     return CampaignResults(
@@ -95,19 +95,19 @@ def evaluate_campaign(
     ).keep(path)
 
 
-def _by_rays(calibration: AnyCalibration) -> Calibration:
+def _require_camera_model(calibration: AnyCalibration) -> Calibration:
     if not isinstance(calibration, Calibration):
-        raise TypeError("a calibration by polynomials has neither camera nor window")
+        raise TypeError("a polynomial calibration has neither camera nor window")
     return calibration
 
 
-def _measured(
+def _measure_scans(
     folder: CampaignFolder,
     calibrated: dict[tuple[str, str], AnyCalibration],
     workers: int | None,
     progress: ProgressListener,
 ) -> list[Measurement]:
-    """All scans, several at a time."""
+    """Measure all scans in parallel."""
     clouds = folder.path / "clouds"
     clouds.mkdir(exist_ok=True)
     scans, numbers = folder.scans(), count(1)
@@ -138,7 +138,7 @@ def _sphere_scans(folder: CampaignFolder, calibration: Calibration) -> list[Sphe
 
 
 def _curves(calibration: PolynomialCalibration) -> PolynomialCurves:
-    """Z(v) and Y(Z) of an outer, the middle and the other outer profile line (Figures 58 and 59), and the residual."""
+    """Return Z(v) and Y(Z) of the outer and middle profile lines (Figures 58 and 59), and the residual."""
     lines = {}
     known = np.flatnonzero(np.isfinite(calibration.domains()[:, 0]))
     for name, share in _SHOWN_LINES.items():
@@ -152,7 +152,7 @@ def _curves(calibration: PolynomialCalibration) -> PolynomialCurves:
         lines[name] = PolynomialLine(number, np.round(centres, 3).tolist(), y_mm, z_mm)
     rms = calibration.figures("depth")["rms_mm"]
     if not isinstance(rms, int | float):
-        raise CaptureError(f"the polynomials' residual is {rms!r}; expected a number of mm: calibrate again")
+        raise CaptureError(f"the polynomials' residual is {rms!r}; expected a number in mm: calibrate again")
     return PolynomialCurves(lines, rms)
 
 
@@ -172,7 +172,7 @@ def _budget(
 def _monte_carlo(
     folder: CampaignFolder, scans: list[SphereScan], trials: int, workers: int | None, progress: ProgressListener
 ) -> list[SpacingInterval]:
-    """Intervals of every scan of spheres."""
+    """Return Monte-Carlo intervals of every scan of spheres."""
     if trials == 0 or not scans:
         return []
     options = CalibrationOptions(refractions=1)
@@ -180,13 +180,13 @@ def _monte_carlo(
         air = [stack.enter_context(Capture(folder.target("air")))]
         steps = [stack.enter_context(Capture(path)) for path in folder.steps()]
         evidence, medium = gather(air, steps, options=options), steps[0].header.medium
-    # Imperfections of the inputs, from the plan that lies beside the campaigns; none without one.
+    # Imperfections of the inputs are read from the plan in the campaigns' folder, if there is one.
     plan = folder.path.parent / "plan.json"
     try:
         campaign = read_json(plan, called="plan").get("campaign") if plan.exists() else {"imperfections": {}}
         knowledge = _Known.model_validate(campaign).imperfections
     except ValidationError as error:
-        raise CaptureError(f"{plan} does not hold the campaign's imperfections: {problems_of(error)}") from error
+        raise CaptureError(f"{plan} does not contain the campaign's imperfections: {problems_of(error)}") from error
     shown = partial(progress, stage="Monte Carlo")
     return [
         SpacingInterval(each.placement, each.observed_mm, each.std_mm(), each.interval_mm(), each.contains_truth())
@@ -197,7 +197,7 @@ def _monte_carlo(
 
 
 def _line_profile(folder: CampaignFolder, side: str) -> LineProfile | None:
-    """Stripe on the pipe by the calibration of a sensor that is as described: its length along Y and points, mm."""
+    """Return the stripe on the pipe with the nominal calibration: its length along Y and its points, mm."""
     path = folder.line(side)
     if path is None:
         return None

@@ -1,8 +1,8 @@
-"""The joint calibration compared with the thesis's two ways, by the evidence it uses, on scans that none has used.
+"""Comparison of the joint calibration with the thesis's two methods, on scans that no calibration has used.
 
-The thesis's two ways use the target in air, without or with the camera's window, and the steps. The joint calibration
-is made from both of these together, then with the target in water, then with half of the scans of spheres in water.
-Judged are the other half, and all scans in air.
+The thesis's two methods use the target in air, without or with the camera's window, and the steps. The joint
+calibration uses the evidence of both, then also the target in water, then also half of the scans of spheres in water.
+The errors are those of the other half, and of all scans in air.
 """
 
 import time
@@ -53,19 +53,25 @@ RESULTS = "joint.json"
 JOINT: tuple[JointMethod, ...] = get_args(JointMethod)
 _USED = ("near", "standoff", "far")
 """Placements of the spheres in water that a calibration may use."""
-_COVERAGE = 1.96  # standard deviations on either side that hold 95 % of a normal distribution
-_BESIDE = 0.16  # of the distance between two campaigns, from method to method
+_COVERAGE = 1.96  # standard deviations on either side that contain 95 % of a normal distribution
+_BESIDE = 0.16  # distance between methods, relative to the distance between campaigns
 SPACING, DIAMETERS = "SSE", ("diameter error sphere 1", "diameter error sphere 2")
 SHIFTS = ("mean error X", "mean error Y", "mean error Z")
-"""Of all points of a scan."""
+"""Mean errors of all points of a scan."""
 
 
 def joint_calibration(folder: CampaignFolder, method: JointMethod) -> tuple[Calibration, float]:
-    """A joint calibration from a campaign, kept with the others; the time to solve it in s.
+    """Calibrate a campaign jointly, and save the calibration with the others; return it with the solution time, s.
 
-    Scans of spheres were made in another water than the calibration, whose index follows from their roundness. Their
-    sizes are not used. CaptureError where a recording is missing or damaged, CalibrationError where they do not
-    determine a calibration, or contradict each other.
+    The scans of spheres were recorded in another water than the calibration, whose index follows from their roundness.
+    Their sizes are not used.
+
+    Raises
+    ------
+    CaptureError
+        A recording is missing or damaged.
+    CalibrationError
+        The recordings do not determine a calibration, or contradict each other.
     """
     options = CalibrationOptions(poses="stage", same_water=False, sizes_known=False)
     same = method == "joint_same_evidence"
@@ -84,7 +90,7 @@ def joint_calibration(folder: CampaignFolder, method: JointMethod) -> tuple[Cali
 
 
 def _is_used(scan: ScanFile) -> bool:
-    """Whether the joint calibration with scans uses a scan, so that none is judged by it."""
+    """Return whether the joint calibration with scans uses a scan, so that its errors are not evaluated."""
     return scan.thing == "spheres" and scan.medium == "water" and scan.placement in _USED
 
 
@@ -95,12 +101,17 @@ def compare_campaigns(
     again: bool = False,
     progress: ProgressListener = unheard,
 ) -> list[JointResults]:
-    """Errors of all judged scans of spheres and planes by all calibrations, with the joint ones' uncertainties.
+    """Evaluate scans of spheres and planes with all calibrations, with the joint calibrations' uncertainties.
 
-    Those of each campaign are kept in its folder, and read from there unless ``again`` is set or a recording is newer.
-    ``progress(done, total)`` counts scans. CaptureError, CalibrationError or EvaluationError where a recording is
-    missing or damaged, does not determine a calibration, or does not show its artefact; SetupError where a process that
-    works on a campaign was ended from outside.
+    The results of each campaign are saved in its folder, and read from there unless ``again`` is set or a recording is
+    newer. ``progress(done, total)`` counts scans.
+
+    Raises
+    ------
+    CaptureError, CalibrationError, EvaluationError
+        A recording is missing or damaged, does not determine a calibration, or does not show its artefact.
+    SetupError
+        A worker process was ended from outside.
     """
     total, numbers = sum(len(_compared(folder)) for folder in folders), count(1)
     return work_through(
@@ -113,7 +124,7 @@ def _compared(folder: CampaignFolder) -> list[ScanFile]:
 
 
 def _compare(again: bool, folder: CampaignFolder, send: Send) -> JointResults:
-    """Results of a campaign; ``send`` is called for every scan."""
+    """Evaluate a campaign; ``send`` is called for every scan."""
     path = folder.path / RESULTS
     if not again and up_to_date(path):
         for _ in _compared(folder):
@@ -134,14 +145,14 @@ def _compare(again: bool, folder: CampaignFolder, send: Send) -> JointResults:
             known: dict[Method, AnyCalibration] = {
                 way: sequential[found] for way, found in ways.items() if found in sequential
             }
-            spheres.append(_of_spheres(scan, known | joint))
+            spheres.append(_evaluate_spheres(scan, known | joint))
         else:
-            planes.append(_of_plane(scan, joint["joint_with_scans"]))
+            planes.append(_evaluate_plane(scan, joint["joint_with_scans"]))
         send(None)
     return JointResults(campaign=folder.path.name, solve_s=solve_s, spheres=spheres, planes=planes).keep(path)
 
 
-def _of_spheres(scan: ScanFile, known: Mapping[Method, AnyCalibration]) -> SphereErrors:
+def _evaluate_spheres(scan: ScanFile, known: Mapping[Method, AnyCalibration]) -> SphereErrors:
     errors: dict[Method, dict[str, float]] = {}
     std_mm: dict[JointMethod, dict[str, float]] = {}
     truth = read_truth(truth_path(scan.path))[1]
@@ -160,8 +171,8 @@ def _of_spheres(scan: ScanFile, known: Mapping[Method, AnyCalibration]) -> Spher
     return SphereErrors(scan.placement, scan.medium, errors, std_mm)
 
 
-def _of_plane(scan: ScanFile, joint: Calibration) -> PlaneScatter:
-    """Scatter of a plane about its fit, over the speckle limit along the laser's axis at its distance."""
+def _evaluate_plane(scan: ScanFile, joint: Calibration) -> PlaneScatter:
+    """Return the plane's residual standard deviation, and its ratio to the speckle limit at that distance."""
     with Capture(scan.path) as capture:
         header = capture.header
         cloud = reconstruct_stripes(capture, find_stripes(capture), joint)
@@ -182,7 +193,7 @@ def _of_plane(scan: ScanFile, joint: Calibration) -> PlaneScatter:
 
 
 def joint_summary(results: Sequence[JointResults]) -> JointSummary:
-    """Errors of all campaigns' scans, share of the intervals that hold the truth, time to solve."""
+    """Summarise all campaigns: errors of scans, coverage of the 95 % intervals, and solution times."""
     water, air = (_medium_summary(results, medium) for medium in ("water", "air"))
     solve_s: dict[JointMethod, list[float]] = {way: [result.solve_s[way] for result in results] for way in JOINT}
     return JointSummary(**dict(water), solve_s=solve_s, campaigns=len(results), water=water, air=air)
@@ -209,7 +220,7 @@ def _medium_summary(results: Sequence[JointResults], medium: str) -> MediumSumma
 
 
 class _Row(NamedTuple):
-    """Mean and largest size of a quantity's errors by one calibration, mm; is it a joint one?"""
+    """Mean and maximum absolute error of a quantity for one calibration, mm."""
 
     quantity: str
     method: str
@@ -234,7 +245,7 @@ def _rows(part: MediumSummary) -> list[_Row]:
 
 
 def summary_lines(summary: JointSummary) -> list[str]:
-    """The summary as sentences."""
+    """Describe the summary in sentences."""
     lines = []
     for medium, part in (("water", summary.water), ("air", summary.air)):
         for name, rows in groupby(_rows(part), lambda row: row.quantity):
@@ -243,7 +254,7 @@ def summary_lines(summary: JointSummary) -> list[str]:
         for way, held in part.coverage_95.items():
             lines.append(f"{medium}, {_WORDS[way]}, truth within the stated 95 % intervals: {100 * held:.0f} %")
         if over := part.plane_std_over_speckle_limit:
-            lines.append(f"{medium}, scatter of planes over the speckle limit: {np.mean(over):.2f} on average")
+            lines.append(f"{medium}, scatter of planes divided by the speckle limit: {np.mean(over):.2f} on average")
     solved = "; ".join(
         f"{_WORDS[way]} {', '.join(f'{s:.1f}' for s in times)}" for way, times in summary.solve_s.items()
     )
@@ -260,7 +271,13 @@ _WORDS: dict[Method, str] = {
 
 
 def write_joint_comparison(folder: Path, results: Sequence[JointResults], *, overwrite: bool = False) -> JointSummary:
-    """Write report.html and summary.json into a folder, each whole or not at all; OutputError where that fails."""
+    """Write report.html and summary.json into a folder, each atomically.
+
+    Raises
+    ------
+    OutputError
+        A file cannot be written.
+    """
     summary = joint_summary(results)
     media = [
         (medium, part, _rows(part), svg_of(_errors_figure(results, medium))) for medium, part in summary.media().items()
@@ -277,7 +294,7 @@ def write_joint_comparison(folder: Path, results: Sequence[JointResults], *, ove
 
 
 def _errors_figure(results: Sequence[JointResults], medium: str) -> Figure:
-    """Errors of all scans by campaign, the methods side by side; the joint ones with their stated 95 % intervals."""
+    """Plot the errors of all scans by campaign and method, with 95 % intervals for joint calibrations."""
     figure, panels = new_figure(9.0, 3.4, columns=2)
     quantities = (("sphere spacing", (SPACING,)), ("sphere diameter", DIAMETERS))
     for axes, (quantity, figures) in zip(panels, quantities, strict=True):

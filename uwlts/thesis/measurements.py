@@ -1,9 +1,9 @@
 """Calibrations of a campaign by every method, and measurements of its scans with them.
 
-The thesis's image processing (section 4.5) is a 5x5 low-pass, then a quadratic through the peak. The thesis works in
-LabVIEW. There "low pass" is IMAQ LowPass, which replaces a pixel by the mean of its neighbours only where it differs
-from them by more than a tolerance, 40 % unless set; it is no plain mean. "Every few columns" of the quadratic fit is
-read as five pixels, the size of the filter. Which lines show a stripe is decided as for all methods.
+The thesis's image processing (section 4.5) is a 5x5 low-pass filter, then a quadratic through the peak, in LabVIEW. The
+filter IMAQ LowPass replaces a pixel by the mean of its neighbours only if it differs from them by more than a tolerance
+(default: 40 %); it is not a plain mean. "Every few columns" of the quadratic fit is interpreted as five pixels, the
+size of the filter. Lines with a stripe are selected as for all methods.
 """
 
 from collections.abc import Mapping
@@ -43,7 +43,7 @@ METHODS = {"air": (PROPOSED, POLYNOMIALS, FORGOTTEN), "water": (PROPOSED, TWO, P
 def calibrations(
     folder: CampaignFolder, *, progress: ProgressListener = unheard
 ) -> dict[tuple[str, str], AnyCalibration]:
-    """Calibrations by method and medium; those made since the recordings are read from the folder ``calibrations``.
+    """Return calibrations by method and medium; up-to-date ones are read from the folder ``calibrations``.
 
     Raises
     ------
@@ -53,11 +53,11 @@ def calibrations(
         The recordings do not determine a calibration.
     """
     made = {
-        (PROPOSED, "water"): lambda: _rays(folder.target("air"), folder.steps(), refractions=1),
-        (TWO, "water"): lambda: _rays(folder.target("bare"), folder.steps(), refractions=2),
-        (SINGLE, "water"): lambda: _rays(folder.target("water"), [], refractions=1),
-        (POLYNOMIALS, "air"): lambda: _polynomials(folder.target("air")),
-        (POLYNOMIALS, "water"): lambda: _polynomials(folder.target("water")),
+        (PROPOSED, "water"): lambda: _calibrate_rays(folder.target("air"), folder.steps(), refractions=1),
+        (TWO, "water"): lambda: _calibrate_rays(folder.target("bare"), folder.steps(), refractions=2),
+        (SINGLE, "water"): lambda: _calibrate_rays(folder.target("water"), [], refractions=1),
+        (POLYNOMIALS, "air"): lambda: _calibrate_polynomials(folder.target("air")),
+        (POLYNOMIALS, "water"): lambda: _calibrate_polynomials(folder.target("water")),
     }
     place = folder.path / "calibrations"
     place.mkdir(exist_ok=True)
@@ -71,48 +71,48 @@ def calibrations(
             make().save(path, overwrite=True)
         found[method, medium] = load_calibration(path)
     progress(len(made), len(made))
-    # In air nothing but camera and sheet is used of a calibration.
+    # In air, only camera and sheet of a calibration are used.
     for method, source in ((PROPOSED, PROPOSED), (FORGOTTEN, TWO)):
         found[method, "air"] = found[source, "water"].model_copy(update={"window": None})
     return found
 
 
-def _rays(target: Path, steps: list[Path], *, refractions: Literal[1, 2]) -> Calibration:
+def _calibrate_rays(target: Path, steps: list[Path], *, refractions: Literal[1, 2]) -> Calibration:
     with ExitStack() as stack:
         air = [stack.enter_context(Capture(target))]
         opened = [stack.enter_context(Capture(path)) for path in steps]
         return calibrate_sequentially(air, opened, options=CalibrationOptions(refractions=refractions)).calibration
 
 
-def _polynomials(target: Path) -> PolynomialCalibration:
+def _calibrate_polynomials(target: Path) -> PolynomialCalibration:
     with Capture(target) as capture:
         return calibrate_polynomials([capture]).calibration
 
 
 _SIZE_PX = 5
 _SEARCHED_PX = 8
-"""Half width of the search for the peak about the stripe's place."""
+"""Half width of the search for the peak about the stripe's position."""
 
 
 def thesis_stripes(
     capture: Capture, found: CaptureStripes, *, tolerance: float = 0.4, fitted_px: int = 5
 ) -> CaptureStripes:
-    """The same lines of the same images with the centres that the thesis's processing gives.
+    """Recompute the stripe centres on the same lines with the thesis's processing.
 
-    ``tolerance`` is the low-pass filter's; 0 makes it a mean of the neighbours. ``fitted_px`` is an odd number.
+    ``tolerance`` is that of the low-pass filter; 0 makes it a mean of the neighbours. ``fitted_px`` is an odd number.
     """
     along_width = capture.header.sensor.camera.stripe_along == "width"
     centre = np.empty(len(found.line))
     for number in np.unique(found.frame):
         own = found.frame == number
         image = capture.image(int(number))
-        smooth = low_passed(image if along_width else image.T, tolerance=tolerance)
+        smooth = apply_low_pass(image if along_width else image.T, tolerance=tolerance)
         centre[own] = _peaks(smooth, found.line[own], found.centre_px[own], half=fitted_px // 2)
     return replace(found, centre_px=centre)
 
 
-def low_passed(image: np.ndarray, *, tolerance: float) -> np.ndarray:
-    """An image (H, W) after IMAQ LowPass of 5x5 pixels, float32."""
+def apply_low_pass(image: np.ndarray, *, tolerance: float) -> np.ndarray:
+    """Filter an image (H, W) with IMAQ LowPass of 5x5 pixels; return float32."""
     grey = image.astype(np.float32)
     count = _SIZE_PX**2
     neighbours = (cv2.blur(grey, (_SIZE_PX, _SIZE_PX)) * count - grey) / (count - 1)
@@ -120,14 +120,14 @@ def low_passed(image: np.ndarray, *, tolerance: float) -> np.ndarray:
 
 
 def _peaks(smooth: np.ndarray, line: np.ndarray, near_px: np.ndarray, *, half: int) -> np.ndarray:
-    """Vertices (N,) of parabolas through pixels on either side of the largest one of columns (N,) near rows (N,)."""
-    # Of several largest ones, those of a plateau, the nearest to the stripe's place is taken.
+    """Return vertices (N,) of parabolas through pixels around the maximum of columns (N,) near rows (N,)."""
+    # On a plateau, the maximum nearest to the stripe's position is used.
     around = np.array(sorted(range(-_SEARCHED_PX, _SEARCHED_PX + 1), key=abs))
     rows = np.clip(np.rint(near_px).astype(int)[:, None] + around, 0, len(smooth) - 1)
     top = rows[np.arange(len(line)), smooth[rows, line[:, None]].argmax(axis=1)]
     offset = np.arange(-half, half + 1)
     rows = np.clip(top[:, None] + offset, 0, len(smooth) - 1)
-    # Below the largest one, so that a plateau is exactly zero. It has no vertex; the place is the best guess.
+    # Relative to the maximum, so that a plateau is exactly zero. It has no vertex; its position is used instead.
     below = smooth[rows, line[:, None]] - smooth[top, line][:, None]
     second, first, _ = np.linalg.pinv(np.vander(offset, 3)) @ below.T
     vertex = np.where(second < 0, -first / np.where(second < 0, 2 * second, 1.0), 0.0)
@@ -141,15 +141,15 @@ VARIANTS = {
     "thesis, fit over 3 px": {"fitted_px": 3},
     "thesis, fit over 7 px": {"fitted_px": 7},
 }
-"""Other readings of the thesis's text, tried on the spheres by the proposed method."""
+"""Other interpretations of the thesis's text, tested on the spheres with the proposed method."""
 _SHOWN = ("pipe", "head", "weld")
-"""Things whose coloured clouds are kept for the report."""
+"""Objects with coloured clouds in the report."""
 
 
 def measure_scan(
     scan: ScanFile, calibrations: Mapping[tuple[str, str], AnyCalibration], *, clouds: Path
 ) -> list[Measurement]:
-    """Measure a scan by every method of its medium and either image processing; ``clouds`` is a folder for clouds."""
+    """Measure a scan by every method of its medium and both image processings; ``clouds`` is a folder for clouds."""
     truth_file = truth_path(scan.path)
     truth = read_truth(truth_file)[1] if truth_file.is_file() else None
     found = []
@@ -177,10 +177,10 @@ def measure_scan(
 
 
 def _figures(evaluation: Evaluation) -> dict[str, float]:
-    """The artefact's figures; of a free form the spread about the true surface after a best fit is the STD.
+    """Return the artefact's figures; for a free form, STD is the spread about the true surface after a best fit.
 
-    PE and RE leave out the 0.3 % of the points that lie farthest off, as VDI/VDE 2634 allows: the published ranges of
-    4 to 6 standard deviations of more than ten thousand points cannot be had without. The full ranges stand beside.
+    PE and RE exclude the 0.3 % of the points with the largest deviations, as VDI/VDE 2634 allows: the published ranges
+    of 4 to 6 standard deviations of more than ten thousand points are otherwise impossible. The full ranges are added.
     """
     figures = {figure.key.name: figure.value_mm for figure in evaluation.figures}
     deviation_mm = evaluation.cloud.deviation_mm
@@ -195,12 +195,12 @@ def _figures(evaluation: Evaluation) -> dict[str, float]:
 
 
 def _range_within(deviation_mm: np.ndarray) -> float:
-    """Range of deviations (N,), NaN where not evaluated, without the largest 0.3 %."""
+    """Return the range of deviations (N,), NaN if not evaluated, without the largest 0.3 %."""
     used = deviation_mm[np.isfinite(deviation_mm)]
     kept = used[np.argsort(np.abs(used))[: len(used) - int(VDI_OUTLIER_SHARE * len(used))]]
     return float(np.ptp(kept))
 
 
 def _line_length(cloud: PointCloud) -> float:
-    """Median over the profiles of how far the points reach along Y, mm."""
+    """Return the median length of the profiles along Y, mm."""
     return float(np.median([np.ptp(cloud.points_mm[cloud.frame == n, 1]) for n in np.unique(cloud.frame)]))

@@ -1,9 +1,9 @@
-"""Uncertainty of the sphere spacing by propagating distributions through the whole pipeline (JCGM 101:2008).
+"""Uncertainty of the sphere spacing by propagation of distributions through the whole pipeline (JCGM 101:2008).
 
-Each trial draws every input of the calibration and of the measurement from what is known of it, calibrates camera,
-sheet and window anew, reconstructs the spheres and measures their spacing. The inputs are perturbed about what was
-observed: circle centres, stripes, stage positions, the target's lattice, its tilt and bow, the step's height, the
-window's tilt and the water's index. The sheet's bow is not among them: the model has a plane.
+Each trial draws every input of the calibration and of the measurement from its known distribution, calibrates camera,
+sheet and window again, reconstructs the spheres and measures their spacing. The inputs are perturbed about the observed
+values: circle centres, stripes, stage positions, the target's lattice, its tilt and bow, the step's height, the
+window's tilt and the water's index. The sheet's bow is not included: the model has a plane.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,9 +28,9 @@ LEAST_TRIALS = 20
 
 @dataclass(frozen=True, eq=False)
 class Propagated:
-    """Trials of the sphere spacing error, mm, of one scan, and the shortest interval that holds 95 % of them.
+    """Trials of the sphere spacing error of one scan, mm, and the shortest 95 % interval.
 
-    ``observed_mm`` is the error measured with the unperturbed calibration, ``trials_mm`` (T,) are the trials'.
+    ``observed_mm`` is the error with the unperturbed calibration, ``trials_mm`` (T,) those of the trials.
     """
 
     placement: str
@@ -38,11 +38,11 @@ class Propagated:
     trials_mm: np.ndarray
 
     def std_mm(self) -> float:
-        """Standard uncertainty of the spacing."""
+        """Return the standard uncertainty of the spacing."""
         return float(np.std(self.trials_mm, ddof=1))
 
     def interval_mm(self) -> tuple[float, float]:
-        """Shortest interval of spacing errors that holds 95 % of the trials (JCGM 101, 7.7.4)."""
+        """Return the shortest interval of spacing errors that contains 95 % of the trials (JCGM 101, 7.7.4)."""
         ordered = np.sort(self.trials_mm)
         held = int(np.ceil(COVERAGE * len(ordered)))
         widths = ordered[held - 1 :] - ordered[: len(ordered) - held + 1]
@@ -50,7 +50,7 @@ class Propagated:
         return float(ordered[first]), float(ordered[first + held - 1])
 
     def contains_truth(self) -> bool:
-        """Whether the interval holds an error of zero, that is, the calibrated spacing."""
+        """Return whether the interval contains an error of zero, that is, the calibrated spacing."""
         low, high = self.interval_mm()
         return low <= 0 <= high
 
@@ -67,11 +67,28 @@ def propagate(
     workers: int | None = None,
     progress: ProgressListener = unheard,
 ) -> list[Propagated]:
-    """Propagate what is known of the inputs to the sphere spacing of every scan.
+    """Propagate the uncertainties of the inputs to the sphere spacing of every scan.
 
-    ``evidence`` is of a calibration with step images, ``medium`` the one in which step and spheres were recorded.
-    ``knowledge`` holds standard deviations and half widths by the names of the campaign's imperfections; those that are
-    missing count as 0. So many ``workers`` make trials at a time, as many as there are processors unless given.
+    Parameters
+    ----------
+    evidence
+        Evidence of a calibration with step images.
+    scans
+        Scans of spheres.
+    medium
+        Medium of the step and the spheres.
+    knowledge
+        Standard deviations and half widths by the names of the campaign's imperfections; missing ones are 0.
+    options
+        Settings of the calibration.
+    trials
+        Number of trials, at least 20.
+    seed
+        Seed of the random numbers.
+    workers
+        Number of trials in parallel. Default: number of processors.
+    progress
+        Called with the number of trials done and the total.
 
     Raises
     ------
@@ -81,9 +98,9 @@ def propagate(
         The unperturbed evidence gives no calibration, or more than a tenth of the trials fail.
     """
     if trials < LEAST_TRIALS:
-        raise RangeError(f"{trials} trials give no 95 % interval: make at least {LEAST_TRIALS}")
+        raise RangeError(f"{trials} trials give no 95 % interval; expected at least {LEAST_TRIALS}")
     start = solve(evidence, options=options)
-    # Offsets of circle centres hardly change from trial to trial; they are taken out once.
+    # Offsets of circle centres barely change between trials; they are corrected once.
     if start.camera.bias_px is not None:
         images = [
             replace(image, pixels=image.pixels - bias)
@@ -110,7 +127,7 @@ def _trial(
     number: int,
     send: Callable[[None], None],
 ) -> list[float] | None:
-    """Sphere spacing errors of one trial; None where its inputs give no calibration or no spheres."""
+    """Return sphere spacing errors of one trial; None if its inputs give no calibration or no spheres."""
     send(None)
     rng = np.random.default_rng([seed, number])
     try:
@@ -119,7 +136,7 @@ def _trial(
         lead, angles = draw.scan(rng)
         errors = []
         for scan in scans:
-            pixels, direction = draw.stripe(scan.pixels, rng), _turned(scan.stage_direction, angles)
+            pixels, direction = draw.stripe(scan.pixels, rng), _rotate_direction(scan.stage_direction, angles)
             drawn = replace(scan, pixels=pixels, stage_mm=scan.stage_mm * (1 + lead), stage_direction=direction)
             errors.append(spacing_error(calibration, drawn, medium_index=index))
         return errors
@@ -128,21 +145,21 @@ def _trial(
 
 
 class _Draw:
-    """Draws inputs about those observed."""
+    """Random inputs about the observed ones."""
 
     def __init__(self, evidence: Evidence, start: CalibrationResult, medium: Medium, knowledge: Mapping[str, float]):
         self.start, self._evidence, self._medium = start, evidence, medium
         self._known = {name: float(value) for name, value in knowledge.items()}
         self._across = 1 if start.calibration.stripe_along == "width" else 0
         self._stripe_px = _stripe_noise_px(start, self._across)
-        # Entrance pupil in the target's frame, of every image.
+        # entrance pupil in the target's frame, for every image
         self._pupils = [-pose[:3, :3].T @ pose[:3, 3] for pose in start.camera.target_poses]
 
     def _std(self, name: str) -> float:
         return self._known.get(name, 0.0)
 
     def evidence(self, rng: np.random.Generator) -> Evidence:
-        """The calibration's evidence with all of its inputs drawn."""
+        """Return the calibration's evidence with random inputs."""
         air, steps = self._air(self._evidence.air, rng), self._steps(rng)
         window = self._evidence.window
         x, y = (self._std("window_tilt_std_deg") * rng.standard_normal(2)).tolist()
@@ -152,7 +169,7 @@ class _Draw:
         return replace(self._evidence, air=air, steps=steps, window=window)
 
     def _air(self, air: AirEvidence, rng: np.random.Generator) -> AirEvidence:
-        # The target may be turned against the stage's travel, and the travel against the laser's axis.
+        # The target may be rotated relative to the stage's travel, and the travel relative to the laser's axis.
         turn = np.hypot(self._std("target_tilt_std_deg"), self._std("stage_misalignment_std_deg"))
         tilt = np.radians(turn) * rng.standard_normal(2)
         lead = self._std("stage_lead_std") * rng.standard_normal()
@@ -166,8 +183,8 @@ class _Draw:
             places = map(tuple, image.points_mm.tolist())
             drawn = (circle_mm * np.append(rng.standard_normal(2), 0.0) for _ in image.points_mm)
             printed = np.array([shifts.setdefault(place, shift) for place, shift in zip(places, drawn, strict=True)])
-            # A target that is not square to the travel moves sideways on itself; what stands out from a bowed one
-            # is seen where its ray meets the flat one.
+            # A target that is not perpendicular to the travel moves sideways on itself. Points above the plane of the
+            # target are seen where their rays meet the plane.
             sideways = np.append(tilt, 0.0) * (image.stage_mm - middle)
             height = bow * (np.linalg.norm(image.points_mm, axis=1, keepdims=True) / farthest) ** 2
             out = height * (image.points_mm - pupil) / pupil[2] * (1.0, 1.0, 0.0)
@@ -189,36 +206,36 @@ class _Draw:
         return steps
 
     def index(self, rng: np.random.Generator) -> float:
-        """Index of the water at a temperature drawn."""
+        """Return the index of the water at a random temperature."""
         warmer = self._std("temperature_half_width_c") * rng.uniform(-1, 1)
         return self._medium.warmer_by(warmer).refractive_index(self.start.calibration.wavelength_nm)
 
     def scan(self, rng: np.random.Generator) -> tuple[float, np.ndarray]:
-        """Relative error of the stage's lead, and by how much its travel is turned, in rad about two axes."""
+        """Return a random relative error of the stage's lead, and rotations of its travel about two axes, rad."""
         lead = self._std("stage_lead_std") * rng.standard_normal()
         return lead, np.radians(self._std("stage_misalignment_std_deg")) * rng.standard_normal(2)
 
     def stripe(self, pixels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Stripe pixels (N, 2) with the noise that stripes on the target have, across the stripe."""
+        """Add the noise of stripes on the target, across the stripe, to stripe pixels (N, 2)."""
         noise = np.zeros_like(pixels)
         noise[:, self._across] = self._stripe_px * rng.standard_normal(len(pixels))
         return pixels + noise
 
 
 def _stripe_noise_px(start: CalibrationResult, across: int) -> float:
-    """Root mean square distance in the image, across the stripe, of its points on the target from the sheet."""
+    """Return the root mean square distance of stripe points on the target from the sheet, in px across the stripe."""
     used, normal = start.sheet.used, np.array(start.sheet.model.normal)
     points = start.stripe_points.points_mm[used]
     faces = start.camera.target_poses[start.stripe_points.image[used], :3, 2]
-    # A point whose stripe centre is wrong has moved on the target, square to the sheet's line on it.
+    # An error of a stripe centre moves the point on the target, perpendicular to the sheet's line on it.
     along = normal - (faces @ normal)[:, None] * faces
     moves = along * (start.sheet.residuals_mm[used] / (along @ normal))[:, None]
     apart = project(start.camera.model, points) - project(start.camera.model, points - moves)
     return float(np.sqrt(np.mean(apart[:, across] ** 2)))
 
 
-def _turned(direction: np.ndarray, angles: np.ndarray) -> np.ndarray:
-    """A unit direction (3,) turned by two small angles about axes square to it."""
+def _rotate_direction(direction: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Rotate a unit direction (3,) by two small angles about axes perpendicular to it."""
     first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
     first /= np.linalg.norm(first)
     turned = direction + angles[0] * first + angles[1] * np.cross(direction, first)

@@ -1,4 +1,4 @@
-"""The thesis's published tables, and ours beside them: one row for every value, over all campaigns."""
+"""The thesis's published tables with our values: one row for every value, over all campaigns."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ from uwlts.thesis.results import CampaignResults
 
 @dataclass(frozen=True)
 class Published:
-    """Published values by the names of the file; see ``scenes/references/thesis-tables.toml``."""
+    """Published values with the names of the file; see ``scenes/references/thesis-tables.toml``."""
 
     title: str
     content: dict[str, Any]
 
     def value(self, *keys: str | int) -> float | None:
-        """The value at a path of keys and list places, None where nothing was published."""
+        """Return the value at a path of keys and list indices; None if nothing was published."""
         found: Any = self.content
         for key in keys:
             try:
@@ -34,17 +34,17 @@ class Published:
         return float(found) if isinstance(found, int | float) else None
 
     def positions(self, thing: str) -> list[str]:
-        """Placements of the spheres or the plane in the order of the published lists."""
+        """Return placements of the spheres or the plane in the order of the published lists."""
         return list(self.content["positions"][thing])
 
 
 def load_published(name_or_path: str | Path = "thesis-tables") -> Published:
-    """Published tables by name or path; DescriptionError where the file holds none."""
+    """Read published tables by name or path; DescriptionError if the file contains none."""
     path = find(name_or_path, "references")
     table = read_table(path, "references")
     positions = table.get("positions")
     if not isinstance(positions, dict) or not {"spheres", "plane"} <= positions.keys():
-        raise DescriptionError(f"{path} holds no published tables: it needs [positions] with spheres and plane")
+        raise DescriptionError(f"{path} contains no published tables; expected [positions] with spheres and plane")
     return Published(str(table.pop("title", path.stem)), table)
 
 
@@ -55,7 +55,7 @@ LARGEST_RATIO = 1.5
 
 @dataclass(frozen=True)
 class TableRow:
-    """One value of a table: published, and ours in every campaign; errors count without their sign."""
+    """Value of a table: published, and ours in every campaign; errors are absolute values."""
 
     table: str
     row: str
@@ -65,16 +65,16 @@ class TableRow:
 
     @property
     def mean(self) -> float | None:
-        """Mean of ours over the campaigns."""
+        """Mean of our values over the campaigns."""
         return float(np.mean(self.ours)) if self.ours else None
 
     @property
     def ratio(self) -> float | None:
-        """Our mean over the published value."""
+        """Our mean divided by the published value."""
         return self.mean / self.published if self.published and self.mean is not None else None
 
     def as_dict(self) -> dict[str, str | float | None]:
-        """As the summary file holds it."""
+        """Return the row as in the summary file."""
         return {
             "table": self.table,
             "row": self.row,
@@ -87,7 +87,7 @@ class TableRow:
 
 
 def all_rows(results: Sequence[CampaignResults], published: Published) -> list[TableRow]:
-    """Rows of all tables from the results of campaigns."""
+    """Return the rows of all tables from the results of campaigns."""
     spheres, planes = ("spheres", ("PE", "STD", "SSE")), ("plane", ("RE", "STD"))
     tables = _Tables(results, published)
     rows = [
@@ -113,7 +113,7 @@ def all_rows(results: Sequence[CampaignResults], published: Published) -> list[T
 
 
 def headline_rows(rows: Sequence[TableRow]) -> list[TableRow]:
-    """The means over the positions of Tables 2, 3, 6 and 7, by which a reproduction is judged."""
+    """Return the means over the positions of Tables 2, 3, 6 and 7, the main results of a reproduction."""
     return [
         row for row in rows if row.table in ("Table 2", "Table 3", "Table 6", "Table 7") and f", {MEAN}," in row.row
     ]
@@ -123,12 +123,12 @@ _KEY = attrgetter("thing", "placement", "medium", "method", "processing")
 
 
 def _sizes(values: Iterable[float | None]) -> tuple[float, ...]:
-    """The values that there are, without their sign."""
+    """Return absolute values without None."""
     return tuple(abs(value) for value in values if value is not None)
 
 
 def _with_mean(rows: list[TableRow], name: str) -> Iterator[TableRow]:
-    """Rows of one quantity and their mean over the positions that were measured, campaign by campaign."""
+    """Yield rows of one quantity, and their mean over the measured positions, for each campaign."""
     yield from rows
     measured = [row for row in rows if row.ours]
     if len({len(row.ours) for row in measured}) != 1:
@@ -147,12 +147,12 @@ class _Tables:
     published: Published
 
     def figures(self, *key: str, name: str) -> tuple[float, ...]:
-        """A figure of every campaign that has it: by thing, place, medium, method and image processing."""
+        """Return a figure of every campaign that has it, for thing, place, medium, method and image processing."""
         found = (measured for result in self.results for measured in result.measurements if _KEY(measured) == key)
         return _sizes(measured.figures_mm.get(name) for measured in found)
 
     def objects(self, table: str, thing: str, names: Sequence[str], method: str, processing: str) -> Iterator[TableRow]:
-        """Rows of a thing's positions in both media and their means; published values are those of the same method."""
+        """Yield rows of a thing's positions in both media and their means, with published values of this method."""
         source = method if method in (PROPOSED, POLYNOMIALS) else PROPOSED
         for medium, name in product(MEDIA, names):
             rows = []
@@ -185,7 +185,7 @@ class _Tables:
             yield from _with_mean(rows, f"{title}, {MEAN}")
 
     def shares(self) -> Iterator[TableRow]:
-        """The thesis's percentages are those of the largest error, though it calls them the division of the error."""
+        """Yield the largest errors relative to the depth; the thesis's text describes them as mean errors."""
         places = self.published.positions("spheres")
         for medium, method in product(MEDIA, (POLYNOMIALS, PROPOSED)):
             found = [self.figures("spheres", place, medium, method, THESIS, name="SSE") for place in places]
@@ -213,7 +213,7 @@ class _Tables:
             yield TableRow("Figure 58", f"Z(v) in {medium}", "residual", theirs, ours)
 
     def free_forms(self) -> Iterator[TableRow]:
-        """STD of the objects of Figure 66 whose values the thesis draws and does not print."""
+        """Yield STD of the objects of Figure 66, whose values the thesis plots but does not print."""
         keys = {_KEY(measured) for result in self.results for measured in result.measurements}
         for key in sorted(keys):
             thing, _, medium, method, processing = key

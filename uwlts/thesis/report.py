@@ -1,4 +1,4 @@
-"""Report of a reproduction: summary.json, tables.csv, summary.md and report.html with the thesis's figures redrawn."""
+"""Report of a reproduction: summary.json, tables.csv, summary.md, and report.html with the thesis's figures."""
 
 import csv
 import io
@@ -50,7 +50,7 @@ from uwlts.thesis.published_tables import (
 from uwlts.thesis.results import CampaignResults, Points
 
 _TEXTS = tomllib.loads(Path(__file__).with_name("texts.toml").read_text(encoding="utf-8"))
-# A table with more quantities has one value to a line.
+# A table with more quantities has one value per line.
 _MOST_COLUMNS = 3
 
 
@@ -73,7 +73,7 @@ def evaluate_thesis(
     overwrite: bool = False,
     progress: ProgressListener = unheard,
 ) -> ThesisReport:
-    """Evaluate campaigns as the thesis does, by all its methods, and set its tables beside the results.
+    """Evaluate campaigns with all methods of the thesis, and compare the results with its tables.
 
     Parameters
     ----------
@@ -85,28 +85,30 @@ def evaluate_thesis(
     trials : int
         Trials of the Monte-Carlo propagation, at least 20, or 0 for none.
     workers : int, optional
-        Scans measured at a time; as many as there are processors unless given.
+        Number of scans measured in parallel. Default: number of processors.
     joint : bool
-        Compare the joint calibration with the thesis's two ways instead, several campaigns at a time and without Monte
-        Carlo; writes report.html and summary.json.
+        Instead compare the joint calibration with the thesis's two methods, with campaigns in parallel and without
+        Monte Carlo; writes report.html and summary.json.
     again : bool
-        Evaluate campaigns anew that have results already.
+        Evaluate campaigns again that already have results.
     overwrite : bool
         Replace an existing report.
     progress : callable, optional
-        Called with the number of parts done and the number in all, starting again for every campaign.
+        Called with the number of parts done and the total, starting again for every campaign.
 
     Raises
     ------
     DescriptionError
-        An argument is out of its range, or the published tables cannot be read.
+        An argument is out of range, or the published tables cannot be read.
     CaptureError, CalibrationError, EvaluationError
         A recording is missing or damaged, does not determine a calibration, or does not show its artefact.
     OutputError
         A file exists and ``overwrite`` is not given, or cannot be written.
     """
     if trials != 0 and trials < LEAST_TRIALS:
-        raise DescriptionError(f"trials is {trials}: take {LEAST_TRIALS} or more, or 0 for no Monte-Carlo propagation")
+        raise DescriptionError(
+            f"trials is {trials}; expected at least {LEAST_TRIALS}, or 0 for no Monte-Carlo propagation"
+        )
     if workers is not None and workers < 1:
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
     folder = Path(folder)
@@ -127,23 +129,26 @@ def evaluate_thesis(
 
 
 def differences(rows: Sequence[TableRow]) -> list[str]:
-    """Sentences with the measured numbers; those whose rows were not measured are left out."""
+    """Return the texts on differences with the measured values; texts without measured values are omitted."""
     means = {(row.table, row.row, row.quantity): row.mean for row in rows}
     found = [(each["text"], [means.get(tuple(key)) for key in each["values"]]) for each in _TEXTS["differences"]]
     return [text.format(*(f"{mean:.3f}" for mean in values)) for text, values in found if None not in values]
 
 
-def far_off(rows: Sequence[TableRow]) -> list[TableRow]:
-    """Rows whose mean lies outside the factor that a reproduction should keep to."""
+def select_outlying_rows(rows: Sequence[TableRow]) -> list[TableRow]:
+    """Return rows whose mean differs from the published one by more than the expected factor."""
     return [row for row in rows if row.ratio is not None and not 1 / LARGEST_RATIO <= row.ratio <= LARGEST_RATIO]
 
 
 def write_comparison(
     folder: Path, results: Sequence[CampaignResults], published: Published, *, overwrite: bool = False
 ) -> list[TableRow]:
-    """Write all four files into a folder, each whole or not at all; returns the rows of the tables.
+    """Write all four files into a folder, each atomically; return the rows of the tables.
 
-    OutputError where a file exists and ``overwrite`` is not given, or cannot be written.
+    Raises
+    ------
+    OutputError
+        A file exists and ``overwrite`` is not given, or it cannot be written.
     """
     rows = all_rows(results, published)
     plain, lines = [row.as_dict() for row in rows], io.StringIO()
@@ -163,7 +168,7 @@ def write_comparison(
 
 
 def markdown(rows: Sequence[TableRow], results: Sequence[CampaignResults]) -> str:
-    """The headline as a Markdown table."""
+    """Format the headline as a Markdown table."""
     campaigns = f"{len(results)} campaign{'s' if len(results) != 1 else ''}"
     lines = [
         f"| mean over the positions | | published, mm | ours, mm | range of {campaigns} | ours / published |",
@@ -181,14 +186,14 @@ def markdown(rows: Sequence[TableRow], results: Sequence[CampaignResults]) -> st
 def report_page(
     folder: Path, results: Sequence[CampaignResults], rows: Sequence[TableRow], published: Published
 ) -> str:
-    """The page as text, with pictures from the first campaign in the folder."""
+    """Render the page, with pictures from the first campaign in the folder."""
     first, headline = results[0], headline_rows(rows)
     z_of_v, y_of_z = polynomials_figures(first)
     free = [row for row in rows if (row.table, row.quantity) == ("Figure 66", "STD") and FORGOTTEN not in row.row]
     shown = [*headline, *(row for row in free if row.row.endswith("thesis image processing"))]
     means = (
-        "Means over the positions: bars are ours (blue in water, red in air), the line spans the campaigns, "
-        "diamonds are the thesis's."
+        "Means over the positions: bars show our values (blue in water, red in air), lines the range over the "
+        "campaigns, diamonds the thesis's values."
     )
     figures = [
         ("Figure 66", means, comparison_figure(shown)),
@@ -205,10 +210,10 @@ def report_page(
         published=published.title,
         campaigns=len(results),
         headline=headline,
-        far_off=far_off(headline),
+        far_off=select_outlying_rows(headline),
         far=LARGEST_RATIO,
         tables=[
-            (name, _TEXTS["titles"].get(name, ""), *_folded(list(group)))
+            (name, _TEXTS["titles"].get(name, ""), *_fold_table(list(group)))
             for name, group in groupby(rows, lambda row: row.table)
         ],
         differences=differences(rows),
@@ -221,8 +226,8 @@ def report_page(
     )
 
 
-def _folded(rows: Sequence[TableRow]) -> tuple[list[str], list[tuple[str, list[TableRow | None]]]]:
-    """A table's quantities side by side: their names, and by row one value for each of them."""
+def _fold_table(rows: Sequence[TableRow]) -> tuple[list[str], list[tuple[str, list[TableRow | None]]]]:
+    """Arrange a table's quantities side by side: their names, and for each row one value for each of them."""
     quantities = list(dict.fromkeys(row.quantity for row in rows))
     if len(quantities) > _MOST_COLUMNS:
         return ["value"], [(f"{row.row}, {row.quantity}", [row]) for row in rows]
@@ -232,7 +237,7 @@ def _folded(rows: Sequence[TableRow]) -> tuple[list[str], list[tuple[str, list[T
 
 
 def _pictures(folder: Path) -> list[tuple[str, str, str]]:
-    """Name, stripe and cloud of the objects of the first campaign that have a coloured cloud."""
+    """Return name, stripe and cloud of the first campaign's objects that have a coloured cloud."""
     campaign = campaign_folders(folder)[0]
     found = []
     for cloud in sorted((campaign.path / "clouds").glob("*-proposed.ply")):
@@ -245,21 +250,21 @@ def _pictures(folder: Path) -> list[tuple[str, str, str]]:
 
 
 def window_distance_figure(results: CampaignResults) -> Figure:
-    """Figure 45: a step's profile for several window distances."""
+    """Plot Figure 45: a step's profile for several window distances."""
     profiles = {f"d = {each.distance_mm:.1f} mm": each.points_mm for each in results.window_profiles}
     figure, (whole, upper) = new_figure(9.0, 3.2, columns=2)
     _draw_profiles(whole, "One step image for different window distances", profiles)
     _draw_profiles(upper, "Its upper face", profiles)
     depths = [z for points in profiles.values() for _, z in points if np.isfinite(z)]
     if depths:
-        # The face is flat within a few tenths of a millimetre for every window distance that is drawn.
+        # The face is flat within a few tenths of a millimetre for every plotted window distance.
         upper.set_ylim(min(depths) - 0.2, min(depths) + 1.2)
     legend_below(figure)
     return figure
 
 
 def polynomials_figures(results: CampaignResults) -> tuple[Figure, Figure]:
-    """Figures 58 and 59: Z(v) and Y(Z) of three profile lines in air and in water."""
+    """Plot Figures 58 and 59: Z(v) and Y(Z) of three profile lines in air and in water."""
     (by_row, rows), (by_depth, depths) = (new_figure(9.0, 3.2, columns=2) for _ in range(2))
     for z_axes, y_axes, (medium, found) in zip(rows, depths, results.polynomials.items(), strict=True):
         for name, line in found.lines.items():
@@ -273,7 +278,7 @@ def polynomials_figures(results: CampaignResults) -> tuple[Figure, Figure]:
 
 
 def line_figure(results: CampaignResults) -> Figure:
-    """Figure 67: the stripe on a 300 mm pipe at the stand-off, for either orientation of the camera."""
+    """Plot Figure 67: the stripe on a 300 mm pipe at the stand-off, for either orientation of the camera."""
     figure, (axes,) = new_figure(4.8, 3.2)
     profiles = {
         f"along the image's {side}: {profile.length_mm:.1f} mm": profile.points_mm
@@ -285,7 +290,7 @@ def line_figure(results: CampaignResults) -> Figure:
 
 
 def comparison_figure(rows: Sequence[TableRow]) -> Figure:
-    """Figure 66: means over the positions, ours as bars with the campaigns' range, the published ones as diamonds."""
+    """Plot Figure 66: means over the positions as bars with the campaigns' range, published values as diamonds."""
     shown = [row for row in rows if row.ours]
     figure, (axes,) = new_figure(9.0, 0.8 + 0.25 * len(shown))
     places = np.arange(len(shown))
@@ -308,7 +313,7 @@ def comparison_figure(rows: Sequence[TableRow]) -> Figure:
 
 
 def _draw_profiles(axes: Axes, title: str, profiles: Mapping[str, Points]) -> None:
-    """Draw points (Y, Z) in mm of profiles by name."""
+    """Plot named profiles of points (Y, Z) in mm."""
     for name, points in profiles.items():
         axes.plot(*np.array(points, float).reshape(-1, 2).T, ".", markersize=3, label=name)
     axes.set(title=title, xlabel="Y / mm", ylabel="Z / mm")

@@ -1,4 +1,4 @@
-"""Results of campaigns as kept in their folders: measurements, window study, budget, and the joint comparison."""
+"""Results of campaigns in their folders: measurements, window study, budget, and the joint comparison."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,29 +14,35 @@ Points = list[tuple[float, float]]
 """Y and Z of points on a profile, mm."""
 
 JointMethod = Literal["joint_same_evidence", "joint_with_target_in_water", "joint_with_scans"]
-"""Joint calibrations by what they use: what the thesis's two ways use together, the target in water, scans besides."""
+"""Joint calibrations by their evidence: that of the thesis's two methods, also the target in water, also scans."""
 
 Method = Literal["one_refraction", "two_refractions"] | JointMethod
-"""Calibrations that the joint comparison sets side by side."""
+"""Calibrations of the joint comparison."""
 
 
 class _Kept(BaseModel):
-    """A file of a campaign's folder."""
+    """File of a campaign's folder."""
 
     model_config = ConfigDict(frozen=True)
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """The file's content; CaptureError where it cannot be read, is damaged or of another version."""
+        """Read the file.
+
+        Raises
+        ------
+        CaptureError
+            It cannot be read, is damaged or has another version.
+        """
         advice = "; remove it to evaluate the campaign again"
         try:
             content = read_json(path, called="file of results")
         except CaptureError as error:
             raise CaptureError(f"{error}{advice}") from error
-        return validated_content(cls, content, f"{path} holds no results that this program reads", advice=advice)
+        return validated_content(cls, content, f"{path} contains no results that this program can read", advice=advice)
 
     def keep(self, path: Path) -> Self:
-        """Write the file, whole or not at all; ValueError where a number is not finite."""
+        """Write the file atomically; ValueError if a number is not finite."""
         with written_aside(path, overwrite=True) as aside:
             aside.write_text(json_text(self.model_dump()), encoding="utf-8")
         return self
@@ -44,7 +50,7 @@ class _Kept(BaseModel):
 
 @dataclass(frozen=True)
 class Measurement:
-    """Figures of one scan by one method and image processing, by name, in mm. ``failure`` says why there are none."""
+    """Figures of one scan by one method and image processing, mm; ``failure`` is the reason for missing ones."""
 
     thing: str
     placement: str
@@ -58,10 +64,10 @@ class Measurement:
 
 @dataclass(frozen=True)
 class WindowChoice:
-    """Window distance found from some step images, and the mean absolute sphere spacing error that it leads to.
+    """Window distance from some step images, and the resulting mean absolute sphere spacing error.
 
-    ``images`` is the place and the image's number (from 1), the place alone, or "all". The numbers are None where the
-    images determine no distance within its bounds.
+    ``images`` is the place and the image's number (from 1), the place alone, or "all". The numbers are None if the
+    images determine no distance within the bounds.
     """
 
     images: str
@@ -71,7 +77,7 @@ class WindowChoice:
 
 @dataclass(frozen=True)
 class WindowProfile:
-    """One step image seen through a window at a distance (Figure 45)."""
+    """Step image through a window at a distance (Figure 45)."""
 
     distance_mm: float
     points_mm: Points
@@ -79,7 +85,7 @@ class WindowProfile:
 
 @dataclass(frozen=True)
 class LineProfile:
-    """The stripe on the pipe and its length along Y (Figure 67)."""
+    """Stripe on the pipe, and its length along Y (Figure 67)."""
 
     length_mm: float
     points_mm: Points
@@ -105,7 +111,7 @@ class PolynomialCurves:
 
 @dataclass(frozen=True)
 class SpacingInterval:
-    """Error of the sphere spacing in a scan, its standard uncertainty and 95 % interval by the Monte-Carlo trials."""
+    """Error of the sphere spacing in a scan, with standard uncertainty and 95 % interval from Monte-Carlo trials."""
 
     placement: str
     observed_mm: float
@@ -132,10 +138,10 @@ class CampaignResults(_Kept):
 
 @dataclass(frozen=True)
 class SphereErrors:
-    """Errors of a scan of spheres by calibration and figure, and the joint ones' standard uncertainties, mm.
+    """Errors of a scan of spheres by calibration and figure, and standard uncertainties of the joint ones, mm.
 
-    Besides the figures there is the mean error of all points along X, Y and Z. A medium for which a method has no
-    calibration lacks it.
+    In addition to the figures, there is the mean error of all points along X, Y and Z. Methods without a calibration
+    for the medium are missing.
     """
 
     placement: str
@@ -146,7 +152,7 @@ class SphereErrors:
 
 @dataclass(frozen=True)
 class PlaneScatter:
-    """Standard deviation of a plane about its fit, and the same over the speckle limit at its distance."""
+    """Standard deviation of a plane about its fit, and its ratio to the speckle limit at its distance."""
 
     placement: str
     medium: str
@@ -155,7 +161,7 @@ class PlaneScatter:
 
 
 class JointResults(_Kept):
-    """Joint and sequential calibrations of one campaign compared: the file joint.json.
+    """Comparison of joint and sequential calibrations of one campaign: the file joint.json.
 
     ``spheres`` and ``planes`` are scans that no calibration has used.
     """
@@ -169,7 +175,7 @@ class JointResults(_Kept):
 
 
 class MediumSummary(BaseModel):
-    """Errors of all scans in a medium by calibration, and the shares of the 95 % intervals that hold the truth."""
+    """Errors of all scans in a medium by calibration, and coverage of the 95 % intervals."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -181,7 +187,7 @@ class MediumSummary(BaseModel):
 
 
 class JointSummary(MediumSummary):
-    """Summary of the comparison on all campaigns; what stands outside the media is in water."""
+    """Summary of the comparison over all campaigns; fields outside the media are for water."""
 
     solve_s: dict[JointMethod, list[float]]
     campaigns: int
@@ -189,6 +195,6 @@ class JointSummary(MediumSummary):
     air: MediumSummary
 
     def media(self) -> dict[str, MediumSummary]:
-        """The summaries by medium, those without scans left out."""
+        """Return the summaries by medium, without media that have no scans."""
         both = {"water": self.water, "air": self.air}
         return {medium: part for medium, part in both.items() if any(part.spacing_error_mm.values())}

@@ -1,4 +1,4 @@
-"""Sphere spacing errors of scans by any calibration, with the step images used (Table 4) and their budget (Table 9)."""
+"""Sphere spacing errors of scans, their dependence on step images (Table 4), and their budget (Table 9)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ from uwlts.thesis.uncertainty_budget import UNIFORM, UncertaintySource, combine
 
 @dataclass(frozen=True, eq=False)
 class SphereScan:
-    """The stripe on two spheres in one scan: its ``pixels`` (N, 2), and the ``sphere`` (N,), 0 or 1, of each.
+    """Stripe on two spheres in one scan: ``pixels`` (N, 2), and the ``sphere`` (N,), 0 or 1, of each.
 
     ``stage_mm`` (N,) are positions of the stage along ``stage_direction`` (3,), ``spacing_mm`` is the calibrated
     distance of the centres.
@@ -42,13 +42,19 @@ class SphereScan:
     spacing_mm: float
 
     def spacing_error(self, points: np.ndarray) -> float:
-        """Sphere spacing error of points (N, 3) of these stripes, mm."""
+        """Return the sphere spacing error of points (N, 3) of these stripes, mm."""
         first, second = (fit_sphere(points[self.sphere == number]).centre_mm for number in (0, 1))
         return float(np.linalg.norm(second - first)) - self.spacing_mm
 
 
 def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str) -> SphereScan:
-    """Stripes of a scan of two spheres, assigned to these by a calibration; EvaluationError where it shows none."""
+    """Assign the stripes of a scan to two spheres, with a calibration.
+
+    Raises
+    ------
+    EvaluationError
+        The scan shows no spheres.
+    """
     standard = SphereStandard.model_validate(capture.header.artefact)
     stripes = find_stripes(capture)
     scan = reconstruct_stripes(capture, stripes, calibration)
@@ -72,23 +78,23 @@ def sphere_scan(capture: Capture, calibration: AnyCalibration, *, placement: str
 
 
 _TRIED_SHARES = (0.25, 0.5, 1.0, 1.5)
-"""Window distances of Figure 45, as shares of the calibrated one."""
+"""Window distances of Figure 45, relative to the calibrated one."""
 
 
 def window_of(calibration: Calibration) -> WindowModel:
-    """The window of a calibration; CalibrationError where it has none."""
+    """Return the window of a calibration; CalibrationError if it has none."""
     if calibration.window is None:
         raise CalibrationError("the calibration has no window: calibrate with step images")
     return calibration.window
 
 
 def mean_spacing_error(calibration: Calibration, scans: Sequence[SphereScan]) -> float:
-    """Mean absolute sphere spacing error of scans in mm."""
+    """Return the mean absolute sphere spacing error of scans in mm."""
     return float(np.mean([abs(spacing_error(calibration, scan)) for scan in scans]))
 
 
 def spacing_error(calibration: Calibration, scan: SphereScan, *, medium_index: float | None = None) -> float:
-    """Sphere spacing error of a scan in mm, in a medium of another index if one is given."""
+    """Return the sphere spacing error of a scan in mm, optionally for another medium index."""
     points = reconstruct_pixels(
         calibration,
         scan.pixels,
@@ -102,9 +108,16 @@ def spacing_error(calibration: Calibration, scan: SphereScan, *, medium_index: f
 def window_choices(
     folder: CampaignFolder, calibration: Calibration, scans: Sequence[SphereScan]
 ) -> tuple[list[WindowChoice], list[WindowProfile]]:
-    """Every step image alone, the three of each place, and all nine; and profiles of a step at several distances.
+    """Determine the window from every step image, the three of each place, and all nine; also return step profiles.
 
-    CaptureError where a recording is missing or damaged, CalibrationError where the calibration has no window.
+    The profiles are those of one step at several window distances.
+
+    Raises
+    ------
+    CaptureError
+        A recording is missing or damaged.
+    CalibrationError
+        The calibration has no window.
     """
     nominal = window_of(calibration)
     images: dict[str, list[StepImage]] = {}
@@ -137,22 +150,22 @@ def window_choices(
 
 TEMPERATURE_HALF_WIDTH_C = 5.0
 _EXPANSION_PER_K = 22.2e-6
-"""Of the standard: the thesis's 0.011 mm for 5 K over 99.18 mm, as aluminium expands."""
+"""Thermal expansion of the standard: the thesis's 0.011 mm for 5 K and 99.18 mm, as for aluminium."""
 _STANDARD_EXPANDED_MM = 0.004
-"""Of its calibration, k = 2 (thesis, Table 9)."""
+"""Expanded uncertainty of its calibration, k = 2 (thesis, Table 9)."""
 _SUBPIXEL = 0.1
-"""The thesis takes a tenth of a pixel as the effective resolution."""
+"""Effective resolution in px, from the thesis."""
 
 
 def spacing_budget(
     calibration: Calibration, scans: Sequence[SphereScan], medium: Medium, *, deviation_mm: float
 ) -> dict[str, float]:
-    """Budget of the sphere spacing by the thesis's sources, as standard uncertainties and what follows from them, mm.
+    """Return the budget of the sphere spacing with the thesis's sources: standard uncertainties and results, mm.
 
-    Index: the change of the spacing when the index changes by what 5 degC do, the calibration left as it is; mean over
-    the scans. Resolution: a tenth of the change of Z per pixel at the stand-off. SSE: the standard deviation of the
-    scans' spacing errors, of at least two, with their mean as the correction. ``deviation_mm``, the largest standard
-    deviation of the points about the spheres, enters as the thesis's PE.
+    Index: change of the spacing if the index changes as for 5 degC, with an unchanged calibration; mean over the scans.
+    Resolution: a tenth of the change of Z per pixel at the stand-off. SSE: standard deviation of the scans' spacing
+    errors (at least two), with their mean as the correction. ``deviation_mm``, the largest standard deviation of the
+    points about the spheres, is used as the thesis's PE.
     """
     errors = np.array([spacing_error(calibration, scan) for scan in scans])
     warm, cold = (
@@ -184,7 +197,7 @@ def spacing_budget(
 
 
 def mm_per_px(calibration: Calibration, medium_index: float) -> float:
-    """Change of Z per pixel across the stripe where the camera's axis meets the sheet, mm."""
+    """Return the change of Z per pixel across the stripe at the sheet's intersection with the camera's axis, mm."""
     camera = calibration.camera
     across = np.array([0.0, 0.5] if calibration.stripe_along == "width" else [0.5, 0.0])
     pixels = np.array([camera.cx_px, camera.cy_px]) + np.array([-across, across])

@@ -110,7 +110,7 @@ def test_a_damaged_origin_is_noticed_when_it_is_read(written, tmp_path, key, val
 def test_indices_without_their_media_are_noticed(written):
     calibration = read_calibration(written)
     assert found_estimate(calibration, WATER).parameters.media == ("water",)
-    with pytest.raises(CalibrationError, match="1 indices of media, the calibration 0 media"):
+    with pytest.raises(CalibrationError, match="1 indices for 0 media"):
         found_estimate(calibration.model_copy(update={"media": ()}), WATER)
 
 

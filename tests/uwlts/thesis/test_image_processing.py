@@ -8,7 +8,7 @@ from uwlts.model.sensor import Medium
 from uwlts.storage.capture import Capture, CaptureHeader, Frame
 from uwlts.storage.capture_writer import CaptureWriter
 from uwlts.stripe import CaptureStripes
-from uwlts.thesis.measurements import low_passed, thesis_stripes
+from uwlts.thesis.measurements import apply_low_pass, thesis_stripes
 
 LINES, LENGTH = 40, 64
 
@@ -31,7 +31,7 @@ def by_definition(image, *, tolerance):
 def test_a_pixel_within_forty_percent_of_its_neighbours_stays(value, kept):
     image = np.full((15, 15), 100, np.uint8)
     image[7, 7] = value
-    smooth = low_passed(image, tolerance=0.4)
+    smooth = apply_low_pass(image, tolerance=0.4)
     assert smooth[7, 7] == pytest.approx(value if kept else 100.0, abs=1e-4)
     # The odd pixel is one of 24 neighbours of those around it, which are within 2 % of their mean.
     image[7, 7] = 100
@@ -45,7 +45,7 @@ def test_a_pixel_within_forty_percent_of_its_neighbours_stays(value, kept):
 def test_the_filter_is_that_of_the_manual(dtype, top, tolerance):
     image = np.random.default_rng(0).integers(1, top, (24, 30), endpoint=True).astype(dtype)
     expected, deviation = by_definition(image, tolerance=tolerance)
-    smooth = low_passed(image, tolerance=tolerance)
+    smooth = apply_low_pass(image, tolerance=tolerance)
     assert smooth.dtype == np.float32
     # Sums of 25 pixels rounded to float32: 6e-8 of 25 times full scale, a few times, over 24.
     inside = np.abs(deviation - tolerance) > 1e-5
@@ -57,7 +57,7 @@ def test_the_filter_is_that_of_the_manual(dtype, top, tolerance):
 
 
 def test_black_stays_black():
-    np.testing.assert_array_equal(low_passed(np.zeros((9, 9), np.uint8), tolerance=0.4), np.zeros((9, 9)))
+    np.testing.assert_array_equal(apply_low_pass(np.zeros((9, 9), np.uint8), tolerance=0.4), np.zeros((9, 9)))
 
 
 def capture(path, images, *, stripe_along):
@@ -108,7 +108,7 @@ VERTICES = np.array([30.0 + np.arange(LINES) / 8, 41.5 - np.arange(LINES) / 8])
 @pytest.mark.parametrize("fitted_px", [3, 5, 7])
 def test_the_vertex_of_a_sampled_parabola_is_exact(tmp_path, stripe_along, fitted_px):
     images = [parabolas(vertices) for vertices in VERTICES]
-    # The place that is known beforehand decides where to look, not what is found.
+    # The approximate position decides where to search, not the result.
     known = found(VERTICES + np.random.default_rng(1).uniform(-5, 5, VERTICES.shape))
     with capture(tmp_path / "stripe.h5", images, stripe_along=stripe_along) as opened:
         measured = thesis_stripes(opened, known, fitted_px=fitted_px)
@@ -129,7 +129,7 @@ def test_the_mean_of_the_neighbours_keeps_a_parabolas_vertex(tmp_path):
 
 
 def test_noise_within_the_tolerance_is_not_smoothed(tmp_path):
-    """What the plain mean takes out reaches the fit through LabVIEW's filter: 25 pixels against a few."""
+    """Noise that the plain mean removes reaches the fit through LabVIEW's filter: 25 pixels against a few."""
     rng, vertices = np.random.default_rng(2), np.full((4, LINES), 30.0)
     images = [
         (parabolas(row, height=40000, curvature=320) + rng.normal(0, 100, (LENGTH, LINES))).astype(np.uint16)
@@ -175,7 +175,7 @@ def test_a_plateau_is_placed_at_the_stripe_known_or_in_its_own_middle(tmp_path):
 
 
 def test_the_vertex_stays_within_the_fit(tmp_path):
-    """A peak at the rim of the searched range, on a slope, has no vertex there."""
+    """A peak at the rim of the searched range, on a slope, without a vertex there."""
     image = np.repeat((np.arange(LENGTH, dtype=np.uint16) ** 2 * 10)[:, None], LINES, axis=1)
     known = np.full((1, LINES), 30.0)
     with capture(tmp_path / "stripe.h5", [image], stripe_along="width") as opened:

@@ -14,7 +14,7 @@ FIGURES = ("SSE", "diameter error sphere 1", "diameter error sphere 2", *SHIFTS)
 
 
 def result(number):
-    """Errors in mm of one campaign: in water those of all three ways, in air of two."""
+    """Errors in mm of one campaign: of all three methods in water, of two in air."""
 
     def scan(medium, ways):
         found = {way: dict(zip(FIGURES, (size, -size, size / 2) * 2, strict=True)) for way, size in ways.items()}

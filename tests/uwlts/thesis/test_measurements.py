@@ -153,7 +153,7 @@ def test_figures_of_a_plane_stand_beside_those_of_all_points():
         metadata={},
     )
     figures = _figures(evaluate(cloud, {"kind": "plane"}))
-    # Of 40,000 normal numbers the largest lie 4 standard deviations out or more, of all but 0.3 % of them 2.97.
+    # Of 40,000 normal numbers, the largest exceed 4 standard deviations; without 0.3 % of them, 2.97.
     assert figures["STD"] == pytest.approx(0.05, rel=0.05)
     assert figures["RE"] == pytest.approx(2 * 2.97 * 0.05, rel=0.05)
     assert figures["RE of all points"] > 1.1 * figures["RE"]

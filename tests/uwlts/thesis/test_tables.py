@@ -24,10 +24,10 @@ from uwlts.thesis.published_tables import TableRow, all_rows, headline_rows, loa
 from uwlts.thesis.report import (
     comparison_figure,
     differences,
-    far_off,
     line_figure,
     markdown,
     polynomials_figures,
+    select_outlying_rows,
     window_distance_figure,
     write_comparison,
 )
@@ -221,14 +221,14 @@ def test_headline_rows_are_the_means_of_four_tables():
     assert counts == {"Table 2": 6, "Table 3": 4, "Table 6": 6, "Table 7": 4}
     assert len(rows) == 20
     assert all(", mean, " in row.row for row in rows)
-    assert not far_off(rows)
-    assert far_off(headline_rows(all_rows([campaign(1.6)], PUBLISHED))) == headline_rows(
+    assert not select_outlying_rows(rows)
+    assert select_outlying_rows(headline_rows(all_rows([campaign(1.6)], PUBLISHED))) == headline_rows(
         all_rows([campaign(1.6)], PUBLISHED)
     )
 
 
 def without(results, **what):
-    """Results in which measurements that match have failed."""
+    """Return results with failures of the matching measurements."""
     measurements = [
         replace(m, figures_mm={}, failure="lost") if what.items() <= vars(m).items() else m
         for m in results.measurements
@@ -246,7 +246,7 @@ def test_a_position_that_was_not_measured():
     mean = alone["Table 6", "spheres, mean, water", "PE"]
     assert mean.ours == pytest.approx(((0.69 + 0.66 + 0.51 + 0.51 + 0.48) / 5,))
     assert mean.ratio == pytest.approx(1.0)
-    # A campaign that lacks a position has no mean to stand beside the other's.
+    # A campaign without a position is missing in the mean.
     both = rows_of(campaign(), without(campaign(), **lost))
     assert both["Table 6", "spheres, far, water", "PE"].ours == pytest.approx((0.46,))
     assert ("Table 6", "spheres, mean, water", "PE") not in both
@@ -301,7 +301,7 @@ def test_free_forms_and_experiments():
 
 def test_sentences_give_the_measured_numbers():
     reported = " ".join(differences(all_rows([campaign()], PUBLISHED)))
-    assert "The polynomials in water err by 0.115 mm" in reported
+    assert "The polynomials in water have an error of 0.115 mm" in reported
     assert "single viewpoint" not in reported
 
 

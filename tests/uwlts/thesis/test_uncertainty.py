@@ -51,7 +51,7 @@ TARGET = CircleTarget(
 )
 RADIUS_MM, SPACING_MM = 25.06, 99.18
 BEND_MM = 0.02
-"""How far the target's corners stand out where it is bowed."""
+"""Height of the target's corners for a bowed target."""
 
 
 def warmer(kelvin):
@@ -83,7 +83,7 @@ def seen(
     noise=0.0,
     stripe_points=120,
 ):
-    """What a sensor sees whose target, stage, step, window and water differ so much from what they are taken for."""
+    """Evidence of a sensor whose target, stage, step, window and water differ from their descriptions."""
     rng = np.random.default_rng(0)
     images, poses, _ = stage_images(
         SENSOR, positions=np.arange(5) * 40.0, points=POINTS, stage_tilt=stage_tilt, noise_px=noise, rng=rng
@@ -235,7 +235,7 @@ def test_what_is_drawn_does_what_a_wrong_sensor_does(name):
     truly = abs(error_by(seen(**wrong)))
     drawn = abs(error_by(draw({name: size}).evidence(Fixed())))
     print(f"{name} {size:g}: spheres wrong by {truly:.4f} mm, drawn {drawn:.4f} mm")
-    # What is drawn moves what is known, the wrong sensor what is seen: opposite signs, and the same but for the square
+    # A draw changes the known values, the wrong sensor the observed ones: opposite signs, equal except for the square
     # of the change, 1 % for a stage tilted about both axes.
     assert truly > 1e-3
     assert drawn == pytest.approx(truly, rel=0.02)
@@ -325,7 +325,7 @@ def test_temperature_alone_spreads_by_its_sensitivities():
     # The kurtosis of the sum of two evenly spread numbers is at most 2.4: a standard deviation of 40 is good to
     # sqrt(1.4 / 160), 9 %; 3.5 of it.
     assert result.std_mm() == pytest.approx(expected, rel=0.33)
-    # No trial lies beyond both ends together; the index is curved by 10 % over the range.
+    # No trial exceeds both ends together; the index is curved by 10 % over the range.
     limit = max(map(abs, measuring)) + max(map(abs, calibrating))
     assert 0.5 * limit < np.abs(result.trials_mm).max() < limit
     assert result.contains_truth()
@@ -340,7 +340,7 @@ def propagated(trials):
 
 
 def test_the_shortest_interval_of_a_known_sample():
-    # Squares lie densest at 0: the first 95 of 100.
+    # Squares are densest at 0: the first 95 of 100.
     squares = np.random.default_rng(3).permutation(np.arange(100.0)) ** 2
     assert propagated(squares).interval_mm() == (0.0, 94.0**2)
     # Twenty: 19 of them; the outlier is left out, whichever side it is on.
@@ -436,7 +436,7 @@ def test_a_pixel_is_as_many_mm_as_a_point_moves():
     window, frame = SENSOR.camera.window, camera_from_object(SENSOR)
     faces = plate(distance=window.distance_mm, thickness=window.thickness_mm, normal=window.normal())
     indices = [1.0, window.index(SENSOR.laser.wavelength_nm), INDEX]
-    # Rows in which points along the laser's axis are seen, which pass 0.6 px beside the principal point.
+    # Rows that see points along the laser's axis, which pass 0.6 px beside the principal point.
     depth = np.linspace(-60, 60, 4001)
     points = np.column_stack([0 * depth, 0 * depth, depth]) @ frame[:3, :3].T + frame[:3, 3]
     row = LENS.pixels(directions_seen(points, faces, indices))[:, 1]

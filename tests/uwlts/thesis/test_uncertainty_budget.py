@@ -47,7 +47,7 @@ def test_the_thesis_factor_is_not_that_of_95_percent():
 
 def test_the_end_gauge_of_the_gum():
     # GUM Table H.1 in nm. The temperature's deviation and the standard's expansion have a sensitivity of zero. The
-    # difference of the expansions lies within 1e-6 per K and has 50 degrees of freedom, with a sensitivity of 50 mm x
+    # difference of the expansions is within 1e-6 per K and has 50 degrees of freedom, with a sensitivity of 50 mm x
     # 0.1 K; that of the temperatures within 0.05 K with 2, and 50 mm x 11.5e-6 per K.
     sources = [
         UncertaintySource(name="standard", standard_uncertainty=75 / 3, degrees_of_freedom=18),
@@ -73,7 +73,7 @@ def test_sources_of_one_kind():
     repeated = combine([UncertaintySource(name="mean", standard_uncertainty=0.3, degrees_of_freedom=5)])
     assert repeated.degrees_of_freedom == pytest.approx(5)
     assert repeated.coverage_factor == pytest.approx(2.571, abs=5e-4)
-    # Two alike have twice as many.
+    # Two equal sources have twice as many.
     assert combine(
         [UncertaintySource(name=n, standard_uncertainty=0.3, degrees_of_freedom=5) for n in "ab"]
     ).degrees_of_freedom == pytest.approx(10)

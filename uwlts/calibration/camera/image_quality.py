@@ -1,4 +1,4 @@
-"""Quality of images of the target and of the laser line on it, and the reasons for refusing one."""
+"""Quality of images of the target and of the laser line on it, with reasons for rejection."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,45 +10,45 @@ from uwlts.errors import ImageError
 from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
 from uwlts.targets import Target, TargetView
 
-# The edge of Gaussian blur s has the slope 0.4 / s over its contrast.
+# The edge of a Gaussian blur s has the slope 0.4 / s times its contrast.
 _SLOPE_TIMES_BLUR = 0.4
-_JUDGED_POINTS = 80  # enough for a median of the sharpness
-# Points with fewer neighbours on the target than this are too far apart to compare two images by them.
+_JUDGED_POINTS = 80  # points for the median sharpness
+# Common points that two images need for a comparison.
 _FEWEST_COMMON = 4
 
 
 class LampFault(str):
-    """A reason against an image that another exposure by the lamp may remove."""
+    """Reason for rejection that another lamp exposure may remove."""
 
 
 class LaserFault(str):
-    """A reason against an image that another exposure by the laser may remove."""
+    """Reason for rejection that another laser exposure may remove."""
 
 
 class MotionFault(str):
-    """A reason against an image that is gone once the target is at rest."""
+    """Reason for rejection that disappears when the target is at rest."""
 
 
 @dataclass(frozen=True)
 class QualityLimits:
-    """Limits that images must keep."""
+    """Limits for accepted images."""
 
-    fewest_points: int = 12  # points of the target in an image, where it has so many
-    smallest_share: float = 0.1  # share of the target's points; a target larger than the image is seen in part
+    fewest_points: int = 12  # points of the target in an image, unless it has fewer
+    smallest_share: float = 0.1  # fraction of the target's points; a target larger than the image is partly visible
     largest_blur_px: float = 2.5  # Gaussian blur (standard deviation) of the edges, median over the points
-    smallest_contrast: float = 0.08  # grey levels between bright and dark, median over the points; of the full scale
-    largest_saturated: float = 0.02  # share of the target's pixels, or of the stripe's lines, at the full scale
-    largest_motion_px: float = 0.5  # way of the points between two images of one pose, see `way_px`
-    smallest_change_px: float = 5.0  # way of the points from the nearest pose recorded before
+    smallest_contrast: float = 0.08  # bright minus dark, median over the points, relative to full scale
+    largest_saturated: float = 0.02  # fraction of the target's pixels, or of the stripe's lines, at full scale
+    largest_motion_px: float = 0.5  # shift of the points between two images of one pose, see `way_px`
+    smallest_change_px: float = 5.0  # shift of the points from the nearest recorded pose
     fewest_lines: int = 20  # profile lines with the stripe on the target
 
 
 @dataclass(frozen=True)
 class TargetQuality:
-    """Quality of an image of the target; ``reasons`` are why it is refused, empty if it is not.
+    """Quality of an image of the target; ``reasons`` for rejection are empty for a good image.
 
-    ``points`` is how many were found, ``share`` of how many the target has, ``blur_px`` the edges' Gaussian blur,
-    ``contrast`` and ``saturated`` are shares of the full scale and of the target's pixels.
+    ``points`` is the number of points found, ``share`` their fraction of the target's points, ``blur_px`` the Gaussian
+    blur of the edges. ``contrast`` is relative to full scale, ``saturated`` is the fraction of the target's pixels.
     """
 
     points: int
@@ -61,7 +61,7 @@ class TargetQuality:
 
 @dataclass(frozen=True, eq=False)
 class StripeQuality:
-    """Quality of a laser image: stripe pixels (N, 2) on the target, the share of them saturated, and the reasons."""
+    """Quality of a laser image: stripe pixels (N, 2) on the target, fraction of saturated lines, and reasons."""
 
     pixels: np.ndarray
     saturated: float
@@ -69,14 +69,14 @@ class StripeQuality:
 
     @property
     def lines(self) -> int:
-        """Profile lines with the stripe on the target."""
+        """Number of profile lines with the stripe on the target."""
         return len(self.pixels)
 
 
 def judge_target(
     image: np.ndarray, view: TargetView, target: Target, *, full_dn: int, limits: QualityLimits = QualityLimits()
 ) -> TargetQuality:
-    """Quality of an image (H, W) in which the target was found; pixels clip at the grey value ``full_dn``."""
+    """Assess an image (H, W) in which the target was found; pixels saturate at the grey value ``full_dn``."""
     count, of_all = len(view.pixels), len(target.indices)
     share = count / of_all
     blur = edge_blur_px(image, view.pixels, half_px=_spacing_px(view, target) / 2)
@@ -88,15 +88,15 @@ def judge_target(
         f"partial: {count} of {of_all} points found; bring more of the target into the image": (
             count < min(limits.fewest_points, of_all) or share < limits.smallest_share
         ),
-        f"blurred: edges are {blur:.1f} px wide, at most {limits.largest_blur_px:g} are good; focus, or change the "
+        f"blurred: edges are {blur:.1f} px wide, at most {limits.largest_blur_px:g} are allowed; focus, or change the "
         "distance": blur > limits.largest_blur_px,
         LampFault(
             f"faint: {100 * contrast:.0f} % of the full scale between bright and dark, at least "
-            f"{100 * limits.smallest_contrast:.0f} % are good; more light or a longer lamp_ms"
+            f"{100 * limits.smallest_contrast:.0f} % are needed; use more light or a longer lamp_ms"
         ): contrast < limits.smallest_contrast,
         LampFault(
             f"saturated: {100 * saturated:.0f} % of the target's pixels are at the full scale, at most "
-            f"{100 * limits.largest_saturated:.0f} % are good; less light or a shorter lamp_ms"
+            f"{100 * limits.largest_saturated:.0f} % are allowed; use less light or a shorter lamp_ms"
         ): saturated > limits.largest_saturated,
     }
     refused = tuple(reason for reason, applies in reasons.items() if applies)
@@ -104,10 +104,10 @@ def judge_target(
 
 
 def edge_blur_px(image: np.ndarray, pixels: np.ndarray, *, half_px: float) -> float:
-    """Gaussian blur of the edges around the points (N, 2), median: from the steepest slope and the whole contrast.
+    """Estimate the median Gaussian blur of the edges around the points (N, 2) from steepest slope and contrast.
 
-    Each point is judged in a square of ``half_px`` to all sides, which holds bright and dark far from the edge: levels
-    read close to a blurred edge would make it look sharp.
+    The window of ``half_px`` on every side of a point includes bright and dark far from the edge: levels near a blurred
+    edge would make it look sharp.
     """
     grey = image.astype(np.float32)
     slope = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1)) / 8
@@ -121,22 +121,22 @@ def edge_blur_px(image: np.ndarray, pixels: np.ndarray, *, half_px: float) -> fl
 
 
 def why_not_found(image: np.ndarray, error: str, *, full_dn: int) -> str:
-    """Reason why no target was found: the light, if it is too dark or too bright, else the detector's own."""
+    """Return the reason why no target was found: too dark, too bright, or the detector's error."""
     brightest = float(np.quantile(image, 0.995)) / full_dn
     clipped = float(np.mean(image >= full_dn))
     if brightest < 0.1:
         reached = f"the image reaches {100 * brightest:.0f} % of the full scale"
-        return LampFault(f"too dark: {reached}; more light or a longer lamp_ms")
+        return LampFault(f"too dark: {reached}; use more light or a longer lamp_ms")
     if clipped > 0.3:
         filled = f"{100 * clipped:.0f} % of the image is at the full scale"
-        return LampFault(f"saturated: {filled}; less light or a shorter lamp_ms")
+        return LampFault(f"saturated: {filled}; use less light or a shorter lamp_ms")
     return error
 
 
 def way_px(one: TargetView, other: TargetView) -> float:
-    """Distance in px that nine tenths of the points keep to which both views show; infinite where these are few.
+    """Return the 90 % quantile of the shifts in px of common points of two views; infinite for few points.
 
-    A target that is turned about its middle moves its outer points only, so the median would not show it.
+    A target that rotates about its middle moves its outer points only, so the median would not show it.
     """
     places = {tuple(place): k for k, place in enumerate(one.indices.tolist())}
     pairs = [(places[tuple(p)], k) for k, p in enumerate(other.indices.tolist()) if tuple(p) in places]
@@ -147,20 +147,20 @@ def way_px(one: TargetView, other: TargetView) -> float:
 
 
 def judge_motion(before: TargetView, after: TargetView, limits: QualityLimits = QualityLimits()) -> tuple[str, ...]:
-    """Reasons why two images of one pose do not belong together; empty if they do."""
+    """Return a reason if the target moved between two images of one pose; else empty."""
     way, most = way_px(before, after), limits.largest_motion_px
-    reason = MotionFault(f"moved: the target went {way:.1f} px between its images, at most {most:g} are good")
+    reason = MotionFault(f"moved: the target moved {way:.1f} px between its images, at most {most:g} are allowed")
     return () if way <= most else (reason,)
 
 
 def judge_novelty(
     view: TargetView, recorded: Sequence[TargetView], limits: QualityLimits = QualityLimits()
 ) -> tuple[str, ...]:
-    """Reason why a pose adds nothing to those recorded; empty if it does."""
+    """Return a reason if a pose is too similar to a recorded one; else empty."""
     ways = [way_px(view, old) for old in recorded]
     if not ways or min(ways) >= limits.smallest_change_px:
         return ()
-    return (f"too similar to image {int(np.argmin(ways)) + 1}: {min(ways):.1f} px apart; move or tilt the target",)
+    return (f"too similar to image {int(np.argmin(ways)) + 1}: differs by {min(ways):.1f} px; move or tilt the target",)
 
 
 def judge_stripe(
@@ -173,9 +173,9 @@ def judge_stripe(
     options: StripeOptions = StripeOptions(),
     limits: QualityLimits = QualityLimits(),
 ) -> StripeQuality:
-    """Quality of a laser image (H, W), taken at the pose in which the lamp showed the target in ``view``.
+    """Assess a laser image (H, W), taken at the pose of the lamp image ``view``.
 
-    A stripe that misses the target is no fault of the image: then there are no lines, and no reasons.
+    A stripe that misses the target is not an error: the result then has no lines and no reasons.
     """
     try:
         stripe = extract_stripe(image, stripe_along=stripe_along, options=options, saturation=full_dn)
@@ -189,19 +189,19 @@ def judge_stripe(
     lit = max(int(found.sum()), int(clipped.sum()), 1)
     saturated, reasons = float(clipped.sum()) / lit, ()
     if lit >= limits.fewest_lines and saturated > 0.05:
-        share = f"{100 * saturated:.0f} % of its lines, at most 5 % are good"
+        share = f"{100 * saturated:.0f} % of its lines, at most 5 % are allowed"
         reasons = (LaserFault(f"stripe saturated on {share}; shorten laser_ms"),)
     return StripeQuality(pixels[np.array(on_target, dtype=bool)], saturated, reasons)
 
 
 def _hull(pixels: np.ndarray, *, margin_px: float = 0.0) -> np.ndarray:
-    """Corners (K, 2) of the points' convex hull, moved out from its middle by a margin."""
+    """Return the corners (K, 2) of the points' convex hull, expanded by a margin."""
     hull = cv2.convexHull(pixels.astype(np.float32))[:, 0]
     outward = hull - hull.mean(axis=0)
     return hull + margin_px * outward / np.maximum(np.linalg.norm(outward, axis=1, keepdims=True), 1e-9)
 
 
 def _spacing_px(view: TargetView, target: Target) -> float:
-    """Roughly how far apart neighbouring points are in the image."""
+    """Return the approximate distance of neighbouring points in the image."""
     size_px, size_mm = np.ptp(view.pixels, axis=0).max(), np.ptp(view.points_mm[:, :2], axis=0).max()
     return float(target.spacing_mm * size_px / max(size_mm, 1e-9))

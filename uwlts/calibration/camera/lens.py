@@ -1,9 +1,9 @@
-"""A lens from images of a target alone: the model that predicts best, without doubtful points and images.
+"""Lens calibration from images of a target: selection of the model, of points and of images.
 
-Misses of the points of one image go together where the model is not perfect. So a model is chosen by how well it
-predicts images that it was not calibrated from, an image is judged by how far it moves the parameters, and the
-uncertainties follow from what leaving out one image after the other does (the delete-one-group jackknife). Tangential
-distortion that prediction does not ask for is small, but not known to be zero, and moves the principal point.
+Residuals of the points of one image are correlated if the model is not perfect. Therefore, a model is scored by its
+prediction of images that were not used for its calibration. An image is rejected if it changes the parameters too much.
+The uncertainties follow from leaving out one image at a time (delete-one-group jackknife). Tangential distortion that
+does not improve predictions is small but not known to be zero, and shifts the principal point.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,24 +24,24 @@ from uwlts.model.sensor import Uncertainty
 from uwlts.runtime.progress import ProgressListener, unheard
 
 BESIDES = (("p1", "p2"), ("k3",), ("p1", "p2", "k3"))
-"""Coefficients that lenses are tried with besides k1 and k2."""
+"""Coefficients that are tried in addition to k1 and k2."""
 RATIONAL_BESIDES = (("k4", "k5"), ("p1", "p2", "k4", "k5"))
-"""Those that are tried where k3 helps."""
+"""Coefficients that are tried if k3 helps."""
 _USUAL = ("k1", "k2")
 _DISTORTIONS = ((), ("k1",), _USUAL, *((*_USUAL, *names) for names in BESIDES))
 _RATIONAL = tuple((*_USUAL, *names) for names in RATIONAL_BESIDES)
 _FOLDS = 5
-_WORSE = 1.0  # standard errors of the mean difference of squares; below, a model counts as good as the best
-_LEAST_GAIN = 0.01  # of the mean square; less is of no use, however certain
-_SOFT = 2.0  # robust standard deviations from where a point counts less
-_OUTLIER = 5.0  # robust standard deviations from where a point does not count
-_LARGEST_REJECTED = 0.3  # of an image's points; more are another board, or another pose
-_LEAST_SCATTER_PX = 1e-6  # of points; drawn ones may have none
-_MOVED = 3.0  # standard uncertainties by which one image may move a parameter
+_WORSE = 1.0  # standard errors of the mean difference of squares within which a model is as good as the best
+_LEAST_GAIN = 0.01  # relative to the mean square; a smaller gain is useless even if significant
+_SOFT = 2.0  # robust standard deviations from which a point has less weight
+_OUTLIER = 5.0  # robust standard deviations from which a point is rejected
+_LARGEST_REJECTED = 0.3  # fraction of an image's points; more indicate another board or pose
+_LEAST_SCATTER_PX = 1e-6  # scatter of points; simulated ones may have none
+_MOVED = 3.0  # standard uncertainties by which one image may change a parameter
 HALVES_APART = 4.0
-"""Standard uncertainties that a parameter from one half of the images may differ from that by the other."""
-_FEWEST_IMAGES = 5  # that are left: of fewer the influence of one says little
-_LARGEST_LEFT_OUT = 0.2  # share of the images: where more move a parameter, it is not clear which are right
+"""Largest difference of a parameter between two halves of the images, in its standard uncertainties."""
+_FEWEST_IMAGES = 5  # images that must remain: with fewer, the influence of one image is uncertain
+_LARGEST_LEFT_OUT = 0.2  # fraction of the images: if more change a parameter, it is unclear which are right
 
 Coefficient = Literal["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"]
 Distortion = Literal["auto"] | tuple[Coefficient, ...]
@@ -49,18 +49,18 @@ Pixels = Literal["auto", "square", "free"]
 
 
 def require_coefficients(distortion: Distortion) -> None:
-    """Raise DescriptionError unless distortion is auto alone, or each coefficient at most once."""
+    """Raise DescriptionError unless distortion is only auto, or each coefficient at most once."""
     if distortion != "auto" and (not set(distortion) <= set(DISTORTION) or len(set(distortion)) < len(distortion)):
         given = distortion if isinstance(distortion, str) else " ".join(distortion)
-        raise DescriptionError(f"`distortion` {given}: expected auto alone, or each of {', '.join(DISTORTION)} once")
+        raise DescriptionError(f"`distortion` {given}: expected only auto, or each of {', '.join(DISTORTION)} once")
 
 
 @dataclass(frozen=True)
 class LensChoice:
-    """What of a lens is estimated; "auto" chooses by prediction of images left out.
+    """Parameters of a lens to estimate; "auto" selects them by prediction of held-out images.
 
-    Where p1 and p2 are not chosen, they are estimated as known to be zero but for a standard deviation ``tangential``.
-    Pixels that are not free are of ``pixel_aspect``, fy over fx.
+    If p1 and p2 are not selected, they are estimated with zero prior mean and standard deviation ``tangential``. Pixels
+    with a fixed shape have ``pixel_aspect``, fy / fx.
     """
 
     distortion: Distortion = "auto"
@@ -71,10 +71,11 @@ class LensChoice:
 
 @dataclass(frozen=True)
 class LensCandidate:
-    """A lens model, and how well it predicts images that it was not calibrated from.
+    """Lens model with its prediction error for images that were not used for its calibration.
 
-    ``rms_px`` is the root mean square miss of their points, NaN where the images do not determine the model; ``worse``
-    the mean difference of the squares from the best model's, over its standard error: 0 for the best, infinite for NaN.
+    ``rms_px`` is the root mean square error of their points, NaN if the images do not determine the model. ``worse`` is
+    the mean difference of squared errors from the best model, divided by its standard error (0 for the best, infinite
+    for NaN).
     """
 
     options: CameraOptions
@@ -83,31 +84,31 @@ class LensCandidate:
 
     @property
     def name(self) -> str:
-        """The coefficients and the pixels in words."""
+        """Coefficients and pixel shape."""
         return _name(self.options)
 
     def parameters(self) -> int:
-        """Number of parameters that are estimated."""
+        """Return the number of estimated parameters."""
         return len(self.options.distortion) + (4 if self.options.pixel_aspect is None else 3)
 
 
 @dataclass(frozen=True, eq=False)
 class LensCalibration:
-    """A calibrated lens and what it rests on.
+    """Calibrated lens and its evidence.
 
     Attributes
     ----------
-    solution : for the images used, in their order; its covariance is the one of independent points
-    used, images : numbers (F,) of the images used, among those given, and these without their outliers
-    left_out : number of an image left out, and the reason
-    moved : (F,); how far leaving out each image used moves a parameter at most, in its standard deviations without it;
-        NaN if without it nothing is determined
-    rejected_share : share of the points that were left out, of the images used
-    halves : (2,); the solutions from every second image and from the others, None where they determine none
-    without : (F,); the solutions from all images used but one, None where they determine none
-    candidates : models compared; none if the model was given
-    options : the model that was taken
-    covariance : (P, P); of the parameters, with the misses of an image taken to go together
+    solution : solution for the used images, in their order; its covariance assumes independent points
+    used, images : numbers (F,) of the used images, and these images without outliers
+    left_out : number of each rejected image, and the reason
+    moved : (F,); largest change of a parameter without each used image, in its standard deviations without it; NaN if
+        the parameters are then not determined
+    rejected_share : fraction of rejected points in the used images
+    halves : (2,); solutions from every second image and from the others; None if not determined
+    without : (F,); solutions from all used images except one; None if not determined
+    candidates : compared models; empty if the model was given
+    options : selected model
+    covariance : (P, P); of the parameters, with correlated errors in each image
     """
 
     solution: CameraSolution
@@ -124,24 +125,24 @@ class LensCalibration:
 
     @property
     def name(self) -> str:
-        """The lens model in words."""
+        """Name of the lens model."""
         return _name(self.options)
 
     def values(self) -> dict[str, float]:
-        """Every estimated parameter."""
+        """Return every estimated parameter."""
         return self.solution.values()
 
     def std(self) -> dict[str, float]:
-        """Standard uncertainty of every estimated parameter."""
+        """Return the standard uncertainty of every estimated parameter."""
         return dict(zip(self.solution.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     def half_values(self) -> list[dict[str, float]]:
-        """Every estimated parameter by each half of the images; none where a half determines no camera."""
+        """Return every estimated parameter for each half of the images; empty if a half determines no camera."""
         found = [each for each in self.halves if each is not None]
         return [each.values() for each in found] if len(found) == 2 else []
 
     def half_doubts(self) -> list[str]:
-        """What the halves of the images say against the uncertainties of the parameters, in words."""
+        """Return warnings for parameters whose half-sample estimates differ by more than their uncertainties allow."""
         doubts, values = [], self.half_values()
         for name, std in self.std().items() if values else ():
             one, two = (each[name] for each in values)
@@ -151,16 +152,16 @@ class LensCalibration:
 
 
 def half_doubt(found: str, *, apart: float, std: float) -> list[str]:
-    """A warning where two halves of the images are further ``apart`` than a standard uncertainty ``std`` of all allows.
+    """Return a warning if two half-sample estimates differ by more than the standard uncertainty ``std`` allows.
 
-    Of independent halves the difference has twice the standard uncertainty of all.
+    The difference of independent halves has twice the standard uncertainty of the full sample.
     """
     if apart <= HALVES_APART * 2 * std:
         return []
     sigmas = apart / (2 * std)
     return [
-        f"two halves of the images disagree: {found}, {sigmas:.1f} standard uncertainties of such a difference apart: "
-        "uncertainties are larger than stated"
+        f"two halves of the images disagree: {found}, which differ by {sigmas:.1f} standard uncertainties of this "
+        "difference: uncertainties are larger than stated"
     ]
 
 
@@ -179,13 +180,19 @@ def calibrate_lens(
 
     Parameters
     ----------
-    choice : what is estimated. A stage's direction that is taken for the target's normal, and is not, looks like
-        another lens: so with the poses "stage-normal" "auto" is k1 and k2; with both poses of a stage pixels are square
-    progress : called with the number of models tried and of all
+    images, width_px, height_px, poses, approaching, circle_diameter_mm
+        As for `solve_camera`.
+    choice
+        Parameters to estimate. If the stage's direction is wrongly assumed to be the target's normal, this has the same
+        effect as another lens. With the poses "stage-normal", "auto" therefore is k1 and k2; with both stage poses,
+        pixels are square.
+    progress
+        Called with the number of models tried and the total.
 
-    Other parameters are those of `solve_camera`.
-
-    Raises CalibrationError: no model is determined by the images, or they contradict each other.
+    Raises
+    ------
+    CalibrationError
+        The images determine no model, or contradict each other.
     """
 
     def solved(
@@ -206,34 +213,34 @@ def calibrate_lens(
     usual = tried[0] if len(tried) == 1 else _candidates((_USUAL,), replace(choice, distortion="auto"), poses)[0]
 
     def inliers(options: CameraOptions) -> list[np.ndarray]:
-        """Points (N,) of each image near to where the lens sees them, found without trust in any of them."""
+        """Return masks (N,) of the points near their predicted positions, from a robust fit."""
         plain = solved(images, options=options, circles=True)
         robust = solved(images, plain, options=replace(options, soft_limit_px=_SOFT * _scatter(plain)), circles=True)
         return _inliers(robust)
 
     candidates: list[LensCandidate] = []
     options, keep = usual, inliers(usual)
-    good = [_without_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _fits(inside)]
+    good = [_remove_outliers(i, inside) for i, inside in zip(images, keep, strict=True) if _has_enough_inliers(inside)]
     if len(tried) > 1 and len(good) > _FEWEST_IMAGES:
-        centred = _centred(good, solved(good, options=usual, circles=True))
+        centred = _correct_circles(good, solved(good, options=usual, circles=True))
         squares: dict[CameraOptions, np.ndarray] = {}
         for further in (tried, _candidates(_RATIONAL, choice, poses)):
             for number, each in enumerate(further):
-                squares[each] = _misses_predicted(centred, partial(solved, options=each, circles=False))
+                squares[each] = _cross_validate(centred, partial(solved, options=each, circles=False))
                 progress(number + 1, len(further))
-            candidates = _compared(squares)
-            options = _chosen(candidates, usual)
+            candidates = _compare_models(squares)
+            options = _select_model(candidates, usual)
             if choice.distortion != "auto" or "k3" not in options.distortion:
                 break
     if options != usual:
         keep = inliers(options)
     left_out = {
-        number: f"{100 * (1 - inside.mean()):.0f} % of its points do not lie where the others' lens sees them"
+        number: f"{100 * (1 - inside.mean()):.0f} % of its points are not where the other images predict them"
         for number, inside in enumerate(keep)
-        if not _fits(inside)
+        if not _has_enough_inliers(inside)
     }
     used = [number for number in range(len(images)) if number not in left_out]
-    cleaned = {number: _without_outliers(images[number], keep[number]) for number in used}
+    cleaned = {number: _remove_outliers(images[number], keep[number]) for number in used}
     full = options
     if (
         choice.distortion == "auto"
@@ -249,10 +256,10 @@ def calibrate_lens(
     while True:
         chosen = [cleaned[number] for number in used]
         solution = solved(chosen, options=full, circles=True)
-        centred = _centred(chosen, solution)
+        centred = _correct_circles(chosen, solution)
         numbers = np.arange(len(used))
         all_but_one = [np.delete(numbers, number) for number in numbers]
-        without = _of_some(centred, solution, all_but_one, solved_again)
+        without = _solve_subsets(centred, solution, all_but_one, solved_again)
         values, none = intrinsics.from_model(solution.model), np.full(len(intrinsics.names), np.nan)
         changes = np.array([none if s is None else intrinsics.from_model(s.model) - values for s in without])
         others_std = np.array([none if s is None else np.sqrt(np.diag(s.covariance)) for s in without])
@@ -267,7 +274,7 @@ def calibrate_lens(
         if moved[worst] <= _MOVED or not enough:
             break
         name = solution.parameters[int(np.nanargmax(np.abs(changes[worst]) / unit[worst]))]
-        left_out[used[worst]] = f"it alone moves {name} by {moved[worst]:.1f} standard uncertainties"
+        left_out[used[worst]] = f"it alone changes {name} by {moved[worst]:.1f} standard uncertainties"
         del used[worst]
     std, known = np.sqrt(np.diag(solution.covariance)), changes[np.isfinite(changes).all(axis=1)]
     larger = np.maximum(np.sqrt(np.diag(jackknife(known))) / std, 1.0)
@@ -278,7 +285,7 @@ def calibrate_lens(
         left_out=left_out,
         moved=moved,
         without=without,
-        halves=_of_some(centred, solution, [numbers[::2], numbers[1::2]], solved_again),
+        halves=_solve_subsets(centred, solution, [numbers[::2], numbers[1::2]], solved_again),
         rejected_share=float(1.0 - np.mean(np.concatenate([keep[number] for number in used]))),
         candidates=candidates,
         options=options,
@@ -302,37 +309,35 @@ def _candidates(any_of: Sequence[tuple[str, ...]], choice: LensChoice, poses: Po
 
 
 def _scatter(solution: CameraSolution) -> float:
-    """Robust standard deviation of one coordinate of the misses."""
-    # The median of a distance in two coordinates is 1.1774 of one coordinate's standard deviation.
+    """Return the robust standard deviation of one coordinate of the residuals."""
+    # median distance in two coordinates, divided by the standard deviation of one
     return float(np.median(np.linalg.norm(np.vstack(solution.residuals_px), axis=1))) / 1.1774
 
 
 def _inliers(solution: CameraSolution) -> list[np.ndarray]:
-    """Points (N,) of each image within five robust standard deviations of all."""
+    """Return masks (N,) of points within five robust standard deviations."""
     limit = _OUTLIER * _scatter(solution)
     return [np.linalg.norm(residuals, axis=1) <= limit for residuals in solution.residuals_px]
 
 
-def _fits(inside: np.ndarray) -> bool:
-    """Whether an image has enough points (N,) within the limit to be one of the target."""
+def _has_enough_inliers(inside: np.ndarray) -> bool:
+    """Return whether enough points (N,) of an image are inliers."""
     return bool(inside.mean() >= 1 - _LARGEST_REJECTED)
 
 
-def _without_outliers(image: TargetImage, keep: np.ndarray) -> TargetImage:
+def _remove_outliers(image: TargetImage, keep: np.ndarray) -> TargetImage:
     return replace(image, points_mm=image.points_mm[keep], pixels=image.pixels[keep])
 
 
-def _centred(images: Sequence[TargetImage], solution: CameraSolution) -> list[TargetImage]:
-    """The images with the offsets of circles taken out."""
+def _correct_circles(images: Sequence[TargetImage], solution: CameraSolution) -> list[TargetImage]:
+    """Correct images for the offsets of circle centres."""
     if solution.bias_px is None:
         return list(images)
     return [replace(i, pixels=i.pixels - bias) for i, bias in zip(images, solution.bias_px, strict=True)]
 
 
-def _misses_predicted(
-    images: list[TargetImage], solve: Callable[[Sequence[TargetImage]], CameraSolution]
-) -> np.ndarray:
-    """Mean square miss (F,) of each image by a calibration without every fifth, it among them; NaN if one has none."""
+def _cross_validate(images: list[TargetImage], solve: Callable[[Sequence[TargetImage]], CameraSolution]) -> np.ndarray:
+    """Return each image's mean square prediction error (F,) from five-fold calibrations; NaN if one fails."""
     folds = min(_FOLDS, len(images))
     squares = np.full(len(images), np.nan)
     try:
@@ -345,8 +350,8 @@ def _misses_predicted(
     return squares
 
 
-def _compared(squares: dict[CameraOptions, np.ndarray]) -> list[LensCandidate]:
-    """Models by the mean squares of their misses (F,); none if no model has any."""
+def _compare_models(squares: dict[CameraOptions, np.ndarray]) -> list[LensCandidate]:
+    """Compare models by their mean square errors (F,); empty if no model has any."""
     means = {options: float(each.mean()) for options, each in squares.items()}
     least = np.nanmin([*means.values(), np.inf])
     if np.isinf(least):
@@ -363,29 +368,29 @@ def _compared(squares: dict[CameraOptions, np.ndarray]) -> list[LensCandidate]:
 
 
 def _mean_square_miss(model: CameraModel, image: TargetImage) -> float:
-    """Mean square distance of an image's points from where the model sees them, in the pose that fits them best."""
+    """Return the mean square distance of an image's points from their prediction, with the best-fitting pose."""
     matrix, coefficients = model.matrix(), model.coefficients()
     found, rotation, shift = cv2.solvePnP(image.points_mm, image.pixels, matrix, coefficients)
     if not found:
-        raise CalibrationError("no pose of the target explains one of its images")
+        raise CalibrationError("no pose of the target fits one of its images")
     rotation, shift = cv2.solvePnPRefineLM(image.points_mm, image.pixels, matrix, coefficients, rotation, shift)
     seen = cv2.projectPoints(image.points_mm, rotation, shift, matrix, coefficients)[0].reshape(-1, 2)
     return float(np.mean(np.sum((image.pixels - seen) ** 2, axis=1)))
 
 
-def _chosen(candidates: list[LensCandidate], usual: CameraOptions) -> CameraOptions:
-    """The model with the fewest parameters among those as good as the best; the usual one if none was tried."""
+def _select_model(candidates: list[LensCandidate], usual: CameraOptions) -> CameraOptions:
+    """Select the model with the fewest parameters of those as good as the best, else the usual one."""
     good = [each for each in candidates if each.worse <= _WORSE]
     return min(good, key=lambda each: (each.parameters(), each.rms_px)).options if good else usual
 
 
-def _of_some(
+def _solve_subsets(
     images: list[TargetImage],
     solution: CameraSolution,
     chosen: Sequence[np.ndarray],
     solve: Callable[[Sequence[TargetImage], CameraSolution], CameraSolution],
 ) -> list[CameraSolution | None]:
-    """The solutions from some of the images, by their numbers; None where they determine none."""
+    """Solve for subsets of the images, given by their numbers; None if a subset does not determine the camera."""
     found: list[CameraSolution | None] = []
     for numbers in chosen:
         try:
@@ -397,8 +402,8 @@ def _of_some(
 
 
 def jackknife(changes: np.ndarray) -> np.ndarray:
-    """Covariance (P, P) of parameters from their changes (F, P) when one group of observations is left out after other.
+    """Return the covariance (P, P) of parameters from their changes (F, P) without each group of observations.
 
-    Of the delete-one-group jackknife: (F - 1) / F times the sum of squares (Efron and Stein, 1981, eq. 1.4).
+    Delete-one-group jackknife: (F - 1) / F times the sum of squares (Efron and Stein, 1981, eq. 1.4).
     """
     return (len(changes) - 1) / max(len(changes), 1) * changes.T @ changes

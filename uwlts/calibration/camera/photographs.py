@@ -1,4 +1,4 @@
-"""A camera calibrated from a folder of photographs of a target, without a laser."""
+"""Camera calibration from a folder of photographs of a target, without a laser."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -32,10 +32,10 @@ _FEWEST_IMAGES = 4
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """One image file: the points (N, 2) of the target found, or the reason why it was left out.
+    """Image file with the detected target points (N, 2), or the reason why it was rejected.
 
-    Of images used, ``misses_px`` (N, 2) are found minus calculated pixels, and ``moved`` is how far leaving it out
-    moves a parameter at most, in standard uncertainties.
+    For used images, ``misses_px`` (N, 2) are detected minus calculated pixels. ``moved`` is the largest change of a
+    parameter without this image, in standard uncertainties.
     """
 
     name: str
@@ -45,20 +45,20 @@ class Photograph:
     moved: float = np.nan
 
     def rms_px(self) -> float:
-        """Root mean square distance between found and calculated pixels."""
+        """Return the root mean square distance between detected and calculated pixels."""
         return float(np.sqrt(np.mean(np.sum(self.misses_px**2, axis=1))))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CameraCalibration(Brief):
-    """A camera calibrated from photographs.
+    """Camera calibrated from photographs.
 
     Attributes
     ----------
-    folder : where the photographs lie
-    lens : the lens and what it rests on
+    folder : folder of the photographs
+    lens : calibrated lens
     photographs : all image files in natural order
-    warnings : what may be wrong
+    warnings : possible problems
     """
 
     folder: Path
@@ -70,7 +70,10 @@ class CameraCalibration(Brief):
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
         """Write the camera as YAML in the form of ROS CameraInfo, which `uwlts import` reads as ``intrinsics``.
 
-        OutputError if the file exists and ``overwrite`` is not given, or it cannot be written.
+        Raises
+        ------
+        OutputError
+            The file exists and ``overwrite`` is not given, or it cannot be written.
         """
         lens, model = self.lens, self.lens.solution.model
 
@@ -110,42 +113,42 @@ def calibrate_camera(
     pixels: Pixels = "auto",
     progress: ProgressListener = unheard,
 ) -> CameraCalibration:
-    """Calibrate a camera alone, from photographs of a target that is held differently in each.
+    """Calibrate a camera from photographs of a target in different poses.
 
     Parameters
     ----------
     folder : str or Path
-        Folder of PNG, TIFF, BMP or JPEG images, in it or in folders below it. Those that do not show the target are
-        named with the reason.
+        Folder of PNG, TIFF, BMP or JPEG images, directly or in subfolders. Images without the target are reported with
+        the reason.
     target : str or Path, optional
-        Description of the target (TOML), perhaps in a table [target]; target.toml or import.toml in the folder unless
-        given.
+        Description of the target (TOML), optionally in a table [target]. Default: target.toml or import.toml in the
+        folder.
     channel : str, optional
-        Channel of colour images, or a formula of channels; their luminance unless given.
+        Channel of colour images, or a formula of channels. Default: luminance.
     distortion : "auto" or tuple of str
-        Distortion coefficients to estimate; auto: those that predict images left out best.
+        Distortion coefficients to estimate. auto: those that best predict held-out images.
     pixels : {"auto", "square", "free"}
-        Whether pixels are square or free to be not; auto: as distortion.
+        Whether pixels are square or have a free shape. auto: the choice that best predicts held-out images.
     progress : callable, optional
-        Called with the number of images or models done, the number in all, and the name of the stage.
+        Called with the number of images or models done, the total, and the name of the stage.
 
     Returns
     -------
     CameraCalibration
-        Its uncertainties take the misses of one image to go together.
+        Its uncertainties take the correlation of errors within an image into account.
 
     Raises
     ------
     DescriptionError
-        No target is described, or wrongly, or ``channel`` is none.
+        The target's description is missing or wrong, or ``channel`` is invalid.
     ImageError
-        The folder holds no images.
+        The folder contains no images.
     CalibrationError
         The target is found in fewer than four images, or these do not determine a camera.
     """
     require_coefficients(distortion)
     folder = Path(folder)
-    described = _described_target(folder, target)
+    described = _read_target(folder, target)
     names = image_files(folder)
     try:
         wanted = checked_channel(channel or "grey")
@@ -162,11 +165,11 @@ def calibrate_camera(
         except (ImageError, TargetError, CalibrationError) as error:
             reasons[name] = str(error).replace(f"{folder / name}", "it").removeprefix(f"{name} ")
         progress(number + 1, len(names), "target")
-    # An image of another camera is the odd one out.
+    # Images of another size are from another camera.
     size = Counter(own for own, _ in seen.values()).most_common(1)[0][0] if seen else (0, 0)
     for number, ((width, height), _) in list(seen.items()):
         if (width, height) != size:
-            reasons[names[number]] = f"it has {width} x {height} pixels, most images have {size[0]} x {size[1]}"
+            reasons[names[number]] = f"it has {width} x {height} pixels; most images have {size[0]} x {size[1]}"
             del seen[number]
     found, places = [image for _, image in seen.values()], list(seen)
     photographs = [Photograph(name, np.empty((0, 2)), reason) for name, reason in reasons.items()]
@@ -196,8 +199,8 @@ def calibrate_camera(
     return CameraCalibration(folder, described, lens, photographs, warnings + lens.half_doubts())
 
 
-def _described_target(folder: Path, path: str | Path | None) -> Target:
-    """The target in a file, or in one of the folder's own."""
+def _read_target(folder: Path, path: str | Path | None) -> Target:
+    """Read the target from a file, or from one in the folder."""
     if not folder.is_dir():
         raise ImageError(f"no folder at {folder}")
     known = [folder / "target.toml", folder / DESCRIPTION_NAME] if path is None else [Path(path)]

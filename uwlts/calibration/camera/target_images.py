@@ -1,4 +1,4 @@
-"""Images of the calibration target: the points of one image, and all images of one placement with their derivatives."""
+"""Images of the calibration target: points of one image, and images of one placement with derivatives."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from uwlts.calibration.camera.camera_parameters import Intrinsics
 from uwlts.errors import CalibrationError
 from uwlts.fitting.schur_least_squares import Observation
 
-_FEWEST = 6  # points; a pose has six parameters, a point gives two of them
-_COLLINEAR = 1e-3  # extent across over extent along, of points that lie on a line but for their noise
+_FEWEST = 6  # points; a pose has six parameters, and a point gives two equations
+_COLLINEAR = 1e-3  # ratio of extents of points that are collinear except for noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,30 +19,30 @@ class TargetImage:
     """Target points found in one image."""
 
     points_mm: np.ndarray  # (N, 3); in the target's frame, z = 0
-    pixels: np.ndarray  # (N, 2); where they appear, (u, v)
+    pixels: np.ndarray  # pixel coordinates (u, v)
     stage_mm: float = 0.0  # position of the stage that moves the sensor
-    placement: int = 0  # counts how often the target was put up anew; in between only the stage moved
+    placement: int = 0  # number of the target's placement; within one, only the stage moves
 
     def __post_init__(self) -> None:
         points = np.ascontiguousarray(self.points_mm, dtype=np.float64)
         pixels = np.ascontiguousarray(self.pixels, dtype=np.float64)
         if points.shape != (len(points), 3) or pixels.shape != (len(points), 2):
-            raise ValueError(f"(N, 3) points and (N, 2) pixels expected, not {points.shape} and {pixels.shape}")
+            raise ValueError(f"expected (N, 3) points and (N, 2) pixels, found {points.shape} and {pixels.shape}")
         if not (np.isfinite(points).all() and np.isfinite(pixels).all() and np.isfinite(self.stage_mm)):
-            raise CalibrationError("a target image holds points, pixels or a stage position that are not finite")
+            raise CalibrationError("a target image contains points, pixels or a stage position that are not finite")
         if len(points) < _FEWEST:
             raise CalibrationError(f"a target image needs at least {_FEWEST} points; there are {len(points)}")
         if np.abs(points[:, 2]).max() > 1e-9 * np.abs(points).max():
-            raise CalibrationError("the target's points must lie in its plane z = 0")
+            raise CalibrationError("the target's points must be in its plane z = 0")
         extents = np.linalg.svd(points[:, :2] - points[:, :2].mean(axis=0), compute_uv=False)
         if extents[1] <= _COLLINEAR * extents[0]:
-            raise CalibrationError("all points of a target image lie on one line: more of the target must be seen")
+            raise CalibrationError("all points of a target image are on one line: more of the target must be visible")
         object.__setattr__(self, "points_mm", points)
         object.__setattr__(self, "pixels", pixels)
 
 
 def z_away(image: TargetImage) -> bool:
-    """Whether the target's z axis points away from the camera, by the sense in which x turns into y."""
+    """Return whether the target's z axis points away from the camera, from the handedness of x and y in the image."""
     flat = np.column_stack([image.points_mm[:, :2], np.ones(len(image.points_mm))])
     linear = np.linalg.lstsq(flat, image.pixels, rcond=None)[0][:2]
     return bool(np.linalg.det(linear) > 0)
@@ -50,7 +50,7 @@ def z_away(image: TargetImage) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Images that share one pose of the target, but for the known displacement of the stage."""
+    """Images with one target pose, except for the known displacement of the stage."""
 
     points_mm: np.ndarray  # (N, 3); in the target's frame
     shifts_mm: np.ndarray  # (N,); stage position s - s0 of each point's image, s0 that of the first image
@@ -59,25 +59,28 @@ class Placement:
     along_z: float  # +1 or -1: the stage moves the sensor roughly along +z or -z of the target
 
     def direction(self, tilt: np.ndarray) -> np.ndarray:
-        """Unit direction (3,) of the stage in the target's frame: (a, b, along_z) for a tilt (a, b), z for none."""
+        """Return the unit direction (3,) of the stage in the target's frame: (a, b, along_z) for a tilt (a, b)."""
         raw = np.array([*(tilt if len(tilt) else (0.0, 0.0)), self.along_z])
         return raw / np.linalg.norm(raw)
 
     def displaced(self, direction: np.ndarray | None = None) -> np.ndarray:
-        """Points (N, 3) in the target's frame at s0, as if the sensor had not moved: the stage moves them back."""
+        """Return points (N, 3) in the target's frame at s0, shifted back by the stage's motion."""
         along = self.direction(np.empty(0)) if direction is None else direction
         return self.points_mm - self.shifts_mm[:, None] * along
 
 
 def pose_values(pose: np.ndarray) -> np.ndarray:
-    """Rotation vector and translation in mm (6,) of a transform (4, 4)."""
+    """Return rotation vector and translation in mm (6,) of a transform (4, 4)."""
     return np.r_[cv2.Rodrigues(pose[:3, :3])[0].ravel(), pose[:3, 3]]
 
 
 def placements(images: Sequence[TargetImage], *, approaching: bool | None) -> list[Placement]:
-    """Images joined by their placement number, or one by one if the stage's sense is None.
+    """Group images by placement number, or use single images if ``approaching`` is None.
 
-    Raises CalibrationError: the target appears mirrored in some images of a placement.
+    Raises
+    ------
+    CalibrationError
+        The target appears mirrored in some images of a placement.
     """
     numbers = [index if approaching is None else image.placement for index, image in enumerate(images)]
     joined = []
@@ -87,7 +90,7 @@ def placements(images: Sequence[TargetImage], *, approaching: bool | None) -> li
         counts = [len(member.points_mm) for member in members]
         facing = {z_away(member) for member in members}
         if len(facing) > 1:
-            raise CalibrationError("the target is mirrored in some of its images: its columns or rows run backwards")
+            raise CalibrationError("the target is mirrored in some images: its columns or rows are in reverse order")
         joined.append(
             Placement(
                 points_mm=np.vstack([member.points_mm for member in members]),
@@ -103,12 +106,16 @@ def placements(images: Sequence[TargetImage], *, approaching: bool | None) -> li
 def observe(
     placement: Placement, intrinsics: Intrinsics, global_values: np.ndarray, local: np.ndarray
 ) -> Observation | None:
-    """Residuals (found minus calculated) of a placement and their derivatives; None with points behind the camera.
+    """Return residuals (found minus calculated) of a placement with derivatives; None for points behind the camera.
 
     Parameters
     ----------
-    global_values : (P,); camera parameters, as `Intrinsics` names them
-    local : (6,) or (8,); rotation vector, translation in mm and, where the stage's direction is free, its tilt (a, b)
+    placement, intrinsics
+        Images of the target, and parameterisation of the camera.
+    global_values
+        Camera parameters (P,), as `Intrinsics` names them.
+    local
+        Rotation vector and translation in mm (6,), followed by the tilt (a, b) of a free stage direction (8,).
     """
     direction = placement.direction(local[6:])
     points = placement.displaced(direction)
@@ -120,7 +127,7 @@ def observe(
     )
     by_local = jacobian[:, :6]
     if len(local) > 6:
-        # Moving a point along a vector acts like translating the target by the rotated vector.
+        # Shifting a point along a vector is equivalent to translating the target by the rotated vector.
         turning = (np.eye(3) - np.outer(direction, direction))[:, :2] * abs(direction[2])
         by_tilt = -np.repeat(placement.shifts_mm, 2)[:, None] * (jacobian[:, 3:6] @ (rotation @ turning))
         by_local = np.hstack([by_local, by_tilt])

@@ -1,4 +1,4 @@
-"""Camera parameters and target poses from images of a flat target, by the stage's displacements or by free poses."""
+"""Camera parameters and target poses from images of a flat target, with a stage or with free poses."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -18,35 +18,38 @@ from uwlts.model.calibration import CameraModel
 from uwlts.optics.camera import project
 from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
-# Coordinates of size one: a direction in which points extend less than this share of the widest one, or a null vector
-# of the equations that is not alone by this share, cannot be separated from rounding and lens distortion.
+# Coordinates are normalised: a direction with an extent of the points below this fraction of the largest one, or
+# a null vector separated from others by less than this, cannot be distinguished from rounding and lens distortion.
 _FLAT = 1e-4
 _AMBIGUOUS = 1e-9
 
 
 def direct_linear(points_mm: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pinhole camera from at least six points in space, by the normalised linear method without lens distortion.
+    """Estimate a pinhole camera without distortion from at least six points in space, by the normalised linear method.
 
     Hartley and Zisserman, Multiple View Geometry, 2nd ed., algorithm 7.1 (linear part) and section 6.2.4 (RQ). From
     points (N, 3) in mm, in any frame, and pixels (N, 2): camera matrix K (3, 3), rotation (3, 3) and translation (3,)
     in mm from the points' frame to the camera's.
 
-    Raises CalibrationError: the points lie in one plane or are too few, or the image is mirrored against them.
+    Raises
+    ------
+    CalibrationError
+        The points are coplanar or too few, or the image is mirrored relative to them.
     """
     if len(points_mm) < 6:
         raise CalibrationError(f"the linear start needs at least 6 target points; there are {len(points_mm)}")
-    to_unit, unit = _normalised(points_mm)
-    pixel_to_unit, unit_pixels = _normalised(pixels)
+    to_unit, unit = _normalise(points_mm)
+    pixel_to_unit, unit_pixels = _normalise(pixels)
     extents = np.linalg.svd(unit[:, :3], compute_uv=False)
     if extents[2] < _FLAT * extents[0]:
         raise CalibrationError(
-            "all target points lie in one plane: move the stage between the target images, or use poses='free' with a "
+            "all target points are in one plane: move the stage between the target images, or use poses='free' with a "
             "tilted target"
         )
     nothing = np.zeros_like(unit)
     u, v = unit_pixels[:, :1], unit_pixels[:, 1:2]
     equations = np.vstack([np.hstack([unit, nothing, -u * unit]), np.hstack([nothing, unit, -v * unit])])
-    # The triangular factor has the equations' singular values and is only 12 x 12.
+    # The triangular factor has the same singular values as the equations and is only 12 x 12.
     _, singular, rows = np.linalg.svd(np.linalg.qr(equations, mode="r"))
     if singular[10] < _AMBIGUOUS * singular[0]:
         raise CalibrationError("the target points do not determine the camera: use more points, spread over the image")
@@ -55,8 +58,8 @@ def direct_linear(points_mm: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray
         projection = -projection
     if np.linalg.det(projection[:, :3]) < 0:
         raise CalibrationError(
-            "the target images are mirrored against the stage positions: the stage moved the other way than "
-            "stage_direction says, or the target's columns or rows are numbered the wrong way round"
+            "the target images are mirrored relative to the stage positions: the stage moved opposite to "
+            "stage_direction, or the target's columns or rows are numbered in the wrong direction"
         )
     # RQ from QR of the rows in reverse order; the signs make the camera matrix's diagonal positive.
     orthogonal, triangular = np.linalg.qr(projection[::-1, :3].T)
@@ -66,13 +69,13 @@ def direct_linear(points_mm: np.ndarray, pixels: np.ndarray) -> tuple[np.ndarray
     return matrix / matrix[2, 2], rotation, np.linalg.solve(matrix, projection[:, 3])
 
 
-def _normalised(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Similarity (D + 1, D + 1) to centroid zero and rms distance sqrt(D), and the homogeneous result (N, D + 1)."""
+def _normalise(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a similarity (D + 1, D + 1) to centroid 0 and rms distance sqrt(D), and the result (N, D + 1)."""
     dimension = coordinates.shape[1]
     centroid = coordinates.mean(axis=0)
     spread = np.sqrt(np.mean(np.sum((coordinates - centroid) ** 2, axis=1)))
     if not spread > 0:
-        raise CalibrationError("all target points fall on one place: is the target detected at all?")
+        raise CalibrationError("all target points have the same place: was the target detected correctly?")
     similarity = np.eye(dimension + 1) * np.sqrt(dimension) / spread
     similarity[:-1, -1] = -centroid * np.sqrt(dimension) / spread
     similarity[-1, -1] = 1.0
@@ -80,9 +83,9 @@ def _normalised(coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _linear_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Camera parameters (P,) and poses (6,) of a target that the stage displaces along its normal.
+    """Estimate camera parameters (P,) and poses (6,) of a target that the stage moves along its normal.
 
-    The placement that reaches farthest gives both by the linear method, the others then have their poses found.
+    The placement with the largest motion gives both by the linear method; the poses of the others follow.
     """
     farthest = int(np.argmax([np.ptp(view.shifts_mm) for view in views]))
     matrix, rotation, translation = direct_linear(views[farthest].displaced(), views[farthest].pixels)
@@ -93,37 +96,38 @@ def _linear_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.nd
 
 
 def _planar_start(views: list[Placement], intrinsics: Intrinsics) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Camera parameters (P,) and poses (6,) of single images: f from homographies, the principal point in the middle.
+    """Estimate camera parameters (P,) and poses (6,) of single images, with f from homographies.
 
-    `cv2.initCameraMatrix2D`, after Zhang, A flexible new technique for camera calibration, PAMI 2000.
+    The principal point is the centre. See `cv2.initCameraMatrix2D`, after Zhang, A flexible new technique for camera
+    calibration, PAMI 2000.
     """
     size = (intrinsics.width_px, intrinsics.height_px)
     points, pixels = ([getattr(v, name).astype(np.float32) for v in views] for name in ("points_mm", "pixels"))
     matrix = cv2.initCameraMatrix2D(points, pixels, size, 1.0)
     if not (np.isfinite(matrix).all() and 0.1 < matrix[0, 0] / max(size) < 100):
         raise CalibrationError(
-            "the target images do not show the focal length: tilt the target against the camera's axis, differently "
-            "from image to image"
+            "the target images do not determine the focal length: tilt the target differently relative to the camera's "
+            "axis in each image"
         )
     global_values = intrinsics.from_matrix(matrix)
     return global_values, [placement_pose(view, intrinsics.matrix(global_values)) for view in views]
 
 
 def placement_pose(placement: Placement, matrix: np.ndarray) -> np.ndarray:
-    """Rotation vector and shift (6,) of a placement seen by a camera without distortion."""
+    """Estimate rotation vector and shift (6,) of a placement for a camera without distortion."""
     found, rotation, translation = cv2.solvePnP(placement.displaced(), placement.pixels, matrix, None)
     if not found:
-        raise CalibrationError("no pose of the target explains one of its images: is it the right target?")
+        raise CalibrationError("no pose of the target fits one of its images: is it the right target?")
     return np.r_[rotation.ravel(), translation.ravel()]
 
 
 Poses = Literal["stage-normal", "stage", "free"]
 
-# Beyond these shares of f and of the image's side a camera counts as not determined: lengths would be wrong as much.
+# Largest standard deviations relative to f and to the image's side: lengths would have the same relative errors.
 _LARGEST_FOCAL_STD = 0.02
 _LARGEST_CENTRE_STD = 0.05
-# Offsets of circles' images are calculated again until they change by less; a few rounds settle, unless the diameter
-# is wrong.
+# Offsets of circle images are recalculated until they change by less; a few rounds suffice, unless the diameter is
+# wrong.
 _SETTLED_PX = 1e-4
 _BIAS_ROUNDS = 10
 _X, _Y = np.eye(3)[:2]
@@ -131,21 +135,21 @@ _X, _Y = np.eye(3)[:2]
 
 @dataclass(frozen=True, eq=False)
 class CameraSolution:
-    """A calibrated camera and how well it was determined.
+    """Calibrated camera with its uncertainty.
 
     Attributes
     ----------
     target_poses : (F, 4, 4); ``T_camera_target`` of every image
     residuals_px : list of (N, 2); found minus calculated pixel, for every image
-    parameters : names of the camera parameters that were estimated
+    parameters : names of the estimated camera parameters
     covariance : (P, P); of these parameters
-    sigma_px : standard deviation of one coordinate, with the degrees of freedom counted
-    stage_direction : (3,) or None; unit direction in which the stage moves the sensor, camera frame; None where free
-        poses do not follow a stage
-    stage_tilt_rad, stage_tilt_std_rad : angle between that direction and the target's normal and its standard
+    sigma_px : standard deviation of one coordinate, corrected for the degrees of freedom
+    stage_direction : (3,) or None; unit direction of the sensor's motion by the stage, camera frame; None if free poses
+        do not follow a stage
+    stage_tilt_rad, stage_tilt_std_rad : angle between that direction and the target's normal, and its standard
         deviation, for poses "stage"; the largest of all placements
-    stopped : why the iteration ended
-    bias_px : list of (N, 2) or None; offsets taken out of the centres of the circles' images
+    stopped : reason why the iteration ended
+    bias_px : list of (N, 2) or None; corrected offsets of the circle images' centres
     """
 
     model: CameraModel
@@ -162,28 +166,28 @@ class CameraSolution:
     bias_px: list[np.ndarray] | None = None
 
     def values(self) -> dict[str, float]:
-        """Every estimated parameter."""
+        """Return every estimated parameter."""
         known = self.model.parameters()
         return {name: known[name] for name in self.parameters}
 
     def std(self) -> dict[str, float]:
-        """Standard deviation of every estimated parameter."""
+        """Return the standard deviation of every estimated parameter."""
         return dict(zip(self.parameters, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     def image_rms_px(self) -> np.ndarray:
-        """Root mean square distance (F,) between found and calculated pixels of every image."""
+        """Return the root mean square distance (F,) between detected and calculated pixels of every image."""
         return np.array([np.sqrt(np.mean(np.sum(r**2, axis=1))) for r in self.residuals_px])
 
     def rms_px(self) -> float:
-        """Root mean square distance between found and calculated pixels over all images."""
+        """Return the root mean square distance between detected and calculated pixels over all images."""
         return float(np.sqrt(np.mean(np.sum(np.vstack(self.residuals_px) ** 2, axis=1))))
 
     def largest_bias_px(self) -> float | None:
-        """Longest offset taken out, over all circles."""
+        """Return the largest corrected offset over all circles."""
         return None if self.bias_px is None else float(np.max(np.linalg.norm(np.vstack(self.bias_px), axis=1)))
 
     def figures(self) -> dict[str, JsonValue]:
-        """Residuals, standard deviations and covariance as files hold them; None for what is missing."""
+        """Return residuals, standard deviations and covariance for files; None for missing values."""
         direction, tilt, tilt_std = self.stage_direction, self.stage_tilt_rad, self.stage_tilt_std_rad
         return {
             "images": len(self.residuals_px),
@@ -216,33 +220,42 @@ def solve_camera(
 ) -> CameraSolution:
     """Calibrate the camera by least squares of the pixel distances.
 
-    The stage moves the sensor by s along d, so that the target moves by -s d as the sensor sees it: a point x of the
-    target is at R (x - (s - s0) d) + t in the camera frame, with d in the target's frame.
+    The stage moves the sensor by s along d, so the target moves by -s d relative to the sensor. A point x of the target
+    is at R (x - (s - s0) d) + t in the camera frame, with d in the target's frame.
 
     Parameters
     ----------
-    width_px, height_px : size of the images
-    poses : {"stage-normal", "stage", "free"}; "stage-normal" (the thesis): one pose per placement of the target, d is
-        the target's normal. "stage": d is estimated too, for each placement; needs pixels of known shape. "free": one
-        pose per image, stage positions unused
-    approaching : whether growing stage positions bring the sensor nearer to the target; unused by "free"
-    start : a solution for nearly the same pixels, with the same options and poses
-    circle_diameter_mm : the pixels are centres of the images of circles of this diameter; their offsets from the images
-        of the circles' centres are calculated, taken out, and calculated again until they stay
+    images
+        Target points in each image.
+    width_px, height_px
+        Size of the images.
+    poses : {"stage-normal", "stage", "free"}
+        "stage-normal" (the thesis): one pose per placement of the target, d is the target's normal. "stage": d is
+        estimated too, for each placement; this needs pixels of known shape. "free": one pose per image, stage positions
+        are not used.
+    approaching
+        Whether increasing stage positions move the sensor towards the target; unused for "free".
+    options
+        Parameters to estimate.
+    start
+        Solution for nearly the same pixels, with the same options and poses.
+    circle_diameter_mm
+        The pixels are centres of images of circles with this diameter. Their offsets from the images of the circles'
+        centres are corrected iteratively.
 
     Raises
     ------
     CalibrationError
-        There are too few images, the stage did not move, the target is mirrored against the stage, the parameters are
-        not determined, or the offsets do not settle.
+        There are too few images, the stage did not move, the target is mirrored relative to the stage, the parameters
+        are not determined, or the offsets do not converge.
     RangeError
-        A circle's image is no ellipse.
+        A circle's image is not an ellipse.
     """
     options = CameraOptions() if options is None else options
     intrinsics = Intrinsics(options, width_px=width_px, height_px=height_px)
 
     def solved(images: Sequence[TargetImage], start: CameraSolution | None) -> CameraSolution:
-        views = _accepted(images, poses, approaching, options)
+        views = _group_views(images, poses, approaching, options)
         if start is not None:
             global_values, local = intrinsics.from_model(start.model), [_restart(view, start, poses) for view in views]
         else:
@@ -252,7 +265,7 @@ def solve_camera(
 
         def model(group: int, global_values: np.ndarray, local: np.ndarray) -> Observation | None:
             if group == len(views):
-                return _known_before(intrinsics, global_values)
+                return _prior_observation(intrinsics, global_values)
             return observe(views[group], intrinsics, global_values, local)
 
         if options.tangential is not None:
@@ -275,13 +288,13 @@ def solve_camera(
         if max(np.max(np.abs(b - a)) for a, b in zip(before, bias, strict=True)) <= _SETTLED_PX:
             return replace(start, bias_px=before)
     raise CalibrationError(
-        f"the offsets of the circles' images did not settle in {_BIAS_ROUNDS} rounds: is the circles' diameter "
+        f"the offsets of the circles' images did not converge in {_BIAS_ROUNDS} rounds: is the circles' diameter "
         f"{circle_diameter_mm:g} mm?"
     )
 
 
-def _known_before(intrinsics: Intrinsics, global_values: np.ndarray) -> Observation:
-    """What is known of p1 and p2 before, as residuals in px."""
+def _prior_observation(intrinsics: Intrinsics, global_values: np.ndarray) -> Observation:
+    """Return the prior knowledge of p1 and p2 as residuals in px."""
     std, sigma_px = intrinsics.options.tangential or (math.inf, 0.0)
     by_global = np.array([[float(name == own) for name in intrinsics.names] for own in ("p1", "p2")]) * (sigma_px / std)
     return Observation(by_global @ global_values[:, None], by_global, np.empty((2, 0)))
@@ -290,12 +303,15 @@ def _known_before(intrinsics: Intrinsics, global_values: np.ndarray) -> Observat
 def centre_offsets(
     project: Callable[[np.ndarray], np.ndarray], pose: np.ndarray, points_mm: np.ndarray, *, diameter_mm: float
 ) -> np.ndarray:
-    """Offsets (N, 2) in px of the centres of circles' images from the images of the circles' centres.
+    """Return offsets (N, 2) in px of the centres of circle images from the images of the circles' centres.
 
-    The circles lie in the plane of a target at ``T_camera_target`` (4, 4); ``project`` maps points (M, 3) of the camera
+    The circles are in the plane of a target at ``T_camera_target`` (4, 4); ``project`` maps points (M, 3) of the camera
     frame to pixels (M, 2).
 
-    Raises RangeError: a circle's image is no ellipse.
+    Raises
+    ------
+    RangeError
+        A circle's image is not an ellipse.
     """
 
     def seen(points: np.ndarray) -> np.ndarray:
@@ -304,7 +320,7 @@ def centre_offsets(
     return circle_centre_bias(seen, points_mm, diameter_mm=diameter_mm, axis_u=_X, axis_v=_Y)
 
 
-def _accepted(
+def _group_views(
     images: Sequence[TargetImage], poses: Poses, approaching: bool, options: CameraOptions
 ) -> list[Placement]:
     if poses == "free":
@@ -313,7 +329,7 @@ def _accepted(
         return placements(images, approaching=None)
     if poses == "stage" and options.pixel_aspect is None:
         raise CalibrationError(
-            "a free stage direction and the pixels' shape cannot be separated: give square pixels, or "
+            "a free stage direction and the pixels' shape cannot be separated: use square pixels, or "
             "poses='stage-normal' or 'free'"
         )
     views = placements(images, approaching=approaching)
@@ -340,8 +356,8 @@ def _refuse_undetermined(fit: SchurFit, intrinsics: Intrinsics) -> None:
     for name, std in zip(intrinsics.names, np.sqrt(np.diag(fit.covariance)), strict=True):
         if name in limits and not std <= limits[name]:
             raise CalibrationError(
-                f"the target images determine {name} with a standard deviation of {std:.3g} px; more than "
-                f"{limits[name]:.3g} px is of no use: take more images, tilted differently, or fix some parameters"
+                f"the target images determine {name} with a standard deviation of {std:.3g} px; at most "
+                f"{limits[name]:.3g} px is allowed: take more images, tilted differently, or fix some parameters"
             )
 
 
@@ -350,7 +366,7 @@ def _solution(
 ) -> CameraSolution:
     target_poses, directions, tilts = np.tile(np.eye(4), (len(images), 1, 1)), [], []
     residuals = [np.empty((0, 2))] * len(images)
-    # What is known before is a group of its own, behind those of the views.
+    # Prior knowledge is the last group, after those of the views.
     own = (each[: len(views)] for each in (fit.local, fit.local_covariances, fit.residuals))
     for view, local, covariance, misses in zip(views, *own, strict=True):
         rotation = cv2.Rodrigues(local[:3])[0]
@@ -383,30 +399,30 @@ def _solution(
 
 
 def _tilt(tilt: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
-    """Angle in rad between the stage's direction and the normal, and its standard deviation."""
+    """Return the angle in rad between the stage's direction and the normal, and its standard deviation."""
     size = float(np.hypot(*tilt))
     outward = tilt / size if size > 0 else np.array([1.0, 0.0])
     return float(np.arctan(size)), float(np.sqrt(outward @ covariance @ outward)) / (1 + size**2)
 
 
 def stage_direction(target_poses: np.ndarray, stage_mm: np.ndarray) -> np.ndarray | None:
-    """Unit direction (3,) in the camera frame in which the stage moves the sensor, from poses of a fixed target.
+    """Estimate the unit direction (3,) of the sensor's motion by the stage, from poses of a fixed target.
 
-    ``target_poses`` (F, 4, 4) are ``T_camera_target``; the target's origin moves against the sensor. None where the
-    stage stood still, or the poses do not move as far as it did: then the target was moved by other means.
+    ``target_poses`` (F, 4, 4) are ``T_camera_target``; the result is in the camera frame. None if the stage did not
+    move, or if the poses do not move as far as the stage: then the target was moved in another way.
     """
     moved = stage_mm - stage_mm.mean()
     if not np.any(moved):
         return None
     velocity = -(moved @ target_poses[:, :3, 3]) / (moved @ moved)
     speed = float(np.linalg.norm(velocity))
-    return velocity / speed if abs(speed - 1) < 0.05 else None  # scales of stage and target agree better than that
+    return velocity / speed if abs(speed - 1) < 0.05 else None  # scales of stage and target agree better than this
 
 
 _LEAST_TURN = np.radians(20)
-"""Angle between a direction and its description from which images may be turned: descriptions are rough."""
+"""Angle between a direction and its description above which images may be rotated: descriptions are rough."""
 _MUCH_CLOSER = 1 / 3
-"""Share of that angle below which a direction lies where turned images would put it."""
+"""Fraction of that angle within which a direction must agree with rotated images."""
 _TURNS = {
     "turned by 180 deg": np.array([-1.0, -1.0, 1.0]),
     "mirrored top to bottom": np.array([1.0, -1.0, 1.0]),
@@ -415,9 +431,9 @@ _TURNS = {
 
 
 def turned_like(found: np.ndarray, described: np.ndarray, *, either_way: bool = False) -> str:
-    """How images are turned that explain a unit direction (3,) against the one described, in words; empty if none do.
+    """Describe the image rotation that explains a unit direction (3,) different from the description; else empty.
 
-    Camera frame. ``either_way`` is for normals, of which the opposite is the same plane's.
+    Both are in the camera frame. ``either_way`` is for normals, whose opposite is equivalent.
     """
 
     def angle(other: np.ndarray) -> float:
@@ -431,15 +447,15 @@ def turned_like(found: np.ndarray, described: np.ndarray, *, either_way: bool = 
 
 
 def refuse_turned_travel(found: np.ndarray | None, described: np.ndarray) -> None:
-    """Refuse a stage that moves the sensor (3,) as in turned images, against its described direction (3,).
+    """Raise CalibrationError if the stage's direction (3,) agrees with the described one (3,) only for rotated images.
 
-    A board that looks the same in a mirror shows nothing of that itself. Both in the camera frame; None where poses do
-    not follow a stage. Raises CalibrationError.
+    A board that looks the same in a mirror does not reveal this. Both directions are in the camera frame; None if poses
+    do not follow a stage.
     """
     described = described / np.linalg.norm(described)
     if found is not None and (how := turned_like(found, described)):
         raise CalibrationError(
-            f"by the target's poses the stage moves the sensor along {np.round(found, 2).tolist()} (camera: right, "
-            f"down, ahead), by stage_direction along {np.round(described, 2).tolist()}, as it is where the images are "
-            f"{how}: turn the images back, or correct stage_direction"
+            f"from the target's poses, the stage moves the sensor along {np.round(found, 2).tolist()} (camera: right, "
+            f"down, ahead); from stage_direction, along {np.round(described, 2).tolist()}. This occurs if the images "
+            f"are {how}: correct the images' orientation, or stage_direction"
         )

@@ -1,4 +1,4 @@
-"""Guidance of a camera calibration: what recorded poses determine, what is missing, and the pose that helps most."""
+"""Guidance of a camera calibration: what the recorded poses determine, what is missing, and the most helpful pose."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,13 +19,13 @@ from uwlts.model.sensor import Medium, Sensor
 from uwlts.optics.camera import directions, project
 from uwlts.targets import Target, TargetView
 
-_CONTRADICTION = 3.0  # times the residual of the other images from which one contradicts them
-_ALLOWANCE_PX = 0.1  # what noise alone may add to that
+_CONTRADICTION = 3.0  # ratio to the residual of the other images above which an image contradicts them
+_ALLOWANCE_PX = 0.1  # additional contribution of noise
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedPose:
-    """A pose of the target as recorded: what the lamp showed, the stripe (N, 2) on the target, the stage's position."""
+    """Recorded pose of the target: lamp image, stripe (N, 2) on the target, and stage position."""
 
     view: TargetView
     stripe: np.ndarray
@@ -34,7 +34,7 @@ class RecordedPose:
 
 @dataclass(frozen=True)
 class Setting:
-    """Sensor, target, the medium it stands in, and how the recorded poses belong together."""
+    """Sensor, target, medium, and how the recorded poses are related."""
 
     sensor: Sensor
     target: Target
@@ -44,36 +44,39 @@ class Setting:
     camera: CameraOptions = CameraOptions()
 
     def intrinsics(self) -> Intrinsics:
-        """The camera parameters that are estimated."""
+        """Return the camera parameters that are estimated."""
         camera = self.sensor.camera
         return Intrinsics(self.camera.described(camera), width_px=camera.width_px, height_px=camera.height_px)
 
 
 def nominal_camera(setting: Setting) -> CameraModel:
-    """The described camera; through a window into a medium its focal length grows by the medium's index."""
+    """Return the described camera; behind a window, the medium's index multiplies its focal length."""
     camera = setting.sensor.camera
     index = setting.medium.refractive_index(setting.sensor.laser.wavelength_nm) if camera.window.mounted else 1.0
     return CameraModel.described(camera, magnified=index)
 
 
 def pose_of(view: TargetView, camera: CameraModel) -> np.ndarray:
-    """``T_camera_target`` (4, 4) of a view by a known camera.
+    """Estimate ``T_camera_target`` (4, 4) of a view with a known camera.
 
-    Raises CalibrationError: no pose explains the points.
+    Raises
+    ------
+    CalibrationError
+        No pose fits the points.
     """
     found, rotation, translation = cv2.solvePnP(view.points_mm, view.pixels, camera.matrix(), camera.coefficients())
     if not found or not np.isfinite(translation).all():
-        raise CalibrationError("no pose of the target explains its image: is it the described target?")
+        raise CalibrationError("no pose of the target fits its image: is it the described target?")
     return rigid_transform(cv2.Rodrigues(rotation)[0], translation[:, 0])
 
 
 def judge_residual(before: CameraSolution | None, after: CameraSolution) -> tuple[str, ...]:
-    """Reason why the last image of ``after`` contradicts those that ``before`` was solved from, if it does."""
+    """Return a reason if the last image of ``after`` contradicts those of ``before``."""
     if before is None:
         return ()
     rms, usual = after.image_rms_px(), before.rms_px()
     limit = _CONTRADICTION * usual + _ALLOWANCE_PX
-    # A wrong image pulls the others along, so they are looked at too.
+    # A wrong image also changes the residuals of the others.
     worst = max(float(rms[-1]), float(np.sqrt(np.mean(rms[:-1] ** 2))))
     reason = (
         f"contradicts the others: with it the residual is {worst:.2f} px, without it {usual:.2f} px, at most "
@@ -83,18 +86,18 @@ def judge_residual(before: CameraSolution | None, after: CameraSolution) -> tupl
 
 
 def without_window(sensor: Sensor) -> Sensor:
-    """The sensor with its camera's window taken off."""
+    """Return the sensor without its camera's window."""
     window = sensor.camera.window.model_copy(update={"mounted": False})
     return sensor.model_copy(update={"camera": sensor.camera.model_copy(update={"window": window})})
 
 
-_LONG_SIDE_CELLS = 8  # fine enough for distortion, coarse enough to be filled by some ten images
+_LONG_SIDE_CELLS = 8  # fine enough for distortion, coarse enough to be filled by about ten images
 _POINTS_IN_CELL = 3  # one or two may be a corner of the target that touches the cell
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Points of all images in a grid of nearly square cells over the image: ``counts`` (rows, columns) in each."""
+    """Points of all images in a grid of nearly square cells over the image: ``counts`` (rows, columns)."""
 
     counts: np.ndarray
     width_px: int
@@ -102,18 +105,18 @@ class Coverage:
 
     @property
     def covered(self) -> np.ndarray:
-        """Mask (rows, columns) of the cells that hold points enough: three."""
+        """Mask (rows, columns) of the cells with at least three points."""
         return self.counts >= _POINTS_IN_CELL
 
     @property
     def share(self) -> float:
-        """Share of the cells that are covered."""
+        """Fraction of the cells that are covered."""
         return float(self.covered.mean())
 
     def with_points(self, pixels: np.ndarray) -> "Coverage":
-        """The coverage with the points (N, 2) of one more image; points outside the image count nowhere."""
+        """Add the points (N, 2) of one image; points outside the image are ignored."""
         rows, columns = self.counts.shape
-        # Pixel (0, 0) is the centre of the first pixel, so the image begins half a pixel before it.
+        # Pixel (0, 0) is the centre of the first pixel, so the image starts half a pixel before it.
         place = np.floor((pixels + 0.5) / [self.width_px, self.height_px] * [columns, rows]).astype(int)
         column, row = place[((place >= 0) & (place < [columns, rows])).all(axis=1)].T
         counts = self.counts.copy()
@@ -121,7 +124,7 @@ class Coverage:
         return replace(self, counts=counts)
 
     def emptiest(self) -> str | None:
-        """Ninth of the image with most empty cells, in words; None where none has any."""
+        """Name the ninth of the image with most empty cells; None if no cell is empty."""
         empty = ~self.covered
         if not empty.any():
             return None
@@ -133,7 +136,7 @@ class Coverage:
 
 
 def coverage_of(views: Sequence[np.ndarray], *, width_px: int, height_px: int) -> Coverage:
-    """Coverage by the points (N, 2) of several images, or of none."""
+    """Return the coverage by the points (N, 2) of any number of images."""
     side = max(width_px, height_px) / _LONG_SIDE_CELLS
     shape = max(2, round(height_px / side)), max(2, round(width_px / side))
     coverage = Coverage(np.zeros(shape, dtype=np.int64), width_px, height_px)
@@ -143,7 +146,7 @@ def coverage_of(views: Sequence[np.ndarray], *, width_px: int, height_px: int) -
 
 
 def place_words(x: float, y: float) -> str:
-    """A place in the image, x and y as shares of its width and height, in words."""
+    """Name a position in the image; x and y are fractions of its width and height."""
     across = "left" if x < 0.4 else "right" if x > 0.6 else ""
     if 0.4 <= y <= 0.6:
         return across or "middle"
@@ -153,23 +156,23 @@ def place_words(x: float, y: float) -> str:
 
 
 def tilts_rad(pose: np.ndarray) -> tuple[float, float]:
-    """Tilts of the target at a pose ``T_camera_target`` (4, 4): right side farther, lower side farther."""
+    """Return the tilts of a pose ``T_camera_target`` (4, 4): right side farther, lower side farther."""
     normal = pose[:3, 2] * np.sign(pose[2, 2] or 1.0)
     return float(np.arctan2(-normal[0], normal[2])), float(np.arctan2(-normal[1], normal[2]))
 
 
-TILT_RAD = np.radians(25.0)  # easily reached by hand, and printed circles stay detectable
-_PLACES = (0.2, 0.5, 0.8)  # shares of the image's sides, inside it
-_DEPTHS = (0.1, 0.5, 0.9)  # shares of the working range, inside it
-_MARGIN_PX = 10.0  # of the image, in which circles would be cut
-_SAMPLE = 100  # points of a candidate that stand for all: more repeat what these say
+TILT_RAD = np.radians(25.0)  # easily reached by hand, and printed circles remain detectable
+_PLACES = (0.2, 0.5, 0.8)  # fractions of the image's sides
+_DEPTHS = (0.1, 0.5, 0.9)  # fractions of the working range
+_MARGIN_PX = 10.0  # margin of the image, in which circles would be cut
+_SAMPLE = 100  # points used for a candidate's information; more are redundant
 
 
 @dataclass(frozen=True, eq=False)
 class CandidatePose:
-    """A pose ``T_camera_target`` (4, 4) with the pixels (N, 2) and the information (P, P) that its image would give.
+    """Candidate pose ``T_camera_target`` (4, 4), with pixels (N, 2) and information (P, P) of its image.
 
-    The information is for points that are found to 1 px.
+    The information is for a point noise of 1 px.
     """
 
     pose: np.ndarray
@@ -180,9 +183,9 @@ class CandidatePose:
 def information_of(
     points_mm: np.ndarray, pixels: np.ndarray, pose: np.ndarray, camera: CameraModel, setting: Setting
 ) -> np.ndarray:
-    """Information (P, P) on the camera's parameters in points of one image, each found to 1 px, the pose being unknown.
+    """Return the information (P, P) of one image with unknown pose on the camera's parameters, for 1 px noise.
 
-    The pose's part is eliminated from the normal equations (Schur complement). Zeros for a pose behind the camera.
+    The pose is eliminated from the normal equations (Schur complement). Zeros for a pose behind the camera.
     """
     intrinsics, count = setting.intrinsics(), len(points_mm)
     placement = Placement(points_mm, np.zeros(count), pixels, np.zeros(count, dtype=int), 1.0)
@@ -195,10 +198,10 @@ def information_of(
 
 
 def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) -> list[CandidatePose]:
-    """Poses at three distances in the working range, nine places, nine tilts, in which the target could be found.
+    """Return poses with a detectable target: three distances, nine places in the image, nine tilts.
 
-    Tilts are none and those that make one of eight sides of the image farther. ``spin_rad`` is how the target is turned
-    in the image, from its x axis to the image's.
+    One tilt is zero; the others move one of eight sides away from the camera. ``spin_rad`` is the target's rotation in
+    the image, from its x axis to the image's.
     """
     target, volume, window = setting.target, setting.sensor.volume, setting.sensor.camera.window
     outer = window.distance_mm + window.thickness_mm
@@ -226,10 +229,10 @@ def candidates(setting: Setting, camera: CameraModel, *, spin_rad: float = 0.0) 
     return found
 
 
-_USUAL_SIGMA_PX = 0.1  # how well points are usually found, used until residuals are known
-_LEAST_SIGMA_PX = 0.02  # how well points are found at best: sharp circles are, in reality too
-# What is known of a described lens before anything is seen, as standard deviations: shares of f and of the image's
-# side, and plain coefficients.
+_USUAL_SIGMA_PX = 0.1  # usual point noise, until residuals are known
+_LEAST_SIGMA_PX = 0.02  # smallest point noise: sharp circles, also in reality
+# Prior standard deviations of a described lens: relative to the focal length and the image's side, and of plain
+# coefficients.
 _FOCAL: tuple[LensParameter, ...] = (LensParameter.F, LensParameter.FX, LensParameter.FY)
 _CENTRE: tuple[LensParameter, ...] = (LensParameter.CX, LensParameter.CY)
 _PRIOR = dict.fromkeys((*_FOCAL, *_CENTRE), 0.05) | {
@@ -239,25 +242,25 @@ _PRIOR = dict.fromkeys((*_FOCAL, *_CENTRE), 0.05) | {
     LensParameter.P2: 0.02,
     LensParameter.K3: 10.0,
 }
-_COVERAGE_WEIGHT = 4.0  # logarithm of the factor in a standard deviation, 55, as which a fully uncovered image counts
-_SPREAD_WEIGHT = 0.5  # the same, 1.6, for a side of the target that was never tilted
+_COVERAGE_WEIGHT = 4.0  # log of the factor, 55, in a standard deviation that equals a fully uncovered image
+_SPREAD_WEIGHT = 0.5  # the same, a factor of 1.6, for a side of the target that was never tilted
 _SIDES = ("right side", "left side", "lower side", "upper side")
-_BEYOND = 0.05  # decides between poses once everything wanted is reached
-_SAME_TILT_RAD = np.radians(9.0)  # tilt against the advised pose that a hand can keep: below, nothing is said
-_SAME_PLACE = 0.15  # the same of the target's middle, as a share of the image's sides
-_SAME_DISTANCE = 0.1  # the same of the distance, as a share of it
+_BEYOND = 0.05  # decides between poses once all limits are reached
+_SAME_TILT_RAD = np.radians(9.0)  # tilt difference from the advised pose without an instruction: a hand can keep it
+_SAME_PLACE = 0.15  # the same for the target's middle, relative to the image's sides
+_SAME_DISTANCE = 0.1  # the same for the distance, relative to it
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """Limits at which a calibration is good enough.
+    """Limits of a complete calibration.
 
     Attributes
     ----------
     focal_std_px, centre_std_px : standard deviations of the focal length and of the principal point
-    coverage : share of the image's cells in which points were seen
-    tilt_rad : free poses: each of the target's four sides was once farther by as much. A scatter of pixels does not
-        need that, but a target that is not quite flat, or not quite as described, then shows.
+    coverage : fraction of the image's cells with points
+    tilt_rad : for free poses, tilt that each of the target's four sides must reach once. It reveals a target that is
+        not flat or not as described.
     """
 
     focal_std_px: float = 0.5
@@ -267,37 +270,37 @@ class Wanted:
     fewest_images: int = 8
 
     def std_px(self) -> dict[LensParameter, float]:
-        """Wanted standard deviation of every parameter of which one is wanted."""
+        """Return the limits of the standard deviations by parameter."""
         return dict.fromkeys(_FOCAL, self.focal_std_px) | dict.fromkeys(_CENTRE, self.centre_std_px)
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """State of a calibration by the poses recorded so far."""
+    """State of a calibration after the recorded poses."""
 
     setting: Setting
     wanted: Wanted
     recorded: tuple[RecordedPose, ...]
-    camera: CameraModel  # as far as it is known
-    solution: CameraSolution | None  # None as long as the poses do not determine it
-    undetermined: str  # why the poses do not determine it
+    camera: CameraModel  # known so far
+    solution: CameraSolution | None  # None if the poses do not determine it
+    undetermined: str  # reason why the poses do not determine it
     poses: np.ndarray  # (F, 4, 4); ``T_camera_target`` of the recorded poses
     coverage: Coverage
-    information: np.ndarray  # (P, P); on the camera's parameters, of the description alone at first
+    information: np.ndarray  # (P, P); on the camera's parameters, initially from the description
 
     def std(self) -> dict[LensParameter, float]:
-        """Standard deviation of every camera parameter: the solution's, or what is expected without one."""
+        """Return the standard deviation of every camera parameter: the solution's, else the expected one."""
         if self.solution is None:
             return self.expected_std()
         return dict(zip(self.setting.intrinsics().keys, self.solution.std().values(), strict=True))
 
     def expected_std(self) -> dict[LensParameter, float]:
-        """Standard deviations that belong to the information."""
+        """Return the standard deviations that follow from the information."""
         std = np.sqrt(np.diag(np.linalg.inv(self.information))).tolist()
         return dict(zip(self.setting.intrinsics().keys, std, strict=True))
 
     def with_image(self, pose: np.ndarray, pixels: np.ndarray, information: np.ndarray) -> "State":
-        """As expected with one more image: its pose (4, 4), pixels (N, 2) and information (P, P) by points of 1 px."""
+        """Add an expected image: pose (4, 4), pixels (N, 2) and information (P, P) for 1 px noise."""
         sigma = _USUAL_SIGMA_PX if self.solution is None else max(self.solution.sigma_px, _LEAST_SIGMA_PX)
         return replace(
             self,
@@ -307,16 +310,16 @@ class State:
         )
 
     def with_view(self, view: TargetView, pose: np.ndarray) -> "State":
-        """As expected with one more image that shows the target at a pose ``T_camera_target`` (4, 4)."""
+        """Add an expected image that shows the target at a pose ``T_camera_target`` (4, 4)."""
         information = information_of(view.points_mm, view.pixels, pose, self.camera, self.setting)
         return self.with_image(pose, view.pixels, information)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseAdvice:
-    """The pose that would help most, by how much, and where the target's middle then lies.
+    """Most helpful pose, its benefit, and the place of the target's middle.
 
-    ``gain`` is in the units of `lack`; ``place`` are shares of the image's width and height, ``distance_mm`` runs along
+    ``gain`` is in the units of `lack`, ``place`` in fractions of the image's width and height, ``distance_mm`` along
     the camera's axis.
     """
 
@@ -327,9 +330,12 @@ class PoseAdvice:
 
 
 def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted = Wanted()) -> State:
-    """State of a calibration by the recorded poses.
+    """Solve the calibration with the recorded poses and return its state.
 
-    Raises CalibrationError: no pose of the target explains one of its images.
+    Raises
+    ------
+    CalibrationError
+        No pose of the target fits one of its images.
     """
     image, camera, solution, undetermined = setting.sensor.camera, nominal_camera(setting), None, "no image yet"
     if recorded:
@@ -367,7 +373,7 @@ def state_of(recorded: Sequence[RecordedPose], setting: Setting, wanted: Wanted 
 
 
 def lack(state: State) -> float:
-    """Measure of the shortfall: 0 once everything wanted is reached, else logarithms of ratios and weighted shares."""
+    """Return a measure of missing evidence: 0 when all limits are reached, else log ratios and weighted fractions."""
     std, share = state.expected_std(), state.coverage.share
     ratios = np.log([std[key] / limit for key, limit in state.wanted.std_px().items() if key in std])
     beyond = _BEYOND * (ratios.sum() + _COVERAGE_WEIGHT * (1 - share))
@@ -376,7 +382,7 @@ def lack(state: State) -> float:
 
 
 def _untilted(state: State) -> np.ndarray:
-    """For each of the target's four sides, what share (4,) of the wanted tilt it was never farther by."""
+    """Return for each side of the target the missing fraction (4,) of the wanted tilt."""
     if state.setting.poses != "free":
         return np.zeros(4)
     across, down = np.array([tilts_rad(pose) for pose in state.poses]).reshape(-1, 2).T
@@ -385,10 +391,7 @@ def _untilted(state: State) -> np.ndarray:
 
 
 def best_pose(state: State, *, spin_rad: float = 0.0, skipped: int = 0) -> PoseAdvice | None:
-    """The candidate pose that leaves least missing, after so many that were ``skipped``.
-
-    None where the target can be found in none.
-    """
+    """Return the most helpful candidate pose after ``skipped`` skipped ones; None if no candidate shows the target."""
     options = candidates(state.setting, state.camera, spin_rad=spin_rad)
     if not options:
         return None
@@ -399,19 +402,19 @@ def best_pose(state: State, *, spin_rad: float = 0.0, skipped: int = 0) -> PoseA
 
 
 def gain_of(state: State, view: TargetView, pose: np.ndarray) -> float:
-    """By how much an image, seen at a pose ``T_camera_target`` (4, 4), would lessen what is missing."""
+    """Return the reduction of missing evidence by an image at a pose ``T_camera_target`` (4, 4)."""
     return lack(state) - lack(state.with_view(view, pose))
 
 
 def middle_of(pose: np.ndarray, state: State) -> tuple[tuple[float, float], float]:
-    """Place of the target's middle in shares of the image's sides, and its distance in mm along the axis."""
+    """Return the place of the target's middle in fractions of the image's sides, and its distance, mm."""
     middle = pose[:3, :3] @ state.setting.target.points_mm.mean(axis=0) + pose[:3, 3]
     u, v = project(state.camera, middle[None])[0]
     return (float(u / state.camera.width_px), float(v / state.camera.height_px)), float(middle[2])
 
 
 def format_pose_advice(advice: PoseAdvice, state: State, pose: np.ndarray | None) -> str:
-    """Instruction for moving the target from its present pose (4, 4), None if unknown, to the advised one."""
+    """Describe how to move the target from its present pose (4, 4), None if unknown, to the advised one."""
     parts, aim = [], advice.candidate.pose
     place, distance = (None, None) if pose is None else middle_of(pose, state)
     if pose is None or np.arccos(np.clip(pose[:3, 2] @ aim[:3, 2], -1, 1)) > _SAME_TILT_RAD:
@@ -429,7 +432,7 @@ def format_pose_advice(advice: PoseAdvice, state: State, pose: np.ndarray | None
 
 
 def _tilt_words(aim: np.ndarray, pose: np.ndarray | None) -> str:
-    """Instruction for tilting the target: the side that shall be farther, and by how much."""
+    """Describe how to tilt the target: the side to move away, and the angle."""
     across, down = tilts_rad(aim)
     size = np.degrees(np.arccos(np.clip(1 / np.sqrt(1 + np.tan(across) ** 2 + np.tan(down) ** 2), -1, 1)))
     if size < 5:
@@ -443,7 +446,7 @@ def _tilt_words(aim: np.ndarray, pose: np.ndarray | None) -> str:
 
 
 def missing(state: State) -> list[str]:
-    """Limits that are not reached yet, in words; empty when all that is wanted is reached."""
+    """Describe limits that are not reached yet; empty if all are reached."""
     said, wanted = [], state.wanted
     if len(state.recorded) < wanted.fewest_images:
         said.append(f"{len(state.recorded)} images, at least {wanted.fewest_images} are wanted")
@@ -467,7 +470,7 @@ def missing(state: State) -> list[str]:
 
 
 def missing_sheet(state: State) -> list[str]:
-    """Reasons why the laser sheet is not determined yet, in words; none as long as the camera is not known."""
+    """Describe why the laser sheet is not determined yet; empty if the camera is not known."""
     if state.solution is None:
         return []
     target, stripes = state.setting.target, [pose.stripe for pose in state.recorded]

@@ -1,4 +1,4 @@
-"""Quality of laser images of the step standard, and the depths at which the standard is still wanted."""
+"""Quality of laser images of the step standard, and depths of images that are still needed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,15 +16,15 @@ from uwlts.optics.triangulation import points_on_sheet
 from uwlts.stripe import StripeOptions, StripeStatus, extract_stripe
 
 PLACES = 3
-"""At so many depths the standard is wanted: near, in the middle and far."""
-_APART = 1 / 7  # of the volume's depth
-_FEWEST_LINES = 20  # fewer are reflections or specks rather than the stripe
-_MOST_SATURATED = 0.05  # share of the lines; outlier tests bear so many wrong centres
+"""Number of depths of the standard that are needed: near, middle and far."""
+_APART = 1 / 7  # fraction of the volume's depth
+_FEWEST_LINES = 20  # fewer lines are reflections or specks, not the stripe
+_MOST_SATURATED = 0.05  # fraction of the lines; outlier tests tolerate this many wrong centres
 
 
 @dataclass(frozen=True, eq=False)
 class StepQuality:
-    """Stripe pixels (N, 2) on the step standard, their depth outside the nominal window, and reasons to refuse it."""
+    """Stripe pixels (N, 2) on the step standard, their depth outside the nominal window, and reasons for rejection."""
 
     pixels: np.ndarray
     depth_mm: float | None
@@ -32,10 +32,10 @@ class StepQuality:
 
 
 def next_depth_mm(seen_mm: Sequence[float], sensor: Sensor, *, skipped: int = 0) -> float | None:
-    """Depth for the standard's next image, mm outside the window; None once it was seen at three depths apart.
+    """Return the depth for the standard's next image, mm outside the window; None after three separate depths.
 
-    Of the middles of the measuring volume's thirds the one farthest from where it was seen; the next in turn where so
-    many were ``skipped``.
+    Candidates are the centres of three equal parts of the measuring volume; the one farthest from previous depths is
+    returned. After ``skipped`` skipped depths, the next candidates follow in turn.
     """
     if len(apart_mm(seen_mm, sensor)) >= PLACES:
         return None
@@ -46,7 +46,7 @@ def next_depth_mm(seen_mm: Sequence[float], sensor: Sensor, *, skipped: int = 0)
 
 
 def apart_mm(seen_mm: Sequence[float], sensor: Sensor) -> list[float]:
-    """Those of the depths that are far from each other."""
+    """Return those depths that are far from each other."""
     chosen: list[float] = []
     for depth in seen_mm:
         chosen += [depth] if is_new(depth, chosen, sensor) else []
@@ -54,12 +54,12 @@ def apart_mm(seen_mm: Sequence[float], sensor: Sensor) -> list[float]:
 
 
 def is_new(depth_mm: float, seen_mm: Sequence[float], sensor: Sensor) -> bool:
-    """Whether a depth is farther from all others than a seventh of the measuring volume's depth."""
+    """Return whether a depth differs from all others by more than a seventh of the measuring volume's depth."""
     return all(abs(depth_mm - other) >= least_apart_mm(sensor) for other in seen_mm)
 
 
 def least_apart_mm(sensor: Sensor) -> float:
-    """Least distance of two depths of the standard, mm."""
+    """Return the smallest difference between two depths of the standard, mm."""
     return _APART * (sensor.volume.far_mm - sensor.volume.near_mm)
 
 
@@ -73,7 +73,7 @@ def judge_step(
     full_dn: int,
     options: StripeOptions = StripeOptions(),
 ) -> StepQuality:
-    """Quality of a laser image (H, W) of the step standard, by a calibration in air and the nominal window."""
+    """Assess a laser image (H, W) of the step standard, with a calibration in air and the nominal window."""
     along = calibration.stripe_along
     try:
         stripe = extract_stripe(image, stripe_along=along, options=options, saturation=full_dn)
@@ -81,8 +81,8 @@ def judge_step(
         return StepQuality(np.empty((0, 2)), None, (str(error),))
     pixels, reasons = stripe.pixels(), []
     if len(pixels) < _FEWEST_LINES:
-        reason = f"the laser line is seen on {len(pixels)} lines only, at least {_FEWEST_LINES} are of use"
-        return StepQuality(pixels, None, (f"{reason}; is the laser lit, the standard in the sheet?",))
+        reason = f"the laser line is found on {len(pixels)} lines only; at least {_FEWEST_LINES} are needed"
+        return StepQuality(pixels, None, (f"{reason}; is the laser on, is the standard in the sheet?",))
     clipped = (image.max(axis=0 if along == "width" else 1) >= full_dn) & (stripe.status != StripeStatus.NO_STRIPE)
     saturated = float(clipped.sum()) / len(pixels)
     if saturated > _MOST_SATURATED:
@@ -94,6 +94,6 @@ def judge_step(
     placed = calibration.model_copy(update={"window": window})
     depths = points_on_sheet(placed, pixels, medium_index=medium_index).points_mm[:, 2]
     if not np.isfinite(depths).any():
-        return StepQuality(pixels, None, (*reasons, "the laser line does not lie on the sheet"))
+        return StepQuality(pixels, None, (*reasons, "the laser line is not on the sheet"))
     depth = float(np.median(depths[np.isfinite(depths)])) - window.distance_mm - window.thickness_mm
     return StepQuality(pixels, depth, tuple(reasons))

@@ -1,4 +1,4 @@
-"""Checks whether evidence, prior knowledge and noise of a joint estimate agree, and which images and values do not."""
+"""Consistency of evidence, prior knowledge and noise of a joint estimate: which images and values disagree."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -43,11 +43,11 @@ _CHECK: dict[SingleParameter, str] = {
     LensParameter.P1: "the lens, or uncertainty.tangential",
     LensParameter.P2: "the lens, or uncertainty.tangential",
 }
-"""Checks of the parameters of which something is known before."""
+"""Entries to check for the parameters with prior knowledge."""
 
 
 def format_deviation(key: ParameterKey, value: float, known: float, std: float, *, sigmas: float) -> str:
-    """That the images alone say a value, so many standard uncertainties of both off what was known before."""
+    """Describe the deviation of a parameter, estimated from images only, from its prior value, with advice."""
     match key:
         case StageParameter.SCALE:
             return (
@@ -60,7 +60,9 @@ def format_deviation(key: ParameterKey, value: float, known: float, std: float, 
             check = "which standard it is"
             if value > known:
                 turn = np.degrees(np.arccos(known / value))
-                check += f", and whether it faces the laser: turned by {turn:.1f}° about the stripe it seems so high"
+                check += (
+                    f", and whether it faces the laser: a rotation by {turn:.1f}° about the stripe explains the height"
+                )
         case LensParameter() | WindowParameter() | SheetParameter() | StageParameter() | TargetParameter():
             check = _CHECK[key]
         case _:
@@ -73,45 +75,45 @@ def format_deviation(key: ParameterKey, value: float, known: float, std: float, 
 
 
 _LARGEST_TARGET_PX = 0.5
-"""Scatter beyond which target points were misdetected or contradict each other, whatever the image."""
+"""Scatter beyond which target points are misdetected or contradict each other, in every image."""
 _LARGEST_STRIPE_PX = 1.0  # the same for stripes
-_FEWEST_VALUES = 20  # residuals of an image: a median of fewer is no scatter
-_OVER_OTHERS = 3.0  # times the scatter of other images: sharpness and light differ from image to image, but not so much
-_OVER_OTHERS_PX = 0.15  # the same in px, where the others hardly scatter; the larger of both counts
+_FEWEST_VALUES = 20  # residuals of an image: fewer give no reliable scatter
+_OVER_OTHERS = 3.0  # times the scatter of other images, more than differences in sharpness and light explain
+_OVER_OTHERS_PX = 0.15  # the same in px, if the others have little scatter; the larger limit applies
 _OVER_NOISE = 2.5
-"""Times the noise by an image's fine structure, which is up to twice too small where neighbours share it."""
+"""Factor of the noise from an image's fine structure, which correlation can make up to twice too small."""
 _WAVES_DOUBTFUL = 8.0
-"""Lines that err together from which there is a doubt: the filter that finds the stripe, and speckle, join 2 to 4."""
-_WAVES_WRONG = 20.0  # lines that err together from which the model lacks something
-_OUTLIER_SHARE = 0.2  # share of outliers: they are few, more are another structure in the images
+"""Correlated lines for a doubt: the filter that finds the stripe, and speckle, correlate 2 to 4."""
+_WAVES_WRONG = 20.0  # correlated lines from which the model is incomplete
+_OUTLIER_SHARE = 0.2  # fraction of outliers above which the images contain another structure
 _DOUBTFUL = 4.0
-"""Standard uncertainties from what was known before, beyond which lies one normal error in 16,000: a doubt."""
+"""Standard uncertainties from the prior value for a doubt: one normal error in 16,000 is larger."""
 _WRONG = 6.0
-"""The same beyond which it is a contradiction: design values are rough, so that smaller deviations are only doubts."""
-_LEAST_GAIN = 0.02  # information gained, as a share of the prior's standard uncertainty, that rounding does not make
-_MUCH_GAINED = 0.5  # the same from which a parameter counts for Birge's ratio
-_FALSE_ALARM = 1e-3  # probability that Birge's ratio takes what is known for less certain where it is as stated
-_FEWEST_GAINED = 6  # parameters that Birge's ratio needs: by six it is known to 30 %
-_ROUGH_SIZE = 2e-3  # share by which sizes that are stated without an uncertainty are usually off
-_ALIKE = 3.0  # standard uncertainties within which sizes are off by the same share
+"""The same for a contradiction: design values are rough, so that smaller deviations are only doubts."""
+_LEAST_GAIN = 0.02  # information gain, relative to the prior standard uncertainty, above rounding errors
+_MUCH_GAINED = 0.5  # the same from which a parameter is included in Birge's ratio
+_FALSE_ALARM = 1e-3  # probability that correct prior uncertainties are enlarged by Birge's ratio
+_FEWEST_GAINED = 6  # parameters that Birge's ratio needs: six determine it to 30 %
+_ROUGH_SIZE = 2e-3  # usual relative error of sizes that are stated without an uncertainty
+_ALIKE = 3.0  # standard uncertainties within which sizes have the same relative error
 _FOCAL_DOUBTFUL = 0.08
-"""Share of the focal length that is a doubt: a lens's name rounds it, and focusing near lengthens it."""
-_FOCAL_WRONG = 0.2  # the same that is a contradiction
+"""Relative error of the focal length for a doubt: lens names are rounded, and near focus lengthens it."""
+_FOCAL_WRONG = 0.2  # the same for a contradiction
 _POSITIONS_WRONG = 3.0
-"""Rms of the stage's positions over their stated uncertainty: that of four exceeds it once in a million."""
+"""Rms position error of the stage divided by its stated uncertainty: four positions exceed it once in a million."""
 _FEWEST_POSITIONS = 4
-_MOST_NAMED = 4  # findings of a kind that a message names
-_MOST_SAID = 6  # findings in a message that can be read
+_MOST_NAMED = 4  # findings of a kind that a message lists
+_MOST_SAID = 6  # findings in a readable message
 
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings against an estimate, in words.
+    """Messages on what contradicts an estimate.
 
-    ``contradictions`` are those of what is known before, and make it useless. ``unfit`` are images, by their sources,
-    that contradict all others, and ``misfits`` kinds of residuals that show throughout what the model lacks. Doubts are
-    everything else. ``stretch`` is what the evidence alone says of the target's rows and columns where that is not
-    what was known; pixels of another shape look like it.
+    ``contradictions`` are those of prior knowledge, and make the estimate useless. ``unfit`` maps the sources of images
+    that contradict all others to messages. ``misfits`` are kinds of residuals with a systematic misfit. Doubts are
+    everything else. ``stretch`` is the target's stretch from the evidence alone if it differs from the prior; pixels of
+    another aspect ratio have the same effect.
     """
 
     contradictions: list[str]
@@ -121,11 +123,11 @@ class Findings:
     stretch: dict[ParameterKey, float] = field(default_factory=dict)
 
     def all_against(self) -> list[str]:
-        """All that speaks against the estimate but doubts."""
-        return [*self.contradictions, *_some(self.unfit.values()), *self.misfits.values()]
+        """Return all messages except doubts."""
+        return [*self.contradictions, *_shorten_list(self.unfit.values()), *self.misfits.values()]
 
     def refusal(self) -> str:
-        """The gravest of it as a message."""
+        """Return an error message with the most severe findings."""
         every = self.all_against()
         more = len(every) - _MOST_SAID
         said = "; ".join(every[:_MOST_SAID])
@@ -133,12 +135,12 @@ class Findings:
 
 
 _Found = Iterator[tuple[bool, str]]
-"""Findings against an estimate, each with a flag that is true for a contradiction and false for a doubt."""
+"""Messages on an estimate, each with a flag: True for a contradiction, False for a doubt."""
 
 
 @dataclass(frozen=True)
 class _Image:
-    """Robust scatter of one kind of residual in one image, and that of its fine structure, which no parameter moves."""
+    """Robust scatter of one kind of residual in one image, and its fine-structure noise, independent of parameters."""
 
     source: str
     kind: str
@@ -150,30 +152,30 @@ class _Image:
     def of(cls, residuals: Residuals, evidence: Evidence) -> "_Image":
         values = residuals.values
         scatter = robust_std(values)
-        # Residuals of neighbouring points or lines share what a wrong model does to them.
+        # A wrong model has the same effect on neighbouring points or lines.
         steps = np.diff(values.reshape(-1, 2 if residuals.kind == TARGET else 1), axis=0)
         noise = robust_std(steps) / np.sqrt(2.0) if len(steps) else scatter
         source, kind = evidence.sources[residuals.image], residuals.kind
         return cls(source, kind, (kind, evidence.view), scatter, noise)
 
     def largest_px(self) -> float:
-        """Scatter that is too large for its kind, whatever the noise."""
+        """Return the scatter that is too large for this kind, independent of the noise."""
         return _LARGEST_TARGET_PX if self.kind == TARGET else _LARGEST_STRIPE_PX
 
 
-def findings(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) -> Findings:
-    """Findings against an estimate, from its evidence and the sensor as described."""
+def check_consistency(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) -> Findings:
+    """Check an estimate against its evidence and the sensor's description."""
     images = [
         _Image.of(residuals, piece)
         for piece, parts in zip(evidence, result.residuals, strict=True)
         for residuals in parts
         if len(residuals.values) >= _FEWEST_VALUES
     ]
-    known = [*((each.wrong(), each.words()) for each in deviations(result)), *_of_stage(result, evidence, sensor)]
-    lens = [*_of_lens(result, sensor)]
-    earlier = [] if any(wrong for wrong, _ in known + lens) else [*_of_earlier(result)]
-    unfit, noisy = _of_images(images)
-    misfits, waves = _of_kinds(images), [*_of_shapes(result)]
+    known = [*((each.wrong(), each.words()) for each in deviations(result)), *_check_stage(result, evidence, sensor)]
+    lens = [*_check_lens(result, sensor)]
+    earlier = [] if any(wrong for wrong, _ in known + lens) else [*_check_earlier(result)]
+    unfit, noisy = _check_images(images)
+    misfits, waves = _check_kinds(images), [*_check_correlations(result)]
     for wrong, kind, words in waves:
         if wrong:
             misfits[kind] = "; ".join(filter(None, [misfits.get(kind), words]))
@@ -182,7 +184,7 @@ def findings(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) 
     doubts += [words for wrong, _, words in waves if not wrong]
     doubts += [
         f"{100 * share:.0f} % of the {kind} was left out as outliers: look at the images"
-        for kind, share in much_left_out(result).items()
+        for kind, share in find_excess_outliers(result).items()
     ]
     if result.stopped == UNSETTLED:
         doubts.append(f"{UNSETTLED}: some of the evidence contradicts the rest")
@@ -191,7 +193,7 @@ def findings(result: Estimate, evidence: Sequence[Evidence], *, sensor: Sensor) 
 
 @dataclass(frozen=True)
 class Deviation:
-    """A parameter that the evidence ``alone`` says far from what was ``known`` before with the uncertainty ``std``."""
+    """Deviation of a parameter: its value from evidence ``alone``, and ``known`` before with uncertainty ``std``."""
 
     sigmas: float
     key: ParameterKey
@@ -200,30 +202,30 @@ class Deviation:
     std: float
 
     def wrong(self) -> bool:
-        """Whether it contradicts what was known, rather than gives a doubt."""
+        """Return whether it is a contradiction, not only a doubt."""
         return self.sigmas > _WRONG
 
     def words(self) -> str:
-        """The deviation, and what to check."""
+        """Describe the deviation and what to check."""
         return format_deviation(self.key, self.alone, self.known, self.std, sigmas=self.sigmas)
 
 
 def deviations(result: Estimate, *, least: float = _DOUBTFUL) -> list[Deviation]:
-    """Parameters at least so many standard uncertainties from what was known before, the farthest first."""
-    far = [each for each, _ in _compared(result) if each.sigmas > least]
+    """Return parameters that deviate from prior knowledge by more than ``least`` standard uncertainties, sorted."""
+    far = [each for each, _ in _compare_with_priors(result) if each.sigmas > least]
     return sorted(far, key=lambda each: each.sigmas, reverse=True)
 
 
-def understated(result: Estimate) -> float:
-    """By which factor what was known of sensor, media and stage is farther off than stated; 1 if it is not.
+def estimate_birge_ratio(result: Estimate) -> float:
+    """Return the factor of too small prior uncertainties of sensor, media and stage, at least 1.
 
-    The root of the mean square of deviations over standard uncertainties (Birge's ratio), where chance alone would
-    make that as large once in a thousand calibrations.
+    This is Birge's ratio, the RMS of deviations divided by standard uncertainties, if chance exceeds it less than once
+    in a thousand calibrations.
     """
     squares = np.array(
         [
             each.sigmas**2
-            for each, gain in _compared(result)
+            for each, gain in _compare_with_priors(result)
             if gain > _MUCH_GAINED and not isinstance(each.key, TargetParameter)
         ]
     )
@@ -232,11 +234,11 @@ def understated(result: Estimate) -> float:
     return float(np.sqrt(squares.mean()))
 
 
-def _compared(result: Estimate) -> Iterator[tuple[Deviation, float]]:
-    """Parameters known before, each with the standard deviation that the evidence removed, over that before.
+def _compare_with_priors(result: Estimate) -> Iterator[tuple[Deviation, float]]:
+    """Compare parameters with prior knowledge; return deviation and relative information gain.
 
-    Without the stripe's shift on the target: images hardly show it, and what they say of it is the smallest errors of
-    the model, many times enlarged.
+    The stripe's shift on the target is excluded: images have little information on it, so that small model errors
+    dominate.
     """
     parameters = result.parameters
     for key, value, known, std, after in zip(
@@ -248,7 +250,7 @@ def _compared(result: Estimate) -> Iterator[tuple[Deviation, float]]:
         strict=True,
     ):
         if np.isfinite(std) and key is not SHIFT:
-            # The estimate contains the prior: this is the variance of their difference where both are right.
+            # The estimate includes the prior: this is the variance of their difference if both are right.
             gain = float(np.sqrt(max(1.0 - (after / std) ** 2, _LEAST_GAIN**2)))
             alone = known + (value - known) / gain**2
             yield Deviation(abs(value - known) / (gain * std), key, alone, known, std), gain
@@ -256,10 +258,9 @@ def _compared(result: Estimate) -> Iterator[tuple[Deviation, float]]:
 
 @dataclass(frozen=True)
 class SizeDeviation:
-    """A size of a scanned object, found ``off_mm`` larger than described.
+    """Deviation ``off_mm`` of a scanned object's size from its description.
 
-    ``std_mm`` is the standard uncertainty stated, infinite where it counts as unknown, ``off_std_mm`` that of the
-    deviation.
+    ``std_mm`` is the stated standard uncertainty (infinite if unknown), ``off_std_mm`` that of the deviation.
     """
 
     scan: str
@@ -270,19 +271,19 @@ class SizeDeviation:
     off_std_mm: float
 
     def sigmas(self) -> float:
-        """The deviation in standard uncertainties."""
+        """Return the deviation in standard uncertainties."""
         return abs(self.off_mm) / self.off_std_mm
 
     def known(self) -> bool:
-        """Whether a standard uncertainty is stated."""
+        """Return whether a standard uncertainty is stated."""
         return bool(np.isfinite(self.std_mm))
 
     def doubtful(self) -> bool:
-        """Whether it is worth a warning; of sizes without a stated uncertainty only where it is large."""
+        """Return whether a warning is due; without a stated uncertainty, only for large deviations."""
         return self.sigmas() > _DOUBTFUL and (self.known() or abs(self.off_mm) > _ROUGH_SIZE * self.described_mm)
 
     def words(self) -> str:
-        """The deviation, and what to check."""
+        """Describe the deviation and what to check."""
         found = self.quantity.format_value(self.described_mm + self.off_mm, self.off_std_mm)
         described = f"{self.described_mm:g}{f' +- {self.std_mm:g}' if self.known() else ''} mm"
         return (
@@ -292,8 +293,8 @@ class SizeDeviation:
         )
 
 
-def size_deviations(result: Estimate, evidence: Sequence[Evidence]) -> list[SizeDeviation]:
-    """Sizes of what was scanned as an estimate has them to which none was known, against those of the evidence."""
+def compute_size_deviations(result: Estimate, evidence: Sequence[Evidence]) -> list[SizeDeviation]:
+    """Compare the described sizes of scanned objects with those of an estimate without known sizes."""
     found = []
     for piece, local, covariance in zip(evidence, result.local, result.local_covariances, strict=True):
         if isinstance(piece, SurfaceScanEvidence):
@@ -309,10 +310,10 @@ def size_deviations(result: Estimate, evidence: Sequence[Evidence]) -> list[Size
     return found
 
 
-def wrong_sizes(deviations: Sequence[SizeDeviation], *, least: float = _WRONG) -> list[str]:
-    """Known sizes at least so many standard uncertainties off, the farthest first, in words.
+def describe_wrong_sizes(deviations: Sequence[SizeDeviation], *, least: float = _WRONG) -> list[str]:
+    """Describe known sizes off by more than ``least`` standard uncertainties, largest first.
 
-    Where all known sizes are off by the same share, the scale of the calibration may as well be wrong.
+    If all known sizes have the same relative deviation, the scale of the calibration may be wrong instead.
     """
     known = [each for each in deviations if each.known()]
     far = sorted((each for each in known if each.sigmas() > least), key=SizeDeviation.sigmas, reverse=True)
@@ -320,14 +321,14 @@ def wrong_sizes(deviations: Sequence[SizeDeviation], *, least: float = _WRONG) -
         return []
     share, std = np.array([(each.off_mm, each.off_std_mm) for each in known]).T / [each.described_mm for each in known]
     common = float(np.sum(share / std**2) / np.sum(1 / std**2))
-    words = _some(each.words() for each in far)
+    words = _shorten_list(each.words() for each in far)
     if len(known) > 1 and np.all(np.abs(share - common) < _ALIKE * std):
-        words.append(f"all known sizes are off by the same {100 * common:+.2f} %: check the target's spacings as well")
+        words.append(f"all known sizes are off by the same {100 * common:+.2f} %: also check the target's spacings")
     return words
 
 
-def _of_earlier(result: Estimate) -> _Found:
-    """The parameter that new evidence moves farthest from an earlier calibration; one is named, as many go with it."""
+def _check_earlier(result: Estimate) -> _Found:
+    """Describe the parameter with the largest change from an earlier calibration; others change with it."""
     earlier = result.parameters.earlier
     if earlier is None:
         return
@@ -340,27 +341,27 @@ def _of_earlier(result: Estimate) -> _Found:
         value, known, std = (float(each[worst]) for each in (result.values, earlier.values, before))
         yield (
             bool(sigmas[worst] > _WRONG),
-            f"the new images contradict the earlier calibration by {sigmas[worst]:.1f} standard uncertainties, most in "
-            f"the {quantity.words}: {quantity.format_value(value, std)} against "
+            f"the new images contradict the earlier calibration by {sigmas[worst]:.1f} standard uncertainties, mostly "
+            f"in the {quantity.words}: {quantity.format_value(value, std)} instead of "
             f"{quantity.format_with_std(known, std)}: check heights and media in the captures; if they are right, the "
-            "sensor has changed, calibrate again",
+            "sensor has changed: calibrate again",
         )
 
 
-def _of_lens(result: Estimate, sensor: Sensor) -> _Found:
-    """A focal length far from the lens's: spacing, medium and stage can be wrong together and fit nevertheless."""
+def _check_lens(result: Estimate, sensor: Sensor) -> _Found:
+    """Compare the focal length with the lens's: errors of spacing, medium and stage can cancel in residuals."""
     camera, described = result.parameters.camera(result.values), sensor.camera.focal_length_px()
     off = abs(camera.fx_px / described - 1)
     if off > _FOCAL_DOUBTFUL:
         yield (
             off > _FOCAL_WRONG,
-            f"the focal length is {camera.fx_px:.1f} px, by the description {described:.1f} px: check the target's "
-            "spacing, the medium in the captures, and the lens",
+            f"the focal length is {camera.fx_px:.1f} px; expected {described:.1f} px from the description: check the "
+            "target's spacing, the medium in the captures, and the lens",
         )
 
 
-def _of_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) -> _Found:
-    """Directions and positions of the stage far from what its description says."""
+def _check_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) -> _Found:
+    """Compare directions and positions of the stage with its description."""
     alignment, std = sensor.uncertainty.stage_alignment_deg, sensor.uncertainty.stage_position_mm
     for piece, local in zip(evidence, result.local, strict=True):
         if not (isinstance(piece, TargetEvidence) and piece.staged):
@@ -370,21 +371,21 @@ def _of_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) ->
         if tilt > _WRONG * alignment:
             yield (
                 True,
-                f"{capture}: the stage moves {tilt:.2g} deg off the target's normal, described as within "
+                f"{capture}: the stage moves {tilt:.2g} deg off the target's normal; expected within "
                 f"{alignment:g} deg (uncertainty.stage_alignment_deg)",
             )
         errors, images = local[8:], piece.images()
         if not len(errors):
             continue
-        # The first position has no error of its own, so all others share its.
+        # The first position lacks an error parameter, so all others share its error.
         errors = errors - np.median(np.append(errors, 0.0))
-        # One that is far off bends the camera and so moves the others too.
+        # A large error of one position distorts the camera parameters and so shifts the others.
         wrong = np.abs(errors) > _WRONG * max(std, robust_std(errors))
         rms = float(np.sqrt(np.mean(errors**2)))
         if 0 < wrong.sum() <= max(1, len(errors) // 4):
             stood = zip((piece.sources[image] for image in images[wrong]), errors[wrong], strict=True)
-            said = f"mm from where it said, stated uncertainty {std:g} mm"
-            for words in _some(f"{source}: the stage stood {error:+.3f} {said}" for source, error in stood):
+            said = f"mm from its stated position (stated uncertainty {std:g} mm)"
+            for words in _shorten_list(f"{source}: the stage was {error:+.3f} {said}" for source, error in stood):
                 yield True, words
         elif len(errors) >= _FEWEST_POSITIONS and rms > _POSITIONS_WRONG * std:
             yield (
@@ -394,8 +395,8 @@ def _of_stage(result: Estimate, evidence: Sequence[Evidence], sensor: Sensor) ->
             )
 
 
-def _of_images(images: Sequence[_Image]) -> tuple[dict[str, str], list[str]]:
-    """Images that fit far worse than their like: contradictions by source, and doubts where it is their own noise."""
+def _check_images(images: Sequence[_Image]) -> tuple[dict[str, str], list[str]]:
+    """Find images that fit worse than similar ones: contradictions by source, and doubts for noisy images."""
     unfit: dict[str, str] = {}
     noisy = []
     for image in images:
@@ -410,11 +411,11 @@ def _of_images(images: Sequence[_Image]) -> tuple[dict[str, str], list[str]]:
             unfit.setdefault(image.source, words)
         else:
             noisy.append(words)
-    return unfit, _some(noisy)
+    return unfit, _shorten_list(noisy)
 
 
-def _of_kinds(images: Sequence[_Image]) -> dict[str, str]:
-    """Kinds of residuals that scatter more than images are noisy."""
+def _check_kinds(images: Sequence[_Image]) -> dict[str, str]:
+    """Find kinds of residuals that scatter more than the images' noise."""
     found = {}
     for kind in dict.fromkeys(image.kind for image in images):
         of_kind = [image for image in images if image.kind == kind]
@@ -422,17 +423,17 @@ def _of_kinds(images: Sequence[_Image]) -> dict[str, str]:
         if scatter > of_kind[0].largest_px() or scatter > max(_OVER_NOISE * noise, noise + _OVER_OTHERS_PX):
             worst = max(of_kind, key=lambda image: image.scatter_px)
             found[kind] = (
-                f"the {kind} is {scatter:.2f} px off (rms) in most images, noise accounts for {noise:.2f} px; worst is "
+                f"the {kind} is {scatter:.2f} px off (rms) in most images; noise explains {noise:.2f} px; the worst is "
                 f"{worst.source} with {worst.scatter_px:.2f} px"
             )
     return found
 
 
-def _of_shapes(result: Estimate) -> Iterator[tuple[bool, str, str]]:
-    """Kinds whose residuals run together over many lines or points, as those of a wrong lens or height do."""
+def _check_correlations(result: Estimate) -> Iterator[tuple[bool, str, str]]:
+    """Find kinds with residuals correlated over many lines or points, as from a wrong lens or height."""
     for kind, noise in result.noise.items():
         if noise.together > _WAVES_DOUBTFUL:
-            where, values = ("across the image", "points") if kind == TARGET else ("along itself", "lines")
+            where, values = ("across the image", "points") if kind == TARGET else ("along the stripe", "lines")
             check = (
                 "the target's flatness, and the lens"
                 if kind == TARGET
@@ -441,13 +442,13 @@ def _of_shapes(result: Estimate) -> Iterator[tuple[bool, str, str]]:
             yield (
                 noise.together > _WAVES_WRONG,
                 kind,
-                f"the {kind} is off in waves {where} rather than by noise ({noise.sigma_px:.2f} px rms, as good as one "
-                f"independent value in {noise.together:.0f} {values}): check {check}",
+                f"the {kind} has systematic deviations {where} beyond noise ({noise.sigma_px:.2f} px rms, equivalent "
+                f"to one independent value in {noise.together:.0f} {values}): check {check}",
             )
 
 
-def much_left_out(result: Estimate) -> dict[str, float]:
-    """The share that was left out as outliers, of the kinds of residuals of which that is much."""
+def find_excess_outliers(result: Estimate) -> dict[str, float]:
+    """Return the fraction of outliers for kinds of residuals with too many."""
     found = {}
     for kind, noise in result.noise.items():
         parts = [part for parts in result.residuals for part in parts if part.kind == kind]
@@ -457,8 +458,8 @@ def much_left_out(result: Estimate) -> dict[str, float]:
     return found
 
 
-def _some(found: Iterable[str]) -> list[str]:
-    """The first of findings that are alike, and the number of the others."""
+def _shorten_list(found: Iterable[str]) -> list[str]:
+    """Shorten a list of similar messages."""
     every = list(found)
     more = len(every) - _MOST_NAMED
     return every[:_MOST_NAMED] + ([f"and {more} more images"] if more > 0 else [])

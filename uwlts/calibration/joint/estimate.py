@@ -1,4 +1,4 @@
-"""The joint least squares: all evidence and prior knowledge, weighted by the scatter and noise of the residuals."""
+"""Joint least-squares estimate from all evidence and prior knowledge, weighted by the noise of the residuals."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -19,11 +19,11 @@ Evidence = TargetEvidence | StepProfileEvidence | SurfaceScanEvidence
 
 @dataclass(frozen=True)
 class Noise:
-    """Scatter of one kind of residual: ``sigma_px``, the standard deviation of one, without outliers.
+    """Noise of one kind of residual; ``sigma_px`` is the standard deviation of a residual without outliers.
 
-    ``together`` is the variance of a mean of many over that of as many independent ones, as neighbours along a stripe
-    and images of the same point of the target err together; ``besides`` adds to that for errors that do not show, and
-    for what the model lacks.
+    ``together`` is the variance of a mean of many residuals relative to independent ones: errors of neighbours along a
+    stripe, or of a target point in several images, are correlated. ``besides`` is added to it for errors that residuals
+    do not show, and for an incomplete model.
     """
 
     sigma_px: float
@@ -31,38 +31,38 @@ class Noise:
     besides: float = 0.0
 
     def effective_px(self) -> float:
-        """Standard deviation of independent residuals that would say as little."""
+        """Return the standard deviation of independent residuals with the same information."""
         return self.sigma_px * float(np.sqrt(self.together + self.besides))
 
 
 _FIRST = {TARGET: Noise(0.1), STRIPE: Noise(0.3), STEP: Noise(0.3), **dict.fromkeys(SCANNED, Noise(0.3))}
-_SOFT_LIMIT = 3.0  # standard deviations; outliers of the first round, not known yet, count linearly
-_ROUNDS = 10  # of weights and corrections; a few settle, unless parts of the evidence contradict each other
-_SETTLED = 0.02  # relative change of a scatter: as the standard uncertainty of that of a thousand values
+_SOFT_LIMIT = 3.0  # standard deviations; larger residuals count linearly in the first round
+_ROUNDS = 10  # of weights and corrections; a few suffice, unless parts of the evidence contradict each other
+_SETTLED = 0.02  # relative change of a scatter: the standard uncertainty of the scatter of a thousand values
 UNSETTLED = "the residuals' scatter changes from round to round"
-_SETTLED_PX = 1e-3  # of a corrected centre, as `_FINEST_PX` of the noise
+_SETTLED_PX = 1e-3  # change of a corrected centre, as `_FINEST_PX` for the noise
 _SMALLEST_GAIN = 1e-7
-"""Share of the cost, which is the number of residuals: a step that gains so little moves the parameters by a tenth of
-their uncertainty, and what is left after it is far less."""
-_FIRST_GAIN = 1e-3  # the same in the first round, whose result is but a start for the next
-_DAMPING = 1e-9  # of the first step near the solution
-_FIRST_DAMPING = 1e-4  # of the first step from the start
-_FIRST_LINES = slice(None, None, 4)  # of the stripes on targets in the first round: good enough for a start, and fast
-_FIRST_ROUNDS = 30  # then outliers are left out and the rest is solved to its end
-_OUTLIER = 5.0  # standard deviations; of a million normal values one is farther
-_LAGS = 100  # lines; filters and speckle join a few, wrong models some tens
-_SHARED_LAG = 0.05  # correlation that some thousand pairs no longer separate from none, by three standard errors
-_FEWEST_POINTS = 25  # of an image, for its ten smooth functions
-_FINEST_PX = 1e-3  # no point of an image counts as better known: what is known before would count for nothing
+"""Smallest gain of a step, relative to the number of residuals: it changes parameters by a tenth of their uncertainty.
+"""
+_FIRST_GAIN = 1e-3  # the same in the first round, whose result is only the next start
+_DAMPING = 1e-9  # for the first step near the solution
+_FIRST_DAMPING = 1e-4  # for the first step from the start
+_FIRST_LINES = slice(None, None, 4)  # stripe pixels on targets in the first round: enough for a start, and fast
+_FIRST_ROUNDS = 30  # then outliers are rejected and the rest is solved to convergence
+_OUTLIER = 5.0  # standard deviations; of a million normal values, one is larger
+_LAGS = 100  # lines; filters and speckle correlate a few, wrong models some tens
+_SHARED_LAG = 0.05  # correlation that some thousand pairs can distinguish from zero by three standard errors
+_FEWEST_POINTS = 25  # points of an image, for its ten smooth functions
+_FINEST_PX = 1e-3  # smallest noise of an image point: a smaller one would make prior knowledge irrelevant
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The global parameters, ``values`` (P,) with their ``covariance`` (P, P), and what the evidence says of them.
+    """Global parameters ``values`` (P,) with ``covariance`` (P, P), and the residuals of the evidence.
 
-    ``local``, (b,) each, with ``local_covariances``, (b, b) each, and ``residuals``, outliers included, are those of
-    every piece of evidence, ``noise`` that of every kind of residual; ``outliers`` is the number left out, ``rounds``
-    that of all least squares together.
+    ``local`` (b,) with ``local_covariances`` (b, b) and ``residuals`` (with outliers) are those of every piece of
+    evidence. ``noise`` is that of every kind of residual, ``outliers`` the number of rejected residuals. ``rounds``
+    counts all least-squares iterations.
     """
 
     parameters: Parameters
@@ -77,7 +77,7 @@ class Estimate:
     stopped: str
 
     def std(self) -> dict[ParameterKey, float]:
-        """Standard uncertainty of every parameter."""
+        """Return the standard uncertainty of every parameter."""
         return dict(zip(self.parameters.keys, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
 
@@ -91,15 +91,27 @@ def estimate(
     diameter_mm: float | None = None,
     misfits: Collection[str] = (),
 ) -> Estimate:
-    """Least squares over all evidence, repeated until weights and corrections agree with the solution.
+    """Solve least squares over all evidence, repeated until weights and corrections are consistent with the solution.
 
-    At first large residuals count linearly; then outliers, beyond five standard deviations, are left out. The start is
-    ``global_values`` (P,) and ``local``, (b,) of every piece of evidence. With ``diameter_mm`` of the target's circles
-    the offsets of their images' centres are taken out. Of kinds of residuals among ``misfits`` the model is known to
-    lack something: all residuals of an image count as one.
+    At first, large residuals count linearly; then outliers beyond five standard deviations are rejected.
 
-    Raises CalibrationError: the start has no meaning, the evidence does not determine the parameters, or corrections do
-    not settle.
+    Parameters
+    ----------
+    parameters, evidence
+        Global parameters with prior knowledge, and pieces of evidence.
+    global_values, local
+        Start values: (P,), and (b,) for every piece of evidence.
+    uncertainty
+        Stated uncertainties of the sensor, for prior knowledge of local parameters.
+    diameter_mm
+        Diameter of the target's circles, to correct the offsets of their images' centres. None: no correction.
+    misfits
+        Kinds of residuals with an incomplete model: all residuals of an image then count as one.
+
+    Raises
+    ------
+    CalibrationError
+        The start is invalid, the evidence does not determine the parameters, or corrections do not converge.
     """
     found, local, rounds, known = list(evidence), list(local), 0, dict(_FIRST)
     left_out: list[list[np.ndarray]] | None = None
@@ -112,15 +124,17 @@ def estimate(
         residuals = []
         for piece, values in zip(evidence, local, strict=True):
             if (parts := piece.residuals(parameters, global_values, values)) is None:
-                raise CalibrationError("the joint calibration diverged: a ray that was seen meets no sheet or target")
+                raise CalibrationError(
+                    "the joint calibration diverged: an observed ray does not meet the sheet or target"
+                )
             residuals.append(parts)
-        before, known = known, _noise(evidence, residuals, misfits)
+        before, known = known, _estimate_all_noise(evidence, residuals, misfits)
         left_out = [[outliers(r, known[r.kind]) for r in parts] for parts in residuals]
         used, evidence = evidence, []
         for piece, values, parts, masks in zip(found, local, residuals, left_out, strict=True):
             if diameter_mm is not None and isinstance(piece, TargetEvidence):
                 piece = piece.with_centres(parameters, global_values, values, diameter_mm)
-            evidence.append(piece.linearised(parts, [~mask for mask in masks]))
+            evidence.append(piece.linearise(parts, [~mask for mask in masks]))
         changes = [
             float(np.abs(a.placement.pixels - b.placement.pixels).max())
             for a, b in zip(used, evidence, strict=True)
@@ -142,8 +156,8 @@ def estimate(
                 stopped=fit.stopped if steady else UNSETTLED,
             )
     raise CalibrationError(
-        f"the joint calibration did not settle in {_ROUNDS} rounds: the offsets of the circles' images still move by "
-        f"{moved:.2g} px; is the circles' diameter right?"
+        f"the joint calibration did not converge in {_ROUNDS} rounds: the offsets of the circles' images still change "
+        f"by {moved:.2g} px; check the diameter of the circles"
     )
 
 
@@ -156,11 +170,11 @@ def _fit(
     noise: dict[str, Noise],
     left_out: list[list[np.ndarray]] | None,
 ) -> SchurFit:
-    """Every piece of evidence as a group with local parameters; the last group is what is known before."""
+    """Solve with every piece of evidence as a group with local parameters; the last group is prior knowledge."""
 
     def model(group: int, global_values: np.ndarray, local: np.ndarray) -> list[Observation] | None:
         if group == len(evidence):
-            return _known_before(parameters, global_values)
+            return _prior_observations(parameters, global_values)
         piece = evidence[group]
         parts = piece.residuals(parameters, global_values, local)
         if parts is None:
@@ -181,8 +195,8 @@ def _fit(
     return schur_least_squares(model, global_values, starts, **first, enough_rounds=_FIRST_ROUNDS)
 
 
-def _known_before(parameters: Parameters, global_values: np.ndarray) -> list[Observation]:
-    """Prior knowledge: of each parameter by itself, and of many at once by an earlier estimate."""
+def _prior_observations(parameters: Parameters, global_values: np.ndarray) -> list[Observation]:
+    """Return prior knowledge: of single parameters, and of many jointly from an earlier estimate."""
     std = parameters.prior_std()
     known = np.isfinite(std)
     found = [((global_values - parameters.prior_mean())[known] / std[known], np.diag(1.0 / std)[known])]
@@ -191,26 +205,26 @@ def _known_before(parameters: Parameters, global_values: np.ndarray) -> list[Obs
     return [Observation(off[:, None], by_global, np.empty((len(off), 0))) for off, by_global in found]
 
 
-def _noise(
+def _estimate_all_noise(
     evidence: Sequence[Evidence], residuals: list[list[Residuals]], misfits: Collection[str]
 ) -> dict[str, Noise]:
     result = {}
     for kind in dict.fromkeys(r.kind for parts in residuals for r in parts):
         points = [e.placement.points_mm for e in evidence if kind == TARGET and isinstance(e, TargetEvidence)]
         of_kind = [r for parts in residuals for r in parts if r.kind == kind]
-        result[kind] = judged(kind, of_kind, points)
+        result[kind] = estimate_noise(kind, of_kind, points)
         if kind in SCANNED:
             scans = [e for e in evidence if isinstance(e, SurfaceScanEvidence) and e.surface.kind == kind]
             common_px, bodies = np.concatenate([e.common_px for e in scans]), sum(e.surface.count for e in scans)
-            result[kind] = with_common_error(result[kind], common_px, bodies=bodies)
+            result[kind] = add_common_error(result[kind], common_px, bodies=bodies)
         if kind in misfits:
             per_image = float(np.mean([len(r.values) for r in of_kind]))
-            result[kind] = with_misfit(result[kind], per_image=per_image)
+            result[kind] = add_misfit(result[kind], per_image=per_image)
     return result
 
 
 def outliers(residuals: Residuals, noise: Noise) -> np.ndarray:
-    """Which residuals (n,) are too large to be noise; of the target's points both coordinates."""
+    """Return which residuals (n,) are outliers; for target points, both coordinates together."""
     large = np.asarray(np.abs(residuals.values) > _OUTLIER * noise.sigma_px)
     if residuals.kind == TARGET:
         large = np.repeat(np.any(large.reshape(-1, 2), axis=1), 2)
@@ -218,12 +232,12 @@ def outliers(residuals: Residuals, noise: Noise) -> np.ndarray:
 
 
 def outlier_limit(values: np.ndarray) -> float:
-    """Size beyond which values are outliers: five standard deviations, by a median that half of them leave as it is."""
+    """Return the absolute value beyond which values are outliers: five robust standard deviations."""
     return _OUTLIER * MAD_TO_STD * float(np.median(np.abs(values)))
 
 
-def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarray]) -> Noise:
-    """Scatter of all residuals of a kind; ``points`` (N, 3) of each placement are the target's, for that kind."""
+def estimate_noise(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarray]) -> Noise:
+    """Estimate the noise of all residuals of a kind; ``points`` (N, 3) of each placement are used for target points."""
     values = np.concatenate([r.values for r in residuals])
     limit = outlier_limit(values)
     kept = np.abs(values) <= limit
@@ -232,25 +246,27 @@ def judged(kind: str, residuals: Sequence[Residuals], points: Sequence[np.ndarra
         return Noise(_FINEST_PX)
     if kind == TARGET:
         places = np.vstack(points)[:, :2]
-        together = max(_of_points(values, places, kept, sigma), _of_images(residuals, places, sigma))
+        together = max(
+            _point_variance_factor(values, places, kept, sigma), _image_variance_factor(residuals, places, sigma)
+        )
     else:
-        together = _of_neighbours(residuals, sigma)
+        together = _neighbour_variance_factor(residuals, sigma)
     return Noise(sigma, max(together, 1.0))
 
 
-def with_common_error(noise: Noise, common_px: np.ndarray, *, bodies: float) -> Noise:
-    """Noise on scanned bodies, all points of which share an error of the standard uncertainties ``common_px`` (N,)."""
+def add_common_error(noise: Noise, common_px: np.ndarray, *, bodies: float) -> Noise:
+    """Add a common error of all points of a scanned body, with standard uncertainties ``common_px`` (N,)."""
     points_per_body, common = len(common_px) / bodies, float(np.mean(common_px**2))
     return Noise(noise.sigma_px, noise.together, points_per_body * common / noise.sigma_px**2)
 
 
-def with_misfit(noise: Noise, *, per_image: float) -> Noise:
-    """Noise of residuals whose model lacks something: the ``per_image`` residuals of an image say as much as one."""
+def add_misfit(noise: Noise, *, per_image: float) -> Noise:
+    """Return the noise with an incomplete model: the ``per_image`` residuals of an image count as one."""
     return replace(noise, besides=noise.besides + max(per_image - noise.together, 0.0))
 
 
-def _of_points(values: np.ndarray, places: np.ndarray, kept: np.ndarray, sigma: float) -> float:
-    """By how much residuals of the same point in several images share their error."""
+def _point_variance_factor(values: np.ndarray, places: np.ndarray, kept: np.ndarray, sigma: float) -> float:
+    """Return the variance factor of residuals of the same point in several images, from their correlation."""
     _, point = np.unique(np.round(places, 6), axis=0, return_inverse=True)
     pairs, kept = values.reshape(-1, 2), np.all(kept.reshape(-1, 2), axis=1)
     number = np.bincount(point[kept], minlength=point.max() + 1)
@@ -258,15 +274,15 @@ def _of_points(values: np.ndarray, places: np.ndarray, kept: np.ndarray, sigma: 
     if not often.any():
         return 1.0
     sums = np.stack([np.bincount(point[kept], pairs[kept, axis], len(number)) for axis in (0, 1)])
-    # n times the variance of the mean of n, over the variance of one.
+    # n times the variance of the mean of n, divided by the variance of one
     return float(np.mean(sums[:, often] ** 2 / number[often])) / sigma**2
 
 
-def _of_images(residuals: Sequence[Residuals], places: np.ndarray, sigma: float) -> float:
-    """By how much residuals vary smoothly across an image, as those of a wrong lens or a bent target do.
+def _image_variance_factor(residuals: Sequence[Residuals], places: np.ndarray, sigma: float) -> float:
+    """Return the variance factor of residuals that vary smoothly across an image, as with a wrong lens or bent target.
 
-    Independent ones have the variance sigma^2 along each of orthonormal functions of the place; here all products of
-    powers up to the third order. The median of the images counts: a single one that does not fit is another matter.
+    Independent residuals have the variance sigma^2 along each orthonormal function of the position; here all products
+    of powers up to third order. The median over the images excludes single images that do not fit.
     """
     found = []
     ends = np.cumsum([len(part.values) // 2 for part in residuals])
@@ -282,8 +298,8 @@ def _of_images(residuals: Sequence[Residuals], places: np.ndarray, sigma: float)
     return float(np.median(found)) if found else 1.0
 
 
-def _of_neighbours(residuals: Sequence[Residuals], sigma: float) -> float:
-    """1 + 2 sum of the autocorrelation along the stripe, up to where it fades, over all images."""
+def _neighbour_variance_factor(residuals: Sequence[Residuals], sigma: float) -> float:
+    """Return the variance factor 1 + 2 sum of the autocorrelation along the stripe, over all images."""
     products, counts = np.zeros(_LAGS), np.zeros(_LAGS)
     for part in residuals:
         kept = (np.abs(part.values) <= _OUTLIER * sigma).astype(np.float64)

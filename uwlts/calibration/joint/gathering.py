@@ -1,4 +1,4 @@
-"""Evidence of captures and prior knowledge from descriptions, as the joint calibration needs them."""
+"""Collection of evidence from captures, and of prior knowledge from descriptions, for the joint calibration."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +8,13 @@ from pydantic import JsonValue
 
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.target_images import Placement, placements
-from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence, air_evidence, no_stripe_in, step_evidence
+from uwlts.calibration.capture_evidence import (
+    AirEvidence,
+    StepEvidence,
+    air_evidence,
+    explain_missing_stripe,
+    step_evidence,
+)
 from uwlts.calibration.joint.parameters import SHEET, Prior, ViewMedium, window_values
 from uwlts.calibration.joint.residuals import BENDS, SHIFT, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import SLOPES
@@ -30,17 +36,17 @@ from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture
 from uwlts.stripe import StripeSettings, find_stripes
 
-_FEWEST_KEPT = 3  # images that are left where some contradict the others
-_MOST_LEFT_OUT = 0.3  # share of the images: where more contradict the rest, it is not clear which are right
+_FEWEST_KEPT = 3  # images that must remain if some are rejected
+_MOST_LEFT_OUT = 0.3  # fraction of the images: if more contradict the rest, it is unclear which are right
 Scanned = SphereStandard | PlaneStandard | PipeStandard
 
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """Images of the target seen through the same, in captures of these names.
+    """Images of the target through the same window and medium, from captures with these names.
 
-    ``approaching`` says whether the stage moves the sensor towards the target; None where it moves otherwise.
-    ``directions`` (3,) are those of the captures' stages, OCS.
+    ``approaching`` says whether the stage moves the sensor towards the target; None if it moves in another direction.
+    ``directions`` (3,) are the stage directions of the captures, OCS.
     """
 
     view: ViewMedium
@@ -50,20 +56,20 @@ class Series:
     directions: Sequence[tuple[float, float, float]] = ()
 
     def placements(self, *, free: bool) -> list[Placement]:
-        """The images joined by the stage's motion, or one by one."""
+        """Return placements: images joined by the stage's motion, or single images if ``free``."""
         return placements(self.found.images, approaching=None if free else self.approaching)
 
     def sources(self, images: np.ndarray) -> dict[int, str]:
-        """Capture and frame of images by their numbers."""
+        """Return capture and frame for each image number."""
         frames = {int(image): self.found.frames[image] for image in images}
         return {image: f"{self.names[capture]}, frame {frame}" for image, (capture, frame) in frames.items()}
 
 
 @dataclass(frozen=True, eq=False)
 class ScanStripes:
-    """The stripe centres (N,) of a scan, the stage's positions (F,), and what is known of what was scanned.
+    """Stripe centres (N,) of a scan, the stage's positions (F,), and the described object.
 
-    ``blur_px`` (N,) is by how much blur may move them, ``slopes`` (N,) are those of the brightness
+    ``blur_px`` (N,) is the possible shift by blur, ``slopes`` (N,) are those of the brightness
     (`uwlts.optics.brightness`).
     """
 
@@ -80,14 +86,14 @@ class ScanStripes:
     view: ViewMedium
 
     def image_names(self) -> list[str]:
-        """Capture and place of each of the F images."""
+        """Return capture and stage position of each of the F images."""
         return [f"{self.source}, at {position:g} mm" for position in self.stage_mm]
 
     def without(self, sources: Collection[str]) -> "ScanStripes | None":
-        """The same without the images of these names; None where too many would go."""
+        """Remove images by name; return None if too few would remain."""
         left_out = np.array([name in sources for name in self.image_names()])
         seen = np.unique(self.frame)
-        if not _enough(int(np.sum(~left_out[seen])), len(seen)):
+        if not _remain_enough(int(np.sum(~left_out[seen])), len(seen)):
             return None
         kept, lines = ~left_out[self.frame], ("frame", "line", "centre_px", "width_px", "blur_px", "slopes")
         return replace(self, **{name: getattr(self, name)[kept] for name in lines})
@@ -95,10 +101,10 @@ class ScanStripes:
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """All that the captures show.
+    """Evidence from all captures.
 
-    ``sensor`` is as the first capture describes it, with the window as mounted in the medium of use; ``media`` are
-    those other than air by their names, ``series`` the target images by what they were seen through.
+    ``sensor`` is described by the first capture, with the window as mounted in the medium of use. ``media`` maps names
+    to media other than air. ``series`` are the target images for each window state and medium.
     """
 
     sensor: Sensor
@@ -110,25 +116,25 @@ class Gathered:
     warnings: list[str]
 
     def views(self) -> list[ViewMedium]:
-        """Through what each series of target images, each step image and each scan was seen."""
+        """Return window state and medium of each series of target images, each scan and each step image."""
         return [s.view for s in [*self.series, *self.scans]] + [view for _, view in self.steps]
 
     def without(self, sources: Collection[str]) -> "Gathered | None":
-        """The same without the images of these names; None where too many of a series, the steps or a scan would go."""
+        """Remove images by name; return None if too few of a series, the steps or a scan would remain."""
         series = []
         for each in self.series:
             kept = [n for n, name in each.sources(np.arange(len(each.found.images))).items() if name not in sources]
-            if not _enough(len(kept), len(each.found.images)):
+            if not _remain_enough(len(kept), len(each.found.images)):
                 return None
             series.append(replace(each, found=each.found.only(np.array(kept), [each.found.images[n] for n in kept])))
         steps = [(step, view) for step, view in self.steps if step.source not in sources]
         scans = [kept for scan in self.scans if (kept := scan.without(sources)) is not None]
-        if not _enough(len(steps), len(self.steps)) or len(scans) < len(self.scans):
+        if not _remain_enough(len(steps), len(self.steps)) or len(scans) < len(self.scans):
             return None
         return replace(self, series=series, steps=steps, scans=scans)
 
     def indices(self, options: CalibrationOptions) -> list[float]:
-        """Refractive indices of the media, as described or as the options give them."""
+        """Return the refractive indices of the media, as described or as given in the options."""
         wavelength = self.sensor.laser.wavelength_nm
         return [options.medium_index or medium.refractive_index(wavelength) for medium in self.media.values()]
 
@@ -141,18 +147,23 @@ def gather_jointly(
     options: CalibrationOptions,
     progress: ProgressListener = unheard,
 ) -> Gathered:
-    """Find the target, the stripes on it and those on steps and scanned surfaces in all images.
+    """Find the target, the stripes on it, and the stripes on steps and scanned surfaces in all images.
 
-    Raises CalibrationError: the captures come from different sensors, show no target or several, mean different media
-    by one name, or one is given twice, so that its noise would count as two independent ones; no step image shows a
-    stripe, or a scan carries poses. DescriptionError: a capture describes its target wrongly, or not its step standard
-    or what it scans. CaptureError: a scan shows no stripe, or an image is damaged.
+    Raises
+    ------
+    CalibrationError
+        The captures are from different sensors, show no target or several targets, or use one name for different media;
+        a capture is given twice (its noise would count twice); no step image shows a stripe; a scan contains poses.
+    DescriptionError
+        A capture does not describe its target, step standard or scanned object correctly.
+    CaptureError
+        A scan shows no stripe, or an image is damaged.
     """
     sensor, provenance = common_sensor([*targets, *steps, *scans]), sources_of(targets, steps, scans)
     media: dict[str, Medium] = {}
     views: dict[ViewMedium, list[Capture]] = {}
     for capture in targets:
-        views.setdefault(_view(capture, media), []).append(capture)
+        views.setdefault(_identify_view(capture, media), []).append(capture)
     series, on_steps, on_scans, warnings = [], [], [], []
     for view, captures in views.items():
         found = air_evidence(captures, stripe=options.stripe, progress=progress)
@@ -160,33 +171,39 @@ def gather_jointly(
         directions = [capture.header.stage_direction for capture in captures]
         series.append(Series(view, found, _approaching(captures), [c.path.name for c in captures], directions))
     for capture in steps:
-        view, index = _view(capture, media), options.medium_index
+        view, index = _identify_view(capture, media), options.medium_index
         found_steps, left_out = step_evidence([capture], medium_index=index, stripe=options.stripe, progress=progress)
         on_steps += [(step, view) for step in found_steps]
         warnings += left_out
     if steps and not on_steps:
-        raise CalibrationError(no_stripe_in(steps))
+        raise CalibrationError(explain_missing_stripe(steps))
     for capture in scans:
         name = capture.header.medium_name if options.same_water else f"{capture.header.medium_name} of the scans"
-        on_scans.append(scan_stripes(capture, _view(capture, media, name), stripe=options.stripe))
+        on_scans.append(scan_stripes(capture, _identify_view(capture, media, name), stripe=options.stripe))
     seen = [capture.header.sensor for capture in [*steps, *targets, *scans]]
     sensor = next((each for each in seen if each.camera.window.mounted), sensor)
     return Gathered(sensor, media, series, on_steps, on_scans, provenance, warnings)
 
 
-def _enough(kept: int, images: int) -> bool:
+def _remain_enough(kept: int, images: int) -> bool:
     return kept == images or (kept >= _FEWEST_KEPT and images - kept <= _MOST_LEFT_OUT * images)
 
 
 def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeSettings) -> ScanStripes:
     """Find the stripes of a scan.
 
-    Raises DescriptionError: the capture does not describe spheres, a plane or a pipe. CaptureError: no image shows a
-    stripe. CalibrationError: the images carry poses of their own.
+    Raises
+    ------
+    DescriptionError
+        The capture does not describe spheres, a plane or a pipe.
+    CaptureError
+        No image shows a stripe.
+    CalibrationError
+        The images contain poses.
     """
-    wanted = "a scan to calibrate from shows spheres, a plane or a pipe, described as its artefact"
+    wanted = "a scan for calibration must describe spheres, a plane or a pipe as its artefact"
     if capture.header.artefact is None:
-        raise DescriptionError(f"{capture.path.name} does not say what it shows: {wanted}")
+        raise DescriptionError(f"{capture.path.name} does not describe what it shows: {wanted}")
     try:
         artefact = parse_artefact(capture.header.artefact)
     except EvaluationError as error:
@@ -195,8 +212,8 @@ def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeSettings) 
         raise DescriptionError(f"{capture.path.name} shows a {artefact.kind}: {wanted}")
     if np.isfinite(capture.pose).any():
         raise CalibrationError(
-            f"the images of {capture.path.name} carry poses: in a scan to calibrate from the stage alone moves the "
-            "sensor, take one without poses"
+            f"{capture.path.name} contains poses. Scans for calibration must be moved by the stage only: use a capture "
+            "without poses"
         )
     found = find_stripes(capture, options=stripe)
     sharp, blur = sharp_lines(found)
@@ -217,34 +234,35 @@ def scan_stripes(capture: Capture, view: ViewMedium, *, stripe: StripeSettings) 
     )
 
 
-def _view(capture: Capture, media: dict[str, Medium], name: str | None = None) -> ViewMedium:
-    """Through what a capture was taken; ``name`` is the medium's own unless given."""
+def _identify_view(capture: Capture, media: dict[str, Medium], name: str | None = None) -> ViewMedium:
+    """Return window state and medium of a capture; ``name`` replaces the medium's name."""
     header = capture.header
     window = header.sensor.camera.window.mounted
     if header.medium.kind == "air":
         return ViewMedium(window, None)
     name = name or header.medium_name
     if media.setdefault(name, header.medium) != header.medium:
-        raise CalibrationError(f"the captures mean different media by '{name}': {media[name]} and {header.medium}")
+        raise CalibrationError(f"the captures use '{name}' for different media: {media[name]} and {header.medium}")
     return ViewMedium(window, list(media).index(name))
 
 
 def _approaching(captures: Sequence[Capture]) -> bool | None:
-    """Whether the stage moves the sensor towards the target; None where it does not move along the OCS's Z."""
+    """Return whether the stage moves the sensor towards the target; None if it does not move along the OCS's Z."""
     along = {float(capture.header.stage_direction[2]) for capture in captures}
     return min(along) > 0 if min(map(abs, along)) >= 0.9 and min(along) * max(along) > 0 else None
 
 
-def priors_of(
+def build_priors(
     gathered: Gathered,
     window: WindowModel | None,
     turns: np.ndarray,
     heights: dict[StepHeight, Prior],
     options: CalibrationOptions,
 ) -> dict[ParameterKey, Prior]:
-    """Prior knowledge of all global parameters but those of the lens that only the evidence tells.
+    """Return priors of all global parameters except lens parameters without prior knowledge.
 
-    ``window`` is as described; the sheet's turns and shift start at ``turns`` (3,); ``heights`` are of step standards.
+    ``window`` is as described; ``turns`` (3,) are the start values of the sheet's rotations and shift; ``heights`` are
+    those of step standards.
     """
     sensor, known = gathered.sensor, gathered.sensor.uncertainty
     priors: dict[ParameterKey, Prior] = {}
@@ -270,11 +288,11 @@ def priors_of(
         priors |= dict.fromkeys(BENDS, Prior(0.0, known.target_bow_mm))
         priors |= dict.fromkeys(STRETCH, Prior(0.0, known.target_stretch))
         priors[SHIFT] = Prior(0.0, known.target_stripe_px)
-        priors |= dict.fromkeys(added_tangential(options.camera, known), Prior(0.0, known.tangential))
+        priors |= dict.fromkeys(list_added_tangential(options.camera, known), Prior(0.0, known.tangential))
     return priors | heights
 
 
-def added_tangential(camera: CameraOptions, known: Uncertainty) -> tuple[LensParameter, ...]:
-    """Tangential distortions that are estimated though not asked for, from what is known of them before."""
+def list_added_tangential(camera: CameraOptions, known: Uncertainty) -> tuple[LensParameter, ...]:
+    """Return tangential distortion parameters that are estimated, with prior knowledge, although not requested."""
     asked = {"p1", "p2"} & {*camera.distortion} or known.tangential == 0
     return () if asked else (LensParameter.P1, LensParameter.P2)

@@ -10,7 +10,7 @@ import numpy as np
 from uwlts.calibration.camera.camera_parameters import DISTORTION, Intrinsics
 from uwlts.calibration.camera.target_images import Placement
 from uwlts.calibration.camera.target_poses import placement_pose, refuse_turned_travel, solve_camera, stage_direction
-from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series, added_tangential
+from uwlts.calibration.joint.gathering import Gathered, Scanned, ScanStripes, Series, list_added_tangential
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.residuals import StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import (
@@ -40,19 +40,20 @@ from uwlts.optics.camera import directions
 from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.optics.window import trace_window
 
-_LARGEST_MISFIT_PX = 1.5  # median miss of the images that a start is found from: what the stage's errors leave in them
-_LARGEST_MISFIT = 1e-3  # the same as a share of the focal length, for images of many pixels; the larger of both counts
+_LARGEST_MISFIT_PX = 1.5  # largest median residual of the images that a start is found from, caused by stage errors
+_LARGEST_MISFIT = 1e-3  # the same divided by the focal length, for high-resolution images; the larger limit applies
 _LARGEST_REJECTED = 0.45
-"""Share of the stripe points beside the start's sheet: as robust as a median can be, as all are judged again."""
-_MOST_POINTS = 2000  # points of a scan: more add little, as neighbours err together
-_FEWEST_POINTS = 100  # points of an image of a scan, before thinning: with fewer it shows the rim of a body
+"""Largest fraction of stripe points off the start's sheet: the limit of a median; inliers are selected again later.
+"""
+_MOST_POINTS = 2000  # points of a scan: more add little, as errors of neighbours are correlated
+_FEWEST_POINTS = 100  # points of an image of a scan, before thinning: with fewer, it shows the rim of a body
 _STEEPEST = 0.3
-"""Slope of the brightness, per mm of the stage, beyond which the place that the light comes from is uncertain."""
+"""Relative brightness slope per mm of the stage above which the origin of the light is uncertain."""
 
 
 @dataclass(frozen=True, eq=False)
 class SeriesStart:
-    """Start of lens (L,) and of all placements' local parameters, with the stripes that lie on the target.
+    """Start values of the lens (L,) and of all placements' local parameters, with the stripes on the target.
 
     Sensor, window and the ``indices`` of the media are as described.
     """
@@ -66,7 +67,7 @@ class SeriesStart:
     local: list[np.ndarray]
 
     def calibration(self, sheet: SheetModel) -> Calibration:
-        """A calibration of the start, good enough to separate the faces of a step."""
+        """Return a calibration from the start values, accurate enough to separate the faces of a step."""
         frame = object_frame(sheet, laser_axis=laser_pose(self.sensor).axis)
         return Calibration(
             sensor_name=self.sensor.name,
@@ -79,10 +80,14 @@ class SeriesStart:
         )
 
     def sheet(self) -> tuple[DescribedSheet, np.ndarray] | None:
-        """The sheet as described, and turns and shift (3,) to the plane through the stripes.
+        """Return the described sheet, and rotations and shift (3,) to the plane through the stripes.
 
-        Those count that the window disturbs least; None where no stripe falls on the target. Raises CalibrationError:
-        the stripes do not lie on a plane, or do not determine one.
+        Only stripes with the least influence of the window are used; None if no stripe is on the target.
+
+        Raises
+        ------
+        CalibrationError
+            The stripes are not on a plane, or do not determine one.
         """
         views = {e.view for e in self.evidence if len(e.pixels)}
         if not views:
@@ -110,7 +115,7 @@ class SeriesStart:
         return described, np.array([*turns, sheet.offset_mm - normal @ middle])
 
 
-def series_start(
+def estimate_series_start(
     series: Sequence[Series],
     sensor: Sensor,
     window: WindowModel | None,
@@ -118,17 +123,20 @@ def series_start(
     *,
     options: CalibrationOptions,
 ) -> SeriesStart:
-    """Camera from the series that the window disturbs least, poses of all series, stripes that fall on the target.
+    """Estimate the camera from the series with the least influence of the window, then all poses and stripes.
 
-    Seen paraxially through the window, a pane d away from the pupil, t thick, of the index g, the medium of the index n
-    looks as if a pinhole of n times the focal length stood at d + t - n (d + t / g) on the axis.
+    The window has the distance d, thickness t and index g; the medium has the index n. In the paraxial approximation,
+    they act like a pinhole at d + t - n (d + t / g) on the axis, with n times the focal length.
 
-    Raises CalibrationError: a camera without a window in air does not explain the images by and large, or they are
-    turned or mirrored against the stage.
+    Raises
+    ------
+    CalibrationError
+        A camera without a window in air does not approximately fit the images, or they are rotated or mirrored against
+        the stage.
     """
     width_px, height_px, free = sensor.camera.width_px, sensor.camera.height_px, options.poses == "free"
     camera = options.camera.described(sensor.camera)
-    tangential = tuple(key.text for key in added_tangential(camera, sensor.uncertainty))
+    tangential = tuple(key.text for key in list_added_tangential(camera, sensor.uncertainty))
     extended = replace(camera, distortion=(*camera.distortion, *tangential))
     intrinsics = Intrinsics(extended, width_px=width_px, height_px=height_px)
     base = min(series, key=lambda s: (s.view.medium is not None, s.view.window, -len(s.found.images)))
@@ -146,12 +154,12 @@ def series_start(
     if base.view == ViewMedium(False, None) and not explained:
         image = int(np.argmax(rms))
         raise CalibrationError(
-            f"no camera explains the target images in air: {np.median(rms):.1f} px (rms) are left in most of them, and "
+            f"no camera fits the target images in air: the median residual is {np.median(rms):.1f} px (rms), and "
             f"{rms.max():.1f} px in {base.sources(np.array([image]))[image]}: check the target's spacing, the stage's "
-            "positions, and that all captures come from the same camera and medium"
+            "positions, and that all captures are from the same camera and medium"
         )
     lens = intrinsics.from_model(seen.model)
-    index = _index(base.view, indices)
+    index = _index_behind_window(base.view, indices)
     for place, name in enumerate(intrinsics.names):
         lens[place] /= index if name in ("f", "fx", "fy") else index**2 if name in DISTORTION else 1.0
     start = SeriesStart(sensor, window, indices, intrinsics, lens, [], [])
@@ -160,7 +168,7 @@ def series_start(
         staged = not free and part.approaching is not None
         for placement in part.placements(free=free):
             pose = seen_by.pose(placement)
-            piece = _evidence(part, placement, seen_by, pose, sensor, staged=staged)
+            piece = _build_target_evidence(part, placement, seen_by, pose, sensor, staged=staged)
             start.evidence.append(piece)
             start.local.append(np.append(pose, np.zeros(2 + len(piece.images()) if staged else 0)))
         if free:
@@ -169,7 +177,7 @@ def series_start(
 
 
 def _refuse_turned_images(series: Series, poses: Sequence[np.ndarray], sensor: Sensor) -> None:
-    """Refuse free poses (6,) of images in which the stage moves as in turned ones, against its described direction."""
+    """Raise an error if free poses (6,) imply a stage direction that fits rotated images only."""
     target_poses = np.tile(np.eye(4), (len(poses), 1, 1))
     target_poses[:, :3, 3] = [pose[3:6] for pose in poses]
     stage_mm, capture = (np.array([getattr(i, n) for i in series.found.images]) for n in ("stage_mm", "placement"))
@@ -180,22 +188,26 @@ def _refuse_turned_images(series: Series, poses: Sequence[np.ndarray], sensor: S
             refuse_turned_travel(travel, camera_from_object(sensor)[:3, :3] @ direction)
 
 
-def _index(view: ViewMedium, indices: Sequence[float]) -> float:
-    """Index behind the window; without one the lens itself looks into the medium, whatever it is."""
+def _index_behind_window(view: ViewMedium, indices: Sequence[float]) -> float:
+    """Return the index behind the window; without a window the lens model includes the medium."""
     return indices[view.medium] if view.window and view.medium is not None else 1.0
 
 
 class _Viewpoint:
-    """A camera with the window in its view and the index behind it."""
+    """Camera with the window in its view and the index behind it."""
 
     def __init__(self, camera: CameraModel, window: WindowModel | None, indices: Sequence[float], view: ViewMedium):
-        self._camera, self._window, self._index = camera, window if view.window else None, _index(view, indices)
+        self._camera, self._window, self._index = (
+            camera,
+            window if view.window else None,
+            _index_behind_window(view, indices),
+        )
 
     def pose(self, placement: Placement) -> np.ndarray:
-        """Rotation vector and shift (6,) of a placement, seen through the window as if from a single viewpoint."""
+        """Estimate rotation vector and shift (6,) of a placement; the window is approximated by a single viewpoint."""
         rays = directions(self._camera, placement.pixels)
         if not np.isfinite(rays).all():
-            raise CalibrationError("the distortion found first has no inverse where the target is seen: fix some of it")
+            raise CalibrationError("the initial distortion has no inverse at some target points: fix some coefficients")
         seen = replace(placement, pixels=rays[:, :2] / rays[:, 2:])
         pose, window = placement_pose(seen, np.diag([self._index, self._index, 1.0])), self._window
         if window is not None:
@@ -204,7 +216,7 @@ class _Viewpoint:
         return pose
 
     def on_target(self, pixels: np.ndarray, pose: np.ndarray, moved_mm: np.ndarray) -> np.ndarray:
-        """Points (N, 3) of the moved target where rays meet it, in its frame; NaN where one does not."""
+        """Intersect rays of pixels with the shifted target; return points (N, 3) in its frame, else NaN."""
         rays = trace_window(directions(self._camera, pixels), self._window, medium_index=self._index)
         rotation = cv2.Rodrigues(pose[:3])[0]
         start = (rays.origins - pose[3:6]) @ rotation + moved_mm
@@ -213,7 +225,7 @@ class _Viewpoint:
             return start - (start[:, 2] / along[:, 2])[:, None] * along
 
 
-def _evidence(
+def _build_target_evidence(
     series: Series, placement: Placement, seen_by: _Viewpoint, pose: np.ndarray, sensor: Sensor, *, staged: bool
 ) -> TargetEvidence:
     found, numbers = series.found, np.unique(placement.image)
@@ -237,12 +249,12 @@ def _evidence(
     return evidence.with_stripes(np.flatnonzero(on_target))
 
 
-def step_profiles(
+def build_step_evidence(
     gathered: Gathered, start: Calibration, window: WindowModel | None
 ) -> tuple[list[StepProfileEvidence], dict[StepHeight, Prior], list[str]]:
-    """Evidence of every step image and what is known of heights, by a calibration nearly as sought; warnings.
+    """Return evidence of every step image, priors of the heights, and warnings, from an approximate calibration.
 
-    Of a height is known what its certificate states, and how far the standard may be turned about the stripe.
+    The prior of a height includes its certificate and the possible rotation of the standard about the stripe.
     """
     transform, uncertainty = start.object_transform(), gathered.sensor.uncertainty
     found, heights = [], {}
@@ -270,22 +282,27 @@ def step_profiles(
     return found, heights, warnings
 
 
-def line_start(evidence: StepProfileEvidence, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
-    """The lower face's line (2,) at the parameters' start."""
+def estimate_line_start(evidence: StepProfileEvidence, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
+    """Return the lower face's line (2,) at the parameters' start."""
     points = evidence.on_sheet(parameters, global_values).points()
     if points is None:
-        raise CalibrationError("the stripe on a step meets no sheet at the calibration's start: check the window")
+        raise CalibrationError(
+            "the stripe on a step does not meet the sheet of the initial calibration: check the window"
+        )
     up = evidence.upward @ points.points - evidence.upper_mm(parameters, global_values)
     slope, offset = np.polyfit(evidence.along @ points.points, up, 1)
     return np.array([-slope, offset / np.hypot(1.0, slope)])
 
 
-def surface_scan(
+def build_scan_evidence(
     stripes: ScanStripes, start: Calibration, sensor: Sensor, *, medium_index: float, sizes_known: bool, image: int
 ) -> tuple[SurfaceScanEvidence, np.ndarray]:
-    """Evidence and the start of its local parameters, by a calibration nearly as sought.
+    """Return the evidence of a scan and the start of its local parameters, from an approximate calibration.
 
-    Raises EvaluationError: the points do not show what was scanned.
+    Raises
+    ------
+    EvaluationError
+        The points do not show the described object.
     """
     line, centre, direction = stripes.line, stripes.centre_px, stripes.stage_direction
     across = 1 if start.stripe_along == "width" else 0
@@ -301,19 +318,19 @@ def surface_scan(
     sheet = LitSheet.of(start, sensor, line, centre, medium_index=medium_index)
     beside = sheet.beside(stripes.width_px, stripes.slopes, stage_direction=tuple(direction.tolist()))
     points = on_sheet + beside
-    # At the rims few points are left, and those are doubtful, as are those where the brightness changes fast.
+    # Exclude rims, where few points are left and are unreliable, and fast changes of brightness.
     often = np.bincount(stripes.frame)[stripes.frame] >= _FEWEST_POINTS
     good = often & (np.abs(stripes.slopes) < _STEEPEST) & np.isfinite(points).all(axis=1)
     if not good.any():
-        raise EvaluationError(f"no image shows it on {_FEWEST_POINTS} profile lines, sharp and evenly bright")
+        raise EvaluationError(f"no image shows it on {_FEWEST_POINTS} sharp, evenly bright profile lines")
     there = np.flatnonzero(good)
     there = there[:: -(-len(there) // _MOST_POINTS)]
     transform = start.object_transform()
-    used, surface, local = _surface(stripes.artefact, points[there], transform, sizes_known=sizes_known)
+    used, surface, local = _fit_surface(stripes.artefact, points[there], transform, sizes_known=sizes_known)
     kept = there[used]
     frames, frame = np.unique(stripes.frame[kept], return_inverse=True)
     rotation, position_mm = transform[:3, :3], stripes.stage_mm[frames]
-    # What light from beside the sheet moves the points by, as pixels across the stripe.
+    # Shift of the points by light from beside the sheet, as pixels across the stripe.
     per_px = reconstructed(pixels[kept] + np.eye(2)[across], stage_mm[kept]) - on_sheet[kept]
     outward = surface.distances(rotation @ points[kept].T + transform[:3, 3:], local).outward.T @ rotation
     least = LEAST_SHARE * np.linalg.norm(per_px, axis=1)
@@ -335,21 +352,24 @@ def surface_scan(
     return evidence, np.append(local, np.zeros(len(frames)))
 
 
-def surface_scans(
+def build_all_scan_evidence(
     scans: Sequence[ScanStripes], start: Calibration, sensor: Sensor, indices: Sequence[float], *, sizes_known: bool
 ) -> tuple[list[tuple[SurfaceScanEvidence, np.ndarray]], list[str]]:
-    """Evidence of every scan with the start of its local parameters, and warnings about scans left out.
+    """Return the evidence of every scan with the start of its local parameters, and warnings about rejected scans.
 
-    Raises CalibrationError: the scans move along different directions.
+    Raises
+    ------
+    CalibrationError
+        The scans move along different directions.
     """
     found, warnings, image = [], [], 0
     if any(not np.allclose(scan.stage_direction, scans[0].stage_direction) for scan in scans):
-        raise CalibrationError("the scans move along different directions: calibrate with those along one of them")
+        raise CalibrationError("the scans move along different directions: use only scans along one direction")
     for stripes in scans:
         index = 1.0 if stripes.view.medium is None else indices[stripes.view.medium]
         through = start if stripes.view.window else start.model_copy(update={"window": None})
         try:
-            evidence, local = surface_scan(
+            evidence, local = build_scan_evidence(
                 stripes, through, sensor, medium_index=index, sizes_known=sizes_known, image=image
             )
         except EvaluationError as error:
@@ -360,17 +380,20 @@ def surface_scans(
     return found, warnings
 
 
-def _surface(
+def _fit_surface(
     artefact: Scanned, points: np.ndarray, transform: np.ndarray, *, sizes_known: bool
 ) -> tuple[np.ndarray, Surface, np.ndarray]:
-    """Which points (N, 3) of the OCS lie on the surface (N,), that surface in the camera frame, its start (k,).
+    """Select the points (N, 3) (OCS) on the surface; return mask (N,), surface in the camera frame, and start (k,).
 
-    Raises EvaluationError: the points do not show what was scanned.
+    Raises
+    ------
+    EvaluationError
+        The points do not show the described object.
     """
     rotation = transform[:3, :3]
 
     def std(expanded_mm: float | None) -> float:
-        """Standard uncertainty of a certificate's expanded one; infinite where it states none, or does not count."""
+        """Return the standard uncertainty of a certificate; infinite if it is missing or is not to be used."""
         return expanded_mm / 2 if sizes_known and expanded_mm else np.inf
 
     def in_camera(point_mm: Sequence[float]) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The further shot that would improve measured lengths most, by the information that it would add."""
+"""Selection of the image that would improve measured lengths most, from the information that it would add."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.camera.target_images import Placement, pose_values
-from uwlts.calibration.joint.estimate import Evidence, Noise, with_common_error
+from uwlts.calibration.joint.estimate import Evidence, Noise, add_common_error
 from uwlts.calibration.joint.observability import (
     estimate_in,
     format_weaknesses,
@@ -19,32 +19,32 @@ from uwlts.calibration.joint.observability import (
 from uwlts.calibration.joint.parameters import Prior, ViewMedium
 from uwlts.calibration.joint.residuals import TARGET, StepProfileEvidence, TargetEvidence
 from uwlts.calibration.joint.scanned_surfaces import SLOPES, Spheres, SurfaceScanEvidence
-from uwlts.calibration.joint.stored_estimate import StoredEstimate, covariance_root, require_joint, with_independent
+from uwlts.calibration.joint.stored_estimate import StoredEstimate, append_independent, covariance_root, require_joint
 from uwlts.model.calibration import Calibration, rigid_transform
 from uwlts.model.parameter_keys import ParameterKey, StageParameter, StepHeight
 from uwlts.model.sensor import Uncertainty
 from uwlts.optics.sheet import sheet_surface
 from uwlts.targets import Target, parse_target
 
-_FEWEST_POINTS = 20  # target points in view: an image with fewer determines its own pose poorly
+_FEWEST_POINTS = 20  # target points in view: fewer determine the pose of an image poorly
 _FEWEST_LINES = 20  # profile lines on a surface in view
-_SAMPLES = 400  # points of a curve: more than its image needs for a point on each of its lines to be interpolated
+_SAMPLES = 400  # points of a curve, enough to interpolate a point on each profile line of its image
 STEP_MM = 20.0
-"""Height of the step standard, as the thesis's."""
+"""Height of the step standard, as in the thesis."""
 _STEP_HALF_MM = 30.0  # half the length of its upper face along the stripe
-_STEP_REACH_MM = 70.0  # how far its lower faces reach from the middle
+_STEP_REACH_MM = 70.0  # extent of its lower faces from the middle
 SPHERES = 2
 SPHERE_MM = 30.0
-"""Diameter of the spheres, as the thesis's."""
-_SPHERES_APART_MM = 60.0  # spacing of their centres, which leaves a diameter between them
-_SPHERE_IMAGES = 29  # images of a scan of them, some 1 mm apart: more say nothing new
+"""Diameter of the spheres, as in the thesis."""
+_SPHERES_APART_MM = 60.0  # spacing of their centres, twice the diameter
+_SPHERE_IMAGES = 29  # images of their scan, some 1 mm apart; more are redundant
 _ON_SPHERES_PX = 0.01
 """Standard uncertainty of stripe centres on matt spheres by blur, for a stripe with a full width of 4 px."""
 
 _SEEN = np.radians(60)
-"""A sphere is seen this far round from the side that faces the sensor."""
+"""Visible angle of a sphere from the side that faces the sensor."""
 
-_TILT_DEG = 20.0  # easily reached by hand, and printed circles stay detectable
+_TILT_DEG = 20.0  # easily reached by hand, and printed circles remain detectable
 _PLACES = {"near": 0.05, "in the middle": 0.5, "far": 0.95}
 _TILTS = {
     "square": (0.0, 0.0),
@@ -53,16 +53,16 @@ _TILTS = {
     "upper edge nearer": (1.0, 0.0),
     "lower edge nearer": (-1.0, 0.0),
 }
-"""Turns about the camera's x and y axes."""
-_HELPFUL = 0.95  # of the uncertainty before: less than a twentieth is not an improvement
+"""Rotations about the camera's x and y axes."""
+_HELPFUL = 0.95  # ratio to the previous uncertainty; less than a twentieth is not an improvement
 
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """A shot in words and what it would do.
+    """Possible image with its description and effect.
 
     ``before_mm`` and ``after_mm`` are the standard uncertainty of lengths over the volume (root mean square) without
-    and with it, ``covariance`` (P, P) is that of the parameters with it, ``pose`` (4, 4) ``T_camera_target`` of a
+    and with it. ``covariance`` (P, P) is that of the parameters with it, ``pose`` (4, 4) the ``T_camera_target`` of a
     target.
     """
 
@@ -74,23 +74,26 @@ class Outlook:
     pose: np.ndarray | None = None
 
     def advice(self) -> str:
-        """The shot as advice, without a full stop."""
+        """Describe the image as advice, without a full stop."""
         if self.after_mm > _HELPFUL * self.before_mm:
-            return "no further shot alone would lower the uncertainty of lengths by a twentieth"
+            return "no single further image would reduce the uncertainty of lengths by a twentieth"
         return (
-            f"{self.words} would lower the standard uncertainty of lengths over the volume from {self.before_mm:.4f} "
+            f"{self.words} would reduce the standard uncertainty of lengths over the volume from {self.before_mm:.4f} "
             f"to {self.after_mm:.4f} mm"
         )
 
 
 _Shot = tuple[StoredEstimate, Evidence, np.ndarray]
-"""The estimate, perhaps with parameters that the shot adds, the shot's evidence, and its local parameters."""
+"""The estimate (with parameters that the image adds), the image's evidence, and its local parameters."""
 
 
 def next_shots(calibration: Calibration) -> list[Outlook]:
-    """Further shots, the most helpful one first; none where the evidence covers no area.
+    """Return possible further images, the most helpful one first; empty if the evidence covers no area.
 
-    Raises CalibrationError: the calibration holds no joint estimate, or a damaged one.
+    Raises
+    ------
+    CalibrationError
+        The calibration contains no joint estimate, or a damaged one.
     """
     region = next(iter(regions(calibration)), None)
     if region is None or not region.has_area():
@@ -100,10 +103,10 @@ def next_shots(calibration: Calibration) -> list[Outlook]:
     count, before_mm, found = len(known.values), _rms(lengths.std_mm(known.covariance)), []
     low, high = region.outline_mm[:, 1].min(), region.outline_mm[:, 1].max()
     depths = {words: float(low + share * (high - low)) for words, share in _PLACES.items()}
-    for words, shot, pose in _candidates(known, region.name, depths, uncertainty):
-        added = None if shot is None else _information(shot, uncertainty)
+    for words, shot, pose in _generate_candidates(known, region.name, depths, uncertainty):
+        added = None if shot is None else _compute_information(shot, uncertainty)
         if shot is not None and added is not None:
-            # By a root of the covariance, as its inverse may be out of reach of rounding.
+            # Use a root of the covariance: its inverse may be numerically inaccurate.
             root = covariance_root(shot[0].covariance)
             covariance = root @ np.linalg.solve(np.eye(root.shape[1]) + root.T @ added @ root, root.T)
             covariance = covariance[:count, :count]
@@ -113,35 +116,41 @@ def next_shots(calibration: Calibration) -> list[Outlook]:
 
 
 def advice_lines(calibration: Calibration) -> list[str]:
-    """Weak directions and the shot that would help most; CalibrationError where the estimate is missing or damaged."""
+    """Describe weak directions and the most helpful image.
+
+    Raises
+    ------
+    CalibrationError
+        The calibration contains no joint estimate, or a damaged one.
+    """
     region = next(iter(regions(calibration)), None)
     if region is None or not region.has_area():
-        return ["the stripes of the evidence cover no area: the uncertainty of lengths measured by it is not known"]
+        return ["the stripes of the evidence cover no area: the uncertainty of measured lengths is not known"]
     known = estimate_in(calibration, region)
     lines = format_weaknesses(weaknesses(lengths_over(known, region), known.parameters.keys, known.covariance))
     return [*lines, *(f"next: {outlook.advice()}" for outlook in next_shots(calibration)[:1])]
 
 
-def _candidates(
+def _generate_candidates(
     known: StoredEstimate, medium: str, depths: Mapping[str, float], uncertainty: Uncertainty
 ) -> Iterator[tuple[str, _Shot | None, np.ndarray | None]]:
-    """Shots in words, where they are possible, with the pose of a target."""
+    """Generate descriptions and simulated evidence of images, None if impossible, with the pose of a target."""
     described = known.calibration.origin().target
     if described is not None:
         views = {medium: known.view}
-        # One image in air is of use beside others taken so, whose series determines the camera.
+        # An image in air helps only beside others in air, whose series determines the camera.
         in_air = [other.view for other in regions(known.calibration) if other.view.medium is None]
         if known.view.medium is not None and in_air:
             views["air"] = in_air[0]
         for name, view in views.items():
-            yield from _targets(replace(known, view=view), name, parse_target(described), depths)
+            yield from _generate_target_shots(replace(known, view=view), name, parse_target(described), depths)
     for words, depth in depths.items():
         place = f"in {medium}, {words} (Z {depth:+.0f} mm),"
-        yield f"an image of a step {place}", _step_shot(known, depth, uncertainty), None
-        yield f"a scan of two spheres of {SPHERE_MM:g} mm {place}", _sphere_shot(known, depth, uncertainty), None
+        yield f"an image of a step {place}", _simulate_step(known, depth, uncertainty), None
+        yield f"a scan of two spheres of {SPHERE_MM:g} mm {place}", _simulate_spheres(known, depth, uncertainty), None
 
 
-def _targets(
+def _generate_target_shots(
     known: StoredEstimate, medium: str, target: Target, depths: Mapping[str, float]
 ) -> Iterator[tuple[str, _Shot | None, np.ndarray | None]]:
     through = " without the window" if known.calibration.window is not None and not known.view.window else ""
@@ -150,22 +159,22 @@ def _targets(
             pose = _pose(known.calibration, target, depth, turns)
             words = f"an image of the target in {medium}{through}, {where} (Z {depth:+.0f} mm), {tilt}"
             words += "," if tilt == "square" else f" by {_TILT_DEG:g}°,"
-            yield words, _target_shot(known, target, pose), pose
+            yield words, _simulate_target(known, target, pose), pose
 
 
 def _pose(calibration: Calibration, target: Target, depth_mm: float, turns: tuple[float, float]) -> np.ndarray:
-    """``T_camera_target`` (4, 4) with the target's middle on the OCS's axis, turned from being square to that axis."""
+    """Return ``T_camera_target`` (4, 4) with the target's middle on the OCS's axis, tilted by ``turns``."""
     frame, middle = calibration.object_transform(), np.append(target.extent_mm.mean(axis=0), 0.0)
     turn = Rotation.from_euler("XY", _TILT_DEG * np.array(turns), degrees=True).as_matrix() @ frame[:3, :3]
     return rigid_transform(turn, frame[:3, 3] + depth_mm * frame[:3, 2] - turn @ middle)
 
 
-def _target_shot(known: StoredEstimate, target: Target, pose: np.ndarray) -> _Shot | None:
-    """An image of the target with the stripe on it, at ``T_camera_target`` (4, 4); None where too little is in view."""
+def _simulate_target(known: StoredEstimate, target: Target, pose: np.ndarray) -> _Shot | None:
+    """Simulate an image of the target with the stripe at ``T_camera_target`` (4, 4); None if too little is in view."""
     points = target.points_mm
-    pixels = _in_image(known, known.project(points @ pose[:3, :3].T + pose[:3, 3]))
+    pixels = _mask_outside(known, known.project(points @ pose[:3, :3].T + pose[:3, 3]))
     inside = np.isfinite(pixels).all(axis=1)
-    count, lit = int(inside.sum()), _lit(known, target, pose)
+    count, lit = int(inside.sum()), _simulate_stripe(known, target, pose)
     if count < _FEWEST_POINTS or len(lit) < _FEWEST_LINES:
         return None
     evidence = TargetEvidence(
@@ -181,20 +190,20 @@ def _target_shot(known: StoredEstimate, target: Target, pose: np.ndarray) -> _Sh
     return known, evidence, pose_values(pose)
 
 
-def _step_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Shot | None:
-    """An image of a step standard whose lower face lies at a depth Z, the evidence's own where it has one.
+def _simulate_step(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Shot | None:
+    """Simulate an image of a step standard with the lower face at a depth Z; None if too little is in view.
 
-    None where too little of it is in view.
+    The standard of the evidence is used if it contains one.
     """
     height = next((key for key in known.parameters.keys if isinstance(key, StepHeight)), None)
     if height is None:
         height = StepHeight(STEP_MM)
-        known = _extended(known, {height: Prior(STEP_MM, uncertainty.step_height_mm)})
+        known = _append_parameters(known, {height: Prior(STEP_MM, uncertainty.step_height_mm)})
     y = np.linspace(-_STEP_REACH_MM, _STEP_REACH_MM, _SAMPLES)
     upper = np.abs(y) < _STEP_HALF_MM
     raised = depth_mm - known.parameters.value(known.values, height)
     faces = ((~upper & (y < 0), depth_mm), (upper, raised), (~upper & (y > 0), depth_mm))
-    kept = [_on_lines(known, np.column_stack([y[face], np.full(face.sum(), z)])) for face, z in faces]
+    kept = [_sample_curve(known, np.column_stack([y[face], np.full(face.sum(), z)])) for face, z in faces]
     if min(map(len, kept)) < _FEWEST_LINES:
         return None
     frame = known.calibration.object_transform()
@@ -211,17 +220,17 @@ def _step_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty)
     return known, evidence, np.array([0.0, -frame[:3, 2] @ (frame[:3, 3] + frame[:3, 2] * depth_mm)])
 
 
-def _sphere_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Shot | None:
-    """A scan along X of two spheres of unknown size, their centres at a depth Z; None where they are not in view."""
+def _simulate_spheres(known: StoredEstimate, depth_mm: float, uncertainty: Uncertainty) -> _Shot | None:
+    """Simulate a scan along X of two spheres of unknown size at a depth Z; None if they are not in view."""
     stage: dict[ParameterKey, Prior] = {key: Prior(0.0, uncertainty.stage_lean()) for key in SLOPES}
-    known = _extended(known, stage | {StageParameter.SCALE: Prior(0.0, uncertainty.stage_scale)})
+    known = _append_parameters(known, stage | {StageParameter.SCALE: Prior(0.0, uncertainty.stage_scale)})
     frame, radius = known.calibration.object_transform(), SPHERE_MM / 2
     positions = np.linspace(-0.9, 0.9, _SPHERE_IMAGES) * radius
     centres = np.array([(0.0, side * _SPHERES_APART_MM / 2, depth_mm) for side in (-1, 1)])
     turn = np.linspace(-_SEEN, _SEEN, _SAMPLES)
     arc = np.column_stack([np.sin(turn), -np.cos(turn)])
     chords = np.sqrt(radius**2 - positions**2)
-    pixels = [_on_lines(known, centre[1:] + chord * arc) for chord in chords for centre in centres]
+    pixels = [_sample_curve(known, centre[1:] + chord * arc) for chord in chords for centre in centres]
     counts = [len(found) for found in pixels]
     if min(counts) < _FEWEST_LINES:
         return None
@@ -244,19 +253,19 @@ def _sphere_shot(known: StoredEstimate, depth_mm: float, uncertainty: Uncertaint
     return known, evidence, np.append(centres @ frame[:3, :3].T + frame[:3, 3], np.zeros(SPHERES + len(positions)))
 
 
-def _extended(known: StoredEstimate, priors: Mapping[ParameterKey, Prior]) -> StoredEstimate:
-    """The estimate with those of these parameters that it lacks and that are not known exactly, behind its own."""
+def _append_parameters(known: StoredEstimate, priors: Mapping[ParameterKey, Prior]) -> StoredEstimate:
+    """Append those of these parameters to an estimate that it does not contain and that are not known exactly."""
     added = {key: prior for key, prior in priors.items() if key not in known.parameters.keys and prior.std > 0}
     return replace(
         known,
         parameters=replace(known.parameters, priors=known.parameters.priors | added),
         values=np.append(known.values, [prior.mean for prior in added.values()]),
-        covariance=with_independent(known.covariance, [prior.std for prior in added.values()]),
+        covariance=append_independent(known.covariance, [prior.std for prior in added.values()]),
     )
 
 
-def _lit(known: StoredEstimate, target: Target, pose: np.ndarray) -> np.ndarray:
-    """Stripe pixels on the target, one for each profile line, by the plane that is nearest to the sheet."""
+def _simulate_stripe(known: StoredEstimate, target: Target, pose: np.ndarray) -> np.ndarray:
+    """Return stripe pixels on the target, one for each profile line, from the plane that approximates the sheet."""
     index = known.parameters.medium_index(known.values, known.view)
     sheet = sheet_surface(known.parameters.sheet_model(known.values), medium_index=index)
     facing, along = pose[:3, 2], np.cross(sheet.normal, pose[:3, 2])
@@ -270,16 +279,16 @@ def _lit(known: StoredEstimate, target: Target, pose: np.ndarray) -> np.ndarray:
     reach = float(np.ptp(target.plate_mm, axis=0).sum())
     points = start + np.linspace(-reach, reach, _SAMPLES)[:, None] * along
     at = (points - pose[:3, 3]) @ pose[:3, :3]
-    return _lines_through(known, known.project(points[target.on_plate(at[:, :2])]))
+    return _interpolate_lines(known, known.project(points[target.on_plate(at[:, :2])]))
 
 
-def _on_lines(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
-    """Pixels (N, 2) of a curve Y and Z (K, 2) on the sheet, one for each profile line in the image."""
-    return _lines_through(known, pixels_at(known, at_mm))
+def _sample_curve(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
+    """Return pixels (N, 2) of a curve Y and Z (K, 2) on the sheet, one for each profile line in the image."""
+    return _interpolate_lines(known, pixels_at(known, at_mm))
 
 
-def _lines_through(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
-    across, pixels = known.across(), _in_image(known, pixels)
+def _interpolate_lines(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
+    across, pixels = known.across(), _mask_outside(known, pixels)
     seen = pixels[np.isfinite(pixels).all(axis=1)]
     if len(seen) < 2:
         return np.empty((0, 2))
@@ -289,17 +298,17 @@ def _lines_through(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
     return np.column_stack([lines, centres] if across else [centres, lines])
 
 
-def _in_image(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
-    """The pixels (N, 2), NaN outside the image."""
+def _mask_outside(known: StoredEstimate, pixels: np.ndarray) -> np.ndarray:
+    """Replace pixels (N, 2) outside the image by NaN."""
     camera = known.parameters.camera(known.values)
     inside = np.all((pixels >= 0) & (pixels <= [camera.width_px - 1, camera.height_px - 1]), axis=1)
     return np.where(inside[:, None], pixels, np.nan)
 
 
-def _information(shot: _Shot, uncertainty: Uncertainty) -> np.ndarray | None:
-    """Information (P, P) that a shot adds to the inverse of the covariance; None where a ray meets nothing.
+def _compute_information(shot: _Shot, uncertainty: Uncertainty) -> np.ndarray | None:
+    """Return the information (P, P) that an image adds to the inverse covariance; None if a ray meets nothing.
 
-    Its residuals are as noisy as those of the same kind; those of a kind new to the evidence as the noisiest stripe's.
+    The noise is that of the same kind of residual, or of the noisiest stripe for a new kind.
     """
     known, evidence, local_values = shot
     parts = evidence.residuals(known.parameters, known.values, local_values)
@@ -311,7 +320,7 @@ def _information(shot: _Shot, uncertainty: Uncertainty) -> np.ndarray | None:
     noise = {part.kind: noise.get(part.kind, stripe) for part in parts}
     if isinstance(evidence, SurfaceScanEvidence):
         kind, surface = evidence.surface.kind, evidence.surface
-        noise[kind] = with_common_error(noise[kind], evidence.common_px, bodies=surface.count)
+        noise[kind] = add_common_error(noise[kind], evidence.common_px, bodies=surface.count)
     count, local = len(known.values), len(local_values)
     total = np.zeros((count + local,) * 2)
     _, before = evidence.known_before(local_values, uncertainty)

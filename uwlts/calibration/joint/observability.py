@@ -1,4 +1,4 @@
-"""Uncertainty of points and lengths over the covered volume, and the directions that the evidence leaves open."""
+"""Uncertainty of points and lengths over the covered volume, and weakly determined parameter combinations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,18 +12,18 @@ from uwlts.model.calibration import Calibration
 from uwlts.model.parameter_keys import ParameterInFile, ParameterKey
 from uwlts.model.sensor import Medium
 
-_ROWS = 7  # depths of a mesh, which with its columns has 1953 lengths, between ends in all parts of a region
-_COLUMNS = 9  # places along the stripe of a mesh
-_INSET = 0.02  # share of the depth left out at either end, where an outline may come to a point
-_LEAST_MM = 1.0  # extent of a region over which lengths mean something
+_ROWS = 7  # depths of a mesh, which has 1953 lengths between points in all parts of a region
+_COLUMNS = 9  # positions of a mesh along the stripe
+_INSET = 0.02  # fraction of the depth omitted at either end, where an outline may be a point
+_LEAST_MM = 1.0  # smallest useful extent of a region
 
 
 @dataclass(frozen=True, eq=False)
 class SheetRegion:
-    """A region of the sheet that evidence covers, in the medium of a name, and through what it was seen.
+    """Region of the sheet that evidence covers, in a named medium, with its view.
 
-    ``outline_mm`` (K, 2) is convex, Y and Z in the OCS; ``camera_depth_mm`` (2,) are the nearest and farthest depths
-    along the camera's axis from its entrance pupil; ``points`` is the number of stripe pixels in it.
+    ``outline_mm`` (K, 2) is convex, Y and Z in the OCS. ``camera_depth_mm`` (2,) contains the smallest and largest
+    depth along the camera's axis from its entrance pupil. ``points`` is the number of stripe pixels in the region.
     """
 
     name: str
@@ -34,11 +34,11 @@ class SheetRegion:
     points: int
 
     def has_area(self) -> bool:
-        """Whether it extends by more than a millimetre in Y and in Z."""
+        """Return whether the region extends by more than a millimetre in Y and in Z."""
         return bool(len(self.outline_mm) > 2 and np.ptp(self.outline_mm, axis=0).min() > _LEAST_MM)
 
     def width_at(self, depth_mm: float) -> tuple[float, float]:
-        """Least and largest Y at a depth Z within it."""
+        """Return the smallest and largest Y at a depth Z in the region."""
         start, end = self.outline_mm, np.roll(self.outline_mm, -1, axis=0)
         low, high = np.minimum(start[:, 1], end[:, 1]), np.maximum(start[:, 1], end[:, 1])
         crossed = (low <= depth_mm) & (depth_mm <= high) & (high > low)
@@ -47,7 +47,7 @@ class SheetRegion:
         return float(across.min()), float(across.max())
 
     def mesh(self, rows: int = _ROWS, columns: int = _COLUMNS) -> np.ndarray:
-        """Points (rows, columns, 2), Y and Z in mm: each row at one depth, from one side to the other."""
+        """Return points (rows, columns, 2), Y and Z in mm: each row at one depth, from side to side."""
         low, high = self.outline_mm[:, 1].min(), self.outline_mm[:, 1].max()
         inset = _INSET * (high - low)
         depths = np.linspace(low + inset, high - inset, rows)
@@ -58,7 +58,7 @@ class SheetRegion:
 
 @dataclass(frozen=True, eq=False)
 class SheetSamples:
-    """Points of the sheet at Y and Z (N, 2) of the OCS, and how they move, mm.
+    """Points of the sheet at Y and Z (N, 2) of the OCS, mm, and derivatives.
 
     The derivatives are ``by_parameters`` (N, 3, P), and ``by_px`` (N, 3) for one pixel across the stripe.
     """
@@ -70,10 +70,9 @@ class SheetSamples:
 
 @dataclass(frozen=True, eq=False)
 class Lengths:
-    """Lengths (M,) between points of the sheet, at Y and Z of both ends (M, 2, 2).
+    """Lengths (M,) between points of the sheet, with Y and Z of both ends (M, 2, 2).
 
-    The derivatives are ``by_parameters`` (M, P), and ``by_px`` (M,) for a pixel's noise at each end, independent of the
-    other's.
+    The derivatives are ``by_parameters`` (M, P), and ``by_px`` (M,) for independent pixel noise at both ends.
     """
 
     ends_mm: np.ndarray
@@ -82,13 +81,19 @@ class Lengths:
     by_px: np.ndarray
 
     def std_mm(self, covariance: np.ndarray, *, noise_px: float = 0.0) -> np.ndarray:
-        """Standard uncertainty (M,) in mm for a covariance (P, P) of the parameters and noise of each stripe centre."""
+        """Return the standard uncertainty (M,) in mm for a covariance (P, P) of the parameters and stripe noise."""
         variance = np.sum((self.by_parameters @ covariance) * self.by_parameters, axis=1)
         return np.sqrt(np.maximum(variance, 0.0) + (noise_px * self.by_px) ** 2)
 
 
 def regions(calibration: Calibration) -> list[SheetRegion]:
-    """The regions that a joint calibration's evidence covers, that of its use first; CalibrationError if damaged."""
+    """Return the regions that a joint calibration's evidence covers, that of its medium of use first.
+
+    Raises
+    ------
+    CalibrationError
+        The covered volume is damaged.
+    """
     found = []
     for covered in require_joint(calibration).covered:
         number = covered.medium
@@ -103,30 +108,36 @@ def regions(calibration: Calibration) -> list[SheetRegion]:
 
 
 def estimate_in(calibration: Calibration, region: SheetRegion) -> StoredEstimate:
-    """The joint estimate as found, for what is seen as a region was; CalibrationError as `found_estimate`."""
+    """Return the joint estimate for the view of a region; errors as `found_estimate`."""
     return replace(found_estimate(calibration, region.medium), view=region.view)
 
 
 def points_at(known: StoredEstimate, at_mm: np.ndarray) -> SheetSamples:
-    """Points of the sheet at Y and Z (N, 2) of the OCS; CalibrationError where the camera does not see one of them."""
+    """Return points of the sheet at Y and Z (N, 2) of the OCS.
+
+    Raises
+    ------
+    CalibrationError
+        A point is outside the camera's view.
+    """
     pixels = pixels_at(known, at_mm)
     found = None
     if np.isfinite(pixels).all():
         found = known.parameters.stripe_points(known.values, known.view, pixels, across=known.across())
     if found is None:
-        raise CalibrationError("the calibration's covered volume lies outside the camera's view: calibrate again")
+        raise CalibrationError("the calibration's covered volume is outside the camera's view: calibrate again")
     by = np.einsum("ji,njp->nip", known.calibration.object_transform()[:3, :3], found.by)
     return SheetSamples(at_mm, by[:, :, 1:], by[:, :, 0])
 
 
 def pixels_at(known: StoredEstimate, at_mm: np.ndarray) -> np.ndarray:
-    """Image places (N, 2) of points at Y and Z (N, 2) of the OCS; NaN where the camera does not see them."""
+    """Return pixels (N, 2) of points at Y and Z (N, 2) of the OCS; NaN if the camera does not see them."""
     transform = known.calibration.object_transform()
     return known.project(at_mm @ transform[:3, 1:3].T + transform[:3, 3])
 
 
 def lengths_between(points: SheetSamples, start: np.ndarray, end: np.ndarray) -> Lengths:
-    """Lengths from points to others by their numbers (M,)."""
+    """Return lengths between points, given by their numbers (M,)."""
     apart = points.at_mm[end] - points.at_mm[start]
     length = np.linalg.norm(apart, axis=1)
     unit = apart / length[:, None]
@@ -137,28 +148,28 @@ def lengths_between(points: SheetSamples, start: np.ndarray, end: np.ndarray) ->
 
 
 def lengths_over(known: StoredEstimate, region: SheetRegion) -> Lengths:
-    """Lengths between all pairs of points of a region's mesh."""
+    """Return lengths between all pairs of points of a region's mesh."""
     at = region.mesh().reshape(-1, 2)
     return lengths_between(points_at(known, at), *np.triu_indices(len(at), k=1))
 
 
-_MOST = 3  # more than a reader keeps in mind are not named
-_LEAST_SHARE = 0.1  # of the variance of all lengths; a direction that adds less is not named
-_NAMED_SHARE = 0.4  # of the most important parameter's; others are not named with it
-_CAUSE_SHARE = 0.3  # of a direction that knowing one parameter must close to count as its cause
+_MOST = 3  # largest number of parameters or directions to list
+_LEAST_SHARE = 0.1  # fraction of the variance of all lengths; a direction with less is not listed
+_NAMED_SHARE = 0.4  # fraction of the most important parameter's contribution; others are not listed with it
+_CAUSE_SHARE = 0.3  # fraction of a direction that knowledge of one parameter must determine to count as its cause
 _CONFUSED = 0.3
-"""Smallest eigenvalue of the correlation of two parameters or more that cannot be separated: 0.7 for two."""
+"""Smallest correlation eigenvalue below which parameters are inseparable: correlation of 0.7 for two."""
 _NEGLIGIBLE_MM = 1e-3  # far below the noise of a scanned point
-_AXIS_COSINE = 0.9  # within 26 deg a length runs along an axis
+_AXIS_COSINE = 0.9  # within 26 deg, a length is along an axis
 
 
 @dataclass(frozen=True)
 class Weakness:
-    """A direction that the evidence leaves open, with the parameters that make it up, the most important first.
+    """Weakly determined direction in parameter space, with its main parameters, the most important first.
 
-    ``confused`` says whether the evidence cannot separate these, rather than knows each too little. ``cost_mm`` is the
-    standard uncertainty that it adds to the length that it changes most, which runs ``along`` "Y", "Z" or "Y and Z" and
-    whose ends lie at most at the depth Z ``depth_mm`` of the OCS.
+    ``confused`` says whether the evidence cannot separate these parameters. ``cost_mm`` is the standard uncertainty
+    that the direction adds to the length that it changes most. This length is ``along`` "Y", "Z" or "Y and Z", and its
+    deeper end is at the depth Z ``depth_mm`` of the OCS.
     """
 
     parameters: tuple[ParameterInFile, ...]
@@ -169,19 +180,19 @@ class Weakness:
     depth_mm: float
 
     def words(self) -> str:
-        """The weakness as a sentence without its full stop."""
+        """Describe the weakness, without a full stop."""
         names = [key.quantity.words for key in self.parameters]
         what = f"{self.cost_mm:.3f} mm in a length of {self.length_mm:.0f} mm along {self.along}"
         if len(names) == 1:
-            return f"{names[0]} is known too little; it costs {what}"
-        why = "cannot be separated by these images" if self.confused else "are known too little"
-        return f"{', '.join(names[:-1])} and {names[-1]} {why}; together they cost {what}"
+            return f"{names[0]} is not known well enough; this adds {what}"
+        why = "cannot be separated by these images" if self.confused else "are not known well enough"
+        return f"{', '.join(names[:-1])} and {names[-1]} {why}; together they add {what}"
 
 
 def weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.ndarray) -> list[Weakness]:
-    """The directions that cost most, at most three; none where no length becomes uncertain by a micrometre.
+    """Return at most three weakest directions; empty if every length is certain to a micrometre.
 
-    The lengths are those over the volume; ``covariance`` is (P, P).
+    ``lengths`` are those over the volume; ``covariance`` is (P, P).
     """
     std, root = np.sqrt(np.diag(covariance)), covariance_root(covariance)
     _, sizes, parts = np.linalg.svd(lengths.by_parameters @ root, full_matrices=False)
@@ -193,7 +204,7 @@ def weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.nd
         worst = int(np.argmax(np.abs(changes)))
         if size**2 < _LEAST_SHARE * total or abs(changes[worst]) < _NEGLIGIBLE_MM:
             break
-        named = _named(lengths, direction, std)
+        named = _select_main_parameters(lengths, direction, std)
         start, end = lengths.ends_mm[worst]
         along_y, along_z = np.abs(end - start) / np.linalg.norm(end - start) > _AXIS_COSINE
         correlation = covariance[np.ix_(named, named)] / np.outer(std[named], std[named])
@@ -211,18 +222,18 @@ def weaknesses(lengths: Lengths, keys: Sequence[ParameterKey], covariance: np.nd
 
 
 def format_weaknesses(found: Sequence[Weakness]) -> list[str]:
-    """Weaknesses as sentences; that there are none is one."""
+    """Describe weaknesses; an empty list gives one sentence."""
     if not found:
-        return ["nothing that these images leave open changes a length over the volume by more than 0.001 mm"]
+        return ["no weakly determined parameter changes a length over the volume by more than 0.001 mm"]
     return [weakness.words() for weakness in found]
 
 
-def _named(lengths: Lengths, direction: np.ndarray, std: np.ndarray) -> list[int]:
-    """Numbers of the parameters that make up a direction (P,), at most three, the most important first.
+def _select_main_parameters(lengths: Lengths, direction: np.ndarray, std: np.ndarray) -> list[int]:
+    """Return the numbers of at most three main parameters of a direction (P,), the most important first.
 
-    Those count whose knowledge would close the direction: the share of it that goes with a parameter is the square of
-    their correlation. A parameter that moves no point, such as the height of a step, may be the cause as well. Where
-    knowing one would not help, many trade places, and those count that change lengths most.
+    The squared correlation of a parameter with the direction is the fraction of its variance that knowledge of the
+    parameter would remove. This includes parameters that move no point, such as a step height. If no single parameter
+    would help, the parameters with the largest effect on lengths are returned.
     """
     share = np.divide(direction**2, std**2, out=np.zeros_like(std), where=std > 0)
     if share.max() < _CAUSE_SHARE:

@@ -1,4 +1,4 @@
-"""Global parameters of the joint calibration: what is known of them before, and rays and points with derivatives."""
+"""Global parameters of the joint calibration: prior knowledge, and rays and points with derivatives."""
 
 from dataclasses import dataclass, field
 
@@ -16,14 +16,14 @@ from uwlts.optics.window import RayDerivatives, leaning, trace_derivatives
 LENS = tuple(key for key in LensParameter if key is not LensParameter.F)
 WINDOW = tuple(WindowParameter)
 COLUMNS = ("u", "v", *LENS, *WINDOW, "medium_index")
-"""By what rays are differentiated."""
+"""Variables by which rays are differentiated."""
 SHEET = tuple(SheetParameter)
-"""Turns of the normal in rad towards the axis and towards the fan's direction, shift in mm, numbers of `FanModel`."""
+"""Rotations of the normal towards the axis and the fan's direction, rad; shift, mm; parameters of `FanModel`."""
 
 
 @dataclass(frozen=True)
 class ViewMedium:
-    """Through what the camera looks: its window or none, and a medium by its number; None is air."""
+    """Window state and medium of a camera's view: window or none, and the number of a medium; None is air."""
 
     window: bool
     medium: int | None
@@ -31,9 +31,9 @@ class ViewMedium:
 
 @dataclass(frozen=True)
 class Prior:
-    """A parameter known before as ``mean`` with the standard uncertainty ``std``.
+    """Prior knowledge of a parameter: ``mean`` and standard uncertainty ``std``.
 
-    Where that is infinite the mean is but a start; where it is zero the parameter is held and not estimated.
+    With an infinite ``std``, the mean is only a start value. With zero, the parameter is fixed.
     """
 
     mean: float
@@ -41,7 +41,7 @@ class Prior:
 
 
 def window_values(window: WindowModel) -> dict[ParameterKey, float]:
-    """The parameters of a window in their order."""
+    """Return the parameters of a window in their order."""
     slope_x, slope_y, _ = (np.array(window.normal) / window.normal[2]).tolist()
     values = (window.distance_mm, slope_x, slope_y, window.thickness_mm, window.glass_index)
     return dict(zip(WINDOW, values, strict=True))
@@ -49,10 +49,15 @@ def window_values(window: WindowModel) -> dict[ParameterKey, float]:
 
 @dataclass(frozen=True, eq=False)
 class EarlierEstimate:
-    """An earlier estimate of the first K parameters of a vector: ``values`` (K,), ``covariance`` (K, K).
+    """Earlier estimate of the first K parameters of a vector: ``values`` (K,), ``covariance`` (K, K).
 
-    ``whitening`` (K, K) is W with W^T W the inverse of the covariance: W (x - values) are K independent residuals of
-    variance one. Raises CalibrationError: the covariance is not positive definite.
+    ``whitening`` (K, K) is W with W^T W the inverse of the covariance: W (x - values) are K independent residuals with
+    unit variance.
+
+    Raises
+    ------
+    CalibrationError
+        The covariance is not positive definite.
     """
 
     values: np.ndarray
@@ -64,21 +69,21 @@ class EarlierEstimate:
         try:
             if not variance.min() > 0:
                 raise np.linalg.LinAlgError("a variance is not positive")
-            # Pixels, millimetres and radians stand beside each other: factored as correlations, none is lost.
+            # Pixels, millimetres and radians differ in scale: factorise correlations for numerical accuracy.
             std = np.sqrt(variance)
             root = np.linalg.cholesky(self.covariance / np.outer(std, std))
         except np.linalg.LinAlgError as error:
             raise CalibrationError(
-                f"the covariance of the earlier calibration is damaged or says nothing ({error}): calibrate again"
+                f"the covariance of the earlier calibration is damaged or singular ({error}): calibrate again"
             ) from error
         object.__setattr__(self, "whitening", np.linalg.inv(root) / std)
 
     def std(self) -> np.ndarray:
-        """Standard uncertainty (K,) of each parameter."""
+        """Return the standard uncertainty (K,) of each parameter."""
         return np.sqrt(np.diag(self.covariance))
 
     def residuals(self, global_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (K,) of variance one of a vector (P,) that begins with these parameters, and derivatives (K, P)."""
+        """Return whitened residuals (K,) of a vector (P,) that begins with these parameters, and derivatives (K, P)."""
         count = len(self.values)
         by_global = np.zeros((count, len(global_values)))
         by_global[:, :count] = self.whitening
@@ -87,7 +92,7 @@ class EarlierEstimate:
 
 @dataclass(frozen=True, eq=False)
 class DescribedSheet:
-    """The sheet as described, which parameters of zero stand for, camera frame, mm: vectors (3,) as `NominalSheet`."""
+    """Described sheet, for which all parameters are zero, camera frame, mm: vectors (3,) as in `NominalSheet`."""
 
     normal: np.ndarray
     axis: np.ndarray
@@ -97,39 +102,39 @@ class DescribedSheet:
 
     @classmethod
     def of(cls, nominal: NominalSheet) -> "DescribedSheet":
-        """The sheet that a file describes."""
+        """Read the sheet from a file's description."""
         return cls(*(np.array(getattr(nominal, name)) for name in NominalSheet.model_fields))
 
     def nominal(self) -> NominalSheet:
-        """The sheet as a file describes it."""
+        """Return the sheet as a file describes it."""
         return NominalSheet.model_validate({name: vector.tolist() for name, vector in vars(self).items()})
 
     def fan(self, values: np.ndarray) -> FanModel:
-        """The fan of the parameters (5,)."""
+        """Return the fan for parameters (5,)."""
         apex, axis, pivot = (tuple(vector.tolist()) for vector in (self.apex_mm, self.axis, self.pivot_mm))
         return FanModel(
             apex_mm=apex, axis=axis, pivot_mm=pivot, bow_rad=float(values[3]), window_turn_rad=float(values[4])
         )
 
     def model(self, values: np.ndarray) -> SheetModel:
-        """The sheet of the parameters (5,)."""
+        """Return the sheet for parameters (5,)."""
         normal, _ = self._normal(values)
         offset = float(normal @ self.middle_mm + values[2])
         return SheetModel(normal=tuple(normal.tolist()), offset_mm=offset, fan=self.fan(values))
 
     def _normal(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normal (3,) and its derivatives (2, 3) by the two turns."""
+        """Return the normal (3,) and its derivatives (2, 3) by the two rotations."""
         return leaning(self.normal, np.stack([self.axis, np.cross(self.axis, self.normal)]), values[:2])
 
     def miss_by(self, values: np.ndarray, points: np.ndarray, index: float) -> np.ndarray:
-        """Derivatives (6, N) of `SheetSurface.miss_mm` at points (3, N) by the parameters and the medium's index."""
+        """Return derivatives (6, N) of `SheetSurface.miss_mm` at points (3, N) by the parameters and the index."""
         normal, normal_by = self._normal(values)
         turn, bow = values[4], values[3]
         angle = turn * (1.0 - 1.0 / index)
         cosine, sine = np.cos(angle), np.sin(angle)
 
         def across(n: np.ndarray, m: np.ndarray) -> np.ndarray:
-            """Vector (axis x n) x m."""
+            """Return the vector (axis x n) x m."""
             return n * (self.axis @ m) - self.axis * (n @ m)
 
         from_middle, from_pivot = points - self.middle_mm[:, None], points - self.pivot_mm[:, None]
@@ -140,7 +145,7 @@ class DescribedSheet:
         fan = self.fan(values)
         at, behind = fan_distances(points, fan, medium_index=index), behind_window_mm(fan)
         of_bow, of_turn = at.bulges()
-        # The fan seems to begin farther away as the index grows.
+        # The fan's apparent apex moves away as the index grows.
         air_by = (index * (at.along**2 - at.all**2) + at.along * behind) / at.in_air
         of_bow_by = behind * at.along / at.all - air_by
         of_turn_by = at.wet * (behind - air_by) - behind / at.along * at.wet * (at.along - at.in_air)
@@ -155,27 +160,27 @@ class DescribedSheet:
 
 @dataclass(frozen=True, eq=False)
 class SheetPoints:
-    """Points (3, N) of the sheet in mm, camera frame, and their derivatives (N, 3, 1 + P).
+    """Points (3, N) of the sheet in mm, camera frame, and derivatives (N, 3, 1 + P).
 
-    By the pixel across the stripe first, then by the global parameters.
+    The first derivative is by the pixel across the stripe, the others are by the global parameters.
     """
 
     points: np.ndarray
     by: np.ndarray
 
     def along(self, directions: np.ndarray) -> np.ndarray:
-        """Derivatives (N, 1 + P) of how far the points lie along directions (3, N)."""
+        """Return derivatives (N, 1 + P) of the points' coordinates along directions (3, N)."""
         return np.einsum("in,nic->nc", directions, self.by)
 
 
 @dataclass(frozen=True, eq=False)
 class Parameters:
-    """Keys and places of the global parameters in one vector (P,).
+    """Keys and indices of the global parameters in a vector (P,).
 
-    ``sheet`` and ``window`` are as described, the window None where nothing is seen through it; ``media`` are the names
-    of those other than air. ``priors`` has every parameter but the lens's, in the order of the vector, which lacks
-    those that are held, and those of the lens of which something is known before; ``earlier`` is what an earlier
-    calibration says of the vector's first parameters besides.
+    ``sheet`` and ``window`` are as described (None: no view through the window). ``media`` are the names of media other
+    than air. ``priors`` contains all parameters in the order of the vector, except lens parameters without prior
+    knowledge. Fixed parameters are not part of the vector. ``earlier`` is additional knowledge of the vector's first
+    parameters from an earlier calibration.
     """
 
     intrinsics: Intrinsics
@@ -193,23 +198,23 @@ class Parameters:
         object.__setattr__(self, "places", {key: place for place, key in enumerate(self.keys)})
 
     def start(self, lens: np.ndarray) -> np.ndarray:
-        """Vector (P,) with the lens's parameters as given and the others as known before."""
+        """Return a vector (P,) with the given lens parameters and the prior means of the others."""
         return np.concatenate([lens, self.prior_mean()[len(lens) :]])
 
     def prior_std(self) -> np.ndarray:
-        """Standard uncertainty (P,) of each parameter before; infinite where nothing is known."""
+        """Return the prior standard uncertainty (P,) of each parameter; infinite without prior knowledge."""
         return np.array([self.priors[key].std if key in self.priors else np.inf for key in self.keys])
 
     def prior_mean(self) -> np.ndarray:
-        """Prior mean of each parameter (P,): its start where nothing is known, zero for those of the lens."""
+        """Return the prior mean or start value of each parameter (P,); zero for lens parameters without one."""
         return np.array([self.priors[key].mean if key in self.priors else 0.0 for key in self.keys])
 
     def camera(self, values: np.ndarray) -> CameraModel:
-        """The camera of a vector."""
+        """Return the camera of a vector."""
         return self.intrinsics.model(values[: len(self.intrinsics.names)])
 
     def window_model(self, values: np.ndarray) -> WindowModel | None:
-        """The window of a vector."""
+        """Return the window of a vector."""
         if self.window is None:
             return None
         distance, slope_x, slope_y, thickness, index = (self.value(values, key) for key in WINDOW)
@@ -218,24 +223,24 @@ class Parameters:
         return self.window.model_copy(update=found | {"normal": tuple((normal / np.linalg.norm(normal)).tolist())})
 
     def sheet_model(self, values: np.ndarray) -> SheetModel:
-        """The sheet of a vector."""
+        """Return the sheet of a vector."""
         return self.sheet.model(self._sheet_values(values))
 
     def medium_index(self, values: np.ndarray, view: ViewMedium) -> float:
-        """Index of a view's medium relative to air."""
+        """Return the refractive index of a view's medium relative to air."""
         return 1.0 if view.medium is None else self.value(values, self.index_key(view.medium))
 
     def rays(self, values: np.ndarray, view: ViewMedium, pixels: np.ndarray) -> RayDerivatives | None:
-        """Rays of pixels (N, 2) in the medium of a view."""
+        """Return rays of pixels (N, 2) in the medium of a view."""
         window = self.window_model(values) if view.window else None
         return ray_derivatives(self.camera(values), window, pixels, medium_index=self.medium_index(values, view))
 
     def stripe_points(
         self, values: np.ndarray, view: ViewMedium, pixels: np.ndarray, *, across: int
     ) -> SheetPoints | None:
-        """Points of the sheet that pixels (N, 2) show through a view; None where the ray of one meets no sheet.
+        """Intersect rays of pixels (N, 2) with the sheet; None if a ray does not meet it.
 
-        The coordinate ``across``, 0 or 1, of the pixel runs across the stripe.
+        The pixel coordinate ``across``, 0 or 1, is the one across the stripe.
         """
         rays, index = self.rays(values, view, pixels), self.medium_index(values, view)
         if rays is None:
@@ -256,12 +261,12 @@ class Parameters:
         return SheetPoints(points, by)
 
     def project(self, values: np.ndarray, view: ViewMedium, points: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of points (N, 3) in the camera frame, seen through a view; NaN where there is none."""
+        """Project points (N, 3) of the camera frame through a view; return pixels (N, 2), else NaN."""
         window = self.window_model(values) if view.window else None
         return project_through_window(self.camera(values), window, points, medium_index=self.medium_index(values, view))
 
     def by_global(self, by_rays: np.ndarray, view: ViewMedium, by_sheet: np.ndarray | None = None) -> np.ndarray:
-        """Derivatives (N, P) by the global parameters of what depends on rays (C, N) and on sheet and index (6, N)."""
+        """Return derivatives (N, P) by all parameters from those by rays (C, N), and by sheet and index (6, N)."""
         result = np.zeros((by_rays.shape[1], len(self.keys)))
         result[:, : len(self.intrinsics.names)] = by_rays[2 : 2 + len(LENS)].T @ self.intrinsics.map
         index = () if view.medium is None else (self.index_key(view.medium),)
@@ -275,18 +280,18 @@ class Parameters:
         return result
 
     def value(self, values: np.ndarray, key: ParameterKey) -> float:
-        """A parameter but the lens's; zero for one that there is not."""
+        """Return a parameter other than the lens's; zero if it does not exist."""
         if (place := self.places.get(key)) is not None:
             return float(values[place])
         return self.priors[key].mean if key in self.priors else 0.0
 
     def add(self, by_global: np.ndarray, key: ParameterKey, column: np.ndarray) -> None:
-        """Add derivatives (N,) by a parameter to those of all (N, P), where it is estimated."""
+        """Add derivatives (N,) by a parameter to those by all parameters (N, P), if it is estimated."""
         if (place := self.places.get(key)) is not None:
             by_global[:, place] += column
 
     def index_key(self, medium: int) -> MediumIndex:
-        """The index of a medium by its number."""
+        """Return the key of the index of a medium."""
         return MediumIndex(self.media[medium])
 
     def _sheet_values(self, values: np.ndarray) -> np.ndarray:
@@ -296,12 +301,12 @@ class Parameters:
 def ray_derivatives(
     camera: CameraModel, window: WindowModel | None, pixels: np.ndarray, *, medium_index: float
 ) -> RayDerivatives | None:
-    """Rays of pixels (N, 2) with their derivatives by the `COLUMNS`; None where a pixel has no ray in the medium."""
+    """Return rays of pixels (N, 2) with their derivatives by `COLUMNS`; None if a pixel has no ray in the medium."""
     seen = directions(camera, pixels).T
     if not np.isfinite(seen).all():
         return None
     ideal = seen[:2] / seen[2]
-    # Unit vector (x, y, 1) / length by x and y, which stand for the pixel and the lens until the window is passed.
+    # Derivatives of the unit vector (x, y, 1) / length by x and y; those by pixel and lens follow after the window.
     by_ideal = -seen * (seen[:2] * seen[2])[:, None]
     by_ideal[[0, 1], [0, 1]] += seen[2]
     if window is None:

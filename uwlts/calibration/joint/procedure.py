@@ -1,4 +1,4 @@
-"""The joint calibration from captures: target images in air and in water, stripes on it, steps, scans; in any mix."""
+"""Joint calibration from any mix of captures: target images in air and in water, stripes on targets, steps, scans."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,19 +11,24 @@ from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import BESIDES, RATIONAL_BESIDES
 from uwlts.calibration.joint.consistency import (
     Findings,
+    check_consistency,
+    compute_size_deviations,
+    describe_wrong_sizes,
     deviations,
-    findings,
-    size_deviations,
-    understated,
-    wrong_sizes,
+    estimate_birge_ratio,
 )
 from uwlts.calibration.joint.estimate import Estimate, Evidence, estimate
-from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
-from uwlts.calibration.joint.initial import line_start, series_start, step_profiles, surface_scans
+from uwlts.calibration.joint.gathering import Gathered, build_priors, gather_jointly
+from uwlts.calibration.joint.initial import (
+    build_all_scan_evidence,
+    build_step_evidence,
+    estimate_line_start,
+    estimate_series_start,
+)
 from uwlts.calibration.joint.parameters import Parameters
 from uwlts.calibration.joint.residuals import BENDS, STRETCH
 from uwlts.calibration.joint.scanned_surfaces import Plane, SurfaceScanEvidence
-from uwlts.calibration.joint.stored_estimate import calibration_of
+from uwlts.calibration.joint.stored_estimate import build_calibration
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import Calibration, KnownStage, WindowModel
@@ -33,16 +38,17 @@ from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture
 
 _ROUNDS_LEFT_OUT = 3
-_CLEARLY_LESS = 0.9  # scatter with free pixels, over that without
-_NOTICED = 3.0  # standard uncertainties: what is taken for more uncertain loses little where that was chance
+_CLEARLY_LESS = 0.9  # scatter with free pixel shape, relative to that without
+_NOTICED = 3.0  # standard uncertainties: a parameter wrongly considered less certain loses little
 
 
 @dataclass(frozen=True, eq=False)
 class JointProblem:
-    """All evidence with what is to be estimated from it, and where that starts.
+    """All evidence, the parameters to estimate from it, and their start values.
 
-    The start is ``global_values`` (P,) and ``local``, (b,) of every piece of evidence. ``diameter_mm`` is that of the
-    target's circles, whose images are to be corrected; None where nothing is. ``misfits`` are as for `estimate`.
+    The start values are ``global_values`` (P,) and ``local`` (b,) of every piece of evidence. ``diameter_mm`` is that
+    of the target's circles for the correction of their images; None for no correction. ``misfits`` is as for
+    `estimate`.
     """
 
     parameters: Parameters
@@ -55,7 +61,7 @@ class JointProblem:
     misfits: frozenset[str] = frozenset()
 
     def solve(self) -> Estimate:
-        """The estimate, not judged yet; errors as `estimate`."""
+        """Return the estimate without consistency checks; errors as `estimate`."""
         return estimate(
             self.parameters,
             self.evidence,
@@ -67,45 +73,45 @@ class JointProblem:
         )
 
     def judged(self) -> tuple[Estimate, Findings]:
-        """The estimate and what speaks against it; errors as `estimate`.
+        """Return the estimate and the findings against it; errors as `estimate`.
 
-        Sizes of what was scanned are first estimated, all of them, and compared with those described: known sizes
-        that are wrong move lens, window and stage, and hardly show in residuals. That is said as soon as nothing else
-        contradicts.
+        The sizes of scanned objects are first estimated and compared with their descriptions. Wrong sizes would change
+        lens, window and stage, and would be barely visible in residuals. They are reported if there is no other
+        contradiction.
         """
-        free = [_of_unknown_size(piece) for piece in self.evidence]
+        free = [_free_sizes(piece) for piece in self.evidence]
         result, against = replace(self, evidence=free)._judged_as_described()
-        sizes, alone = size_deviations(result, self.evidence), not against.all_against() or bool(self.misfits)
+        sizes, alone = compute_size_deviations(result, self.evidence), not against.all_against() or bool(self.misfits)
         doubts = [each.words() for each in sizes if each.doubtful()]
         if not any(each.known() for each in sizes):
             return result, replace(against, doubts=doubts + against.doubts)
-        wrong = wrong_sizes(sizes)
+        wrong = describe_wrong_sizes(sizes)
         if not wrong:
             start = replace(self, global_values=result.values, local=result.local)
             result, with_sizes = start._judged_as_described()
-            # What only known sizes contradict, they are the cause of.
-            wrong = wrong_sizes(sizes, least=_NOTICED) if alone and with_sizes.all_against() else []
+            # Contradictions that appear only with known sizes are caused by these sizes.
+            wrong = describe_wrong_sizes(sizes, least=_NOTICED) if alone and with_sizes.all_against() else []
             against = replace(with_sizes, doubts=doubts + with_sizes.doubts)
         if alone:
             against = replace(against, contradictions=wrong + against.contradictions)
         return result, against
 
     def _judged_as_described(self) -> tuple[Estimate, Findings]:
-        """The estimate and what speaks against it, with the sizes of what was scanned as the evidence has them.
+        """Return the estimate and the findings against it, with the sizes of scanned objects as in the evidence.
 
-        Where all that was known before is farther off than stated, or the target is bent or stretched more than it is
-        known to be, that is taken for as uncertain as it is off, for what the evidence does not show may be as wrong;
-        but not where a single parameter contradicts what is known.
+        If all prior knowledge deviates more than stated, or the target is bent or stretched more than stated, the prior
+        uncertainties are enlarged to the observed deviations: parameters without evidence may be as wrong. This is not
+        done if a single parameter contradicts prior knowledge.
         """
         result = self.solve()
-        compared, factor = deviations(result, least=0.0), understated(result)
+        compared, factor = deviations(result, least=0.0), estimate_birge_ratio(result)
         of_target = [each for each in compared if isinstance(each.key, TargetParameter)]
         form = [each for each in of_target if each.sigmas > _NOTICED]
-        # What is farthest off is taken for the cause: spacings wrong along both sides show in the stage's scale.
+        # The largest deviation is taken as the cause: wrong spacings along both sides appear in the stage's scale.
         stretched = compared[0] in form and compared[0].key in STRETCH
         stretch = {each.key: each.alone for each in of_target if stretched and each.key in STRETCH}
         if not (form or factor > 1.0) or any(each.wrong() for each in compared if each not in of_target):
-            return result, replace(findings(result, self.evidence, sensor=self.sensor), stretch=stretch)
+            return result, replace(check_consistency(result, self.evidence, sensor=self.sensor), stretch=stretch)
         off = {each.key: abs(each.alone - each.known) for each in of_target}
         priors = {key: replace(prior, std=factor * prior.std) for key, prior in self.parameters.priors.items()}
         for alike in (BENDS, STRETCH):
@@ -116,23 +122,23 @@ class JointProblem:
         scaled = stated.model_copy(update={name: factor * value for name, value in stated})
         sensor = self.sensor.model_copy(update={"uncertainty": scaled})
         result = replace(self, parameters=replace(self.parameters, priors=priors), sensor=sensor).solve()
-        against = findings(result, self.evidence, sensor=sensor)
-        doubts = [f"{each.words()}; taken for as uncertain as that" for each in form]
+        against = check_consistency(result, self.evidence, sensor=sensor)
+        doubts = [f"{each.words()}; its uncertainty was enlarged accordingly" for each in form]
         if factor > 1.0:
             doubts.append(
-                f"what the description states of window, media, laser, stage and target is off by {factor:.1f} times "
-                "the uncertainties stated with it: all are taken for that much larger; check [uncertainty]"
+                f"the description's values of window, media, laser, stage and target deviate by {factor:.1f} times the "
+                "stated uncertainties: all uncertainties were enlarged by this factor; check [uncertainty]"
             )
         return result, replace(against, doubts=doubts + against.doubts, stretch=stretch)
 
 
-def _of_unknown_size(piece: Evidence) -> Evidence:
-    return replace(piece, surface=piece.surface.of_unknown_size()) if isinstance(piece, SurfaceScanEvidence) else piece
+def _free_sizes(piece: Evidence) -> Evidence:
+    return replace(piece, surface=piece.surface.free_sizes()) if isinstance(piece, SurfaceScanEvidence) else piece
 
 
 @dataclass(frozen=True, eq=False)
 class JointResult:
-    """A joint calibration with what a report shows of its making."""
+    """Joint calibration with the data of its report."""
 
     calibration: Calibration
     estimate: Estimate
@@ -151,36 +157,45 @@ def calibrate_jointly(
 
     Parameters
     ----------
-    targets : a target in air or in a medium, with or without the camera's window, as each capture says; each capture is
-        a placement of its own, unless the poses are free. With the laser on at the same stage positions they show the
-        sheet too.
-    steps : a step standard in a medium
-    scans : scans of spheres, a plane or a pipe that stand still while the stage moves the sensor
-    options : its ``refractions`` do not count: windows are panes as described
+    targets
+        Captures of a target in air or in a medium, with or without the camera's window. Each capture is a separate
+        placement, unless the poses are free. Images with the laser on at the same stage positions show the sheet too.
+    steps
+        Captures of a step standard in a medium.
+    scans
+        Scans of spheres, a plane or a pipe that stand still while the stage moves the sensor.
+    options
+        Options. ``refractions`` is ignored: windows are glass plates as described.
+    progress
+        Called with the number of images done, the total, and the name of the stage.
 
-    Raises CalibrationError: no target is among the captures; the evidence does not determine the calibration or
-    contradicts it. DescriptionError and CaptureError: as `gather_jointly`.
+    Raises
+    ------
+    CalibrationError
+        No target is among the captures; the evidence does not determine the calibration or contradicts it.
+    DescriptionError, CaptureError
+        As for `gather_jointly`.
     """
     options = CalibrationOptions() if options is None else options
     return solve_jointly(gather_jointly(targets, steps, scans, options=options, progress=progress), options=options)
 
 
 def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointProblem:
-    """The problem to estimate from the captures, with a start; errors as `calibrate_jointly`."""
+    """Build the problem from the captures, with start values; errors as `calibrate_jointly`."""
     sensor, views = gathered.sensor, gathered.views()
     if not gathered.series:
-        raise CalibrationError("no capture shows a target: the joint calibration starts with one in air or in water")
+        raise CalibrationError("no capture shows a target; joint calibration needs one in air or in water")
     bare = next((v.medium for v in views if v.medium is not None and not v.window and set(views) != {v}), None)
     if bare is not None:
         raise CalibrationError(
-            f"some captures in {list(gathered.media)[bare]} were taken without a window and others were not: a lens "
-            "that touches the medium is another lens; calibrate it by itself, or set window.mounted"
+            f"some captures in {list(gathered.media)[bare]} were taken without a window, others were not: a lens in "
+            "contact with the medium has other parameters; calibrate it separately, or set window.mounted"
         )
     window = None
     if any(view.window for view in views):
         window = WindowModel.described(sensor.camera.window, sensor.laser.wavelength_nm)
     indices = gathered.indices(options)
-    start = series_start(gathered.series, sensor, window, indices, options=options)
+    start = estimate_series_start(gathered.series, sensor, window, indices, options=options)
     found = start.sheet()
     if found is None:
         reasons = [each.found.no_stripe for each in gathered.series if each.found.no_stripe]
@@ -189,12 +204,12 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
         )
     sheet, turns = found
     first = start.calibration(sheet.model(np.append(turns, (0.0, 0.0))))
-    steps, heights, left_out = step_profiles(gathered, first, window)
-    scans, missed = surface_scans(gathered.scans, first, sensor, indices, sizes_known=options.sizes_known)
-    priors = priors_of(gathered, window, turns, heights, options)
+    steps, heights, left_out = build_step_evidence(gathered, first, window)
+    scans, missed = build_all_scan_evidence(gathered.scans, first, sensor, indices, sizes_known=options.sizes_known)
+    priors = build_priors(gathered, window, turns, heights, options)
     parameters = Parameters(start.intrinsics, sheet, window, tuple(gathered.media), priors)
     global_values = parameters.start(start.lens)
-    lines = [line_start(step, parameters, global_values) for step in steps]
+    lines = [estimate_line_start(step, parameters, global_values) for step in steps]
     return JointProblem(
         parameters,
         evidence=[*start.evidence, *steps, *(evidence for evidence, _ in scans)],
@@ -208,7 +223,7 @@ def joint_problem(gathered: Gathered, *, options: CalibrationOptions) -> JointPr
 
 @dataclass(frozen=True, eq=False)
 class _Attempt:
-    """A problem with its estimate and what speaks against that; ``said`` is what was done about it before."""
+    """Problem with its estimate and the findings against it; ``said`` lists previous changes."""
 
     gathered: Gathered
     options: CalibrationOptions
@@ -219,15 +234,14 @@ class _Attempt:
 
     @classmethod
     def at(cls, gathered: Gathered, options: CalibrationOptions, said: tuple[str, ...] = ()) -> Self:
-        """The first one with this evidence and these options."""
+        """Solve the problem for this evidence and these options."""
         problem = joint_problem(gathered, options=options)
         return cls(gathered, options, problem, *problem.judged(), said)
 
-    def settled(self) -> "_Attempt":
-        """The same with a richer lens, if that helps, without images that do not fit; what is left is an error.
+    def improve(self) -> "_Attempt":
+        """Try a richer lens, then remove images that do not fit; contradictions of the description remain.
 
-        Where images still show something that the model lacks, all residuals of an image count as one. What contradicts
-        the description is left to be refused.
+        If images still show systematic deviations, all residuals of an image count as one.
         """
         attempt = self._with_richer_lens()
         if attempt.against.contradictions:
@@ -239,7 +253,7 @@ class _Attempt:
         return attempt._with_error_of_model() if attempt.against.all_against() else attempt
 
     def _without_unfit(self) -> "_Attempt | None":
-        """Without the images that contradict all others; None where that leaves too few, or contradicts more."""
+        """Remove the images that contradict all others; None if too few remain, or more contradictions appear."""
         kept = self.gathered.without(self.against.unfit)
         if kept is None:
             return None
@@ -248,10 +262,10 @@ class _Attempt:
         return None if fewer.against.contradictions else fewer
 
     def _with_richer_lens(self) -> "_Attempt":
-        """With more distortion, pixels of any shape, or both, where that explains the evidence better.
+        """Try more distortion coefficients, free pixel shape, or both; return the attempt that fits the evidence best.
 
-        Only what the options leave open. Pixels of a sensor on a stage are not freed for contradictions alone: a
-        spacing described wrongly along one side looks like them.
+        Only parameters that the options leave open are changed. The pixel shape of a sensor on a stage is not freed for
+        contradictions only: a wrong spacing along one side has the same effect.
         """
         choice, camera, best = self.options.lens, self.options.camera, self
         if choice is None or choice.distortion != "auto":
@@ -259,28 +273,28 @@ class _Attempt:
         odd = any(isinstance(each.key, LensParameter) for each in deviations(self.result, least=_NOTICED))
         for further in (BESIDES, RATIONAL_BESIDES) if odd or self.against.all_against() else ():
             tried = [best._with_lens(replace(camera, distortion=(*camera.distortion, *names))) for names in further]
-            best = _explaining_best([best, *filter(None, tried)])
+            best = _select_best([best, *filter(None, tried)])
             if "k3" not in best.options.camera.distortion:
                 break
         free_poses = self.options.poses == "free"
         if choice.pixels == "auto" and (free_poses or best.against.misfits):
             free = best._with_lens(replace(best.options.camera, pixel_aspect=None))
             if free is not None and (free_poses or free._scatter() < _CLEARLY_LESS * best._scatter()):
-                best = _explaining_best([best, free])
+                best = _select_best([best, free])
         if best is not self:
             given = [name for name in best.options.camera.distortion if name not in camera.distortion]
             given += ["free pixels"] if best.options.camera.pixel_aspect != camera.pixel_aspect else []
-            said = f"the lens was given {', '.join(given)}: without, images and description contradict each other"
+            said = f"{', '.join(given)} were added to the lens: without them, images and description disagree"
             best = replace(best, said=(*best.said, said))
         if choice.pixels == "auto" and not free_poses:
             best = best._with_spacings_and_pixels_free() or best
         return best
 
     def _with_spacings_and_pixels_free(self) -> "_Attempt | None":
-        """With the target's spacings and the pixels' shape unknown; None where the spacings are as described.
+        """Estimate the target's spacings and the pixel shape; None if the spacings are as described.
 
-        On a stage, spacings that are wrong along one side look like pixels of another shape: which of both it is, only
-        placements of the target that are turned against each other tell.
+        On a stage, wrong spacings along one side have the same effect as pixels of another shape. Only placements of
+        the target that are rotated against each other distinguish them.
         """
         found = list(self.against.stretch.values())
         if not found or self.options.camera.pixel_aspect is None:
@@ -292,14 +306,14 @@ class _Attempt:
         camera = replace(self.options.camera, pixel_aspect=None)
         freed = replace(self, gathered=replace(self.gathered, sensor=sensor))._with_lens(camera)
         said = (
-            f"the target's spacings are {' and '.join(f'{1e6 * value:+.0f}' for value in found)} µm/m off along rows "
-            "and columns, or pixels are of another shape than described: both are estimated. Placements of the target "
-            "turned by 90° against each other tell which, and so does `pixels` square or free"
+            f"the target's spacings are off by {' and '.join(f'{1e6 * value:+.0f}' for value in found)} µm/m along "
+            "rows and columns, or the pixels' shape is not as described: both are estimated. To distinguish them, use "
+            "placements of the target rotated by 90° against each other, or set `pixels` to square or free"
         )
         return None if freed is None else replace(freed, said=(*freed.said, said))
 
     def _with_lens(self, camera: CameraOptions) -> "_Attempt | None":
-        """With another lens; None where that is not determined, or the evidence contradicts what is described."""
+        """Solve with another lens; None if it is not determined, or the evidence contradicts the description."""
         try:
             richer = _Attempt.at(self.gathered, replace(self.options, camera=camera), self.said)
         except CalibrationError:
@@ -307,9 +321,9 @@ class _Attempt:
         return None if richer.against.contradictions else richer
 
     def _criterion(self, like: Estimate) -> float:
-        """-2 ln of the likelihood, and the cost of parameters of which nothing is known before.
+        """Return -2 ln of the likelihood, plus the cost of parameters without prior knowledge.
 
-        With as many independent residuals as ``like`` has.
+        The number of independent residuals is that of ``like``.
         """
         number = {
             kind: sum(len(part.values) for parts in like.residuals for part in parts if part.kind == kind)
@@ -325,33 +339,33 @@ class _Attempt:
         return float(scatter + known + np.isinf(parameters.prior_std()).sum() * np.log(sum(number.values())))
 
     def _scatter(self) -> float:
-        """Geometric mean of the scatter of the target's points and stripes, px."""
+        """Return the geometric mean of the scatter of target points and stripes, px."""
         return float(np.exp(np.mean(np.log([noise.sigma_px for noise in self.result.noise.values()]))))
 
     def _with_error_of_model(self) -> "_Attempt":
-        """With what does not fit as an error that all residuals of an image share, of whatever kind.
+        """Treat misfits as an error that all residuals of an image share, for every kind of residual.
 
-        What the model lacks moves lens and poses with it, so that points that fit well are no better known.
+        An incomplete model also biases lens and poses, so that kinds that fit well are affected too.
         """
         problem = replace(self.problem, misfits=frozenset(self.result.noise))
         result, against = problem.judged()
         before, after = self.result.std(), result.std()
         factor = float(np.median([after[key] / before[key] for key in before if key in after]))
-        said = [f"{words}; kept, for too many images are like that" for words in self.against.unfit.values()]
+        said = [f"{words}; kept, as too many images are like this" for words in self.against.unfit.values()]
         said += self.against.misfits.values()
         said.append(
-            "images show something that the model lacks: all points of an image are counted as one, and uncertainties "
-            f"are {factor:.1f} times larger by that (median)"
+            "images show systematic deviations from the model: all points of an image count as one, which makes "
+            f"uncertainties {factor:.1f} times larger (median)"
         )
         against = replace(against, unfit={}, misfits={})
         return replace(self, problem=problem, result=result, against=against, said=(*self.said, *said))
 
 
-def _explaining_best(tried: Sequence[_Attempt]) -> _Attempt:
-    """Of attempts from the same evidence the one that explains it best.
+def _select_best(tried: Sequence[_Attempt]) -> _Attempt:
+    """Select the attempt that fits the evidence best, by the Bayesian information criterion.
 
-    That is by the Bayesian information criterion, with as many independent residuals as in the one of least scatter.
-    What contradicts the description explains nothing.
+    The number of independent residuals is that of the attempt with the least scatter. Attempts that contradict the
+    description are excluded.
     """
     tried = [each for each in tried if not each.against.contradictions] or tried
     like = min(tried, key=_Attempt._scatter).result
@@ -359,10 +373,10 @@ def _explaining_best(tried: Sequence[_Attempt]) -> _Attempt:
 
 
 def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointResult:
-    """Calibrate from what the captures show, with the errors of `calibrate_jointly`."""
+    """Calibrate from gathered evidence; errors as `calibrate_jointly`."""
     attempt = _Attempt.at(gathered, options)
     if not options.strict:
-        attempt = attempt.settled()
+        attempt = attempt.improve()
     sensor, problem, result, against = gathered.sensor, attempt.problem, attempt.result, attempt.against
     if against.all_against():
         raise CalibrationError(against.refusal())
@@ -375,10 +389,10 @@ def solve_jointly(gathered: Gathered, *, options: CalibrationOptions) -> JointRe
         "target": gathered.series[0].found.target.model_dump(mode="json"),
         "warnings": [*warnings],
     }
-    calibration = calibration_of(result, problem.evidence, sensor, list(gathered.media.values()), provenance)
+    calibration = build_calibration(result, problem.evidence, sensor, list(gathered.media.values()), provenance)
     scans = [e for e in problem.evidence if isinstance(e, SurfaceScanEvidence) and not isinstance(e.surface, Plane)]
     if scans:
-        direction = scans[0].moved_direction(problem.parameters, result.values)[0]
+        direction = scans[0].stage_direction(problem.parameters, result.values)[0]
         stage = KnownStage(
             described=gathered.scans[0].stage_direction.tolist(),
             direction=(direction @ calibration.object_transform()[:3, :3]).tolist(),

@@ -1,4 +1,4 @@
-"""Refresh of a joint calibration by images in new water: its index, and the uncertainty of lengths in it."""
+"""Refresh a joint calibration with images in new water: its index, and the uncertainty of lengths in it."""
 
 import itertools
 from collections.abc import Sequence
@@ -9,18 +9,18 @@ import numpy as np
 from pydantic import JsonValue
 
 from uwlts.calibration.joint.estimate import Estimate, Evidence
-from uwlts.calibration.joint.gathering import Gathered, gather_jointly, priors_of
-from uwlts.calibration.joint.initial import line_start, step_profiles
+from uwlts.calibration.joint.gathering import Gathered, build_priors, gather_jointly
+from uwlts.calibration.joint.initial import build_step_evidence, estimate_line_start
 from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
 from uwlts.calibration.joint.parameters import SHEET, EarlierEstimate, ViewMedium
 from uwlts.calibration.joint.procedure import JointProblem
 from uwlts.calibration.joint.stored_estimate import (
     StoredEstimate,
-    calibration_of,
+    append_independent,
+    build_calibration,
+    convex_outline,
     found_estimate,
-    outline,
     require_joint,
-    with_independent,
 )
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions, sources_of
 from uwlts.errors import CalibrationError, RangeError
@@ -40,9 +40,10 @@ from uwlts.stripe import StripeSettings
 
 @dataclass(frozen=True)
 class LengthChange:
-    """The length over the volume that was known worst before, and by how much it is measured longer than before.
+    """The length in the volume with the largest previous uncertainty, and its change.
 
-    ``before_mm`` and ``after_mm`` are its standard uncertainty by the calibration.
+    ``before_mm`` and ``after_mm`` are its standard uncertainty from the calibration. ``longer_mm`` is the increase of
+    its measured value.
     """
 
     length_mm: float
@@ -53,7 +54,7 @@ class LengthChange:
 
 @dataclass(frozen=True)
 class WaterChange:
-    """New water by its name, its index with its standard uncertainty before and after, and what a length gains."""
+    """Index of a new water before and after the refresh, with standard uncertainties, and the change of a length."""
 
     name: str
     index_before: float
@@ -63,25 +64,25 @@ class WaterChange:
     length: LengthChange | None
 
     def lines(self) -> list[str]:
-        """The change in words."""
+        """Describe the change."""
         lines = [
             f"index of {self.name}: {self.index_before:.5f} ± {self.std_before:.2g} before, {self.index:.5f} ± "
-            f"{self.std:.2g} by the step (standard uncertainties)"
+            f"{self.std:.2g} from the step (standard uncertainties)"
         ]
         if (length := self.length) is not None:
             lines.append(
-                f"a length of {length.length_mm:.0f} mm, the one known worst: ± {2 * length.before_mm:.4f} mm before, "
-                f"± {2 * length.after_mm:.4f} mm now (k = 2, by the calibration); it is measured "
+                f"least certain length, {length.length_mm:.0f} mm: ± {2 * length.before_mm:.4f} mm before, "
+                f"± {2 * length.after_mm:.4f} mm now (k = 2, from the calibration); its measured value is "
                 f"{abs(length.longer_mm):.4f} mm {'longer' if length.longer_mm > 0 else 'shorter'}"
             )
         return lines
 
 
-def water_changes(calibration: Calibration, result: Estimate, earlier: EarlierEstimate) -> list[WaterChange]:
-    """Estimated media that a calibration has beyond an earlier one, if they were seen."""
+def compute_water_changes(calibration: Calibration, result: Estimate, earlier: EarlierEstimate) -> list[WaterChange]:
+    """Return the changes of the media that a calibration has in addition to an earlier one, if they were observed."""
     parameters, count = result.parameters, len(earlier.values)
     before = np.append(earlier.values, parameters.prior_mean()[count:])
-    covariance = with_independent(earlier.covariance, parameters.prior_std()[count:].tolist())
+    covariance = append_independent(earlier.covariance, parameters.prior_std()[count:].tolist())
     std_before, std = np.sqrt(np.diag(covariance)), result.std()
     seen = {region.view.medium: region for region in regions(calibration)}
     found = []
@@ -103,17 +104,17 @@ def water_changes(calibration: Calibration, result: Estimate, earlier: EarlierEs
     return found
 
 
-def refreshed_calibration(
+def build_refreshed_calibration(
     earlier: Calibration, gathered: Gathered, result: Estimate, evidence: Sequence[Evidence], *, warnings: list[str]
 ) -> Calibration:
-    """The calibration of an estimate to which an earlier one was known.
+    """Build the calibration of an estimate that used an earlier one as prior knowledge.
 
-    Its figures are those of all evidence, earlier and new, the scatter of steps that of the new ones alone, and its
-    ``std_before`` of what was known before any. Where the camera's pixels were calibrated in earlier water they are in
-    the new as well, so that the volume is the same. Directions of stages stay as they were found.
+    Its figures cover earlier and new evidence, except that the scatter of steps is from the new images only.
+    ``std_before`` is the prior uncertainty before any evidence. The covered region in the new water includes that of
+    earlier water, as it shows where the camera was calibrated. Stage directions are kept.
     """
     media = [*(known.medium for known in earlier.media), *gathered.media.values()]
-    new = calibration_of(result, evidence, gathered.sensor, media, _provenance(earlier, gathered, warnings))
+    new = build_calibration(result, evidence, gathered.sensor, media, _extend_provenance(earlier, gathered, warnings))
     turned = new.object_transform()[:3, :3].T @ earlier.object_transform()[:3, :3]
     found = ("camera", "window", "sheet", "camera_from_object", "media", "provenance")
     figures = {name: earlier.figures(name) | new.figures(name) for name in new.residuals}
@@ -125,13 +126,13 @@ def refreshed_calibration(
                 for stage in earlier.stages
             ),
             "residuals": earlier.residuals | figures,
-            "joint": _joint(require_joint(earlier), require_joint(new)),
+            "joint": _merge_estimates(require_joint(earlier), require_joint(new)),
         }
     )
 
 
-def _joint(before: JointEstimate, new: JointEstimate) -> JointEstimate:
-    """The new estimate with what the earlier one knew of all evidence before."""
+def _merge_estimates(before: JointEstimate, new: JointEstimate) -> JointEstimate:
+    """Merge the new estimate with the earlier estimate's record of its evidence."""
     fields = {name: getattr(new, name) for name in JointEstimate.model_fields}
     return before.model_copy(
         update=fields
@@ -142,13 +143,13 @@ def _joint(before: JointEstimate, new: JointEstimate) -> JointEstimate:
             "residual_count": before.residual_count + new.residual_count,
             "outlier_count": before.outlier_count + new.outlier_count,
             "images": before.images + new.images,
-            "covered": before.covered + tuple(_with_earlier(region, before.covered) for region in new.covered),
+            "covered": before.covered + tuple(_extend_region(region, before.covered) for region in new.covered),
         }
     )
 
 
-def _with_earlier(region: CoveredRegion, covered: Sequence[CoveredRegion]) -> CoveredRegion:
-    """Region covered in new water, with the largest region covered in earlier water through the window."""
+def _extend_region(region: CoveredRegion, covered: Sequence[CoveredRegion]) -> CoveredRegion:
+    """Extend a region covered in new water by the largest region covered in earlier water through the window."""
     wet = [other for other in covered if other.window and other.medium is not None]
     if not wet:
         return region
@@ -158,12 +159,12 @@ def _with_earlier(region: CoveredRegion, covered: Sequence[CoveredRegion]) -> Co
         update={
             "point_count": region.point_count + most.point_count,
             "camera_depth_mm": (min(depths), max(depths)),
-            "outline_mm": tuple(map(tuple, outline(np.array([*region.outline_mm, *most.outline_mm])).tolist())),
+            "outline_mm": tuple(map(tuple, convex_outline(np.array([*region.outline_mm, *most.outline_mm])).tolist())),
         }
     )
 
 
-def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -> dict[str, JsonValue]:
+def _extend_provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -> dict[str, JsonValue]:
     old, new = earlier.provenance, sources_of([], []) | gathered.provenance
     sources = Origin.model_validate(new).captures()
     refreshed = {
@@ -187,13 +188,13 @@ def _provenance(earlier: Calibration, gathered: Gathered, warnings: list[str]) -
 
 
 _AIR = Medium(kind="air")
-_ANY_INDEX = 0.02  # standard uncertainty of the index of a liquid of which nothing is known
-_CONTRADICTED = 4.0  # standard uncertainties by which steps contradict an index
+_ANY_INDEX = 0.02  # standard uncertainty of the index of an unknown liquid
+_CONTRADICTED = 4.0  # standard uncertainties beyond which steps contradict an index
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Refreshed(Brief):
-    """A calibration for new water besides the old, and what that changed, one entry for each new water."""
+    """Calibration with new water in addition to the old, and the change for each new water."""
 
     calibration: Calibration
     changes: list[WaterChange]
@@ -209,45 +210,45 @@ def refresh(
     stripe: StripeSettings = None,
     progress: ProgressListener = unheard,
 ) -> Refreshed:
-    """Adapt a joint calibration to new water, or water of another temperature, by images of a step in it.
+    """Adapt a joint calibration to new water, or to another water temperature, with images of a step.
 
-    All that the calibration found, correlations included, is what is known before; the new water's index is estimated
-    too. The images of the calibration are not needed.
+    The complete earlier estimate with its correlations is prior knowledge, and the new water's index is estimated. The
+    images of the earlier calibration are not needed.
 
     Parameters
     ----------
     calibration : Calibration or path
         Joint calibration of the sensor.
     step : sequence of Capture or path
-        Captures of the step standard in the new water. Its index is a parameter of its own, even where water that is
-        described alike was calibrated in.
+        Captures of the step standard in the new water. Its index is a new parameter, even if a calibrated water has the
+        same description.
     index : float, optional
-        Refractive index of the new water as far as it is known, in place of the one that follows from the captures.
+        Approximate refractive index of the new water. Default: the index that follows from the captures.
     index_std : float, optional
-        Standard uncertainty of that index, in place of what follows from the sensor's description; 0.001 if hardly
-        anything is known of the water.
+        Standard uncertainty of that index. Default: the value from the sensor's description. Use 0.001 if little is
+        known about the water.
     stripe : StripeOptions or dict, optional
         As for `reconstruct`.
     progress : callable, optional
-        Called with the number of images done, the number in all, and the name of the stage.
+        Called with the number of images done, the total, and the name of the stage.
 
     Raises
     ------
     CalibrationError
-        The calibration is not joint or has no window; a capture is of another sensor, in air, without the window, or
-        was calibrated from already; no image shows both faces; the images contradict what is known.
+        The calibration is not joint or has no window; a capture is from another sensor, in air, without the window, or
+        was already used; no image shows both faces; the images contradict the prior knowledge.
     DescriptionError
         A capture does not describe its step.
     RangeError
-        The index is not that of a medium, or its standard uncertainty is not positive.
+        The index is out of range, or its standard uncertainty is not positive.
     """
     if index is not None:
         require_index(index)
     if not isinstance(calibration, Calibration):
         calibration = read_calibration(calibration)
-    _earlier(calibration)
+    _require_earlier(calibration)
     if not step:
-        raise CalibrationError("no capture is given: take at least one image of a step in the new water")
+        raise CalibrationError("`step` is empty: give at least one image of a step in the new water")
     if index_std is not None and not index_std > 0:
         raise RangeError(f"the standard uncertainty of the index is {index_std:g}; it must be positive")
     options = CalibrationOptions(medium_index=index, stripe=stripe)
@@ -258,41 +259,41 @@ def refresh(
     used = {source.sha256 for source in calibration.origin().captures()}
     again = [source.file for source in Origin.model_validate(gathered.provenance).captures() if source.sha256 in used]
     if again:
-        raise CalibrationError(f"the calibration was made from {', '.join(again)} already: take a new image")
+        raise CalibrationError(f"{', '.join(again)} was already used for this calibration: take a new image")
     return solve_refreshed(calibration, gathered, options=options, index_std=index_std)
 
 
 def solve_refreshed(
     calibration: Calibration, gathered: Gathered, *, options: CalibrationOptions, index_std: float | None = None
 ) -> Refreshed:
-    """The same from what the captures show, with the errors of `refresh`."""
-    known = _earlier(calibration)
+    """Refresh a calibration from gathered evidence; errors as `refresh`."""
+    known = _require_earlier(calibration)
     old = known.parameters
-    gathered = _after(gathered, old.media)
-    profiles, heights, left_out = step_profiles(gathered, calibration, calibration.window)
+    gathered = _renumber_media(gathered, old.media)
+    profiles, heights, left_out = build_step_evidence(gathered, calibration, calibration.window)
     warnings = [*gathered.warnings, *left_out]
     if not profiles:
         raise CalibrationError("; ".join(warnings))
     turns = known.values[[old.keys.index(key) for key in SHEET[:3]]]
-    described = priors_of(gathered, calibration.window, turns, heights, options)
+    described = build_priors(gathered, calibration.window, turns, heights, options)
     priors = old.priors | {key: prior for key, prior in described.items() if key not in old.keys}
     if index_std is not None:
         priors |= {key: replace(priors[key], std=index_std) for key in map(MediumIndex, gathered.media)}
     earlier = EarlierEstimate(known.values, known.covariance)
     parameters = replace(old, media=(*old.media, *gathered.media), priors=priors, earlier=earlier)
     start = parameters.start(earlier.values[: len(parameters.intrinsics.names)])
-    lines = [line_start(profile, parameters, start) for profile in profiles]
+    lines = [estimate_line_start(profile, parameters, start) for profile in profiles]
     problem = JointProblem(parameters, profiles, start, lines, gathered.sensor, None, warnings)
     result, against = problem.judged()
     if against.all_against():
-        raise CalibrationError(_other_water(problem, earlier) or against.refusal())
+        raise CalibrationError(_explain_contradiction(problem, earlier) or against.refusal())
     warnings += against.doubts
-    refreshed = refreshed_calibration(calibration, gathered, result, profiles, warnings=warnings)
-    return Refreshed(refreshed, water_changes(refreshed, result, earlier), warnings)
+    refreshed = build_refreshed_calibration(calibration, gathered, result, profiles, warnings=warnings)
+    return Refreshed(refreshed, compute_water_changes(refreshed, result, earlier), warnings)
 
 
-def _other_water(problem: JointProblem, earlier: EarlierEstimate) -> str:
-    """With which indices steps agree that contradict those described, in words; empty where with none."""
+def _explain_contradiction(problem: JointProblem, earlier: EarlierEstimate) -> str:
+    """Describe an index that makes contradicting steps consistent, or return an empty text."""
     parameters = problem.parameters
     new = [key for key in parameters.keys[len(earlier.values) :] if isinstance(key, MediumIndex)]
     free = {key: replace(parameters.priors[key], std=_ANY_INDEX) for key in new}
@@ -307,21 +308,21 @@ def _other_water(problem: JointProblem, earlier: EarlierEstimate) -> str:
         sigmas = abs(found[key] - known.mean) / np.hypot(std, known.std)
         if sigmas >= _CONTRADICTED:
             words.append(
-                f"the steps say that the {key.text} is {found[key]:.4f} +- {std:.2g}, {sigmas:.1f} standard "
-                f"uncertainties from the {known.mean:.5f} +- {known.std:.2g} described"
+                f"from the steps, the {key.text} is {found[key]:.4f} +- {std:.2g}, {sigmas:.1f} standard "
+                f"uncertainties from the described {known.mean:.5f} +- {known.std:.2g}"
             )
     advice = (
-        ": check the step's height and the water's temperature and salinity in the captures, or give with `index` and "
-        "`index_std` what is known of it; if they are right, the sensor has changed: calibrate again"
+        ": check the step's height and the water's temperature and salinity in the captures, or give the known index "
+        "with `index` and `index_std`; if they are right, the sensor has changed: calibrate again"
     )
     return "; ".join(words) + advice if words else ""
 
 
-def _earlier(calibration: Calibration) -> StoredEstimate:
+def _require_earlier(calibration: Calibration) -> StoredEstimate:
     known = found_estimate(calibration, _AIR)
     if calibration.window is None:
         raise CalibrationError(
-            "the calibration has no window, through which new water would be seen: calibrate with images taken in "
+            "the calibration has no window, so it cannot be refreshed for new water: calibrate with images taken in "
             "water (`water`, or `joint` and `step`)"
         )
     return known
@@ -332,18 +333,18 @@ def _refuse_unsuitable(capture: Capture, calibration: Calibration) -> None:
         raise CalibrationError("; ".join(doubts))
     sensor, wavelength = capture.header.sensor, capture.header.sensor.laser.wavelength_nm
     if wavelength != calibration.wavelength_nm:
-        reason = f"with a laser of {wavelength:g} nm, the calibration is for {calibration.wavelength_nm:g} nm"
+        reason = f"with a laser of {wavelength:g} nm; the calibration is for {calibration.wavelength_nm:g} nm"
     elif capture.header.medium.kind == "air":
-        reason = "in air: the index of new water shows in an image of a step in it"
+        reason = "in air; expected an image of a step in the new water"
     elif not sensor.camera.window.mounted:
-        reason = "without the camera's window: new water is seen through that"
+        reason = "without the camera's window; expected an image through it"
     else:
         return
     raise CalibrationError(f"{capture.path.name} was taken {reason}")
 
 
-def _after(gathered: Gathered, media: Sequence[str]) -> Gathered:
-    """The same with its media numbered after earlier ones, and named otherwise than those."""
+def _renumber_media(gathered: Gathered, media: Sequence[str]) -> Gathered:
+    """Renumber the media after earlier ones, and rename those with an earlier name."""
     renamed: dict[str, Medium] = {}
     for name, medium in gathered.media.items():
         names = itertools.chain([name], (f"{name} {number}" for number in itertools.count(2)))

@@ -23,18 +23,18 @@ BENDS = (TargetParameter.BOW, TargetParameter.SADDLE)
 STRETCH = (TargetParameter.STRETCH_X, TargetParameter.STRETCH_Y)
 SHIFT = TargetParameter.STRIPE
 _TABLE_MM, _TABLE_SHARE = 1e-7, 1e-7
-"""Error of tabulated points of the sheet, and that of their derivatives as a share of the largest."""
+"""Error of tabulated points of the sheet, and relative error of their derivatives."""
 
 _TOGETHER = 2000
-"""Pixels whose residuals are computed together: fewer take longer each, and those of more leave the cache."""
+"""Pixels per batch: smaller batches have more overhead, larger ones exceed the cache."""
 
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residuals ``values`` (n,) in px of one kind from one image; of the target's points both coordinates in turn.
+    """Residuals ``values`` (n,) in px of one kind from one image; for target points, x and y alternate.
 
-    ``by_global`` (n, P) are the derivatives by the global parameters, ``by_local`` (n, c) those by the evidence's local
-    parameters that matter in this image, of the numbers ``local_columns`` (c,).
+    ``by_global`` (n, P) are the derivatives by the global parameters. ``by_local`` (n, c) are those by the local
+    parameters ``local_columns`` (c,), which affect this image.
     """
 
     kind: str
@@ -49,8 +49,8 @@ class Residuals:
 class Distances:
     """Signed distances ``values_mm`` (N,) of points from a surface, positive on the side of its normals.
 
-    ``outward`` (3, N) are the derivatives by the points, the unit normals; ``by_local`` (N, k) those by local
-    parameters, ``by_global`` (N,) each those by global parameters other than of the camera's rays and the sheet.
+    ``outward`` (3, N) are the derivatives by the points (unit normals), ``by_local`` (N, k) those by local parameters.
+    ``by_global`` (N,) are those by global parameters other than the camera's rays and the sheet.
     """
 
     values_mm: np.ndarray
@@ -61,10 +61,10 @@ class Distances:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StripeEvidence(ABC):
-    """Stripe ``pixels`` (N, 2) on something, with local parameters of its own.
+    """Stripe ``pixels`` (N, 2) on an object, with local parameters.
 
-    ``across``, 0 or 1, is the coordinate of the pixel that runs across the stripe; ``sources`` names capture and frame
-    of the images by their numbers. Rays are taken at the pixels, or at ``predicted`` ones (N, 2) near them.
+    ``across``, 0 or 1, is the pixel coordinate across the stripe. ``sources`` maps image numbers to capture and frame.
+    Rays are computed at the pixels, or at ``predicted`` pixels (N, 2) near them.
     """
 
     view: ViewMedium
@@ -75,24 +75,24 @@ class StripeEvidence(ABC):
 
     @abstractmethod
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
-        """Those of each image; None where a ray meets nothing."""
+        """Return the residuals of each image; None if a ray does not meet the object."""
 
     @abstractmethod
     def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
-        """Standard uncertainty (b,) of the local parameters before; infinite where nothing is known."""
+        """Return the prior standard uncertainty (b,) of the local parameters; infinite without prior knowledge."""
 
     def known_before(self, local: np.ndarray, uncertainty: Uncertainty) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (c,) of local parameters against prior knowledge, in standard uncertainties; derivatives (c, b)."""
+        """Return prior residuals (c,) of local parameters in standard uncertainties, and derivatives (c, b)."""
         std = self.local_std(uncertainty)
         known = np.isfinite(std)
         return local[known] / std[known], np.diag(1.0 / std)[known]
 
     def lit(self, image: int) -> np.ndarray:
-        """The stripe pixels (N,) of an image."""
+        """Return a mask of the stripe pixels (N,) of an image."""
         return np.ones(len(self.pixels), dtype=bool)
 
-    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
-        """The same with rays taken at the pixels that these residuals predict, but as found where not ``used`` (n,)."""
+    def linearise(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
+        """Compute rays at the pixels that residuals predict; those that are not ``used`` (n,) stay as detected."""
         predicted = self.pixels.copy()
         for part, kept in zip(residuals, used, strict=True):
             if part.kind != TARGET:
@@ -100,7 +100,7 @@ class StripeEvidence(ABC):
         return replace(self, predicted=predicted)
 
     def on_sheet(self, parameters: Parameters, global_values: np.ndarray, *, shifted_px: float = 0.0) -> "SeenSheet":
-        """Points of the sheet that the pixels show, of a stripe shifted across itself."""
+        """Compute the sheet points of the pixels, with the stripe shifted across itself."""
         at_px = self.pixels if self.predicted is None else self.predicted
         at_px = at_px - shifted_px * np.eye(2)[self.across]
         return SeenSheet.of(parameters, global_values, self.view, at_px, across=self.across)
@@ -117,9 +117,9 @@ class StripeEvidence(ABC):
         here: np.ndarray | slice = slice(None),
         least_share: float = 0.0,
     ) -> Residuals:
-        """Distances of points of the sheet from a surface as pixels across the stripe.
+        """Convert distances of sheet points from a surface to pixels across the stripe.
 
-        Where a pixel moves the distance by less than ``least_share`` of how far it moves the point, that share counts.
+        ``least_share`` is the minimum ratio of the distance change to the point's shift per pixel.
         """
         by = points.along(off.outward)
         by_px, by_global = by[:, 0], by[:, 1:]
@@ -142,9 +142,9 @@ class StripeEvidence(ABC):
 
 @dataclass(frozen=True, eq=False)
 class SeenSheet:
-    """Points of the sheet that stripe pixels (N, 2) show: calculated one by one, or by a table where there are many.
+    """Sheet points of stripe pixels (N, 2), computed one by one, or from a table for many pixels.
 
-    ``table`` are the series of lines, and the row and the argument (N,) of each pixel, as of `LineTable.series`.
+    ``table`` contains the series of lines, and the row and argument (N,) of each pixel (see `LineTable.series`).
     """
 
     exact: Callable[[np.ndarray], SheetPoints | None]
@@ -155,7 +155,7 @@ class SeenSheet:
     def of(
         cls, parameters: Parameters, global_values: np.ndarray, view: ViewMedium, pixels: np.ndarray, *, across: int
     ) -> "SeenSheet":
-        """That of a vector of the global parameters."""
+        """Build the sheet for a vector of the global parameters."""
         exact = partial(parameters.stripe_points, global_values, view, across=across)
         line, place = pixels[:, 1 - across].astype(np.intp), pixels[:, across]
         if not (line == pixels[:, 1 - across]).all():
@@ -171,7 +171,7 @@ class SeenSheet:
         return cls(exact, pixels, None if table is None else table.series(line, place))
 
     def places_mm(self) -> np.ndarray | None:
-        """The points (3, N) alone; None where the ray of one meets no sheet."""
+        """Return the points (3, N) only; None if a ray does not meet the sheet."""
         if self.table is None:
             found = self.exact(self.pixels)
             return None if found is None else found.points
@@ -181,7 +181,7 @@ class SeenSheet:
         return values.T
 
     def points(self, here: np.ndarray | slice = slice(None)) -> SheetPoints | None:
-        """Those of some of the pixels (n,); None where the ray of one meets no sheet."""
+        """Return the sheet points of some pixels (n,); None if a ray does not meet the sheet."""
         if self.table is None:
             return self.exact(self.pixels[here])
         series, row, at = self.table
@@ -192,18 +192,19 @@ class SeenSheet:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TargetEvidence(StripeEvidence):
-    """Images of one placement of the target with the stripes on it; local parameters are its pose, and the stage's.
+    """Images of one placement of the target with the stripes on it.
 
-    The local parameters are rotation vector and shift ``T_camera_target`` at the first image, and where the stage
-    moved: the tilt of its direction against the target's normal (2,) and an error in mm of all positions but the first.
+    The local parameters are the rotation vector and shift ``T_camera_target`` at the first image. If the stage moved,
+    the tilt of its direction against the target's normal (2,) and a position error in mm of all images except the first
+    follow.
 
     Attributes
     ----------
-    placement, predicted_points : the target's points as found; (M, 2), their pixels as ``predicted`` for the stripe
-    image : (N,); number of each stripe pixel's image
-    shifts_mm : (N,); stage position of each stripe pixel, from that of the first image
-    staged : whether the images are joined by the stage's motion
-    extent_mm : (K, 2); corners of the target, whose bow is given at the one farthest from the middle
+    placement, predicted_points : detected target points; predicted pixels (M, 2), like ``predicted`` for the stripe
+    image : (N,); image number of each stripe pixel
+    shifts_mm : (N,); stage position of each stripe pixel, relative to the first image
+    staged : whether the stage's motion connects the images
+    extent_mm : (K, 2); corners of the target; its bow is given at the corner farthest from the middle
     """
 
     placement: Placement
@@ -221,20 +222,20 @@ class TargetEvidence(StripeEvidence):
         object.__setattr__(self, "radius_mm", float(np.linalg.norm(self.extent_mm - middle, axis=1).max()))
 
     def images(self) -> np.ndarray:
-        """Numbers of the images whose stage positions have errors of their own."""
+        """Return the numbers of the images with a position error."""
         return np.unique(self.placement.image)[1:] if self.staged else np.empty(0, dtype=int)
 
     def lit(self, image: int) -> np.ndarray:
         return self.image == image
 
     def with_stripes(self, chosen: np.ndarray | slice) -> Self:
-        """The same with some of the stripe pixels only."""
+        """Return the evidence with some of the stripe pixels only."""
         return replace(self, pixels=self.pixels[chosen], image=self.image[chosen], shifts_mm=self.shifts_mm[chosen])
 
     def with_centres(
         self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, diameter_mm: float
     ) -> Self:
-        """The same with the images of the circles' centres instead of the centres of the circles' images."""
+        """Correct the detected centres of circle images to the images of the circles' centres."""
         placement, seen_by = self.placement, partial(parameters.project, global_values, self.view)
         pixels = placement.pixels.copy()
         for image in np.unique(placement.image):
@@ -243,7 +244,7 @@ class TargetEvidence(StripeEvidence):
         return replace(self, placement=replace(placement, pixels=pixels))
 
     def pose(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray, image: int) -> np.ndarray:
-        """``T_camera_target`` (4, 4) of one of the images."""
+        """Return ``T_camera_target`` (4, 4) of an image."""
         pose = _Poses(self, parameters, global_values, local, np.array([image]))
         return rigid_transform(pose.rotation, pose.shift - pose.rotation @ (pose.direction * pose.travel))
 
@@ -254,35 +255,35 @@ class TargetEvidence(StripeEvidence):
         return np.array([*[np.inf] * 6, tilt, tilt, *[position] * len(self.images())])
 
     def residuals(self, parameters: Parameters, global_values: np.ndarray, local: np.ndarray) -> list[Residuals] | None:
-        """Those of the target's points and of the stripe, image by image; None where a ray meets nothing."""
+        """Return the residuals of target points and stripe for each image; None if a ray misses the target."""
         found: list[Residuals] = []
         sheet = self.on_sheet(parameters, global_values, shifted_px=parameters.value(global_values, SHIFT))
         of_stripe = partial(self._of_stripe, sheet)
         for of_kind, image in ((self._of_points, self.placement.image), (of_stripe, self.image)):
-            for here in _batches(image):
+            for here in _split_batches(image):
                 pose = _Poses(self, parameters, global_values, local, image[here])
                 if (parts := of_kind(parameters, global_values, pose, here)) is None:
                     return None
                 found += parts
         return sorted(found, key=lambda part: part.image)
 
-    def linearised(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
+    def linearise(self, residuals: Sequence[Residuals], used: Sequence[np.ndarray]) -> Self:
         points = self.placement.pixels.copy()
         for part, kept in zip(residuals, used, strict=True):
             if part.kind == TARGET:
                 points[self.placement.image == part.image] -= np.where(kept, part.values, 0.0).reshape(-1, 2)
-        return replace(super().linearised(residuals, used), predicted_points=points)
+        return replace(super().linearise(residuals, used), predicted_points=points)
 
     def _of_points(
         self, parameters: Parameters, global_values: np.ndarray, pose: "_Poses", here: np.ndarray
     ) -> list[Residuals] | None:
-        """Those of some of the target's points (n,), image after image."""
+        """Return the residuals of some target points (n,), image after image."""
         found_px = self.placement.pixels[here]
         at_px = found_px if self.predicted_points is None else self.predicted_points[here]
         rays = parameters.rays(global_values, self.view, at_px)
         if rays is None:
             return None
-        start, along = pose.into_target(rays.origins), pose.rotation.T @ rays.directions
+        start, along = pose.to_target_frame(rays.origins), pose.rotation.T @ rays.directions
         known = self.placement.points_mm[here]
         bends = self._bends(known)
         reach = (_values(parameters, global_values, BENDS) @ bends - start[2]) / along[2]
@@ -292,16 +293,16 @@ class TargetEvidence(StripeEvidence):
         slope = along[:2] / along[2]
 
         def flat(moved: np.ndarray) -> np.ndarray:
-            """From a change (..., 3, N) of the point to that (..., 2, N) of where the ray meets the target."""
+            """Convert a shift (..., 3, N) of a point to the shift (..., 2, N) of the ray's target point."""
             return moved[..., :2, :] - slope * moved[..., 2:, :]
 
         by_rays = flat(pose.rotation.T @ (rays.origins_by + reach * rays.directions_by))
         stretch = 1.0 + _values(parameters, global_values, STRETCH)
         found = (start + reach * along)[:2] - stretch[:, None] * known[:, :2].T
-        into = np.linalg.inv(by_rays[:2].transpose(2, 1, 0))  # (N, 2 pixel, 2 target), target mm to px
+        into = np.linalg.inv(by_rays[:2].transpose(2, 1, 0))  # (N, 2 pixel, 2 target), maps target mm to px
 
         def to_pixels(moved: np.ndarray) -> np.ndarray:
-            """From (2, N, c) to rows (2 N, c)."""
+            """Convert (2, N, c) to rows (2 N, c)."""
             return (into @ moved.transpose(1, 0, 2)).reshape(2 * len(known), -1)
 
         by_scale = flat(pose.by_scale())
@@ -314,18 +315,18 @@ class TargetEvidence(StripeEvidence):
             parameters.add(by_global[axis], StageParameter.SCALE, by_scale[axis])
         values = (found_px - at_px).ravel() + to_pixels(found[:, :, None]).ravel()
         by_local = to_pixels(flat(pose.by_local(at)).transpose(1, 2, 0))
-        return pose.by_image(TARGET, values, to_pixels(by_global), by_local)
+        return pose.split_by_image(TARGET, values, to_pixels(by_global), by_local)
 
     def _of_stripe(
         self, sheet: SeenSheet, parameters: Parameters, global_values: np.ndarray, pose: "_Poses", here: np.ndarray
     ) -> list[Residuals] | None:
-        """Those of some of the stripe's pixels (n,), image after image."""
+        """Return the residuals of some stripe pixels (n,), image after image."""
         points = sheet.points(here)
         if points is None:
             return None
-        at = pose.into_target(points.points)
+        at = pose.to_target_frame(points.points)
         bends, (bow, saddle) = self._bends(at.T), _values(parameters, global_values, BENDS)
-        # Height above the bent target: its gradient by the point in the target's frame.
+        # Gradient of the height above the bent target, in the target's frame.
         steep = -2.0 / self.radius_mm**2 * np.array([[bow + saddle], [bow - saddle]])
         gradient = np.stack([*(steep * (at[:2] - self.middle_mm[:, None])), np.ones(at.shape[1])])
         outward = pose.rotation @ gradient
@@ -341,10 +342,10 @@ class TargetEvidence(StripeEvidence):
         every = self.stripe_residuals(
             parameters, points, off, kind=STRIPE, local_columns=all_columns, image=-1, here=here
         )
-        return pose.by_image(STRIPE, every.values, every.by_global, every.by_local)
+        return pose.split_by_image(STRIPE, every.values, every.by_global, every.by_local)
 
     def _bends(self, points: np.ndarray) -> np.ndarray:
-        """Heights (2, N) of the target's points (N, 2 or 3) for a bow of one, and for a saddle of one."""
+        """Return heights (2, N) of target points (N, 2 or 3) for a unit bow, and for a unit saddle."""
         x2, y2 = ((points[:, :2] - self.middle_mm) / self.radius_mm).T ** 2
         return np.stack([x2 + y2, x2 - y2])
 
@@ -353,17 +354,17 @@ def _values(parameters: Parameters, global_values: np.ndarray, keys: tuple[Param
     return np.array([parameters.value(global_values, key) for key in keys])
 
 
-def _batches(image: np.ndarray) -> list[np.ndarray]:
-    """Numbers of pixels, image after image, of as many images at a time as stay in the processor's cache."""
+def _split_batches(image: np.ndarray) -> list[np.ndarray]:
+    """Split pixel numbers into batches of whole images that fit into the processor's cache."""
     order = np.argsort(image, kind="stable")
     starts = np.flatnonzero(np.diff(image[order], prepend=-1))
     return np.split(order, starts[1:][np.diff(starts // _TOGETHER) > 0]) if len(order) else []
 
 
 class _Poses:
-    """Pose of the target to the camera for pixels (n,) of several images, and its derivatives by local parameters.
+    """Target poses for pixels (n,) of several images, and derivatives by local parameters.
 
-    ``image`` (n,) is each pixel's, ``travel`` (n,) how far, in mm, the stage has moved along ``direction`` in it.
+    ``image`` (n,) is each pixel's image, ``travel`` (n,) the motion of the stage along ``direction``, mm.
     """
 
     def __init__(
@@ -383,22 +384,22 @@ class _Poses:
         self._nominal = self.travel = np.zeros(len(image))
         if evidence.staged:
             images, first = np.unique(placement.image, return_index=True)
-            # The first image has no error of its own position.
+            # The first image lacks a position error.
             self._place = np.searchsorted(images, image)
             self._nominal = placement.shifts_mm[first][self._place]
             scale = 1.0 + parameters.value(global_values, StageParameter.SCALE)
             self.travel = self._nominal * scale + np.append(0.0, local[8:])[self._place]
 
-    def into_target(self, points: np.ndarray) -> np.ndarray:
-        """Points (3, n) of the camera frame in the target's frame at the first image."""
+    def to_target_frame(self, points: np.ndarray) -> np.ndarray:
+        """Transform points (3, n) of the camera frame to the target's frame at the first image."""
         return self.rotation.T @ (points - self.shift[:, None]) + self.direction[:, None] * self.travel
 
     def by_scale(self) -> np.ndarray:
-        """Derivatives (3, n) of `into_target` by the stage's scale."""
+        """Return derivatives (3, n) of `into_target` by the stage's scale."""
         return self.direction[:, None] * self._nominal
 
     def by_local(self, points: np.ndarray) -> np.ndarray:
-        """Derivatives (c, 3, n) of `into_target` by the local parameters, the last one that of each pixel's image."""
+        """Return derivatives (c, 3, n) of `into_target` by the local parameters; the last one is the pixel's image."""
         result = np.empty((9 if self._staged else 6, 3, points.shape[1]))
         result[:3] = self._rotation_by.transpose(0, 2, 1) @ (points - self.shift[:, None])
         result[3:6] = -self.rotation[:, :, None]
@@ -407,8 +408,10 @@ class _Poses:
             result[8] = self.direction[:, None]
         return result
 
-    def by_image(self, kind: str, values: np.ndarray, by_global: np.ndarray, by_local: np.ndarray) -> list[Residuals]:
-        """Residuals of each image from those of all pixels, of one coordinate or two each."""
+    def split_by_image(
+        self, kind: str, values: np.ndarray, by_global: np.ndarray, by_local: np.ndarray
+    ) -> list[Residuals]:
+        """Split residuals of pixels with one or two coordinates each by image."""
         images, first = np.unique(self.image, return_index=True)
         rows, found = len(values) // len(self.image), []
         for image, start, end in zip(images, first, np.append(first[1:], len(self.image)), strict=True):
@@ -424,11 +427,10 @@ class _Poses:
 class StepProfileEvidence(StripeEvidence):
     """Stripe pixels on both faces of a step standard in one image; local parameters are the lower face's line.
 
-    The faces are planes square to ``upward + slope * along``; the lower one lies at a distance of the local parameters
-    (slope, distance in mm), the upper one higher by the standard's height, which is the global parameter ``height``,
-    times ``lengthened``, as the sheet cuts the step at an angle to its normal.
-    ``upward``, from the lower face to the upper one, and ``along`` the stripe are unit vectors (3,), camera frame;
-    ``upper`` (N,) marks the pixels on the upper face. ``image`` is the number of the image among all of steps.
+    The faces are planes perpendicular to ``upward + slope * along``. The local parameters (slope, distance in mm) give
+    the lower face. The upper face is higher by the global parameter ``height`` times ``lengthened``: the sheet cuts the
+    step at an angle to its normal. ``upward`` (from the lower face to the upper one) and ``along`` the stripe are unit
+    vectors (3,), camera frame. ``upper`` (N,) marks the pixels on the upper face. ``image`` counts all step images.
     """
 
     upper: np.ndarray
@@ -439,7 +441,7 @@ class StepProfileEvidence(StripeEvidence):
     lengthened: float = 1.0
 
     def upper_mm(self, parameters: Parameters, global_values: np.ndarray) -> np.ndarray:
-        """How far (N,) the pixels' faces lie above the lower one within the sheet."""
+        """Return the height (N,) of each pixel's face above the lower one, within the sheet."""
         return self.upper * (self.lengthened * parameters.value(global_values, self.height))
 
     def local_std(self, uncertainty: Uncertainty) -> np.ndarray:

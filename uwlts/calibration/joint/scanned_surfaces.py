@@ -1,4 +1,4 @@
-"""Scans of spheres, planes and pipes as evidence: distances of points from the surface, with their derivatives."""
+"""Scans of spheres, planes and pipes as evidence: distances of points from the surface, and derivatives."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
@@ -15,10 +15,10 @@ from uwlts.optics.window import leaning
 
 @dataclass(frozen=True, eq=False)
 class Sizes:
-    """Sizes in mm that a description states, (c,) each, by their ``names``, and what the local parameters make of them.
+    """Described sizes (c,) in mm with their ``names``, and their deviations by the local parameters.
 
-    ``off_mm`` is by how much they are larger than ``described_mm``, ``by_local`` (c, k) its derivatives. ``std_mm`` is
-    the standard uncertainty stated, infinite for what counts as unknown.
+    ``off_mm`` are the estimated sizes minus ``described_mm``, ``by_local`` (c, k) the derivatives. ``std_mm`` is the
+    stated standard uncertainty, infinite for an unknown size.
     """
 
     names: tuple[str, ...]
@@ -28,16 +28,16 @@ class Sizes:
     by_local: np.ndarray
 
     def residuals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Those that are known, in standard uncertainties (n,), and their derivatives (n, k)."""
+        """Return deviations of known sizes in standard uncertainties (n,), and derivatives (n, k)."""
         known = np.isfinite(self.std_mm)
         std = self.std_mm[known]
         return self.off_mm[known] / std, self.by_local[known] / std[:, None]
 
 
 class Surface(ABC):
-    """One surface, or several of a kind, all in the camera frame at the stage position 0.
+    """One surface, or several of a kind, in the camera frame at the stage position 0.
 
-    ``kind`` names what a stripe on it gives, ``count`` is the number of its bodies.
+    ``kind`` is the name of its residuals, ``count`` the number of its bodies.
     """
 
     kind: ClassVar[str]
@@ -45,27 +45,27 @@ class Surface(ABC):
 
     @abstractmethod
     def parameter_count(self) -> int:
-        """Number k of its local parameters, of which nothing is known before but `sizes`."""
+        """Return the number k of its local parameters, known before only by `sizes`."""
 
     @abstractmethod
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
-        """Of points (3, N) of the scan's pixels, in their order."""
+        """Return the distances of points (3, N) of the scan's pixels, in their order."""
 
     def sizes(self, local: np.ndarray) -> Sizes:
-        """Its described sizes; none of what has no size."""
+        """Return its described sizes; empty for a surface without a size."""
         return Sizes((), np.empty(0), np.empty(0), np.empty(0), np.empty((0, len(local))))
 
-    def of_unknown_size(self) -> Self:
-        """The same with nothing known of its sizes."""
+    def free_sizes(self) -> Self:
+        """Return the surface with unknown sizes."""
         return self
 
 
 @dataclass(frozen=True, eq=False)
 class Spheres(Surface):
-    """S spheres. Local parameters: the centres in mm, then what the diameters are more than ``diameters_mm`` (S,).
+    """S spheres. Local parameters: centres in mm, then deviations of the diameters from ``diameters_mm`` (S,).
 
-    ``spacings_mm`` (S - 1,) are the distances of consecutive centres; the standard uncertainties of both are infinite
-    for unknown ones. ``sphere`` (N,) says on which of them each pixel of the scan lies.
+    ``spacings_mm`` (S - 1,) are the distances of consecutive centres. Standard uncertainties are infinite for unknown
+    sizes. ``sphere`` (N,) is the sphere of each pixel of the scan.
     """
 
     kind: ClassVar[str] = "stripe on the spheres"
@@ -112,7 +112,7 @@ class Spheres(Surface):
             by_local,
         )
 
-    def of_unknown_size(self) -> Self:
+    def free_sizes(self) -> Self:
         unknown = {name: np.full_like(getattr(self, name), np.inf) for name in ("diameter_std_mm", "spacing_std_mm")}
         return replace(self, **unknown)
 
@@ -122,10 +122,10 @@ class Spheres(Surface):
 
 @dataclass(frozen=True, eq=False)
 class Plane(Surface):
-    """A plane near another through ``point_mm`` (3,) with the unit ``normal`` (3,).
+    """Plane near the one through ``point_mm`` (3,) with the unit ``normal`` (3,).
 
-    Local parameters: two slopes of its normal towards the unit vectors ``across`` (2, 3), which are square to the other
-    normal and each other, and its distance in mm from the point.
+    Local parameters: two slopes of its normal towards the unit vectors ``across`` (2, 3), perpendicular to ``normal``
+    and each other, and its distance in mm from the point.
     """
 
     kind: ClassVar[str] = "stripe on the plane"
@@ -146,11 +146,11 @@ class Plane(Surface):
 
 @dataclass(frozen=True, eq=False)
 class Cylinder(Surface):
-    """A cylinder near another with the unit ``axis`` (3,) through ``point_mm`` (3,), seen from outside or inside.
+    """Cylinder near the one with the unit ``axis`` (3,) through ``point_mm`` (3,), seen from outside or inside.
 
-    Local parameters: two shifts of its axis in mm at the point and two slopes of it, along the unit vectors ``across``
-    (2, 3), which are square to the other axis and each other, and what the diameter is more than ``diameter_mm``, whose
-    standard uncertainty is infinite for an unknown one.
+    Local parameters: two shifts of its axis in mm at the point and two slopes, along the unit vectors ``across`` (2,
+    3), perpendicular to ``axis`` and each other, and the deviation from ``diameter_mm``. The standard uncertainty of
+    the diameter is infinite if unknown.
     """
 
     kind: ClassVar[str] = "stripe on the pipe"
@@ -168,7 +168,7 @@ class Cylinder(Surface):
         described, std = np.array([self.diameter_mm]), np.array([self.diameter_std_mm])
         return Sizes(("diameter of the pipe",), described, std, local[4:], np.eye(5)[4:])
 
-    def of_unknown_size(self) -> Self:
+    def free_sizes(self) -> Self:
         return replace(self, diameter_std_mm=np.inf)
 
     def distances(self, points: np.ndarray, local: np.ndarray) -> Distances:
@@ -184,10 +184,10 @@ class Cylinder(Surface):
 
 
 SCANNED = (Spheres.kind, Plane.kind, Cylinder.kind)
-"""Name of residuals on such surfaces."""
+"""Names of residuals on these surfaces."""
 SLOPES = (StageParameter.SLOPE_1, StageParameter.SLOPE_2)
-"""Inclination of the stage's direction to the one described, towards two directions across it."""
-# Where the ray's crossing with the sheet moves almost along the surface, a residual in px would be out of all bounds.
+"""Slopes of the stage's direction relative to the described one, towards two perpendicular directions."""
+# Limits residuals in px of points that move nearly along the surface if the pixel changes.
 LEAST_SHARE = 0.4
 
 
@@ -195,17 +195,17 @@ LEAST_SHARE = 0.4
 class SurfaceScanEvidence(StripeEvidence):
     """Stripe pixels on a surface that stands still while the stage moves the sensor.
 
-    The local parameters are those of the surface, camera frame at the stage position 0, and an error of each of the F
+    The local parameters are those of the surface (camera frame at the stage position 0), and an error of each of the F
     stage positions ``stage_mm``.
 
     Attributes
     ----------
-    beside_mm : (3, N); from the sheet's middle to where their light comes from, camera frame: `uwlts.optics.brightness`
-    common_px : (N,); standard uncertainty of what that and blur leave, which all points of a body share
-    frame : (N,) int; in which image each lies, from 0
-    direction, across_stage : (3,), (2, 3); in which growing positions move the sensor as described, and two directions
-        across, orthonormal, camera frame
-    image : number of the scan's first image among all of scans
+    beside_mm : (3, N); offset of the light's origin from the sheet's middle, camera frame (`uwlts.optics.brightness`)
+    common_px : (N,); standard uncertainty of remaining brightness and blur errors, common to all points of a body
+    frame : (N,) int; image number of each pixel, from 0
+    direction, across_stage : (3,), (2, 3); described direction of the sensor at increasing positions, and two
+        perpendicular directions, orthonormal, camera frame
+    image : number of the scan's first image among those of all scans
     """
 
     beside_mm: np.ndarray
@@ -218,7 +218,7 @@ class SurfaceScanEvidence(StripeEvidence):
     image: int
 
     def scan(self) -> str:
-        """The scan's capture."""
+        """Return the name of the scan's capture."""
         return self.sources[self.image].rsplit(", at ", 1)[0]
 
     def local_std(self, uncertainty: Uncertainty) -> np.ndarray:
@@ -239,7 +239,7 @@ class SurfaceScanEvidence(StripeEvidence):
         if points is None:
             return None
         count = len(local) - len(self.stage_mm)
-        direction, by_slopes = self.moved_direction(parameters, global_values)
+        direction, by_slopes = self.stage_direction(parameters, global_values)
         nominal = self.stage_mm[self.frame]
         travel = nominal * (1.0 + parameters.value(global_values, StageParameter.SCALE)) + local[count:][self.frame]
         off = self.surface.distances(points.points + self.beside_mm + direction[:, None] * travel, local[:count])
@@ -260,14 +260,14 @@ class SurfaceScanEvidence(StripeEvidence):
             found.append(Residuals(kind, *rows, columns, self.image + int(number)))
         return found
 
-    def moved_direction(self, parameters: Parameters, global_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The stage's direction (3,), camera frame, and its derivatives (2, 3) by the slopes."""
+    def stage_direction(self, parameters: Parameters, global_values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the stage's direction (3,), camera frame, and its derivatives (2, 3) by the slopes."""
         slopes = np.array([parameters.value(global_values, key) for key in SLOPES])
         return leaning(self.direction, self.across_stage, slopes)
 
 
 def across_of(direction: np.ndarray) -> np.ndarray:
-    """Two unit vectors (2, 3) across a direction of the OCS and each other; along Y and Z for a motion along X."""
+    """Return two unit vectors (2, 3) perpendicular to a direction and each other; Y and Z for a motion along X."""
     second = np.cross((0.0, 0.0, 1.0) if abs(direction[2]) < 0.9 else (1.0, 0.0, 0.0), direction)
     second /= np.linalg.norm(second)
     return np.stack([second, np.cross(direction, second)])

@@ -1,4 +1,4 @@
-"""The joint estimate in a calibration: written with a summary of its evidence, and read back, also for other media."""
+"""Joint estimate in a calibration: written with a summary of its evidence, and read for any medium."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ from uwlts.model.sensor import Medium, Sensor, Table, Uncertainty
 from uwlts.model.stripe import pixels_of
 
 _FRAME_STEP = 1e-5
-"""Of the sheet's parameters, rad and mm, for differences: what they leave out is a millionth of a millionth."""
+"""Step of the sheet's parameters, rad and mm, for central differences; their error is negligible."""
 
 
-def calibration_of(
+def build_calibration(
     result: Estimate,
     evidence: Sequence[Evidence],
     sensor: Sensor,
     media: Sequence[Medium],
     provenance: dict[str, JsonValue],
 ) -> Calibration:
-    """The calibration of a joint estimate, by the evidence it was made from, in media other than air."""
+    """Build the calibration of a joint estimate, with its evidence, for media other than air."""
     parameters, values = result.parameters, result.values
     sheet = parameters.sheet_model(values)
     frame = object_frame(sheet, laser_axis=parameters.sheet.axis)
@@ -47,13 +47,13 @@ def calibration_of(
         camera_from_object=tuple(map(tuple, frame.tolist())),
         media=tuple(KnownMedium(medium=m, index=index) for m, index in zip(media, indices, strict=True)),
         residuals=_lens_and_window(result),
-        joint=_joint_estimate(result, evidence, frame),
+        joint=_build_joint_estimate(result, evidence, frame),
         provenance=provenance,
     )
 
 
-def _joint_estimate(result: Estimate, evidence: Sequence[Evidence], object_frame: np.ndarray) -> JointEstimate:
-    """The estimate with the fit of each image and the covered regions in the OCS, at ``T_camera_object`` (4, 4)."""
+def _build_joint_estimate(result: Estimate, evidence: Sequence[Evidence], object_frame: np.ndarray) -> JointEstimate:
+    """Build the stored estimate with the fit of each image and the covered regions, with ``T_camera_object`` (4, 4)."""
     images = []
     lit: dict[ViewMedium, list[np.ndarray]] = {}
     for piece, parts in zip(evidence, result.residuals, strict=True):
@@ -86,14 +86,14 @@ def _joint_estimate(result: Estimate, evidence: Sequence[Evidence], object_frame
         stopped=result.stopped,
         images=tuple(images),
         covered=tuple(
-            _covered(result, view, np.vstack(pixels), object_frame, across=evidence[0].across)
+            _build_covered_region(result, view, np.vstack(pixels), object_frame, across=evidence[0].across)
             for view, pixels in lit.items()
         ),
     )
 
 
 def _lens_and_window(result: Estimate) -> dict[str, Table]:
-    """Standard uncertainties of lens and window, by the names that sequential calibrations give them in files."""
+    """Return standard uncertainties of lens and window, with the names of sequential calibrations in files."""
     std = result.std()
     camera: Table = {"std": {key.text: std[key] for key in std if isinstance(key, LensParameter)}}
     if TARGET in result.noise:
@@ -104,12 +104,12 @@ def _lens_and_window(result: Estimate) -> dict[str, Table]:
     return figures
 
 
-def _covered(
+def _build_covered_region(
     result: Estimate, view: ViewMedium, pixels: np.ndarray, object_frame: np.ndarray, *, across: int
 ) -> CoveredRegion:
     seen = SeenSheet.of(result.parameters, result.values, view, pixels, across=across).places_mm()
     if seen is None:
-        raise CalibrationError("a stripe that was used meets no sheet by the joint estimate")
+        raise CalibrationError("with the joint estimate, the ray of a used stripe pixel does not meet the sheet")
     at = (object_frame[:3, 1:3].T @ (seen - object_frame[:3, 3:4])).T
     return CoveredRegion(
         medium=view.medium,
@@ -117,12 +117,12 @@ def _covered(
         window=view.window,
         point_count=len(at),
         camera_depth_mm=(float(seen[2].min()), float(seen[2].max())),
-        outline_mm=tuple(map(tuple, np.round(outline(at), 3).tolist())),
+        outline_mm=tuple(map(tuple, np.round(convex_outline(at), 3).tolist())),
     )
 
 
-def outline(at: np.ndarray) -> np.ndarray:
-    """Corners (K, 2) of the convex hull; of points on a line its ends."""
+def convex_outline(at: np.ndarray) -> np.ndarray:
+    """Return the corners (K, 2) of the convex hull; for collinear points, the ends."""
     try:
         return at[ConvexHull(at).vertices]
     except QhullError:
@@ -133,7 +133,7 @@ def outline(at: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class StoredEstimate:
-    """Parameters, their values (P,), their covariance (P, P), and through what a scan was seen."""
+    """Parameters, their values (P,) and covariance (P, P), and the view of a scan."""
 
     calibration: Calibration
     parameters: Parameters
@@ -142,14 +142,14 @@ class StoredEstimate:
     view: ViewMedium
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """Pixels (N, 2) of points (N, 3) in the camera frame; NaN where there is none."""
+        """Project points (N, 3) of the camera frame; return pixels (N, 2), else NaN."""
         return self.parameters.project(self.values, self.view, points)
 
     def points_by(self, line: np.ndarray, centre_px: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Points (N, 3) of stripe centres, and their derivatives (N, 3, 1 + P) by the pixel and all parameters.
+        """Return points (N, 3) of stripe centres, and derivatives (N, 3, 1 + P) by the pixel and all parameters.
 
-        The pixel is that across the stripe. In the OCS, which stays where the calibration places it beside the camera.
-        None where a centre has no point.
+        The pixel is that across the stripe. The coordinates are in the OCS, fixed relative to the camera. None if a
+        centre cannot be triangulated.
         """
         pixels = pixels_of(line, centre_px, stripe_along=self.calibration.stripe_along)
         found = self.parameters.stripe_points(self.values, self.view, pixels, across=self.across())
@@ -159,9 +159,9 @@ class StoredEstimate:
         return (found.points.T - frame[:3, 3]) @ frame[:3, :3], np.einsum("ji,njr->nir", frame[:3, :3], found.by)
 
     def frame_by(self) -> np.ndarray:
-        """Derivatives (6, P) of the OCS by the parameters: shift, mm, and rotation, rad, along its own axes.
+        """Return derivatives (6, P) of the OCS by the parameters: shift, mm, and rotation, rad, along its own axes.
 
-        The OCS belongs to the sheet, and moves with it as that becomes known better.
+        The OCS is defined by the sheet, so it changes with the sheet's parameters.
         """
         axis, here = self.parameters.sheet.axis, self.calibration.object_transform()
         result = np.zeros((6, len(self.values)))
@@ -179,19 +179,19 @@ class StoredEstimate:
         return result
 
     def across(self) -> int:
-        """The coordinate of the pixel that runs across the stripe."""
+        """Return the pixel coordinate that runs across the stripe."""
         return 1 if self.calibration.stripe_along == "width" else 0
 
 
-def with_independent(covariance: np.ndarray, std: Sequence[float]) -> np.ndarray:
-    """The covariance (P, P) with k more quantities of these standard uncertainties, independent of all others."""
+def append_independent(covariance: np.ndarray, std: Sequence[float]) -> np.ndarray:
+    """Extend a covariance (P, P) by independent quantities with these standard uncertainties."""
     return np.pad(covariance, (0, len(std))) + np.diag([*[0.0] * len(covariance), *np.square(std)])
 
 
 def covariance_root(covariance: np.ndarray) -> np.ndarray:
-    """The matrix (P, P) whose product with its transpose is the covariance (P, P), by the correlations' symmetric root.
+    """Return the symmetric root (P, P) of a covariance, computed from its correlations.
 
-    It is the same wherever it is calculated, so that its columns, independent parts of the parameters, can be compared.
+    It does not depend on the platform, so its columns (independent parts of the parameters) can be compared.
     """
     scale = np.sqrt(np.diag(covariance))
     scale = np.where(scale > 0, scale, 1.0)
@@ -200,25 +200,34 @@ def covariance_root(covariance: np.ndarray) -> np.ndarray:
 
 
 def require_joint(calibration: Calibration) -> JointEstimate:
-    """The joint estimate of a calibration; CalibrationError where it holds none."""
+    """Return the joint estimate of a calibration.
+
+    Raises
+    ------
+    CalibrationError
+        It contains none.
+    """
     if calibration.joint is None:
-        raise CalibrationError("the calibration holds no uncertainty: calibrate jointly (`water` or `joint`)")
+        raise CalibrationError("the calibration has no uncertainty: calibrate jointly (`water` or `joint`)")
     return calibration.joint
 
 
 def stored_estimate(calibration: Calibration, sensor: Sensor, medium: Medium) -> StoredEstimate:
-    """The estimate of a calibration for scans by a sensor, as their captures describe it, in a medium.
+    """Return the estimate of a calibration for scans of a sensor in a medium.
 
-    In a medium that was calibrated in, its index may have drifted since. In another, the index is as known from the
-    medium, independent of all else.
+    In a calibrated medium, the uncertainty of the index includes its drift. In another medium, the index follows from
+    the medium's description, independent of all other parameters.
 
-    Raises CalibrationError: the calibration holds no joint estimate, or a damaged one.
+    Raises
+    ------
+    CalibrationError
+        The calibration contains no joint estimate, or a damaged one.
     """
     return _read(calibration, medium, mounted=sensor.camera.window.mounted, uncertainty=sensor.uncertainty)
 
 
 def found_estimate(calibration: Calibration, medium: Medium) -> StoredEstimate:
-    """The estimate as its evidence gave it, in one of its media or in air; errors as `stored_estimate`."""
+    """Return the estimate as originally calculated, in one of its media or in air; errors as `stored_estimate`."""
     return _read(calibration, medium, mounted=True, uncertainty=Uncertainty(drift_k=0.0))
 
 
@@ -234,8 +243,8 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
     intrinsics = Intrinsics(options, width_px=camera.width_px, height_px=camera.height_px)
     media = [key.medium for key in keys if isinstance(key, MediumIndex)]
     if len(media) != len(calibration.media):
-        raise _damaged(f"it has {len(media)} indices of media, the calibration {len(calibration.media)} media")
-    # As `Calibration.index_of`: the last of equal ones.
+        raise _damage_error(f"it has {len(media)} indices for {len(calibration.media)} media")
+    # As in `Calibration.index_of`: the last of equal media.
     known = next((n for n, found in reversed([*enumerate(calibration.media)]) if found.medium == medium), None)
     seen_in = None if medium.kind == "air" else known
     if known is not None:
@@ -247,11 +256,11 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
         media.append("the scan")
         keys.append(MediumIndex(media[-1]))
         values = np.append(values, calibration.index_of(medium))
-        covariance = with_independent(covariance, [medium.index_uncertainty(calibration.wavelength_nm, uncertainty)])
+        covariance = append_independent(covariance, [medium.index_uncertainty(calibration.wavelength_nm, uncertainty)])
     lens = len(intrinsics.names)
     if tuple(keys[:lens]) != intrinsics.keys:
-        raise _damaged("its parameters do not fit together")
-    # Parameters that were held and not estimated are what the calibration's models say of window and sheet.
+        raise _damage_error("its parameters are inconsistent with the camera")
+    # Fixed parameters of window and sheet are read from the calibration's models.
     held = {} if calibration.window is None else window_values(calibration.window)
     if (fan := calibration.sheet.fan) is not None:
         held |= {SheetParameter.BOW: fan.bow_rad, SheetParameter.WINDOW_TURN: fan.window_turn_rad}
@@ -263,5 +272,5 @@ def _read(calibration: Calibration, medium: Medium, *, mounted: bool, uncertaint
     return StoredEstimate(calibration, parameters, values, covariance, view)
 
 
-def _damaged(reason: str) -> CalibrationError:
+def _damage_error(reason: str) -> CalibrationError:
     return CalibrationError(f"the calibration's joint estimate is damaged: {reason}")

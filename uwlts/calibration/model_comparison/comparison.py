@@ -1,4 +1,4 @@
-"""Comparison of models of the sensor: each is calibrated and scored, and the simplest that is as good is found."""
+"""Compare sensor models by cross-validation, and select the simplest of the best."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,9 +20,9 @@ from uwlts.calibration.model_comparison.held_out import (
     Candidate,
     Image,
     Prediction,
-    dimensions_of,
     predict,
-    splits,
+    select_dimensions,
+    split_images,
 )
 from uwlts.calibration.polynomial.polynomial_calibration_fit import fit_line_polynomials
 from uwlts.calibration.polynomial.polynomial_evidence import common_header, object_coordinates, stripes_on_plate
@@ -41,17 +41,17 @@ _Captures = Sequence[Capture | str | Path]
 
 
 POINTS, STRIPES = "points", "stripes"
-"""The target's points; stripes on target and steps."""
+"""Point kinds: points of the target; stripe points on targets and steps."""
 
 _DRAWS = 2000  # standard errors to 2 %
 
 
 @dataclass(frozen=True)
 class Score:
-    """Root mean square miss of a model in the images held out in one way.
+    """Root mean square (RMS) error of a model in the held-out images.
 
-    ``px`` are those of the target's points and of the stripes, ``mm`` the same on the object, ``all_mm`` of both
-    together, ``std_mm`` its standard error, by drawing the images anew.
+    ``px`` and ``mm`` are the errors in the image and on the object, for each point kind. ``all_mm`` covers both kinds.
+    ``std_mm`` is its standard error (bootstrap over images).
     """
 
     px: dict[str, float]
@@ -62,9 +62,10 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Tally:
-    """Sums over the points of each image held out, for C models and I images; outliers do not count.
+    """Sums over the points in each held-out image, for C models and I images, without outliers.
 
-    ``px`` and ``mm`` are squares (C, I) of misses, of points and of stripes, ``counts`` numbers (I,) of points.
+    ``px`` and ``mm`` contain the sums of squared errors (C, I) for each point kind, ``counts`` the numbers of points
+    (I,).
     """
 
     px: dict[str, np.ndarray]
@@ -72,7 +73,7 @@ class Tally:
     counts: dict[str, np.ndarray]
 
     def score(self, model: int) -> Score:
-        """Score of a model."""
+        """Return the score of a model."""
         seen = [kind for kind in self.counts if self.counts[kind].any()]
         all_mm, std_mm = rms_of_images(self._all(model), self._number())
         return Score(
@@ -83,13 +84,13 @@ class Tally:
         )
 
     def beyond(self, model: int, other: int) -> tuple[float, float]:
-        """By how much a model's mean square in mm2 is above another's, image by image, and its standard error."""
+        """Return a model's mean squared error minus another's, and the standard error of this difference, mm2."""
         difference, draws = self._all(model) - self._all(other), _draws(len(self._number()))
         drawn = draws @ difference / (draws @ self._number())
         return float(difference.sum() / self._number().sum()), float(drawn.std(ddof=1))
 
     def as_good(self, model: int, other: int) -> bool:
-        """Whether a model is no worse than another, within the standard error of their difference."""
+        """Return whether a model is no worse than another, within the standard error of their difference."""
         difference, std = self.beyond(model, other)
         return difference <= std
 
@@ -100,9 +101,9 @@ class Tally:
         return np.sum(list(self.counts.values()), axis=0)
 
 
-def tally(predictions: Sequence[Prediction], *, among: frozenset[Image] | None = None) -> Tally:
-    """The sums of several predictions of the same images, of all or only some of these."""
-    used, first = _used(predictions), predictions[0].misses
+def sum_errors(predictions: Sequence[Prediction], *, among: frozenset[Image] | None = None) -> Tally:
+    """Sum the errors of several predictions of the same images; ``among`` selects images."""
+    used, first = _mask_inliers(predictions), predictions[0].misses
     images = sorted({miss.image for miss in first if among is None or miss.image in among})
     shape = len(predictions), len(images)
     sums = {what: {kind: np.zeros(shape) for kind in (POINTS, STRIPES)} for what in ("px", "mm")}
@@ -118,8 +119,8 @@ def tally(predictions: Sequence[Prediction], *, among: frozenset[Image] | None =
     return Tally(sums["px"], sums["mm"], counts)
 
 
-def _used(predictions: Sequence[Prediction]) -> list[np.ndarray]:
-    """Masks (n,) of the points that count in each of the misses: not those that all models miss by far."""
+def _mask_inliers(predictions: Sequence[Prediction]) -> list[np.ndarray]:
+    """Return a mask (n,) for each set of errors; it excludes points that are outliers for every model."""
     limits = {
         kind: min(outlier_limit(np.concatenate([m.px for m in p.misses if m.kind == kind])) for p in predictions)
         for kind in {miss.kind for miss in predictions[0].misses}
@@ -129,13 +130,13 @@ def _used(predictions: Sequence[Prediction]) -> list[np.ndarray]:
 
 
 def rms_of_images(squares: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
-    """Root of the mean square over all images, from sums of squares (I,) and counts (I,), and its standard error."""
+    """Return the RMS over all images, from sums of squares (I,) and counts (I,), and its standard error."""
     draws = _draws(len(counts))
     return _rms(squares, counts), float(np.sqrt(draws @ squares / (draws @ counts)).std(ddof=1))
 
 
 def _draws(images: int) -> np.ndarray:
-    """Numbers (B, I) of times that each image is drawn; the same draws for all."""
+    """Return how often each image is drawn in each bootstrap sample (B, I); the samples are always the same."""
     return np.random.default_rng(0).multinomial(images, np.full(images, 1 / images), size=_DRAWS)
 
 
@@ -143,16 +144,16 @@ def _rms(squares: np.ndarray, counts: np.ndarray) -> float:
     return float(np.sqrt(squares.sum() / counts.sum()))
 
 
-DEGREE = 6  # of the polynomials (thesis, section 4.7)
+DEGREE = 6  # degree of the polynomials (thesis, section 4.7)
 
 
 @dataclass(frozen=True)
 class PolynomialScore:
-    """Root mean square misses in mm of stripes on the target, inside the calibrated volume.
+    """RMS error of polynomial calibration for stripes on the target, inside the calibrated volume, mm.
 
-    Polynomials have no camera, so that they are judged on the object only; outside they do not measure. ``all_mm`` and
-    ``std_mm`` are by polynomials, with the standard error, ``model_mm`` and ``model_std_mm`` in the same images by the
-    model they are compared with.
+    Polynomials lack a camera model and do not extrapolate: errors in px or outside the volume do not exist. ``all_mm``
+    and ``std_mm`` are the polynomials' error and its standard error. ``model_mm`` and ``model_std_mm`` are those of the
+    compared model in the same images.
     """
 
     medium: str
@@ -163,12 +164,15 @@ class PolynomialScore:
     model_std_mm: float
 
 
-def polynomial_score(
+def score_polynomials(
     series: Series, header: CaptureHeader, images: Sequence[Image], model: Prediction
 ) -> PolynomialScore | None:
-    """Score of polynomials in the images of a series that are held out; None where there is no such image.
+    """Return the score of polynomials in the held-out images of a series, or None without such an image.
 
-    Raises CalibrationError: the series is not fit for polynomials.
+    Raises
+    ------
+    CalibrationError
+        Polynomials cannot be fitted to the series.
     """
     if not images:
         return None
@@ -188,7 +192,7 @@ def polynomial_score(
 
 
 def _robust_rms(misses: Sequence[np.ndarray]) -> tuple[float, float]:
-    """Root mean square of the misses in several images, without outliers, and its standard error."""
+    """Return the RMS of the errors in several images, without outliers, and its standard error."""
     limit = outlier_limit(np.concatenate(misses))
     kept = [off[np.abs(off) <= limit] for off in misses]
     squares, counts = np.array([np.sum(off**2) for off in kept]), np.array([len(off) for off in kept])
@@ -197,7 +201,7 @@ def _robust_rms(misses: Sequence[np.ndarray]) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class JudgedModel:
-    """A model with its score for each way of holding out, or the reason why it has none."""
+    """Model with its score for each split, or the reason for a missing score."""
 
     candidate: Candidate
     parameters: int | None
@@ -207,11 +211,11 @@ class JudgedModel:
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """The models, the usual one first, and what their scores say.
+    """All models, the usual one first, with their predictions and scores.
 
-    ``ways`` are the images held out, by the name of the way; ``predictions`` those of the models that have scores, by
-    the way; ``tallies`` belong to each way, of those models in their order. ``wet`` are the numbers of images held out
-    that were seen in a medium; ``wet_tallies`` are of these alone, none where they are too few.
+    ``ways`` maps each split to its held-out images. ``predictions`` contains only models with scores, and the models in
+    ``tallies`` have the same order. ``wet`` is the number of held-out images in a medium. ``wet_tallies`` covers only
+    these images, and is empty if they are too few.
     """
 
     judged: list[JudgedModel]
@@ -222,38 +226,38 @@ class Choice:
     wet_tallies: dict[str, Tally]
 
     def best(self) -> Candidate:
-        """The model of the smallest mean square miss, both ways of holding out counting alike."""
+        """Return the model with the smallest mean squared error, summed over the splits."""
         return self._good_among()[0].candidate
 
     def as_good(self) -> list[Candidate]:
-        """Those that are no worse than the best in either way, but for chance."""
+        """Return the models that are no worse than the best in any split, within chance."""
         return [each.candidate for each in self._good_among()[1]]
 
     def simplest(self, among: Sequence[Candidate] | None = None) -> Candidate:
-        """Of all models or some, of those as good as the best that with the fewest parameters."""
+        """Return the model with the fewest parameters of those as good as the best; ``among`` restricts the models."""
         return min(self._good_among(among)[1], key=lambda each: each.parameters or 0).candidate
 
     def level(self, name: str, levels: Sequence[Level]) -> Level:
-        """Of the ways in which one thing can be modelled, the simplest that is as good as the best of them."""
+        """Return the simplest value of a model property that predicts as well as the best value."""
         return getattr(self.simplest([replace(Candidate(), **{name: value}) for value in levels]), name)
 
     def number(self, candidate: Candidate) -> int:
-        """Number of a model among those that have scores."""
+        """Return the number of a model among those with scores."""
         return list(self.predictions).index(candidate)
 
     def no_worse(self, candidate: Candidate, other: Candidate, where: str, *, wet: bool = False) -> bool:
-        """Whether a model predicts as well as another in one way of holding out, in all images or those in a medium.
+        """Return whether a model predicts as well as another in a split; ``wet`` restricts it to images in a medium.
 
-        Where images held out differ by more than chance, all may yet share errors of the stage and of poses that favour
-        one model. So a model that holds parameters of the other also counts as good if the other's estimate cannot
-        separate these from what is held.
+        Held-out images can share errors of the stage and of poses, which favour one model by more than chance. A model
+        with fewer free parameters therefore also counts as good if the other's estimate of the additional parameters
+        does not differ significantly from the fixed values.
         """
         separate = self.predictions[other][INSIDE].separates_from(self.predictions[candidate][INSIDE])
         tallies = self.wet_tallies if wet else self.tallies
         return not separate or tallies[where].as_good(self.number(candidate), self.number(other))
 
     def _good_among(self, among: Sequence[Candidate] | None = None) -> tuple[JudgedModel, list[JudgedModel]]:
-        """Of all models or some the best, and those that are as good in both ways."""
+        """Return the best model and all models as good as it in every split; ``among`` restricts the models."""
         able = [each for each in self.judged if each.scores and (among is None or each.candidate in among)]
         best = min(able, key=lambda each: sum(score.all_mm**2 for score in each.scores.values()))
         good = [e for e in able if all(self.no_worse(e.candidate, best.candidate, where) for where in self.ways)]
@@ -261,16 +265,19 @@ class Choice:
 
 
 Found = dict[Candidate, dict[str, Prediction] | str]
-"""For each model its predictions by the way of holding out, or why there are none."""
+"""For each model its predictions for each split, or the reason for their absence."""
 
 
 def choose(problem: JointProblem, *, workers: int | None = None, progress: ProgressListener = unheard) -> Choice:
-    """Compare models on the evidence of a joint problem: the usual one, what differs by one thing, and the simplest.
+    """Compare the usual model, models that differ from it by one property, and the simplest sufficient one.
 
-    Raises CalibrationError: there are too few images, or the usual model cannot be calibrated without those held out.
+    Raises
+    ------
+    CalibrationError
+        There are too few images, or the usual model cannot be calibrated without the held-out images.
     """
-    ways, usual, done = splits(problem), Candidate(), count(1)
-    dimensions = dimensions_of(problem.parameters)
+    ways, usual, done = split_images(problem), Candidate(), count(1)
+    dimensions = select_dimensions(problem.parameters)
     singles = [usual, *(replace(usual, **{name: other}) for name, others in dimensions.items() for other in others)]
     total = len(ways) * (len(singles) + 1)
 
@@ -287,7 +294,7 @@ def choose(problem: JointProblem, *, workers: int | None = None, progress: Progr
     in_medium = frozenset(number for number, each in enumerate(problem.evidence) if each.view.medium is not None)
     found = predicted(singles)
     if isinstance(found[usual], str):
-        raise CalibrationError(f"without the images held out there is no calibration: {found[usual]}")
+        raise CalibrationError(f"the usual model cannot be calibrated without the held-out images: {found[usual]}")
     first = choice_of(found, ways, in_medium)
     needed = {name: first.level(name, [getattr(usual, name), *others]) for name, others in dimensions.items()}
     simple = replace(usual, **needed)
@@ -307,12 +314,12 @@ def _work(job: tuple[JointProblem, Candidate, frozenset[Image]], send: Send) -> 
 
 
 def choice_of(found: Found, ways: dict[str, frozenset[Image]], in_medium: frozenset[int]) -> Choice:
-    """The choice among models by what each predicts in both ways, or the reason why it does not.
+    """Score and compare models from their predictions, or the reasons for missing ones.
 
-    ``in_medium`` are the numbers of the pieces of evidence that were seen in a medium.
+    ``in_medium`` contains the numbers of the pieces of evidence in a medium.
     """
     predictions = {candidate: result for candidate, result in found.items() if not isinstance(result, str)}
-    tallies = {where: tally([each[where] for each in predictions.values()]) for where in ways}
+    tallies = {where: sum_errors([each[where] for each in predictions.values()]) for where in ways}
     judged, number = [], count()
     for candidate, result in found.items():
         if isinstance(result, str):
@@ -324,15 +331,15 @@ def choice_of(found: Found, ways: dict[str, frozenset[Image]], in_medium: frozen
     wet = {where: frozenset(image for image in held if image[0] in in_medium) for where, held in ways.items()}
     wet_tallies: dict[str, Tally] = {}
     if min(map(len, wet.values())) >= FEWEST_HELD:
-        wet_tallies = {w: tally([each[w] for each in predictions.values()], among=wet[w]) for w in ways}
+        wet_tallies = {w: sum_errors([each[w] for each in predictions.values()], among=wet[w]) for w in ways}
     return Choice(judged, ways, predictions, tallies, {where: len(held) for where, held in wet.items()}, wet_tallies)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Brief):
-    """Misses of models in images held out, with the sensor and the captures.
+    """Comparison of sensor models by their errors in held-out images.
 
-    ``polynomials`` is None without a target in a medium on the stage; ``why_none`` is why they have no score.
+    ``polynomials`` is None without a stage-moved target in a medium; ``why_none`` is the reason.
     """
 
     sensor: str
@@ -354,70 +361,71 @@ def compare_models(
     workers: int | None = None,
     progress: ProgressListener = unheard,
 ) -> Comparison:
-    """Compare models of the sensor by how well each predicts images that its calibration has not seen.
+    """Compare sensor models by how well each predicts images that were not used for its calibration.
 
-    One refraction or two, window tilted or not, sheet with bow or turned by the laser's window or not, distortion:
-    each model is calibrated without every fourth image, and without the nearest and the farthest ones.
+    The models differ in one property: one or two refractions, window tilt, bow of the sheet, turn of the laser's
+    window, or lens distortion. Each model is calibrated without every fourth image, and without the nearest and
+    farthest images.
 
     Parameters
     ----------
     air : sequence of Capture or path
         Captures of the target in air, as for uwlts calibrate.
     water : sequence of Capture or path
-        The same in the medium of use.
+        Captures of the target in the medium of use.
     step : sequence of Capture or path
         Captures of the step standard in the medium of use.
     poses : {"stage", "free"}
-        stage: one pose of the target for each capture, moved by the stage. free: every image has a pose of its own.
+        stage: one target pose per capture, moved by the stage. free: every image has its own pose.
     index : float, optional
-        Refractive index of the medium relative to air, in place of the one that follows from the captures.
+        Refractive index of the medium relative to air. Default: the index that follows from the captures.
     stripe : StripeOptions or dict, optional
         As for `reconstruct`.
     workers : int, optional
-        Models calibrated at a time; as many as there are processors unless given.
+        Number of models calibrated in parallel. Default: number of processors.
     progress : callable, optional
-        Called with the number of images or models done, the number in all, and the name of the stage.
+        Called with the number of images or models done, the total, and the name of the stage.
 
     Raises
     ------
     CalibrationError
         There are too few images, or they do not determine a calibration.
     DescriptionError
-        There is no capture of a target, one does not describe its target or its step standard, or ``workers`` is less
+        There is no capture of a target, a capture does not describe its target or step standard, or ``workers`` is less
         than 1.
     CaptureError
         A file is missing or damaged.
     RangeError
-        The refractive index is not that of a medium.
+        The refractive index is out of range.
     """
     if index is not None:
         require_index(index)
     if workers is not None and workers < 1:
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
     if not (air or water):
-        raise DescriptionError("nothing to compare models by: give `air` or `water` with captures of a target")
+        raise DescriptionError("no captures of a target to compare models with: give `air` or `water`")
     options = CalibrationOptions(poses=poses, medium_index=index, stripe=stripe)
     with opened_captures([*air, *water]) as targets, opened_captures(step) as steps:
         gathered = gather_jointly(targets, steps, options=options, progress=progress)
         problem = joint_problem(gathered, options=options)
         choice = choose(problem, workers=workers, progress=partial(progress, stage="models"))
-        score, why_none = _polynomials(gathered, problem, choice, targets, free=poses == "free")
+        score, why_none = _score_polynomials(gathered, problem, choice, targets, free=poses == "free")
         captures = [capture.path.name for capture in [*targets, *steps]]
     return Comparison(gathered.sensor.name, captures, choice, score, why_none, problem.warnings)
 
 
-def _polynomials(
+def _score_polynomials(
     gathered: Gathered, problem: JointProblem, choice: Choice, targets: Sequence[Capture], *, free: bool
 ) -> tuple[PolynomialScore | None, str]:
-    """Score of polynomials where a target on the stage was seen in a medium, or why there is none."""
+    """Score polynomials on a stage-moved target in a medium, or return the reason why this is not possible."""
     wet = [part for part in gathered.series if part.view.medium is not None]
     if not wet or free:
-        return None, "polynomials need a target in the medium of use that the stage moves"
+        return None, "polynomials need a target in the medium of use that is moved by the stage"
     part = wet[0]
     alike = [n for n, e in enumerate(problem.evidence) if isinstance(e, TargetEvidence) and e.view == part.view]
     images = [image for image in choice.ways[INSIDE] if image[0] in alike]
     try:
         header = common_header([c for c in targets if c.path.name in part.names and c.header.medium.kind != "air"])
-        return polynomial_score(part, header, images, choice.predictions[choice.simplest()][INSIDE]), ""
+        return score_polynomials(part, header, images, choice.predictions[choice.simplest()][INSIDE]), ""
     except CalibrationError as error:
         return None, f"no polynomials: {error}"

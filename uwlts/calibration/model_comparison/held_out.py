@@ -1,4 +1,4 @@
-"""Models of the sensor to choose from, and how well each predicts images held out from its calibration."""
+"""Sensor models to choose from, and their predictions of images held out from the calibration."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from uwlts.calibration.camera.camera_parameters import Intrinsics
 from uwlts.calibration.camera.target_images import pose_values
-from uwlts.calibration.joint.consistency import much_left_out
+from uwlts.calibration.joint.consistency import find_excess_outliers
 from uwlts.calibration.joint.estimate import Estimate, Evidence, outlier_limit
 from uwlts.calibration.joint.parameters import Parameters, ViewMedium
 from uwlts.calibration.joint.procedure import JointProblem
@@ -36,10 +36,11 @@ _GLASS = (WindowParameter.THICKNESS, WindowParameter.GLASS_INDEX)
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model of the sensor; what is not free is held as described.
+    """Sensor model; parameters that are not free keep their described values.
 
-    ``refractions`` is 1 where the camera's window is one interface, 2 for a pane of glass. Free may be the tilt of the
-    camera's window, the sheet's bow and the turn of the laser's window; distortion coefficients not named are zero.
+    ``refractions`` is 1 for a window modelled as one interface, 2 for a glass plate. The tilt of the camera's window,
+    the bow of the sheet, and the turn of the laser's window can be free. Distortion coefficients that are not named are
+    zero.
     """
 
     refractions: Literal[1, 2] = 2
@@ -49,7 +50,7 @@ class Candidate:
     distortion: tuple[str, ...] = ("k1", "k2")
 
     def words(self) -> str:
-        """The model by what sets it apart from the usual one."""
+        """Describe the difference from the usual model."""
         usual = Candidate()
         parts = [words for name, words in _WORDS.items() if getattr(self, name) != getattr(usual, name)]
         if self.distortion != usual.distortion:
@@ -58,7 +59,7 @@ class Candidate:
 
 
 def distortion_words(distortion: tuple[str, ...]) -> str:
-    """Distortion coefficients by name."""
+    """Describe the free distortion coefficients."""
     return "distortion " + " ".join(distortion) if distortion else "no distortion"
 
 
@@ -69,11 +70,11 @@ DIMENSIONS: dict[str, tuple[object, ...]] = {
     "window_turn": (False,),
     "distortion": ((), ("k1",), ("k1", "k2", "k3"), ("k1", "k2", "p1", "p2")),
 }
-"""Departures from the usual model, one at a time."""
+"""Alternatives to each property of the usual model."""
 
 
-def dimensions_of(parameters: Parameters) -> dict[str, tuple[object, ...]]:
-    """Those that the evidence has to do with."""
+def select_dimensions(parameters: Parameters) -> dict[str, tuple[object, ...]]:
+    """Return the properties that affect the parameters of the evidence, with their alternatives."""
     return {
         name: others
         for name, others in DIMENSIONS.items()
@@ -83,11 +84,11 @@ def dimensions_of(parameters: Parameters) -> dict[str, tuple[object, ...]]:
     }
 
 
-def recast(problem: JointProblem, candidate: Candidate) -> JointProblem:
-    """The problem with the candidate's parameters, starting where it started.
+def apply_candidate(problem: JointProblem, candidate: Candidate) -> JointProblem:
+    """Return the problem with the candidate's parameters and the same start values.
 
-    The target is a dish at most: more ways in which it may differ would take up some of what a model lacks.
-    The distance of a single interface is only known to lie near the described one, as it stands for a pane of glass.
+    The target may only have a bow: more shape parameters could absorb errors of the model. The distance of a single
+    interface is free, as it stands for a whole glass plate.
     """
     known = problem.parameters
     options = replace(known.intrinsics.options, distortion=candidate.distortion)
@@ -103,7 +104,7 @@ def recast(problem: JointProblem, candidate: Candidate) -> JointProblem:
             WindowParameter.THICKNESS: replace(priors[WindowParameter.THICKNESS], mean=0.0),
             WindowParameter.GLASS_INDEX: replace(priors[WindowParameter.GLASS_INDEX], mean=1.0),
         }
-    # What is not known of the lens is for the images to tell.
+    # lens parameters must be determined by the images alone
     known_before = {key: prior for key, prior in priors.items() if not isinstance(key, LensParameter)}
     priors = {key: replace(prior, std=0.0) if key in held else prior for key, prior in known_before.items()}
     parameters = replace(known, intrinsics=intrinsics, window=window, priors=priors)
@@ -116,23 +117,26 @@ INSIDE, OUTSIDE = "inside", "outside"
 Image = tuple[int, int]
 """Number of the piece of evidence, and of the image in it."""
 
-_EVERY = 4  # of the images inside one in so many is held out: enough remain, enough are judged
-_OUTER = 1 / 6  # of the depth, at either end
-_FEWEST_KEPT = 4  # images to calibrate from
-FEWEST_HELD = 4  # images to predict: fewer give no standard error
+_EVERY = 4  # one of so many inner images is held out, so that enough images remain on both sides
+_OUTER = 1 / 6  # fraction of the depth range, at either end
+_FEWEST_KEPT = 4  # images for calibration
+FEWEST_HELD = 4  # held-out images: fewer give no standard error
 
 
-def splits(problem: JointProblem) -> dict[str, frozenset[Image]]:
-    """Images held out, inside the volume of the others and outside of it: the nearest and the farthest.
+def split_images(problem: JointProblem) -> dict[str, frozenset[Image]]:
+    """Select held-out images inside the volume of the others, and outside of it.
 
-    An image's depth is where its stripe lies in the image, among those seen alike. Every fourth image is held out, or
-    those in the outer sixths of where stripes lie. Images without a stripe are not.
+    The stripe's position in the image stands for the depth. Inside, every fourth image is held out; outside, all images
+    in the outer sixths of the depth range. Images without a stripe are never held out.
 
-    Raises CalibrationError: there are too few images.
+    Raises
+    ------
+    CalibrationError
+        There are too few images.
     """
     inside: set[Image] = set()
     outside: set[Image] = set()
-    for found in _by_depth(problem).values():
+    for found in _sort_by_depth(problem).values():
         images, places = [image for _, image in found], np.array([place for place, _ in found])
         inside |= set(images[1:-1:_EVERY])
         reach = _OUTER * (places[-1] - places[0])
@@ -142,14 +146,14 @@ def splits(problem: JointProblem) -> dict[str, frozenset[Image]]:
     fewest = min(len(inside), len(outside))
     if fewest < FEWEST_HELD:
         raise CalibrationError(
-            f"the captures have too few images with a stripe to hold some out: {fewest} could be, at least "
-            f"{FEWEST_HELD} are needed; take 16 or more of the target at different depths"
+            f"too few images with a stripe: {fewest} can be held out, at least {FEWEST_HELD} are needed; take 16 or "
+            "more images of the target at different depths"
         )
     return {INSIDE: frozenset(inside), OUTSIDE: frozenset(outside)}
 
 
-def _by_depth(problem: JointProblem) -> dict[ViewMedium, list[tuple[float, Image]]]:
-    """Images that show a stripe, by what they were seen through, in the order of where it lies across its lines."""
+def _sort_by_depth(problem: JointProblem) -> dict[ViewMedium, list[tuple[float, Image]]]:
+    """Return images with a stripe for each view and medium, sorted by the stripe's position across its lines."""
     found: dict[ViewMedium, list[tuple[float, Image]]] = {}
     for number, piece in enumerate(problem.evidence):
         if isinstance(piece, TargetEvidence):
@@ -162,8 +166,8 @@ def _by_depth(problem: JointProblem) -> dict[ViewMedium, list[tuple[float, Image
     return {view: sorted(images) for view, images in found.items()}
 
 
-def without(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem, list[int]]:
-    """The problem without the images held out, and which pieces of its evidence are left."""
+def remove_images(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem, list[int]]:
+    """Remove the held-out images; return the problem and the numbers of its remaining pieces of evidence."""
     evidence: list[Evidence] = []
     local, numbers = [], []
     for number, (piece, start) in enumerate(zip(problem.evidence, problem.local, strict=True)):
@@ -171,7 +175,7 @@ def without(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem
             kept = [image for image in np.unique(piece.placement.image).tolist() if (number, image) not in held]
             if not kept:
                 continue
-            piece = of_images(piece, kept)
+            piece = select_images(piece, kept)
             if piece.staged:
                 start = np.concatenate([start[:8], np.zeros(len(piece.images()))])
         elif (number, piece.image) in held:
@@ -182,8 +186,8 @@ def without(problem: JointProblem, held: frozenset[Image]) -> tuple[JointProblem
     return replace(problem, evidence=evidence, local=local), numbers
 
 
-def of_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence:
-    """The evidence of some of the images; stage positions still count from the first of all."""
+def select_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence:
+    """Return the evidence of some images; stage positions still refer to the first image of all."""
     placement, wanted = evidence.placement, list(images)
     here = np.isin(placement.image, wanted)
     kept = {name: getattr(placement, name)[here] for name in ("points_mm", "shifts_mm", "pixels", "image")}
@@ -191,15 +195,15 @@ def of_images(evidence: TargetEvidence, images: Iterable[int]) -> TargetEvidence
     return some.with_stripes(np.isin(evidence.image, wanted))
 
 
-_ROUNDS = 20  # of steps of the pose; a few settle
-_SETTLED_PX = 1e-4  # of a step, far below the noise of a centre
-_CHOOSING_ROUNDS = 10  # of which so many choose what is near enough to count
-_BY_CHANCE = 0.0027  # probability of three standard deviations or more
+_ROUNDS = 20  # Gauss-Newton steps of a pose; a few suffice
+_SETTLED_PX = 1e-4  # change of the last step, far below the noise of a stripe centre
+_CHOOSING_ROUNDS = 10  # rounds that update the set of inliers
+_BY_CHANCE = 0.0027  # p-value of three standard deviations
 
 
 @dataclass(frozen=True, eq=False)
 class Misses:
-    """By how much the points of one kind in one image are missed: (n,) each in px in the image, in mm on the object."""
+    """Errors of the points of one kind in one image: (n,) each, in px in the image and in mm on the object."""
 
     image: Image
     kind: str
@@ -209,7 +213,7 @@ class Misses:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Misses in all images held out, and what the model estimated: global parameters (P,) and covariance (P, P)."""
+    """Errors in all held-out images, with the estimated global parameters (P,) and their covariance (P, P)."""
 
     misses: list[Misses]
     parameters: Parameters
@@ -217,9 +221,9 @@ class Prediction:
     covariance: np.ndarray
 
     def separates_from(self, smaller: "Prediction") -> bool:
-        """Whether the estimate separates this model from one that holds some of its parameters, by three sigma.
+        """Return whether the estimate differs by three sigma from a smaller model's fixed parameters.
 
-        True of models of which neither holds the other's.
+        True if neither model contains the other.
         """
         keys, others = self.parameters.keys, smaller.parameters.keys
         more = [place for place, key in enumerate(keys) if key not in others]
@@ -232,19 +236,21 @@ class Prediction:
 
 
 def predict(problem: JointProblem, candidate: Candidate, held: frozenset[Image]) -> Prediction:
-    """Calibrate without the images held out, and predict these.
+    """Calibrate without the held-out images, and predict these.
 
-    Where the stage moved the target, its place in an image held out follows from the others and the stage's position,
-    the errors of whose positions are the others' mean. Else the pose is fitted to the target's points, or the line of
-    the lower tread to the stripe on a step: nothing of the calibration is.
+    If the stage moved the target, the pose in a held-out image follows from the other images and the stage position,
+    with their mean position error. Otherwise the pose is fitted to the points of the target, or the line of the lower
+    tread to the stripe on a step. No calibration parameter is fitted to held-out images.
 
-    Raises CalibrationError: the other images do not determine the model or do not fit it, or a ray of the images held
-    out meets nothing.
+    Raises
+    ------
+    CalibrationError
+        The other images do not determine the model or do not fit it, or a ray of a held-out image hits nothing.
     """
-    whole = recast(problem, candidate)
-    training, numbers = without(whole, held)
+    whole = apply_candidate(problem, candidate)
+    training, numbers = remove_images(whole, held)
     estimate = training.solve()
-    if misfits := much_left_out(estimate):
+    if misfits := find_excess_outliers(estimate):
         kind, share = next(iter(misfits.items()))
         raise CalibrationError(f"{100 * share:.0f} % of the {kind} do not fit the model")
     local = dict(zip(numbers, estimate.local, strict=True))
@@ -253,7 +259,7 @@ def predict(problem: JointProblem, candidate: Candidate, held: frozenset[Image])
         piece, images = whole.evidence[number], sorted(image for at, image in held if at == number)
         match piece:
             case TargetEvidence():
-                posed = _posed(whole, piece, number, images, local.get(number))
+                posed = _pose_held_out(whole, piece, number, images, local.get(number))
             case StepProfileEvidence():
                 posed = [(piece, whole.local[number], (STEP,))]
             case SurfaceScanEvidence():
@@ -261,66 +267,68 @@ def predict(problem: JointProblem, candidate: Candidate, held: frozenset[Image])
             case _:
                 assert_never(piece)
         for evidence, pose, fitted in posed:
-            parts = _residuals(whole, estimate, evidence, pose, fitted=fitted)
-            found += [_misses(number, part) for part in parts if part.image in images]
+            parts = _fit_residuals(whole, estimate, evidence, pose, fitted=fitted)
+            found += [_measure_errors(number, part) for part in parts if part.image in images]
     return Prediction(found, estimate.parameters, estimate.values, estimate.covariance)
 
 
-def _posed(
+def _pose_held_out(
     problem: JointProblem, piece: TargetEvidence, number: int, images: list[int], local: np.ndarray | None
 ) -> list[tuple[Evidence, np.ndarray, tuple[str, ...]]]:
-    """Images held out with their local parameters, and the kinds of residuals to which these are yet to be fitted.
+    """Return held-out images with their local parameters, and the residual kinds for a fit of these.
 
-    ``local`` are those of the other images, None without any; beyond the first eight they are errors of positions.
+    ``local`` are the local parameters of the other images, or None. Elements from the ninth on are position errors.
     """
     if local is not None and piece.staged and len(local) > 8:
         rotation, direction = cv2.Rodrigues(local[:3])[0], piece.placement.direction(local[6:8])
-        held = of_images(piece, images)
+        held = select_images(piece, images)
         shift = local[3:6] - rotation @ direction * np.append(local[8:], 0.0).mean()
         return [(held, np.concatenate([local[:3], shift, local[6:8], np.zeros(len(held.images()))]), ())]
     found = []
     for image in images:
         start = pose_values(piece.pose(problem.parameters, problem.global_values, problem.local[number], image))
-        found.append((replace(of_images(piece, [image]), staged=False), start, (TARGET,)))
+        found.append((replace(select_images(piece, [image]), staged=False), start, (TARGET,)))
     return found
 
 
-def _residuals(
+def _fit_residuals(
     problem: JointProblem, estimate: Estimate, evidence: Evidence, local: np.ndarray, *, fitted: tuple[str, ...]
 ) -> list[Residuals]:
-    """Residuals of the evidence with its local parameters, fitted to those of some kinds."""
+    """Return the residuals of the evidence after fitting the local parameters to the ``fitted`` kinds."""
     near = np.empty(0, dtype=bool)
     for number in range(_ROUNDS):
-        parts = _seen(problem, estimate, evidence, local)
+        parts = _compute_residuals(problem, estimate, evidence, local)
         chosen = [part for part in parts if part.kind in fitted]
         if not chosen:
             return parts
         values, by_local = np.concatenate([p.values for p in chosen]), np.vstack([p.by_local for p in chosen])
-        # Values at the limit would be left out and taken in again for ever.
+        # Updating the inliers in every round could oscillate.
         if number < _CHOOSING_ROUNDS:
             near = np.abs(values) <= max(outlier_limit(values), _SETTLED_PX)
         step = -np.linalg.lstsq(by_local[near], values[near], rcond=None)[0]
         local = local + step
         if np.abs(by_local @ step).max() < _SETTLED_PX:
-            return _seen(problem, estimate, evidence, local)
-    raise CalibrationError("the place of what an image shows could not be found by the model")
+            return _compute_residuals(problem, estimate, evidence, local)
+    raise CalibrationError("the pose of a held-out image does not converge with this model")
 
 
-def _seen(problem: JointProblem, estimate: Estimate, evidence: Evidence, local: np.ndarray) -> list[Residuals]:
+def _compute_residuals(
+    problem: JointProblem, estimate: Estimate, evidence: Evidence, local: np.ndarray
+) -> list[Residuals]:
     parameters, values = estimate.parameters, estimate.values
     if problem.diameter_mm is not None and isinstance(evidence, TargetEvidence):
         evidence = evidence.with_centres(parameters, values, local, problem.diameter_mm)
     parts = evidence.residuals(parameters, values, local)
     if parts is None:
-        raise CalibrationError("by this model a ray that was seen meets no sheet or target")
+        raise CalibrationError("with this model an observed ray does not hit the sheet or the target")
     return parts
 
 
-def _misses(number: int, part: Residuals) -> Misses:
-    """Misses of a part: of the target's points the distance, on the object that of the point from its ray.
+def _measure_errors(number: int, part: Residuals) -> Misses:
+    """Convert the residuals of a part to errors in px and mm; for target points, to distances.
 
-    Moving the target by a vector m moves the residuals r by J m; the shortest m that takes r away is J^T (J J^T)^-1 r.
-    On a step the local parameter 1 is how far the tread moves.
+    A shift m of the target changes the residuals r by J m. The shortest m that cancels r is J^T (J J^T)^-1 r. On a
+    step, the local parameter 1 is the shift of the tread.
     """
     where = (number, part.image)
     if part.kind == TARGET:

@@ -1,7 +1,7 @@
-"""The artefacts that a profiler on a platform may look at: where they are in a profile, and distances from them.
+"""Artefacts that a profiler on a platform may observe: detection in a profile, and distances from them.
 
-Each kind is one class: with its start (`start`) and what is stored of it (`uwlts.model.mount`) it is complete.
-Values of an artefact are an array; its parameters are steps from them.
+Each artefact is one class. Its start values are in `start`, its stored form in `uwlts.model.mount`. The values of an
+artefact form an array; its parameters are steps from these values.
 """
 
 from abc import ABC, abstractmethod
@@ -11,28 +11,28 @@ from typing import ClassVar
 
 import numpy as np
 
-from uwlts.calibration.mount.profiles import Seen, find_arc, find_face, find_line, find_step, find_walls
+from uwlts.calibration.mount.profiles import Detection, find_arc, find_face, find_line, find_step, find_walls
 from uwlts.model.mount import PlaneFound, RingFound, SphereFound, StepFound
 from uwlts.storage.mount_files import Artefact
 
 _FEWEST_WALLS = 5
-"""Profiles with a ring's wall: for its place and radius, three unknowns, with some over."""
+"""Profiles with a wall of the ring: place and radius are three unknowns, and some profiles are redundant."""
 
 
 @dataclass(frozen=True)
 class Shape(ABC):
-    """A kind of artefact, and its size (radius or height) where that is known, mm.
+    """Kind of artefact, with its size (radius or height, mm) if known.
 
-    Points (N, 3) are those of the base frame. ``part`` (N,) says on which surface each lies, 0 for the first.
+    Points (N, 3) are in the base frame. ``part`` (N,) is the number of the surface of each point, from 0.
     """
 
     size_mm: float | None = None
 
     kind: ClassVar[Artefact]
     fewest_poses: ClassVar[int]
-    """Poses whose profiles have more numbers (three each, or two) than there are unknowns, with some over."""
+    """Number of poses that makes the problem overdetermined, with two or three equations per pose."""
     flat: ClassVar[bool] = True
-    """Whether profiles show straight or nearly straight lines, which say how a pose is turned."""
+    """Whether profiles contain nearly straight lines, which determine the rotation of a pose."""
     has_size: ClassVar[bool] = False
     place: ClassVar[int] = 3
     """Number of parameters besides the size."""
@@ -43,56 +43,60 @@ class Shape(ABC):
 
     @property
     def count(self) -> int:
-        """Number of parameters; that of the size is the last."""
+        """Number of parameters; the size is the last one."""
         return self.place + self.size_unknown
 
     @abstractmethod
-    def find(self, points: np.ndarray, rng: np.random.Generator) -> Seen | None:
-        """The artefact in a profile (N, 2), or None."""
+    def find(self, points: np.ndarray, rng: np.random.Generator) -> Detection | None:
+        """Find the artefact in a profile (N, 2), or return None."""
 
-    def find_again(self, points: np.ndarray, off: np.ndarray, reach_mm: float, rng: np.random.Generator) -> Seen | None:
-        """The artefact in a profile (N, 2) whose points are ``off`` (N, surfaces) from it as other poses show it."""
+    def find_again(
+        self, points: np.ndarray, off: np.ndarray, reach_mm: float, rng: np.random.Generator
+    ) -> Detection | None:
+        """Find the artefact in a profile (N, 2) again; ``off`` (N, surfaces) are distances from its estimate."""
         near = off.min(axis=1) < reach_mm
         seen = self.find(points[near], rng)
-        return None if seen is None else seen.among(near)
+        return None if seen is None else seen.expand(near)
 
     @abstractmethod
-    def stepped(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Values after a step (count,)."""
+    def apply_step(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Return the values after a step (count,)."""
 
     @abstractmethod
     def distances(self, values: np.ndarray, points: np.ndarray, part: np.ndarray) -> np.ndarray:
-        """Signed distances (N,)."""
+        """Return signed distances (N,)."""
 
     @abstractmethod
     def normals(self, values: np.ndarray, points: np.ndarray, part: np.ndarray) -> np.ndarray:
-        """Derivatives (N, 3) of the distances by the points."""
+        """Return derivatives (N, 3) of the distances by the points."""
 
     @abstractmethod
     def derivatives(self, values: np.ndarray, points: np.ndarray, part: np.ndarray) -> np.ndarray:
-        """Derivatives (N, count) of the distances by the parameters."""
+        """Return derivatives (N, count) of the distances by the parameters."""
 
     @abstractmethod
-    def found(self, values: np.ndarray, size_std_mm: float | None) -> SphereFound | PlaneFound | StepFound | RingFound:
-        """What is stored."""
+    def to_stored(
+        self, values: np.ndarray, size_std_mm: float | None
+    ) -> SphereFound | PlaneFound | StepFound | RingFound:
+        """Return the stored form of the artefact."""
 
-    def off(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Distances (N, surfaces) from all surfaces."""
+    def surface_distances(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Return absolute distances (N, surfaces) from every surface."""
         parts = [np.full(len(points), part) for part in range(self.surfaces)]
         return np.abs(np.column_stack([self.distances(values, points, part) for part in parts]))
 
     surfaces: ClassVar[int] = 1
 
-    def missing(self, parts: Sequence[np.ndarray]) -> str | None:
-        """What too few profiles show, in words, or None; given the surfaces of the points of each."""
+    def describe_missing(self, parts: Sequence[np.ndarray]) -> str | None:
+        """Return a message if too few profiles show a surface; ``parts`` has the surface numbers of each profile."""
         return None
 
-    def parallel(self, part: np.ndarray) -> list[np.ndarray]:
-        """Masks (n,) of the points on surfaces that a sheet cuts in parallel lines."""
+    def group_parallel(self, part: np.ndarray) -> list[np.ndarray]:
+        """Return masks (n,) of the points on surfaces that the sheet cuts in parallel lines."""
         return [np.ones(len(part), dtype=bool)]
 
-    def lines(self, along: np.ndarray, part: np.ndarray) -> np.ndarray:
-        """Columns (n, K) of what can change in a profile besides noise, for points ``along`` its surfaces (n,), mm."""
+    def basis_lines(self, along: np.ndarray, part: np.ndarray) -> np.ndarray:
+        """Return basis functions (n, K) of the noise-free changes of a profile, at ``along`` (n,) its surfaces, mm."""
         return np.column_stack([np.ones(len(along)), along])
 
 
@@ -101,10 +105,10 @@ class SphereShape(Shape):
 
     kind, fewest_poses, flat, has_size = "sphere", 5, False, True
 
-    def find(self, points: np.ndarray, rng: np.random.Generator) -> Seen | None:
+    def find(self, points: np.ndarray, rng: np.random.Generator) -> Detection | None:
         return find_arc(points, self.size_mm, rng)
 
-    def stepped(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
+    def apply_step(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
         return np.append(values[:3] + step[:3], values[3] + (step[3] if self.size_unknown else 0.0))
 
     def distances(self, values: np.ndarray, points: np.ndarray, part: np.ndarray) -> np.ndarray:
@@ -118,21 +122,21 @@ class SphereShape(Shape):
         by_radius = np.full((len(points), int(self.size_unknown)), -1.0)
         return np.hstack([-self.normals(values, points, part), by_radius])
 
-    def found(self, values: np.ndarray, size_std_mm: float | None) -> SphereFound:
+    def to_stored(self, values: np.ndarray, size_std_mm: float | None) -> SphereFound:
         x, y, z, radius = values.tolist()
         return SphereFound(centre_mm=(x, y, z), radius_mm=radius, radius_std_mm=size_std_mm)
 
 
 class PlaneShape(Shape):
-    """Values: normal and distance (4,). Parameters: two turns of the normal, and the distance."""
+    """Values: normal and distance (4,). Parameters: two rotations of the normal, and the distance."""
 
     kind, fewest_poses = "plane", 8
 
-    def find(self, points: np.ndarray, rng: np.random.Generator) -> Seen | None:
+    def find(self, points: np.ndarray, rng: np.random.Generator) -> Detection | None:
         return find_line(points, rng)
 
-    def stepped(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
-        return np.append(_turned(values[:3], step[:2]), values[3] + step[2])
+    def apply_step(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
+        return np.append(_rotate_normal(values[:3], step[:2]), values[3] + step[2])
 
     def distances(self, values: np.ndarray, points: np.ndarray, part: np.ndarray) -> np.ndarray:
         return points @ values[:3] - values[3]
@@ -141,24 +145,23 @@ class PlaneShape(Shape):
         return np.broadcast_to(values[:3], points.shape)
 
     def derivatives(self, values: np.ndarray, points: np.ndarray, part: np.ndarray) -> np.ndarray:
-        return np.column_stack([points @ square_to(values[:3]).T, np.full(len(points), -1.0)])
+        return np.column_stack([points @ perpendicular_to(values[:3]).T, np.full(len(points), -1.0)])
 
-    def found(self, values: np.ndarray, size_std_mm: float | None) -> PlaneFound | StepFound:
+    def to_stored(self, values: np.ndarray, size_std_mm: float | None) -> PlaneFound | StepFound:
         x, y, z, distance = values.tolist()
         return PlaneFound(normal=(x, y, z), distance_mm=distance)
 
 
 class StepShape(PlaneShape):
-    """Values: normal and distance of the face at smaller z of the profiles, and how far along the normal the other lies
-    (5,)."""
+    """Values (5,): normal and distance of the face at smaller z, and the offset of the other face along the normal."""
 
     kind, has_size, surfaces = "step", True, 2
 
-    def find(self, points: np.ndarray, rng: np.random.Generator) -> Seen | None:
+    def find(self, points: np.ndarray, rng: np.random.Generator) -> Detection | None:
         return find_step(points, self.size_mm, rng)
 
-    def stepped(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
-        return np.append(super().stepped(values[:4], step), values[4] + (step[3] if self.size_unknown else 0.0))
+    def apply_step(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
+        return np.append(super().apply_step(values[:4], step), values[4] + (step[3] if self.size_unknown else 0.0))
 
     def distances(self, values: np.ndarray, points: np.ndarray, part: np.ndarray) -> np.ndarray:
         return super().distances(values, points, part) - values[4] * part
@@ -167,41 +170,43 @@ class StepShape(PlaneShape):
         by_plane = super().derivatives(values, points, part)
         return np.column_stack([by_plane, -part]) if self.size_unknown else by_plane
 
-    def lines(self, along: np.ndarray, part: np.ndarray) -> np.ndarray:
-        return np.column_stack([super().lines(along, part), part])
+    def basis_lines(self, along: np.ndarray, part: np.ndarray) -> np.ndarray:
+        return np.column_stack([super().basis_lines(along, part), part])
 
-    def found(self, values: np.ndarray, size_std_mm: float | None) -> StepFound:
+    def to_stored(self, values: np.ndarray, size_std_mm: float | None) -> StepFound:
         x, y, z, distance, height = values.tolist()
         return StepFound(normal=(x, y, z), distance_mm=distance, height_mm=height, height_std_mm=size_std_mm)
 
 
 class RingShape(Shape):
-    """A cylinder's wall and a face square to its axis. Values: axis, centre on the face, radius (7,).
+    """Cylindrical wall and a face perpendicular to its axis. Values (7,): axis, centre on the face, radius.
 
-    Parameters: two turns of the axis about the centre, the centre, and the radius. Part 0 is the face; each run of
-    points on the wall is a part of its own.
+    Parameters: two rotations of the axis about the centre, the centre, and the radius. Part 0 is the face; each
+    contiguous run of points on the wall is a separate part.
     """
 
     kind, fewest_poses, has_size, place, surfaces = "ring", 8, True, 5, 2
 
-    def find(self, points: np.ndarray, rng: np.random.Generator) -> Seen | None:
+    def find(self, points: np.ndarray, rng: np.random.Generator) -> Detection | None:
         return find_face(points, rng)
 
-    def find_again(self, points: np.ndarray, off: np.ndarray, reach_mm: float, rng: np.random.Generator) -> Seen | None:
+    def find_again(
+        self, points: np.ndarray, off: np.ndarray, reach_mm: float, rng: np.random.Generator
+    ) -> Detection | None:
         near = off[:, 0] < reach_mm
         face = find_line(points[near], rng)
         if face is None:
             return None
-        # Edges of a ring are broken: points near both surfaces lie on neither.
+        # Edges of a ring are chamfered: points near both surfaces are on neither.
         walls = find_walls(points, (off[:, 1] < reach_mm) & (off[:, 0] > 2 * reach_mm))
-        return face.among(near).with_parts(walls)
+        return face.expand(near).with_parts(walls)
 
-    def stepped(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
+    def apply_step(self, values: np.ndarray, step: np.ndarray) -> np.ndarray:
         radius = values[6] + (step[5] if self.size_unknown else 0.0)
-        return np.concatenate([_turned(values[:3], step[:2]), values[3:6] + step[2:5], [radius]])
+        return np.concatenate([_rotate_normal(values[:3], step[:2]), values[3:6] + step[2:5], [radius]])
 
     def _radial(self, values: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Heights (N,) over the face, and vectors (N, 3) from the axis square to it."""
+        """Return heights (N,) above the face, and perpendicular vectors (N, 3) from the axis."""
         away = points - values[3:6]
         height = away @ values[:3]
         return height, away - np.outer(height, values[:3])
@@ -218,12 +223,12 @@ class RingShape(Shape):
     def derivatives(self, values: np.ndarray, points: np.ndarray, part: np.ndarray) -> np.ndarray:
         height, radial = self._radial(values, points)
         normals = self.normals(values, points, part)
-        # The distance from the axis r has r^2 = |q|^2 - h^2 and h = n q: it changes by -h q / r where n turns.
+        # The distance r from the axis has r^2 = |q|^2 - h^2 with h = n q; its derivative by n is -h q / r.
         arms = np.where((part == 0)[:, None], radial, -height[:, None] * normals)
         by_radius = -(part > 0).astype(np.float64)[:, None][:, : int(self.size_unknown)]
-        return np.hstack([arms @ square_to(values[:3]).T, -normals, by_radius])
+        return np.hstack([arms @ perpendicular_to(values[:3]).T, -normals, by_radius])
 
-    def missing(self, parts: Sequence[np.ndarray]) -> str | None:
+    def describe_missing(self, parts: Sequence[np.ndarray]) -> str | None:
         walls = sum(bool(part.any()) for part in parts)
         if walls >= _FEWEST_WALLS:
             return None
@@ -233,17 +238,17 @@ class RingShape(Shape):
             "are needed: tilt the sensor so that the sheet meets the wall"
         )
 
-    def parallel(self, part: np.ndarray) -> list[np.ndarray]:
+    def group_parallel(self, part: np.ndarray) -> list[np.ndarray]:
         return [part == run for run in np.unique(part)]
 
-    def lines(self, along: np.ndarray, part: np.ndarray) -> np.ndarray:
+    def basis_lines(self, along: np.ndarray, part: np.ndarray) -> np.ndarray:
         columns = []
         for run in np.unique(part):
-            # A wall that the sheet cuts along its axis is straight, any other bent.
+            # A wall that the sheet cuts along its axis is straight, any other is curved.
             columns += [(part == run) * along**power for power in range(2 if run == 0 else 3)]
         return np.column_stack(columns)
 
-    def found(self, values: np.ndarray, size_std_mm: float | None) -> RingFound:
+    def to_stored(self, values: np.ndarray, size_std_mm: float | None) -> RingFound:
         a, b, c, x, y, z, radius = values.tolist()
         return RingFound(axis=(a, b, c), centre_mm=(x, y, z), radius_mm=radius, radius_std_mm=size_std_mm)
 
@@ -251,13 +256,13 @@ class RingShape(Shape):
 SHAPES: dict[Artefact, type[Shape]] = {each.kind: each for each in (SphereShape, PlaneShape, StepShape, RingShape)}
 
 
-def square_to(normal: np.ndarray) -> np.ndarray:
-    """Unit directions (2, 3) square to a normal and to each other."""
+def perpendicular_to(normal: np.ndarray) -> np.ndarray:
+    """Return two unit directions (2, 3) perpendicular to a normal and to each other."""
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)
     return np.array([first, np.cross(normal, first)])
 
 
-def _turned(normal: np.ndarray, step: np.ndarray) -> np.ndarray:
-    turned = normal + step @ square_to(normal)
+def _rotate_normal(normal: np.ndarray, step: np.ndarray) -> np.ndarray:
+    turned = normal + step @ perpendicular_to(normal)
     return turned / np.linalg.norm(turned)

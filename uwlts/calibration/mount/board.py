@@ -1,6 +1,6 @@
-"""Mount of a calibrated sensor from images of a target from several poses of its platform (hand-eye calibration).
+"""Mount of a calibrated sensor from target images at several platform poses (hand-eye calibration).
 
-Or the axis of a rotary table that turns the target.
+The same estimate gives the axis of a rotary table that turns the target.
 """
 
 import warnings
@@ -20,9 +20,9 @@ from uwlts.calibration.mount.estimate import (
     GroupedEvidence,
     RestrictedEstimate,
     settle_agreeing,
-    solved_step,
+    solve_step,
 )
-from uwlts.calibration.mount.next_pose import OPEN_RAD, missing_turns, require_determined, weaknesses
+from uwlts.calibration.mount.next_pose import OPEN_RAD, describe_missing_turns, require_determined, weaknesses
 from uwlts.calibration.mount.sensor import mount_covariance
 from uwlts.errors import CalibrationError, DescriptionError, TargetError
 from uwlts.files.writing import sha256_of
@@ -37,44 +37,44 @@ from uwlts.targets import CircleTarget, Target, parse_target
 from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
 FEWEST_IMAGES = 4
-"""Three poses with turns about two axes determine the mount; one more shows whether they agree."""
+"""Three poses with rotations about two axes determine the mount; a fourth one shows whether they agree."""
 _LEAST_PX = 1e-3
-"""No corner or circle is found closer."""
+"""Lower bound of the detection error of a corner or circle."""
 POSE_STEPS = np.array([1e-3] * 3 + [1e-6] * 3)
-"""Of shift (mm) and turn (rad) for differences."""
+"""Step sizes of shift (mm) and rotation (rad) for finite differences."""
 _NO_FIT = 0.1
-"""Share of the target's extent by which platforms do not err; a wrong format of the poses gives more."""
+"""Pose error divided by the extent of the target that no platform has; a wrong pose format exceeds it."""
 _TRIPLES = 100
-"""With a third of the images wrong, three right ones are missed by all of them once in 10^15 times."""
+"""Random triples of images: with a third of the images wrong, all triples contain a wrong one once in 10^15 runs."""
 _BOUNDS = np.array([(1.0, 100.0), (1e-4, 1e3), (1e-7, 1.0)])
-"""Of the scatter: factor of the images' errors, which are at least those of their points, mm, and rad."""
-_LEAST_MM = 1e-3  # scatter of shifts that a search starts from at least; no platform is better
-_LEAST_RAD = 1e-6  # the same of turns
+"""Bounds of the scatter: factor of the image errors (at least 1), mm, and rad."""
+_LEAST_MM = 1e-3  # smallest scatter of shifts to start from; no platform is better
+_LEAST_RAD = 1e-6  # smallest scatter of rotations to start from
 
 
 def mount_by_board(
     capture: Capture, calibration: Calibration, poses: np.ndarray | None = None, *, axis: SensorAxis | None = None
 ) -> Mount:
-    """``T_platform_sensor`` from images of a target at an unknown fixed place, the sensor's calibration held fixed.
+    """Estimate ``T_platform_sensor`` from images of a target at an unknown fixed place.
 
-    What a joint estimate of the calibration leaves open becomes part of the covariance.
+    The calibration of the sensor is fixed. The covariance of a joint calibration is propagated to the mount.
 
-    Each image gives the target's pose before the camera, through window and medium. A closed form (Park and Martin,
-    IEEE Trans. Robotics and Automation 10, 1994) starts a least-squares estimate of mount and target's place, weighted
-    by the covariance of each image and the scatter of the platform in position and rotation. Restricted maximum
-    likelihood gives both, and by which factor images err more than their points' scatter says, as those of a bent
-    target do. Images that contradict the others are left out.
+    Each image gives the target's pose in front of the camera, through window and medium. A closed-form solution (Park
+    and Martin, IEEE Trans. Robotics and Automation 10, 1994) starts a least-squares estimate of the mount and the
+    target's place. The weights follow from the covariance of each image and the platform's scatter in position and
+    rotation. Restricted maximum likelihood estimates this scatter, and the ratio of image errors to the noise of their
+    points (for example if the target is bent). Images that contradict the others are rejected.
 
     Parameters
     ----------
     capture
-        Images with the laser off show the target that it describes.
+        Capture that describes its target and shows it with the laser off.
     calibration
-        Of the sensor.
+        Calibration of the sensor.
     poses
-        ``T_base_platform`` (P, 4, 4) of the images with the laser off, in their order, in place of the capture's own.
+        ``T_base_platform`` (P, 4, 4) of the images with the laser off, in their order. Default: those of the capture.
     axis
-        The platform is a rotary table that turns the target, as for `uwlts.calibrate_mount`.
+        Set if the platform is a rotary table that turns the target, as for `uwlts.calibrate_mount`.
 
     Raises
     ------
@@ -85,38 +85,38 @@ def mount_by_board(
     """
     header = capture.header
     known = None if calibration.joint is None else stored_estimate(calibration, header.sensor, header.medium)
-    target, images, reasons = board_images(capture, calibration, known, poses)
+    target, images, reasons = detect_boards(capture, calibration, known, poses)
     middle = target.points_mm.mean(axis=0)
     rotations = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in images])
     if axis is not None:
         require_table(np.array([image.base_from_platform for image in images]), axis=axis)
-    elif missing := missing_turns(rotations, least_rad=OPEN_RAD):
+    elif missing := describe_missing_turns(rotations, least_rad=OPEN_RAD):
         raise CalibrationError(f"the poses do not determine the mount: {'; '.join(missing)}")
     problem = BoardEvidence(images, calibration.object_transform(), middle, axis is not None)
-    estimate, kept = agreeing_images(problem)
-    used, state = problem.selected(kept), estimate.state
+    estimate, kept = select_agreeing_images(problem)
+    used, state = problem.select(kept), estimate.state
     _, position_mm, _ = estimate.scatter
     extent = float(np.linalg.norm(np.ptp(target.points_mm, axis=0)))
     left_out = [image for image in images if image not in used.images]
     if position_mm > _NO_FIT * extent or 2 * len(used.images) < len(images):
         raise CalibrationError(
-            f"no mount makes the images fit: the poses would be wrong by {position_mm:.3g} mm (rms), with "
-            f"{len(left_out)} of {len(images)} left out. Are the poses T_base_platform, is their format right, are "
-            "their units right, and do they come in the order of the images?"
+            f"no mount fits the images: the poses would have errors of {position_mm:.3g} mm (rms), with "
+            f"{len(left_out)} of {len(images)} images rejected. Check that the poses are T_base_platform, their "
+            "format, their units, and that they are in the order of the images"
         )
     if axis is not None and state[0][2, :3] @ SENSOR_AXES[axis] <= 0:
         raise CalibrationError(
             f"the images turn about an axis that points away from {axis} of the sensor's frame, to "
-            f"({', '.join(f'{each:.2f}' for each in state[0][2, :3])}): are the angles counted the other way round?"
+            f"({', '.join(f'{each:.2f}' for each in state[0][2, :3])}): check the sign of the angles"
         )
     covariance, share, factor = mount_covariance(
-        estimate, used.free, state[0][:3, :3], known, lambda: used.moved(state)
+        estimate, used.free, state[0][:3, :3], known, lambda: used.residual_derivatives(state)
     )
     turns = Rotation.from_matrix([image.base_from_platform[:3, :3] for image in used.images])
     weak = weaknesses(covariance[:6, :6], turns, table=used.table)
     require_determined(covariance, weak)
     found = {image.name: used.offsets_mm(state)[k] for k, image in enumerate(used.images)}
-    others = [used.stepped(state, step) for step, _ in estimate.without_each]
+    others = [used.apply_step(state, step) for step, _ in estimate.without_each]
     held = {image.name: used.offsets_mm(others[k])[k] for k, image in enumerate(used.images)}
     rows = [
         MountPose(
@@ -154,12 +154,12 @@ def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
 
 @dataclass(frozen=True, eq=False)
 class BoardImage:
-    """An image of the target: its pose as the camera sees it, and that of the platform.
+    """Target pose in an image, and the platform's pose.
 
-    ``camera_from_target`` (4, 4) in mm; ``covariance`` (6, 6) is of a shift of the target's middle (mm) and a turn
-    about it (rad), in the camera's axes; ``points`` found, whose pixels miss by ``rms_px``; ``base_from_platform``
-    (4, 4). ``by_sensor`` (6, Q) are derivatives of shift and turn by the parameters of the sensor's joint estimate,
-    where it has one.
+    ``camera_from_target`` is (4, 4), mm. ``covariance`` (6, 6) is that of a shift of the target's middle (mm) and a
+    rotation about it (rad), in the camera's axes. ``rms_px`` is the RMS residual of the detected ``points``.
+    ``by_sensor`` (6, Q) contains the derivatives of shift and rotation by the parameters of the joint calibration, if
+    any.
     """
 
     name: str
@@ -171,10 +171,10 @@ class BoardImage:
     by_sensor: np.ndarray | None = None
 
 
-def board_images(
+def detect_boards(
     capture: Capture, calibration: Calibration, known: StoredEstimate | None, poses: np.ndarray | None
 ) -> tuple[Target, list[BoardImage], dict[str, str]]:
-    """The target, its pose in every image that shows it, and why others do not."""
+    """Return the target, its pose in every image that shows it, and the reasons why other images are not used."""
     header = capture.header
     check_fits(header, calibration, source=capture.path.name)
     if header.target is None:
@@ -184,15 +184,15 @@ def board_images(
     numbers = np.flatnonzero(~capture.laser_on)
     taken, at = len(numbers), capture.pose[numbers] if poses is None else poses
     if len(at) != taken:
-        raise DescriptionError(f"there are {len(at)} poses for {taken} images with the laser off: expected one each")
+        raise DescriptionError(f"found {len(at)} poses for {taken} images with the laser off; expected one for each")
     images: list[BoardImage] = []
     reasons: dict[str, str] = {}
     for (frame, image), pose in zip(capture.frames(laser_on=False), at, strict=True):
         name = f"{capture.path.stem}, frame {frame}"
         if not np.isfinite(pose).all():
-            raise DescriptionError(f"{name} has no pose of the platform: give a table of poses, or import them")
+            raise DescriptionError(f"{name} has no platform pose: give a table of poses, or import the poses")
         try:
-            images.append(posed_board(name, image, target, calibration, known, window, index, pose))
+            images.append(estimate_board_pose(name, image, target, calibration, known, window, index, pose))
         except (TargetError, CalibrationError) as error:
             reasons[name] = f"no target: {error}"
     if len(images) < FEWEST_IMAGES:
@@ -203,7 +203,7 @@ def board_images(
     return target, images, reasons
 
 
-def posed_board(
+def estimate_board_pose(
     name: str,
     image: np.ndarray,
     target: Target,
@@ -213,7 +213,7 @@ def posed_board(
     index: float,
     base_from_platform: np.ndarray,
 ) -> BoardImage:
-    """The target's pose in one image by least squares of its points' pixels."""
+    """Estimate the target's pose in one image by least squares of the pixels of its points."""
     camera, view = calibration.camera, target.detect(image)
     if len(view.points_mm) < 6:
         raise CalibrationError(f"{len(view.points_mm)} points found; at least 6 are needed")
@@ -221,12 +221,12 @@ def posed_board(
     slopes = rays.directions[:, :2] / rays.directions[:, 2:]
     good, turn, shift = cv2.solvePnP(view.points_mm, slopes, np.eye(3), None)
     if not good or not np.isfinite(shift).all():
-        raise CalibrationError("its points fit no pose")
+        raise CalibrationError("no pose fits its points")
     middle = target.points_mm.mean(axis=0)
     start = rigid_transform(cv2.Rodrigues(turn)[0], shift.ravel())
 
     def moved(step: np.ndarray) -> np.ndarray:
-        return moved_about(start, middle, step)
+        return move_about(start, middle, step)
 
     def projected(pose: np.ndarray, points: np.ndarray) -> np.ndarray:
         seen = points @ pose[:3, :3].T + pose[:3, 3]
@@ -243,7 +243,7 @@ def posed_board(
         )
         pixels = pixels - bias
     if not np.isfinite(projected(start, view.points_mm)).all():
-        raise CalibrationError("it would lie before the window")
+        raise CalibrationError("its pose would be in front of the window")
     fit = least_squares(
         lambda step: (projected(moved(step), view.points_mm) - pixels).ravel(),
         np.zeros(6),
@@ -255,10 +255,10 @@ def posed_board(
     covariance = spread**2 * np.linalg.inv(fit.jac.T @ fit.jac)
     by_sensor = None
     if known is not None:
-        # The pose goes where the pixels stay as they are.
+        # Derivative of the pose if the sensor's parameters change and the pixels do not.
         found, where = moved(fit.x), np.zeros(6)
         by_pose = differences(
-            lambda step: projected(moved_about(found, middle, step), view.points_mm), where, POSE_STEPS
+            lambda step: projected(move_about(found, middle, step), view.points_mm), where, POSE_STEPS
         )
         placed = view.points_mm @ found[:3, :3].T + found[:3, 3]
         std = np.sqrt(np.diag(known.covariance))
@@ -270,7 +270,7 @@ def posed_board(
 
 
 def differences(values: Callable[[np.ndarray], np.ndarray], at: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Derivatives (N, K) of values, flattened, by central differences with steps (K,); 0 where a step is 0."""
+    """Return derivatives (N, K) of flattened values by central differences with steps (K,); 0 for a zero step."""
     columns = []
     for number, size in enumerate(steps):
         step = np.zeros(len(steps))
@@ -279,8 +279,8 @@ def differences(values: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step
     return np.stack(columns, axis=1)
 
 
-def moved_about(pose: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """A pose (4, 4) after a shift (3,) of the place of a point ``middle`` and a turn (3,) about it."""
+def move_about(pose: np.ndarray, middle: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Shift a point ``middle`` of a pose (4, 4) by (3,) and rotate the pose about it by (3,)."""
     rotation = Rotation.from_rotvec(step[3:]).as_matrix() @ pose[:3, :3]
     place = pose[:3, :3] @ middle + pose[:3, 3] + step[:3]
     return rigid_transform(rotation, place - rotation @ middle)
@@ -292,10 +292,10 @@ _State = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class BoardEvidence(GroupedEvidence[_State]):
-    """Images of a target, ``T_camera_sensor`` and the target's middle (3,) in its own frame.
+    """Target images at several poses; ``camera_from_sensor`` (4, 4) and the target's middle (3,) in its own frame.
 
-    The values are steps of mount and target, the components of the scatter a factor of the images' errors, and position
-    (mm) and turn (rad) of the platform.
+    The parameters are steps of the mount and of the target. The scatter components are a factor of the image errors,
+    and the platform's scatter of position (mm) and rotation (rad).
     """
 
     images: Sequence[BoardImage]
@@ -319,25 +319,25 @@ class BoardEvidence(GroupedEvidence[_State]):
     def groups(self) -> int:
         return len(self.images)
 
-    def selected(self, kept: np.ndarray) -> Self:
+    def select(self, kept: np.ndarray) -> Self:
         return replace(self, images=[self.images[k] for k in np.arange(len(self.images))[kept]])
 
     def bounds(self) -> np.ndarray:
         return _BOUNDS
 
     def start(self) -> _State:
-        """Mount and target by Park and Martin from the relative motions of all pairs of images."""
+        """Estimate mount and target in closed form (Park and Martin) from the relative motions of all image pairs."""
         seen, held = self._sensor_from_target, self._platforms
         first, second = np.triu_indices(len(held), 1)
         tools = np.linalg.inv(held[first]) @ held[second]
         boards = seen[first] @ np.linalg.inv(seen[second])
         by_tool, by_board = (Rotation.from_matrix(each[:, :3, :3]).as_rotvec() for each in (tools, boards))
         if self.table:
-            # Turns about z alone: the sensor's x axis, made square to the axis, shall be the table's.
+            # All rotations are about z: align the table's x axis with the sensor's, made perpendicular to the axis.
             axis = by_board.T @ by_tool[:, 2]
             by_tool, by_board = np.eye(3)[[2, 0]], np.array([axis, np.eye(3)[np.argmin(np.abs(axis))]])
         with warnings.catch_warnings():
-            # Turns about one axis only: the covariance tells.
+            # Rotations about one axis only are reported from the covariance.
             warnings.simplefilter("ignore", UserWarning)
             weights = [np.inf, 1.0] if self.table else None
             rotation = Rotation.align_vectors(by_tool, by_board, weights)[0].as_matrix()
@@ -350,15 +350,15 @@ class BoardEvidence(GroupedEvidence[_State]):
         return mount, rigid_transform(turns, np.median(middles, axis=0) - turns @ self.middle)
 
     def residuals(self, state: _State, step: np.ndarray | None = None) -> np.ndarray:
-        """Per image (K, 6): where its target lies beside the common one, shift of the middle in mm and turn in rad."""
-        mount, common = state if step is None else self.stepped(state, step)
+        """Return each image's deviation (K, 6) from the common target pose: shift (mm) and rotation (rad)."""
+        mount, common = state if step is None else self.apply_step(state, step)
         own = self._platforms @ mount @ self._sensor_from_target
         shift = (own - common)[:, :3] @ np.append(self.middle, 1.0)
         return np.hstack([shift, Rotation.from_matrix(own[:, :3, :3] @ common[:3, :3].T).as_rotvec()])
 
     def covariance(self, state: _State) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
         both, middle = self._by_images(state[0]), state[1][:3] @ np.append(self.middle, 1.0)
-        # A turn of the platform moves what is far from its origin.
+        # A rotation error of the platform shifts points far from its origin.
         lever = np.tile(np.eye(6, 3, -3), (len(both), 1, 1))
         for axis, unit in enumerate(np.eye(3)):
             lever[:, :3, axis] = np.cross(unit, middle - self._platforms[:, :3, 3])
@@ -377,14 +377,14 @@ class BoardEvidence(GroupedEvidence[_State]):
         return [np.eye(6)] * len(self.images)
 
     def _by_images(self, mount: np.ndarray) -> np.ndarray:
-        """Derivatives (K, 6, 6) of the residuals by the errors of the images: these turned into the base frame."""
+        """Return derivatives (K, 6, 6) of the residuals by the image errors, which are rotated into the base frame."""
         turn = (self._platforms @ mount @ np.linalg.inv(self.camera_from_sensor))[:, :3, :3]
         both = np.zeros((len(turn), 6, 6))
         both[:, :3, :3] = both[:, 3:, 3:] = turn
         return both
 
-    def moved(self, state: _State) -> np.ndarray:
-        """Derivatives (K, 6, Q) of the residuals by the parameters of the sensor's calibration."""
+    def residual_derivatives(self, state: _State) -> np.ndarray:
+        """Return derivatives (K, 6, Q) of the residuals by the parameters of the sensor's calibration."""
         return self._by_images(state[0]) @ np.array([image.by_sensor for image in self.images])
 
     def jacobian(self, state: _State, step: np.ndarray | None = None) -> np.ndarray:
@@ -395,28 +395,28 @@ class BoardEvidence(GroupedEvidence[_State]):
 
         return differences(residuals, at, np.tile(POSE_STEPS, 2)).reshape(-1, 6, 12) @ self.free
 
-    def stepped(self, state: _State, step: np.ndarray) -> _State:
+    def apply_step(self, state: _State, step: np.ndarray) -> _State:
         return self._moved(state, self.free @ step)
 
     def _moved(self, state: _State, step: np.ndarray) -> _State:
-        """The state after a shift and a turn of the mount about the platform's axes, and of the target's middle."""
+        """Shift and rotate the mount along the platform's axes, then the target about its middle."""
         mount, common = state
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ mount[:3, :3]
-        return rigid_transform(turned, mount[:3, 3] + step[:3]), moved_about(common, self.middle, step[6:])
+        return rigid_transform(turned, mount[:3, 3] + step[:3]), move_about(common, self.middle, step[6:])
 
     def typical_miss(self, state: _State) -> float:
-        """Median distance by which images miss, of the target's middle and of what lies its distance aside, mm."""
+        """Return the median deviation over the images, of the target's middle and of points beside it, mm."""
         left = self.residuals(state)
         away = np.linalg.norm(self._sensor_from_target[:, :3, 3], axis=1) + 1.0
         return float(np.median(np.linalg.norm(left[:, :3], axis=1) + away * np.linalg.norm(left[:, 3:], axis=1)))
 
     def offsets_mm(self, state: _State) -> np.ndarray:
-        """Distances (K,) of the target's middle in each image from the common place."""
+        """Return the distances (K,) of the target's middle in each image from the common place."""
         return np.linalg.norm(self.residuals(state)[:, :3], axis=1)
 
 
-def agreeing_images(evidence: BoardEvidence) -> tuple[RestrictedEstimate[_State], np.ndarray]:
-    """Estimate from the images that agree, and their mask.
+def select_agreeing_images(evidence: BoardEvidence) -> tuple[RestrictedEstimate[_State], np.ndarray]:
+    """Estimate the mount from the images that agree; return it with their mask.
 
     Raises
     ------
@@ -424,14 +424,14 @@ def agreeing_images(evidence: BoardEvidence) -> tuple[RestrictedEstimate[_State]
         Too few images agree.
     """
     rng, count = np.random.default_rng(0), len(evidence.images)
-    # A wrong image spoils the closed form, so that it starts from three images at a time too.
-    triples = [evidence.selected(rng.choice(count, 3, replace=False)).start() for _ in range(_TRIPLES)]
+    # A wrong image spoils the closed form, so start from random triples of images too.
+    triples = [evidence.select(rng.choice(count, 3, replace=False)).start() for _ in range(_TRIPLES)]
     state = min([evidence.start(), *triples], key=evidence.typical_miss)
     left = evidence.residuals(state)
     sizes = np.median(np.linalg.norm(left.reshape(count, 2, 3), axis=2), axis=0)
     spread = np.maximum(sizes, (_LEAST_MM, _LEAST_RAD))
     rough = np.tile(np.diag(np.repeat(spread, 3) ** 2), (count, 1, 1))
-    state = evidence.stepped(state, solved_step(evidence, state, rough, loss="cauchy"))
+    state = evidence.apply_step(state, solve_step(evidence, state, rough, loss="cauchy"))
     sizes = (np.abs(evidence.residuals(state)) / np.repeat(spread, 3)).max(axis=1)
     near = np.flatnonzero(sizes < LARGEST_ROUGH * max(float(np.median(sizes)), 1.0))
 
@@ -439,12 +439,12 @@ def agreeing_images(evidence: BoardEvidence) -> tuple[RestrictedEstimate[_State]
         if np.count_nonzero(kept) < FEWEST_IMAGES:
             raise CalibrationError(
                 f"{np.count_nonzero(kept)} of {count} images of the target agree with the poses; at least "
-                f"{FEWEST_IMAGES} are needed. Are the poses T_base_platform, is their format right, do they come in "
-                "the images' order?"
+                f"{FEWEST_IMAGES} are needed. Check that the poses are T_base_platform, their format, and that they "
+                "are in the order of the images"
             )
 
-    starts = [(each, np.array([1.0, *spread])) for each in (state, evidence.selected(near).start())]
-    found, among = settle_agreeing(evidence.selected(near), starts, require=require)
+    starts = [(each, np.array([1.0, *spread])) for each in (state, evidence.select(near).start())]
+    found, among = settle_agreeing(evidence.select(near), starts, require=require)
     kept = np.zeros(count, dtype=bool)
     kept[near[among]] = True
     return found, kept

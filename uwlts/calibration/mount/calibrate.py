@@ -1,4 +1,4 @@
-"""Calibration of the mount of a laser profiler on a moving platform, from its profiles of an unknown fixed artefact."""
+"""Calibrate the mount of a laser profiler on a moving platform, from its profiles of an unknown fixed artefact."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -12,7 +12,7 @@ from uwlts.calibration.mount.artefacts import SHAPES
 from uwlts.calibration.mount.board import mount_by_board
 from uwlts.calibration.mount.estimate import LARGEST_ROUGH, NotSettled, RestrictedEstimate, settle, settle_agreeing
 from uwlts.calibration.mount.next_pose import next_pose, require_determined, weaknesses
-from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, in_sheet, in_space
+from uwlts.calibration.mount.profile_evidence import Motion, MountState, Problem, Scatter, from_sheet, to_sheet
 from uwlts.calibration.mount.profiles import LEAST_POINTS
 from uwlts.calibration.mount.sensor import CapturedProfiles, mount_covariance, profiles_of
 from uwlts.calibration.mount.start import NoFit, require_surfaces, start
@@ -26,13 +26,13 @@ from uwlts.storage.mount_files import SENSOR_AXES, Artefact, MountEvidence, Sens
 from uwlts.storage.pose_files import PoseFormat, Unit, read_poses
 
 _MOST_POINTS = 100_000
-"""Points of all profiles together; more take time and hardly lower the uncertainty, as poses err too."""
+"""Points of all profiles together; more take time without lower uncertainty, as pose errors dominate."""
 _NO_FIT = 0.1
-"""Share of a sphere's radius by which platforms do not err; a wrong format of the poses gives more."""
+"""Pose error divided by the sphere's radius that no platform has; a wrong pose format exceeds it."""
 _OTHER_SIZE = 0.03
-"""Share of the given size by which profiles show another one for sure, as profilers' scales err by less."""
+"""Relative difference from the given size that proves another size: scale errors of profilers are smaller."""
 _SURE = 5.0
-"""Standard uncertainties of the same, beyond which lies one normal error in a million; the larger of both counts."""
+"""The same in standard uncertainties (one in a million for normal errors); the larger limit applies."""
 
 
 def calibrate_mount(
@@ -54,37 +54,36 @@ def calibrate_mount(
 ) -> Mount:
     """Calibrate the mount of a laser profiler on a robot or stage, from its profiles of a sphere, plane, step or ring.
 
-    Or that of a calibrated sensor, from a capture of one of them or of a target; or the axis of a rotary table. The
-    result is ``T_platform_sensor`` with its uncertainty, the poses that were left out, what the motions determine
-    badly, and the pose to add next.
+    Also calibrates the mount of a calibrated sensor, from a capture of such an artefact or of a target, or the axis of
+    a rotary table. The result is ``T_platform_sensor`` with its uncertainty, the rejected poses, the weakly determined
+    directions, and the best pose to add.
 
-    The platform's poses ``T_base_platform`` are known, as a robot's flange's. The artefact's place and the mount are
-    estimated together by least squares of the distances of all points from the artefact, weighted by the noise of the
-    points, the smooth error along each profile and the scatter of the poses, which are estimated too (restricted
-    maximum likelihood). Background beside
-    the artefact, and poses that contradict the others, are left out.
+    The platform's poses ``T_base_platform`` are known, for example from a robot's flange. A least-squares fit of the
+    distances of all points from the artefact estimates the artefact's place and the mount together. The weights follow
+    from the noise of the points, the smooth error along each profile and the scatter of the poses. Restricted maximum
+    likelihood estimates these too. Background beside the artefact and poses that contradict the others are rejected.
 
     Parameters
     ----------
     profiles
         Folder with one CSV file (columns x and z) for each pose, one CSV file with a column pose, a cloud whose frames
-        are the poses, or a description of everything (.toml; docs/how-to/calibrate-a-mount.md). With a calibration, a
-        capture of the artefact, or of a target that images with the laser off show. Or one array for each pose: (N, 2)
+        are the poses, or a description of everything (.toml; docs/how-to/calibrate-a-mount.md). With a calibration: a
+        capture of the artefact, or of a target in images with the laser off. Or one array for each pose: (N, 2)
         with x along the profile and z, or (N, 3) with x, y, z in the sensor's frame, in the order along the profile,
-        mm, NaN where nothing was seen.
+        mm, NaN for missing points.
     poses
-        CSV file with the pose of the platform in the base frame for each profile, or image of the target; or
-        ``T_base_platform`` (P, 4, 4), mm. Those of the capture unless given.
+        CSV file with the pose of the platform in the base frame for each profile or target image, or
+        ``T_base_platform`` (P, 4, 4), mm. Default: the poses of the capture.
     artefact
-        What the profiles show: a sphere, a plane, a step (two parallel faces), or a ring (a face, and a cylindrical
-        wall square to it).
+        Artefact in the profiles: a sphere, a plane, a step (two parallel faces), or a ring (a face and a perpendicular
+        cylindrical wall).
     radius_mm
-        Radius of the sphere, or of the ring's wall; estimated unless given.
+        Radius of the sphere, or of the ring's wall. Default: it is estimated.
     height_mm
-        Height of the step; estimated unless given.
+        Height of the step. Default: it is estimated.
     calibration
-        Calibration of the sensor that took the capture, held fixed; what a joint estimate leaves open becomes part of
-        the mount's covariance.
+        Calibration of the sensor that took the capture. It is not changed; the covariance of a joint calibration is
+        propagated to the mount.
     pose_format
         matrix, quaternion-xyzw, quaternion-wxyz, rotvec-rad, rotvec-deg, euler-ZYX-deg (about the moved axes),
         euler-zyx-deg (about the fixed axes) or another order, -rad for radians; angle-deg of a rotary table.
@@ -93,23 +92,24 @@ def calibrate_mount(
     pose_unit
         Unit of the positions.
     axis
-        The sphere or target stands on a rotary table whose axis is not known: direction in the sensor's frame nearest
-        to the axis about which angles turn it counter-clockwise. The mount then leads to a frame whose z axis is the
-        table's.
+        Set if the sphere or target stands on a rotary table with unknown axis. Direction in the sensor's frame nearest
+        to the axis about which positive angles turn counter-clockwise. The mount then maps to a frame whose z axis is
+        the axis of the table.
     scale
-        Estimate the robot's scale too.
+        Also estimate the robot's scale.
     time
         Estimate the offset to add to the profiles' times (columns time_s; the poses are a trajectory).
     profile_times_s, pose_times_s
-        Times (P,) of the profiles and (M,) of the poses, which are then a trajectory of any number M of poses
+        Times (P,) of the profiles and (M,) of the poses. The poses are then a trajectory with any number M of poses
         (`uwlts.Trajectory`).
 
     Raises
     ------
     DescriptionError
-        Files or options that cannot be read or do not go together.
+        Files or options cannot be read or contradict each other.
     CalibrationError
-        Too few profiles show the artefact, or the motions do not determine the mount; which are missing is said.
+        Too few profiles show the artefact, or the motions do not determine the mount. The message names the missing
+        motions.
 
     Examples
     --------
@@ -118,10 +118,10 @@ def calibrate_mount(
     """
     if calibration is not None:
         if not isinstance(profiles, str | Path):
-            raise DescriptionError("a calibration goes with a capture: give the capture's path")
+            raise DescriptionError("a calibration needs a capture: give the capture's path as `profiles`")
         known = loaded_calibration(calibration)
         if not isinstance(known, Calibration):
-            raise DescriptionError("a calibration by polynomials does not place a target: give one with a camera")
+            raise DescriptionError("a polynomial calibration cannot locate a target: give one with a camera model")
         table, times = poses, pose_times_s
         if isinstance(poses, str | Path):
             table, times = read_poses(poses, pose_format=pose_format, unit=pose_unit)
@@ -158,24 +158,24 @@ def calibrate_mount(
 
 
 def _advice(evidence: MountEvidence) -> str:
-    """Name the usual mistakes; of them another size of the artefact is tried."""
+    """Return advice on the usual mistakes; a wrong artefact size is tested by estimating it."""
     if evidence.size_mm is not None:
         with suppress(CalibrationError):
             found = _Calibration(replace(evidence, size_mm=None)).result()
             if 2 * sum(pose.reason is None for pose in found.poses) > len(found.poses):
                 return (
-                    f"They do fit, with {found.rms_mm:.3g} mm rms, if the {evidence.artefact} has another "
+                    f"The profiles fit with {found.rms_mm:.3g} mm rms if the {evidence.artefact} has another "
                     f"{evidence.size}, {found.size_mm():.3f} mm"
                 )
     return (
-        "Are the poses T_base_platform rather than their inverses T_platform_base? Is their format right (Euler angles "
-        "about moved axes, such as ZYX, or fixed ones, such as xyz; the place of w in a quaternion)? Are the units "
-        "right, and do profiles and poses come in the same order?"
+        "Check that the poses are T_base_platform, not their inverses T_platform_base; their format (Euler angles "
+        "about moved axes, such as ZYX, or about fixed axes, such as xyz; position of w in a quaternion); the units; "
+        "and that profiles and poses have the same order"
     )
 
 
 class _Calibration:
-    """The steps of one calibration, in the order in which `result` needs them."""
+    """Steps of one calibration, in the order in which `result` needs them."""
 
     def __init__(self, evidence: MountEvidence, captured: CapturedProfiles | None = None) -> None:
         self.evidence = evidence
@@ -183,15 +183,15 @@ class _Calibration:
         self.shape = SHAPES[evidence.artefact](evidence.size_mm)
         self.rng = np.random.default_rng(0)
         most = max(_MOST_POINTS // len(evidence.profiles), 5 * LEAST_POINTS)
-        self.rows = [_thinned(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
+        self.rows = [_thin(np.flatnonzero(np.isfinite(each).all(axis=1)), most) for each in evidence.profiles]
         chosen = [each[rows] for each, rows in zip(evidence.profiles, self.rows, strict=True)]
-        self.profiles = [each if each.shape[1] == 3 else in_space(each) for each in chosen]
+        self.profiles = [each if each.shape[1] == 3 else from_sheet(each) for each in chosen]
         self.sheet = _sheet_frame(self.profiles)
-        self.flat = in_sheet(self.profiles, self.sheet)
+        self.flat = to_sheet(self.profiles, self.sheet)
         self.reasons: dict[int, str] = {}
 
     def result(self) -> Mount:
-        """The mount with all that is known of it."""
+        """Return the mount with its uncertainty, rejected poses and advice."""
         shapes = [self.shape.find(points, self.rng) for points in self.flat]
         for number, shape in enumerate(shapes):
             if shape is None:
@@ -208,36 +208,36 @@ class _Calibration:
             self.evidence.time,
             self.evidence.axis is not None,
         )
-        problem = whole.of_seen(shapes)
+        problem = whole.select_detected(shapes)
         seen = [shape for shape in shapes if shape is not None]
         towards = None if self.evidence.axis is None else SENSOR_AXES[self.evidence.axis]
-        state, problem = start(problem, whole.selected(kept), seen, self.sheet, towards, self.rng)
+        state, problem = start(problem, whole.select(kept), seen, self.sheet, towards, self.rng)
         misfit = problem.rms_mm(state)
         noise = float(np.median([shape.std_mm for shape in shapes if shape is not None]))
         good = misfit < max(LARGEST_ROUGH * float(np.median(misfit)), 5 * noise)
         typical = max(float(np.median(misfit)), noise, 1e-6)
         scatter = Scatter(max(noise, 1e-6), typical, typical, typical, 1e-3)
-        # What the first search got wrong in single profiles is searched again near the artefact that the others show.
+        # Detect the artefact again, near the place that the other profiles give, to correct errors of the first search.
         for _ in range(2):
-            require_surfaces(problem.selected(good))
-            found = settle(problem.selected(good), [(state, np.array(scatter))])
+            require_surfaces(problem.select(good))
+            found = settle(problem.select(good), [(state, np.array(scatter))])
             scatter = Scatter(*found.scatter)
             reach = 4 * float(np.hypot(np.hypot(scatter.point_mm, scatter.smooth_mm), 2 * scatter.pose_mm))
             state = found.state
-            shapes = whole.seen_again(state, self.flat, reach, self.rng)
+            shapes = whole.detect_again(state, self.flat, reach, self.rng)
             kept = np.array([shape is not None for shape in shapes])
-            problem = whole.of_seen(shapes)
+            problem = whole.select_detected(shapes)
             good = np.ones(len(problem.points), dtype=bool)
             self._require_enough(np.flatnonzero(kept))
 
         def require(good: np.ndarray) -> None:
             self._require_enough(np.flatnonzero(kept)[good])
-            require_surfaces(problem.selected(good))
+            require_surfaces(problem.select(good))
 
-        # The likelier of the estimates from here and from the least squares of all distances alike.
-        starts = [(each, np.array(scatter)) for each in (state, problem.plain(state))]
+        # Select the likelier estimate of two starts: this one, and unweighted least squares of all distances.
+        starts = [(each, np.array(scatter)) for each in (state, problem.solve_unweighted(state))]
         found, good = settle_agreeing(problem, starts, require=require)
-        used, state = problem.selected(good), found.state
+        used, state = problem.select(good), found.state
         numbers = np.flatnonzero(kept)
         names = self.evidence.names
         for number in range(len(names)):
@@ -269,7 +269,7 @@ class _Calibration:
         wrong = float(np.hypot(scatter.pose_mm, scatter.smooth_mm))
         if wrong > limit:
             raise NoFit(
-                f"no mount makes the profiles fit: {len(used.points)} of {len(self.profiles)} poses would be wrong by "
+                f"no mount fits the profiles: {len(used.points)} of {len(self.profiles)} poses would have errors of "
                 f"{wrong:.3g} mm (rms)"
             )
         if self.shape.size_mm is None:
@@ -277,11 +277,11 @@ class _Calibration:
         free = replace(used, shape=SHAPES[self.evidence.artefact]())
         other = RestrictedEstimate(free, state, estimate.scatter)
         at = free.size - free.scale - free.time - 1
-        step, std = float(other.by(other.residuals[:, :, None])[at, 0]), float(np.sqrt(other.covariance[at, at]))
+        step, std = float(other.propagate(other.residuals[:, :, None])[at, 0]), float(np.sqrt(other.covariance[at, at]))
         if abs(step) > max(_OTHER_SIZE * self.shape.size_mm, _SURE * std):
             raise NoFit(
-                f"no mount makes the profiles fit a {self.evidence.artefact} of {self.evidence.size} "
-                f"{self.shape.size_mm:g} mm: they show one that differs by {step:.2g} mm (standard uncertainty "
+                f"no mount fits the profiles of a {self.evidence.artefact} of {self.evidence.size} "
+                f"{self.shape.size_mm:g} mm: the profiles show one that differs by {step:.2g} mm (standard uncertainty "
                 f"{std:.2g} mm)"
             )
 
@@ -302,8 +302,8 @@ class _Calibration:
             wrong = float(np.hypot(scatter.pose_mm, scatter.smooth_mm))
             if self.shape.flat or wrong < 0.2 * _NO_FIT * state.artefact[3]:
                 raise
-            raise NoFit(f"no mount makes the profiles fit: the poses would be wrong by {wrong:.3g} mm (rms)") from error
-        moved = [used.stepped(state, step) for step, _ in estimate.without_each]
+            raise NoFit(f"no mount fits the profiles: the poses would have errors of {wrong:.3g} mm (rms)") from error
+        moved = [used.apply_step(state, step) for step, _ in estimate.without_each]
         rms, held = used.rms_mm(state), np.array([used.rms_mm(each)[place] for place, each in enumerate(moved)])
         off = zip(used.counts.tolist(), rms.tolist(), held.tolist(), strict=True)
         poses = []
@@ -321,7 +321,7 @@ class _Calibration:
                 )
             )
         std, at = np.sqrt(np.diag(covariance)), 6 + self.shape.count
-        found = self.shape.found(state.artefact, float(std[at - 1]) if self.shape.size_unknown else None)
+        found = self.shape.to_stored(state.artefact, float(std[at - 1]) if self.shape.size_unknown else None)
         transform = rigid_transform(Rotation.from_matrix(state.rotation).as_matrix(), state.translation)
         weights = used.counts / used.counts.sum()
         return Mount(
@@ -346,36 +346,38 @@ class _Calibration:
         )
 
     def _moved(self, used: Problem, state: MountState, members: list[np.ndarray]) -> np.ndarray:
-        """Derivatives (P, K, Q) of the residuals by the parameters of the sensor's calibration."""
+        """Return derivatives (P, K, Q) of the residuals by the parameters of the sensor's calibration."""
         assert self.captured is not None
         numbers = [n for n in range(len(members)) if n not in self.reasons]
-        by = np.vstack([self.captured.moved(number, self.rows[number][members[number]]) for number in numbers])
-        return used.means(used.on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
+        by = np.vstack(
+            [self.captured.point_derivatives(number, self.rows[number][members[number]]) for number in numbers]
+        )
+        return used.bin_means(used.project_on_lines(np.einsum("ni,niq->nq", used.normals(state), by)))
 
 
-def _thinned(points: np.ndarray, most: int) -> np.ndarray:
+def _thin(points: np.ndarray, most: int) -> np.ndarray:
     if len(points) <= most:
         return points
     return points[np.linspace(0, len(points) - 1, most).astype(int)]
 
 
 def _sheet_frame(profiles: list[np.ndarray]) -> np.ndarray:
-    """Frame (4, 4) of the plane of all points, with x and z in it; the sensor's where that is its y = 0."""
+    """Return the frame (4, 4) of the plane of all points, with x and z in it; the identity if y is 0 everywhere."""
     points = np.vstack(profiles)
     if not points[:, 1].any():
         return np.eye(4)
     middle = points.mean(axis=0)
-    extents, axes = np.linalg.svd(_thinned(points - middle, 20_000), full_matrices=False)[1:]
+    extents, axes = np.linalg.svd(_thin(points - middle, 20_000), full_matrices=False)[1:]
     if extents[2] > 0.02 * extents[1]:
         raise CalibrationError(
-            "the profiles do not lie in one plane of the sensor's frame: expected the points of a laser sheet, in the "
+            "the profiles are not in one plane of the sensor's frame; expected points of a laser sheet, in the "
             "sensor's frame and without the motion of the platform"
         )
     return rigid_transform(np.column_stack([axes[0], np.cross(axes[1], axes[0]), axes[1]]), middle)
 
 
 def _motion(evidence: MountEvidence) -> Motion:
-    """Rotations and positions of the platform at the profiles, by the offset of their times."""
+    """Return a function of the time offset that gives the platform's rotations and positions at the profiles."""
     rotations, positions = evidence.poses[:, :3, :3], evidence.poses[:, :3, 3]
     if evidence.pose_times_s is None or evidence.profile_times_s is None:
         return lambda offset: (rotations, positions)

@@ -1,4 +1,4 @@
-"""Estimate parameters and variance components together from groups of residuals (restricted maximum likelihood)."""
+"""Restricted maximum likelihood estimate of parameters and variance components from groups of residuals."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -13,19 +13,19 @@ from scipy.stats import chi2, t
 from uwlts.errors import CalibrationError
 
 _FALSE_ALARM = 1e-3
-"""Probability that any pose of a campaign without wrong ones is left out."""
+"""Probability that any pose of a campaign without wrong poses is rejected."""
 LARGEST_ROUGH = 6.0
-"""Times the median misfit of a pose: of 45 normal poses one in millions lies farther out."""
+"""Multiple of the median misfit of a pose: of 45 normal poses, one in millions exceeds it."""
 _SETTLED = 0.01
-"""Last step in standard uncertainties, and last change of the likelihood, which no stated figure shows."""
+"""Last step in standard uncertainties, and last change of the likelihood, too small to change any stated figure."""
 _SHRINKING = 0.7
-"""Ratio of successive steps of opposite directions from which they are damped: faster ones settle within the rounds."""
+"""Ratio of successive steps with opposite signs above which steps are damped; below it the rounds suffice."""
 _MOST_ROUNDS = 60
-"""Rounds after which an estimate counts as not settled: four halvings of the steps, and ten rounds for each."""
+"""Rounds after which an estimate has not converged: four halvings of the step, and ten rounds for each."""
 _LEAST_FRACTION = 1 / 16
 """Smallest fraction of a step: it damps steps that overshoot up to 30-fold."""
 _LEAST_EIGENVALUE = 1e-13
-"""Of information with a unit diagonal: below, rounding errors count and a direction is open."""
+"""Smallest eigenvalue of information with a unit diagonal: below it, rounding errors dominate."""
 
 
 State = TypeVar("State")
@@ -34,10 +34,10 @@ State = TypeVar("State")
 class GroupedEvidence(ABC, Generic[State]):
     """Groups of residuals (one group for each pose), their derivatives, and the variances of their errors.
 
-    Groups have K residuals; shorter ones are filled up with zeros, of unit variance. ``logs`` (Q,) are logarithms of
-    the variance components' standard deviations, and of lengths. ``free`` (V, size) are steps of all V values by the
-    parameters: on a rotary table (``table``) shift of the mount along its z axis and turn about it change nothing, and
-    are none.
+    Groups have K residuals; shorter ones are padded with zeros of unit variance. ``logs`` (Q,) are logarithms of the
+    variance components' standard deviations and lengths. ``free`` (V, size) maps parameters to all V values. On a
+    rotary table (``table``), a shift of the mount along its z axis and a rotation about it have no effect and are not
+    parameters.
     """
 
     table: bool
@@ -45,7 +45,7 @@ class GroupedEvidence(ABC, Generic[State]):
     @property
     @abstractmethod
     def values(self) -> int:
-        """Number of values, of which the first six are shift and turn of the mount."""
+        """Number of values; the first six are shift and rotation of the mount."""
 
     @cached_property
     def free(self) -> np.ndarray:
@@ -63,41 +63,41 @@ class GroupedEvidence(ABC, Generic[State]):
         """Number of groups."""
 
     @abstractmethod
-    def selected(self, kept: np.ndarray) -> Self:
-        """Evidence of some of the groups: a mask, or their numbers."""
+    def select(self, kept: np.ndarray) -> Self:
+        """Return the evidence of some groups, given as a mask or as their numbers."""
 
     @abstractmethod
     def bounds(self) -> np.ndarray:
-        """Bounds (Q, 2) of the components; equal where one is fixed."""
+        """Return bounds (Q, 2) of the components; equal for a fixed one."""
 
     @abstractmethod
-    def stepped(self, state: State, step: np.ndarray) -> State:
-        """State after a step (size,) of the parameters."""
+    def apply_step(self, state: State, step: np.ndarray) -> State:
+        """Return the state after a step (size,) of the parameters."""
 
     @abstractmethod
     def residuals(self, state: State, step: np.ndarray | None = None) -> np.ndarray:
-        """Residuals (G, K) after a step from a state, with the noise of the data as at the state."""
+        """Return residuals (G, K) after a step from a state; the noise of the data stays as at the state."""
 
     @abstractmethod
     def jacobian(self, state: State, step: np.ndarray | None = None) -> np.ndarray:
-        """Derivatives (G, K, size) of the residuals by the step."""
+        """Return derivatives (G, K, size) of the residuals by the step."""
 
     @abstractmethod
     def covariance(self, state: State) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        """Function of ``logs`` that returns covariances (G, K, K) and their derivatives (Q, G, K, K) by ``logs``."""
+        """Return a function of ``logs`` that gives covariances (G, K, K) and their derivatives (Q, G, K, K)."""
 
-    def repeated(self, state: State) -> tuple[int, float]:
-        """Degrees of freedom and sum of squares of further residuals that show the first component alone; none."""
+    def pool_repeats(self, state: State) -> tuple[int, float]:
+        """Return degrees of freedom and sum of squares of further residuals that have the first component only."""
         return 0, 0.0
 
     @abstractmethod
     def pose_directions(self, state: State) -> Sequence[np.ndarray]:
-        """Orthonormal bases (K, q) of all that a wrong pose does to the residuals of each group."""
+        """Return orthonormal bases (K, q) of the residual changes that a wrong pose can cause in each group."""
 
 
 @dataclass(frozen=True, eq=False)
 class RestrictedEstimate(Generic[State]):
-    """Parameters and variance components; ``criterion`` is minus twice the log likelihood where they settled."""
+    """Parameters and variance components; ``criterion`` is minus twice the log likelihood at convergence."""
 
     evidence: GroupedEvidence[State]
     state: State
@@ -131,26 +131,26 @@ class RestrictedEstimate(Generic[State]):
     @cached_property
     def covariance(self) -> np.ndarray:
         """Covariance (size, size) of the parameters."""
-        return inverse(self.information.sum(axis=0))
+        return invert_information(self.information.sum(axis=0))
 
-    def by(self, moved: np.ndarray) -> np.ndarray:
-        """Derivatives (size, M) of the parameters by what moves the residuals by ``moved`` (G, K, M)."""
+    def propagate(self, moved: np.ndarray) -> np.ndarray:
+        """Return derivatives (size, M) of the parameters, given those of the residuals, ``moved`` (G, K, M)."""
         return -self.covariance @ np.einsum("gkp,gkm->pm", self._weighted, moved)
 
     @cached_property
     def without_each(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """For every group the step of the parameters without it (a Gauss-Newton step), and their covariance then."""
+        """Parameter step (a Gauss-Newton step) and covariance of the parameters without each group."""
         slopes = np.einsum("gkp,gk->gp", self._weighted, self.residuals)
         total, slope, found = self.information.sum(axis=0), slopes.sum(axis=0), []
         for information, own in zip(self.information, slopes, strict=True):
-            covariance = inverse(total - information)
+            covariance = invert_information(total - information)
             found.append((-covariance @ (slope - own), covariance))
         return found
 
     def excess(self, *, probability: float) -> np.ndarray:
-        """Squared distance (G,) of each pose from what the others predict, divided by what it exceeds by chance.
+        """Return each pose's squared distance (G,) from the others' prediction, divided by its chi-square limit.
 
-        Squares are chi-square; ``probability`` is that of one pose to exceed 1.
+        One correct pose exceeds 1 with ``probability``.
         """
         excess, bases = [], self.evidence.pose_directions(self.state)
         for g, (basis, (step, covariance)) in enumerate(zip(bases, self.without_each, strict=True)):
@@ -161,11 +161,11 @@ class RestrictedEstimate(Generic[State]):
         return np.array(excess)
 
     def coverage_factor(self, scales: np.ndarray, rows: np.ndarray) -> float:
-        """Student's factor for 95 % intervals of ``rows`` (R, size) of the parameters.
+        """Return the coverage factor (Student's t) for 95 % intervals of ``rows`` (R, size) of the parameters.
 
-        Degrees of freedom are by Satterthwaite, from how well the variance components are known: twice the square of
-        a variance divided by the variance of that (Giesbrecht and Burns, Biometrics 41, 1985). ``scales`` (R,) are
-        shares of the variances that the estimate makes; the rest is known. The median of the rows counts.
+        The degrees of freedom follow from Satterthwaite's formula: twice the squared variance, divided by the variance
+        of that variance (Giesbrecht and Burns, Biometrics 41, 1985). ``scales`` (R,) are the fractions of the variances
+        that are estimated; the rest is known. The median over the rows is used.
         """
         _, changes = self._covariances
         inverses = np.linalg.inv(self._covariances[0])
@@ -182,27 +182,27 @@ class RestrictedEstimate(Generic[State]):
                     - 2 * np.sum(self.covariance * twice.T)
                     + np.sum(summed[a] * summed[b].T)
                 )
-        known[0, 0] += 2 * self.evidence.repeated(self.state)[0]
+        known[0, 0] += 2 * self.evidence.pool_repeats(self.state)[0]
         free = np.diag(known) > 0
         variances = np.einsum("rp,pq,rq->r", rows, self.covariance, rows)
         by = np.einsum("rp,qpm,mn,rn->rq", rows, summed, self.covariance, rows)[:, free]
-        uncertain = np.einsum("rq,qs,rs->r", by, inverse(known[free][:, free]), by)
+        uncertain = np.einsum("rq,qs,rs->r", by, invert_information(known[free][:, free]), by)
         freedom = 2 * variances**2 / np.maximum(uncertain * scales**2, 1e-30 * variances**2)
         return float(t.ppf(0.975, max(float(np.median(freedom)), 1.0)))
 
 
 def settle(evidence: GroupedEvidence[State], starts: Sequence[tuple[State, np.ndarray]]) -> RestrictedEstimate[State]:
-    """The likeliest of the estimates to which the iterations from several states and components settle.
+    """Iterate from several states and components; return the likeliest converged estimate.
 
     Raises
     ------
     CalibrationError
-        None of them settles.
+        The iteration converges from none of the starts.
     """
     found, failed = [], None
     for state, scatter in starts:
         try:
-            found.append(_settled(evidence, state, scatter))
+            found.append(_iterate(evidence, state, scatter))
         except NotSettled as error:
             failed = error
     if not found:
@@ -217,15 +217,15 @@ def settle_agreeing(
     *,
     require: Callable[[np.ndarray], None],
 ) -> tuple[RestrictedEstimate[State], np.ndarray]:
-    """Estimate from the groups that agree, and their mask (G,).
+    """Estimate from the groups that agree, and return their mask (G,).
 
-    While a group contradicts what the others predict, the worst one is left out. ``require`` raises an error where a
+    The worst group is rejected as long as it contradicts the prediction of the others. ``require`` raises an error if a
     mask (G,) leaves too few groups.
     """
     kept = np.ones(evidence.groups, dtype=bool)
     while True:
         require(kept)
-        found = settle(evidence.selected(kept), starts)
+        found = settle(evidence.select(kept), starts)
         excess = found.excess(probability=_FALSE_ALARM / len(kept))
         if excess.max() <= 1:
             return found, kept
@@ -234,15 +234,15 @@ def settle_agreeing(
 
 
 class NotSettled(CalibrationError):
-    """An iteration that still changes its result after all rounds."""
+    """The iteration has not converged after all rounds."""
 
 
-def _settled(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray) -> RestrictedEstimate[State]:
-    """Weighted least squares and likeliest components by turns; steps that oscillate are damped."""
+def _iterate(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray) -> RestrictedEstimate[State]:
+    """Alternate weighted least squares and maximum likelihood of the components; damp oscillating steps."""
     fraction, before, size = 1.0, np.zeros(evidence.size), 0.0
     for _ in range(_MOST_ROUNDS):
         covariances, _ = evidence.covariance(state)(np.log(scatter))
-        step = solved_step(evidence, state, covariances)
+        step = solve_step(evidence, state, covariances)
         by = evidence.jacobian(state)
         information = np.einsum("gkp,gkq->pq", by, np.linalg.solve(covariances, by))
         size, last = (float(np.sqrt(each @ information @ each / evidence.size)) for each in (step, before))
@@ -251,20 +251,21 @@ def _settled(evidence: GroupedEvidence[State], state: State, scatter: np.ndarray
         elif size > _SHRINKING * last:
             fraction = max(fraction / 2, _LEAST_FRACTION)
         before = step
-        state = evidence.stepped(state, fraction * step)
-        scatter, criterion, gain = _likeliest(evidence, state, scatter)
+        state = evidence.apply_step(state, fraction * step)
+        scatter, criterion, gain = _maximise_likelihood(evidence, state, scatter)
         if size < _SETTLED and gain < _SETTLED:
             return RestrictedEstimate(evidence, state, scatter, criterion)
     raise NotSettled(
-        f"the estimate of the mount does not settle: after {_MOST_ROUNDS} rounds it still moves by {size:.2g} standard "
-        "uncertainties. Record more poses, with turns about two axes and the artefact in all parts of the profile"
+        f"the estimate of the mount does not converge: after {_MOST_ROUNDS} rounds it still changes by {size:.2g} "
+        "standard uncertainties. Record more poses, with rotations about two axes and the artefact in all parts of the "
+        "profile"
     )
 
 
-def solved_step(
+def solve_step(
     evidence: GroupedEvidence[State], state: State, covariances: np.ndarray, *, loss: str = "linear"
 ) -> np.ndarray:
-    """The step (size,) from a state to the least weighted squares of the residuals, the covariances held fixed."""
+    """Return the step (size,) from a state that minimises the weighted squared residuals, with fixed covariances."""
     whitener = np.linalg.inv(np.linalg.cholesky(covariances))
 
     def misfit(step: np.ndarray) -> np.ndarray:
@@ -283,16 +284,19 @@ def solved_step(
     ).x
 
 
-def _likeliest(evidence: GroupedEvidence[State], state: State, start: np.ndarray) -> tuple[np.ndarray, float, float]:
-    """Variance components of the greatest restricted likelihood at a state, the criterion, and the gain in it.
+def _maximise_likelihood(
+    evidence: GroupedEvidence[State], state: State, start: np.ndarray
+) -> tuple[np.ndarray, float, float]:
+    """Maximise the restricted likelihood at a state; return the variance components, the criterion and its gain.
 
-    Patterson and Thompson 1971: minus twice the log likelihood of what is left of the residuals after the parameters.
+    The criterion is minus twice the log likelihood of the residuals after projecting out the parameters (Patterson and
+    Thompson, Biometrika 58, 1971).
     """
     residuals, covariance = evidence.residuals(state), evidence.covariance(state)
-    # Any basis of the derivatives has the same likelihood. They are nearly dependent where the base is far away.
+    # Every basis of the derivatives has the same likelihood. They are nearly dependent if the base is far away.
     by = evidence.jacobian(state)
     basis = np.linalg.qr(by.reshape(-1, evidence.size))[0].reshape(by.shape)
-    freedom, squares = evidence.repeated(state)
+    freedom, squares = evidence.pool_repeats(state)
 
     def criterion(logs: np.ndarray) -> tuple[float, np.ndarray]:
         covariances, changes = covariance(logs)
@@ -316,8 +320,8 @@ def _likeliest(evidence: GroupedEvidence[State], state: State, start: np.ndarray
     return np.exp(found.x), float(found.fun), criterion(begin)[0] - float(found.fun)
 
 
-def inverse(information: np.ndarray) -> np.ndarray:
-    """Covariance of an information matrix; directions without information get huge variances."""
+def invert_information(information: np.ndarray) -> np.ndarray:
+    """Invert an information matrix; directions without information get huge variances."""
     size = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
     values, vectors = np.linalg.eigh(size[:, None] * information * size)
     return size[:, None] * (vectors / np.maximum(values, _LEAST_EIGENVALUE)) @ vectors.T * size

@@ -1,4 +1,4 @@
-"""Directions of a mount that are known badly, motions that are missing, and the pose to add next."""
+"""Weakly determined directions of a mount, missing motions, and the best pose to add."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,36 +9,36 @@ from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import SphereShape
 from uwlts.calibration.mount.estimate import RestrictedEstimate
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, in_sheet, point_by_mount
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, point_by_mount, to_sheet
 from uwlts.errors import CalibrationError
 from uwlts.model.calibration import rigid_transform
 from uwlts.model.mount import NextPose
 
 _TURN_RAD = np.radians(30)
-"""A robot turns so far easily with the artefact in view."""
+"""Rotation that a robot easily makes with the artefact in view."""
 _LEAST_TURN_RAD = np.radians(5.0)
-"""Root mean square of turns about an axis below which a note says that there are too few."""
-_OPEN_MM = 5.0  # standard uncertainty from which the shift of a mount counts as not determined: a ruler does better
+"""RMS rotation about an axis below which a warning is given."""
+_OPEN_MM = 5.0  # standard uncertainty of a shift that counts as not determined: a ruler is better
 OPEN_RAD = np.radians(1.0)
-"""The same of its turn: a protractor does better."""
-_WEAK = 5.0  # times the uncertainty of the best determined direction from which another is worth a further pose
-_LEAST_MM = 0.01  # standard uncertainty of a shift below which no direction is worth a further pose
-_LEAST_RAD = np.radians(0.005)  # the same of a turn: 0.02 mm at 220 mm
+"""Standard uncertainty of a rotation that counts as not determined: a protractor is better."""
+_WEAK = 5.0  # ratio to the uncertainty of the best determined direction above which a further pose is advised
+_LEAST_MM = 0.01  # standard uncertainty of a shift below which no further pose is advised
+_LEAST_RAD = np.radians(0.005)  # the same for a rotation: 0.02 mm at 220 mm
 _POINTS = 100
-"""Points of a profile that a pose would add: more repeat what these say."""
+"""Points of a simulated profile; more points are redundant."""
 _UNKNOWN_MM = 100.0
-"""Standard uncertainty of the shift of a mount of which nothing is known, so that open directions can be compared."""
-_UNKNOWN_RAD = 0.5  # the same of its turn
+"""Prior standard uncertainty of the mount's shift, so that undetermined directions can be compared."""
+_UNKNOWN_RAD = 0.5  # the same for its rotation
 
 
 def next_pose(
     problem: Problem, state: MountState, scatter: Scatter, sheet: np.ndarray, names: list[str]
 ) -> NextPose | None:
-    """The best of turns by 30 deg about each axis of the platform, with the artefact at several places of the profile.
+    """Select the best additional pose: a rotation by 30 deg about a platform axis, and a place of the artefact.
 
-    None on a rotary table, or where the plane would be too steep in all of them. Judged by the standard uncertainty of
-    a point in the middle of all points seen. ``sheet`` (4, 4) maps the sheet's frame to the sensor's; ``names`` are
-    those of the poses.
+    Each candidate is scored by the standard uncertainty of a point in the middle of all points. ``sheet`` (4, 4) maps
+    the sheet's frame to the sensor's; ``names`` are those of the poses. None on a rotary table, or if the plane would
+    be too steep in all candidates.
     """
     if problem.table:
         return None
@@ -93,14 +93,14 @@ def next_pose(
 
 
 def _one_pose(problem: Problem, points: np.ndarray, rotation: np.ndarray, position: np.ndarray) -> Problem:
-    # Without a trajectory the pose says nothing about the offset of the times.
+    # Without a trajectory the pose has no information on the time offset.
     part = [np.zeros(len(points), dtype=int)]
     return replace(problem, points=[points], part=part, motion=lambda offset: (rotation[None], position[None]))
 
 
 def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple[np.ndarray, np.ndarray, str]]:
-    """Points (n, 3) of the artefact in the sensor's frame, its place (3,) there, and that in words, for each view."""
-    flat = in_sheet(problem.points, sheet)
+    """Return candidate views: points (n, 3) of the artefact and its place (3,), sensor frame, and a description."""
+    flat = to_sheet(problem.points, sheet)
     low, high = np.quantile(np.vstack(flat), (0.1, 0.9), axis=0)
     views = []
     if isinstance(problem.shape, SphereShape):
@@ -116,15 +116,19 @@ def _views(problem: Problem, state: MountState, sheet: np.ndarray) -> list[tuple
         for u, w, y in product((low[0], high[0]), (low[1], high[1]), (depth, -depth)):
             section = np.sqrt(radius**2 - y**2)
             arc = np.column_stack([u + section * np.cos(angle), np.zeros(_POINTS), w + section * np.sin(angle)])
-            views.append((_to_sensor(arc, sheet), _to_sensor(np.array([u, y, w]), sheet), _place(sheet, u, y, w)))
+            views.append(
+                (_to_sensor(arc, sheet), _to_sensor(np.array([u, y, w]), sheet), _describe_place(sheet, u, y, w))
+            )
     else:
         for u, w in product((low[0], high[0]), (low[1], high[1])):
             line = np.column_stack([np.linspace(low[0], high[0], _POINTS), np.zeros(_POINTS), np.full(_POINTS, w)])
-            views.append((_to_sensor(line, sheet), _to_sensor(np.array([u, 0.0, w]), sheet), _place(sheet, u, 0.0, w)))
+            views.append(
+                (_to_sensor(line, sheet), _to_sensor(np.array([u, 0.0, w]), sheet), _describe_place(sheet, u, 0.0, w))
+            )
     return views
 
 
-def _place(sheet: np.ndarray, u: float, y: float, w: float) -> str:
+def _describe_place(sheet: np.ndarray, u: float, y: float, w: float) -> str:
     at = _to_sensor(np.array([u, y, w]), sheet)
     return f"at x = {at[0]:.0f}, y = {at[1]:.0f}, z = {at[2]:.0f} mm of the sensor's frame"
 
@@ -136,7 +140,7 @@ def _to_sensor(points: np.ndarray, sheet: np.ndarray) -> np.ndarray:
 def _on_plane(
     points: np.ndarray, seen: np.ndarray, to_base: np.ndarray, normal: np.ndarray, sheet: np.ndarray
 ) -> np.ndarray | None:
-    """Points moved along the sheet's z axis onto the plane through a point; None where it is too steep to be seen."""
+    """Move points along the sheet's z axis onto the plane through ``seen``; None if it is too steep to be visible."""
     inside, down = normal @ to_base, sheet[:3, 2]
     steep = float(inside @ down)
     if abs(steep) < 0.5:  # 60 deg
@@ -145,7 +149,7 @@ def _on_plane(
 
 
 def require_determined(covariance: np.ndarray, weak: Sequence[str], advised: NextPose | None = None) -> None:
-    """CalibrationError where the covariance (6, 6) of a mount leaves a direction open; ``weak`` says which."""
+    """Raise CalibrationError if the covariance (6, 6) of a mount leaves a direction undetermined; ``weak`` names it."""
     shift, turn = (np.sqrt(np.linalg.eigvalsh(covariance[k : k + 3, k : k + 3])[-1]) for k in (0, 3))
     if shift > _OPEN_MM or turn > OPEN_RAD:
         raise CalibrationError(
@@ -155,7 +159,7 @@ def require_determined(covariance: np.ndarray, weak: Sequence[str], advised: Nex
 
 
 def weaknesses(covariance: np.ndarray, rotations: Rotation, *, table: bool) -> list[str]:
-    """Directions of a mount that are known badly, and rotations of the platform that are missing, in words."""
+    """Describe weakly determined directions of a mount, and missing rotations of the platform."""
     lines = []
     limits = (
         (_OPEN_MM, _LEAST_MM, "shift along", "mm", 1.0, ""),
@@ -165,7 +169,7 @@ def weaknesses(covariance: np.ndarray, rotations: Rotation, *, table: bool) -> l
             "turn about",
             "deg",
             np.degrees(1.0),
-            ": the artefact stays at nearly the same place before the sensor",
+            ": the artefact stays at nearly the same place in front of the sensor",
         ),
     )
     for first, (limit, least, what, unit, size, why) in zip((0, 3), limits, strict=True):
@@ -174,29 +178,29 @@ def weaknesses(covariance: np.ndarray, rotations: Rotation, *, table: bool) -> l
         for std, axis in zip(stds, axes.T, strict=True):
             if std > min(_WEAK * stds[int(table)], limit) and std > least:
                 known = f"known to {std * size:.2g} {unit} only" if std < limit else "open"
-                lines.append(f"the {what} {axis_words(axis)} is {known}{why}")
-    return lines if table else lines + missing_turns(rotations)
+                lines.append(f"the {what} {describe_axis(axis)} is {known}{why}")
+    return lines if table else lines + describe_missing_turns(rotations)
 
 
-def axis_words(direction: np.ndarray) -> str:
-    """A direction of the platform in words."""
+def describe_axis(direction: np.ndarray) -> str:
+    """Describe a direction of the platform."""
     place = int(np.argmax(np.abs(direction)))
     if abs(direction[place]) > 0.94:  # within 20 deg
         return f"the platform's {'xyz'[place]} axis"
     return f"the platform's direction ({', '.join(f'{each:.2f}' for each in direction)})"
 
 
-def missing_turns(rotations: Rotation, *, least_rad: float = _LEAST_TURN_RAD) -> list[str]:
-    """Axes of the platform about which its rotations hardly turn, in words; none where they turn about two axes.
+def describe_missing_turns(rotations: Rotation, *, least_rad: float = _LEAST_TURN_RAD) -> list[str]:
+    """Describe the axes with insufficient rotation of the platform; empty if it rotates about two axes.
 
-    Turns about one axis alone leave the shift along it open. ``least_rad`` is the root mean square of what counts as a
-    turn.
+    Rotations about one axis only leave the shift along this axis undetermined. ``least_rad`` is the minimum RMS
+    rotation.
     """
     vectors = (rotations.mean().inv() * rotations).as_rotvec()
     if np.linalg.eigvalsh(vectors.T @ vectors / len(vectors))[1] >= least_rad**2:
         return []
     return [
-        f"insufficient rotation about {axis_words(axis)} ({np.degrees(size):.1f} deg rms)"
+        f"insufficient rotation about {describe_axis(axis)} ({np.degrees(size):.1f} deg rms)"
         for size, axis in zip(np.sqrt(np.mean(vectors**2, axis=0)), np.eye(3), strict=True)
         if size < least_rad
     ]

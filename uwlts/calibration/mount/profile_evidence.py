@@ -1,4 +1,4 @@
-"""Model of a profiler on a platform before a fixed artefact: distances, derivatives and weights."""
+"""Model of a profiler on a platform that observes a fixed artefact: distances, derivatives and weights."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -9,29 +9,29 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from uwlts.calibration.mount.artefacts import Shape
-from uwlts.calibration.mount.estimate import GroupedEvidence, solved_step
-from uwlts.calibration.mount.profiles import LEAST_POINTS, Seen
+from uwlts.calibration.mount.estimate import GroupedEvidence, solve_step
+from uwlts.calibration.mount.profiles import LEAST_POINTS, Detection
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray]]
 """Rotations (P, 3, 3) and positions (P, 3) of the platform in the base frame for a time offset, s."""
 
 _TIME_STEP_S = 1e-4
 _POINT_MM = (1e-5, 1e2)
-"""Bounds of scatter in mm: from far below what any profiler resolves to far above what any platform errs."""
-_TURN_RAD = (1e-8, 1.0)  # the same of turns
+"""Bounds of scatter in mm: far below any profiler's resolution, and far above any platform's error."""
+_TURN_RAD = (1e-8, 1.0)  # the same for rotations
 _ROUNDING = 1e-12
-"""Of the largest variance: more than rounding errors change, which make covariances singular."""
+"""Fraction of the largest variance, above rounding errors that would make covariances singular."""
 _BINS = 32
-"""Of a profile, whose points count together in each: a smooth error that changes within one acts like noise."""
+"""Bins of a profile, whose points are averaged: a smooth error that changes within a bin acts like noise."""
 _LEAST_SPAN = 1e-6
-"""Of the largest thing that a pose's errors do to its profile: less counts as nothing."""
+"""Fraction of the largest effect of a pose error on its profile below which an effect is ignored."""
 _LEAST_SHARE = 1e-3
-"""Of the noise that the distances from a plane have: it leans by less than 0.06 deg from the sheet."""
+"""Smallest factor by which a plane reduces the noise: it is tilted by less than 0.06 deg from the sheet."""
 
 
 @dataclass(frozen=True, eq=False)
 class MountState:
-    """Values of all unknowns: mount, artefact (as its `Shape` says), scale and offset."""
+    """Values of all unknowns: mount, artefact (see its `Shape`), scale and time offset."""
 
     rotation: np.ndarray
     translation: np.ndarray
@@ -41,10 +41,10 @@ class MountState:
 
 
 class Scatter(NamedTuple):
-    """Standard deviations: of a point, of the smooth error along a profile, of a pose's coordinates, and of its turn.
+    """Standard deviations of a point, the smooth error along a profile, a pose's coordinates, and its rotation.
 
-    The covariance of the smooth error falls exponentially along the profile, to 1/e at ``length_mm``. The turn (rad)
-    counts for flat artefacts only.
+    The covariance of the smooth error decreases to 1/e over ``length_mm``. ``turn_rad`` is used for flat artefacts
+    only.
     """
 
     point_mm: float
@@ -56,10 +56,10 @@ class Scatter(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem(GroupedEvidence[MountState]):
-    """Points (n, 3) of every pose in the sensor's frame, mm, and which unknowns there are.
+    """Points (n, 3) of every pose in the sensor's frame, mm, and the choice of unknowns.
 
     The parameters are steps from a `MountState`: translation (3), rotation about the platform's axes (3), those of the
-    artefact, then scale and offset. ``part`` says of each point (n,) on which surface of the artefact it lies.
+    artefact, then scale and time offset. ``part`` is the artefact's surface number of each point (n,).
     """
 
     points: Sequence[np.ndarray]
@@ -94,17 +94,17 @@ class Problem(GroupedEvidence[MountState]):
         return len(self.points)
 
     def rms_mm(self, state: MountState) -> np.ndarray:
-        """Root mean square distance (P,) of the points of each pose."""
+        """Return the root mean square distance (P,) of the points of each pose."""
         return np.sqrt(np.bincount(self.poses, self.distances(state) ** 2) / self.counts)
 
     @cached_property
     def _parts(self) -> np.ndarray:
         return np.concatenate(self.part)
 
-    def selected(
+    def select(
         self, kept: np.ndarray, points: Sequence[np.ndarray] | None = None, part: Sequence[np.ndarray] | None = None
     ) -> Self:
-        """The problem of some of the poses, perhaps with other points of all poses."""
+        """Return the problem of some poses, optionally with other points of all poses."""
         motion, numbers = self.motion, np.arange(len(self.points))[kept]
         given, parts = points or self.points, part or self.part
         return replace(
@@ -114,35 +114,35 @@ class Problem(GroupedEvidence[MountState]):
             motion=lambda offset: tuple(each[numbers] for each in motion(offset)),
         )
 
-    def of_seen(self, seen: Sequence[Seen | None]) -> "Problem":
-        """The problem of the points of the artefact, as seen in all poses or (None) not."""
+    def select_detected(self, seen: Sequence[Detection | None]) -> "Problem":
+        """Return the problem of the points on the artefact; poses with None are removed."""
         pairs = [(n, each) for n, each in enumerate(seen) if each is not None]
         points, part = list(self.points), list(self.part)
         for number, each in pairs:
             points[number], part[number] = self.points[number][each.members], each.part[each.members]
-        return self.selected(np.array([each is not None for each in seen]), points, part)
+        return self.select(np.array([each is not None for each in seen]), points, part)
 
-    def seen_again(
+    def detect_again(
         self, state: MountState, flat: Sequence[np.ndarray], reach_mm: float, rng: np.random.Generator
-    ) -> list[Seen | None]:
-        """The artefact near where a state has it, in the profiles (N, 2) of all poses, or None."""
-        off = np.split(self.shape.off(state.artefact, self.base(state)), np.cumsum(self.counts)[:-1])
+    ) -> list[Detection | None]:
+        """Find the artefact again in the profiles (N, 2) of all poses, near its place in a state; else None."""
+        off = np.split(self.shape.surface_distances(state.artefact, self.to_base(state)), np.cumsum(self.counts)[:-1])
         again = [self.shape.find_again(each, own, reach_mm, rng) for each, own in zip(flat, off, strict=True)]
         return [each if each is not None and each.members.sum() >= LEAST_POINTS else None for each in again]
 
-    def thinned(self, most: int) -> "Problem":
-        """The problem with at most so many points of each pose, evenly chosen."""
+    def thin(self, most: int) -> "Problem":
+        """Return the problem with at most ``most`` evenly chosen points of each pose."""
         rows = [np.unique(np.linspace(0, len(each) - 1, most).astype(int)) for each in self.points]
         points, part = (
             [each[own] for each, own in zip(given, rows, strict=True)] for given in (self.points, self.part)
         )
         return replace(self, points=points, part=part)
 
-    def stepped(self, state: MountState, step: np.ndarray) -> MountState:
+    def apply_step(self, state: MountState, step: np.ndarray) -> MountState:
         step = self.free @ step
         turned = Rotation.from_rotvec(step[3:6]).as_matrix() @ state.rotation
         used = 6 + self.shape.count
-        artefact = self.shape.stepped(state.artefact, step[6:used])
+        artefact = self.shape.apply_step(state.artefact, step[6:used])
         return MountState(
             turned,
             state.translation + step[:3],
@@ -152,46 +152,48 @@ class Problem(GroupedEvidence[MountState]):
         )
 
     def distances(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
-        """Signed distances (N,) of all points from the artefact, mm, after a step from a state."""
-        state = state if step is None else self.stepped(state, step)
-        return self.shape.distances(state.artefact, self.base(state), self._parts)
+        """Return signed distances (N,) of all points from the artefact, mm, after a step from a state."""
+        state = state if step is None else self.apply_step(state, step)
+        return self.shape.distances(state.artefact, self.to_base(state), self._parts)
 
-    def base(self, state: MountState) -> np.ndarray:
-        """All points (N, 3) in the base frame, mm."""
+    def to_base(self, state: MountState) -> np.ndarray:
+        """Transform all points to the base frame; return (N, 3), mm."""
         rotations, positions = self.motion(state.offset_s)
         platform = self._all @ state.rotation.T + state.translation
         return np.einsum("nij,nj->ni", rotations[self.poses], platform) + state.scale * positions[self.poses]
 
-    def errors(self, state: MountState) -> np.ndarray:
-        """Derivatives (N, K) of the distances by the error of their pose.
+    def pose_error_derivatives(self, state: MountState) -> np.ndarray:
+        """Return derivatives (N, K) of the distances by the error of their pose.
 
-        A pose errs by a shift in three directions of the base, and by a turn about the middle of its profile where the
-        artefact is flat. (A turn that a sphere sees is a shift of its centre.)
+        A pose error is a shift in three directions of the base. For flat artefacts, a rotation about the middle of the
+        profile is added. (For a sphere, a rotation is equivalent to a shift of its centre.)
         """
-        normals = self._normals(self.base(state), state)
+        normals = self._normals(self.to_base(state), state)
         if not self.shape.flat:
             return normals
         middles = np.repeat([own.mean(axis=0) for own in self.points], self.counts, axis=0)
         arms = np.einsum("nij,nj->ni", self.motion(state.offset_s)[0][self.poses] @ state.rotation, self._all - middles)
-        return self.on_lines(np.hstack([normals, np.cross(arms, normals)]))
+        return self.project_on_lines(np.hstack([normals, np.cross(arms, normals)]))
 
     def derivatives(self, state: MountState) -> np.ndarray:
-        """Derivatives (N, size) of the distances at a state by the parameters."""
+        """Return derivatives (N, size) of the distances at a state by the parameters."""
         return self._derivatives(state) @ self.free
 
     def normals(self, state: MountState) -> np.ndarray:
-        """Derivatives (N, 3) of the distances by the points, along the axes of the sensor."""
+        """Return derivatives (N, 3) of the distances by the points, along the axes of the sensor."""
         rotations = self.motion(state.offset_s)[0]
-        return np.einsum("nij,ni->nj", rotations[self.poses], self._normals(self.base(state), state)) @ state.rotation
+        return (
+            np.einsum("nij,ni->nj", rotations[self.poses], self._normals(self.to_base(state), state)) @ state.rotation
+        )
 
     def _normals(self, base: np.ndarray, state: MountState) -> np.ndarray:
-        """Normals (N, 3) of the artefact at points of the base frame."""
+        """Return normals (N, 3) of the artefact at points of the base frame."""
         return self.shape.normals(state.artefact, base, self._parts)
 
     def _derivatives(self, state: MountState) -> np.ndarray:
-        """Derivatives (N, K) by all values."""
+        """Return derivatives (N, K) by all values."""
         rotations, positions = self.motion(state.offset_s)
-        turned, base = self._all @ state.rotation.T, self.base(state)
+        turned, base = self._all @ state.rotation.T, self.to_base(state)
         normals = self._normals(base, state)
         in_platform = np.einsum("nij,ni->nj", rotations[self.poses], normals)
         columns = [in_platform, np.cross(turned, in_platform)]
@@ -200,18 +202,18 @@ class Problem(GroupedEvidence[MountState]):
             columns.append(np.sum(normals * positions[self.poses], axis=1, keepdims=True))
         if self.time:
             later, earlier = (
-                self.base(replace(state, offset_s=state.offset_s + s)) for s in (_TIME_STEP_S, -_TIME_STEP_S)
+                self.to_base(replace(state, offset_s=state.offset_s + s)) for s in (_TIME_STEP_S, -_TIME_STEP_S)
             )
             columns.append(np.sum(normals * (later - earlier), axis=1, keepdims=True) / (2 * _TIME_STEP_S))
-        return self.on_lines(np.hstack(columns))
+        return self.project_on_lines(np.hstack(columns))
 
     @cached_property
     def _along(self) -> np.ndarray:
-        """Positions (N,) along the parallel lines of each profile, or its wall, from its middle, mm."""
+        """Positions (N,) along the parallel lines or the wall of each profile, from the middle, mm."""
         along = []
         for own, part in zip(self.points, self.part, strict=True):
             result = np.zeros(len(own))
-            for rows in self.shape.parallel(part):
+            for rows in self.shape.group_parallel(part):
                 lines = [own[rows & (part == face)] for face in np.unique(part[rows])]
                 centred = np.vstack([line - line.mean(axis=0) for line in lines])
                 direction = np.linalg.svd(centred, full_matrices=False)[2][0]
@@ -221,14 +223,14 @@ class Problem(GroupedEvidence[MountState]):
 
     @cached_property
     def _lines(self) -> list[np.ndarray]:
-        """Orthonormal bases (n, K) of what can change in each profile besides noise."""
+        """Orthonormal bases (n, K) of the noise-free changes of each profile."""
         along = np.split(self._along, np.cumsum(self.counts)[:-1])
-        return [np.linalg.qr(self.shape.lines(own, part))[0] for own, part in zip(along, self.part, strict=True)]
+        return [np.linalg.qr(self.shape.basis_lines(own, part))[0] for own, part in zip(along, self.part, strict=True)]
 
-    def on_lines(self, values: np.ndarray) -> np.ndarray:
-        """Values (N, ...) beside a flat artefact as those of the lines of the profiles; others as they are.
+    def project_on_lines(self, values: np.ndarray) -> np.ndarray:
+        """Project values (N, ...) of a flat artefact onto the lines of the profiles; return others unchanged.
 
-        With the points' own noise in them, a plane far from the true one would seem to explain this noise.
+        Without the projection, a plane far from the true one could fit the points' noise.
         """
         if not self.shape.flat:
             return values
@@ -237,10 +239,10 @@ class Problem(GroupedEvidence[MountState]):
         return np.concatenate([basis @ (basis.T @ own) for basis, own in parts])
 
     def noise_along(self, state: MountState) -> np.ndarray:
-        """Share (N, 1) of the points' noise, which stays in the sheet, that their distances have.
+        """Return the fraction (N, 1) of the points' noise (in the sheet) that changes their distances.
 
-        A plane that leans against the sheet shows less of it. If this were left out, a plane along the sheet would fit
-        points without any noise. Spheres are cut near their middle.
+        The fraction is small for a plane at a small angle to the sheet. Without it, a plane along the sheet would seem
+        to fit without noise. Spheres are cut near their middle, where the fraction is 1.
         """
         if not self.shape.flat:
             return np.ones((len(self.poses), 1))
@@ -249,7 +251,7 @@ class Problem(GroupedEvidence[MountState]):
 
     @cached_property
     def _bins(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Order (N,) of the points by pose and surface, where bins (B,) begin in it, their poses and places there."""
+        """Order (N,) of the points by pose and surface, and start (B,), pose and number of each bin in it."""
         order, starts, poses, places, first = [], [], [], [], 0
         for pose, part in enumerate(self.part):
             rows = np.argsort(part, kind="stable")
@@ -266,8 +268,8 @@ class Problem(GroupedEvidence[MountState]):
                 first += len(run)
         return np.concatenate(order), np.concatenate(starts), np.concatenate(poses), np.concatenate(places)
 
-    def means(self, values: np.ndarray) -> np.ndarray:
-        """Means (P, K, ...) of values (N, ...) of the points in bins along the profiles; 0 beyond the bins."""
+    def bin_means(self, values: np.ndarray) -> np.ndarray:
+        """Return means (P, K, ...) of values (N, ...) in bins along the profiles, padded with 0."""
         order, starts, poses, places = self._bins
         counts = np.diff(starts, append=len(order)).reshape(-1, *[1] * (values.ndim - 1))
         result = np.zeros((len(self.points), int(places.max()) + 1, *values.shape[1:]))
@@ -276,15 +278,15 @@ class Problem(GroupedEvidence[MountState]):
 
     @cached_property
     def _apart(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Masks (P, K) of the bins with points, numbers of these (P, K), and distances (P, K, K) of bins, mm."""
+        """Masks (P, K) of the bins with points, their numbers of points (P, K), and distances (P, K, K) of bins, mm."""
         order, starts, poses, places = self._bins
-        middles = self.means(self._all)
+        middles = self.bin_means(self._all)
         counts = np.zeros(middles.shape[:2])
         counts[poses, places] = np.diff(starts, append=len(order))
         return counts > 0, counts, np.linalg.norm(middles[:, :, None] - middles[:, None], axis=3)
 
     def bounds(self) -> np.ndarray:
-        """Bounds (5, 2) of `Scatter`."""
+        """Return bounds (5, 2) of `Scatter`."""
         there, _, apart = self._apart
         both = (there[:, :, None] & there[:, None])[:, 1:, :-1]
         beside = float(np.median(np.diagonal(apart[:, 1:, :-1], axis1=1, axis2=2)[np.diagonal(both, axis1=1, axis2=2)]))
@@ -293,21 +295,23 @@ class Problem(GroupedEvidence[MountState]):
         return np.array([_POINT_MM, _POINT_MM, (beside / 2, longest), _POINT_MM, turn])
 
     def residuals(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
-        """Mean distances (P, K) of bins after a step; beside a flat artefact what is off the lines stays as it is."""
+        """Return mean distances (P, K) of bins after a step; for a flat artefact, noise off the lines is unchanged."""
         here = self.distances(state)
-        return self.means(here if step is None else here + self.on_lines(self.distances(state, step) - here))
+        return self.bin_means(
+            here if step is None else here + self.project_on_lines(self.distances(state, step) - here)
+        )
 
     def jacobian(self, state: MountState, step: np.ndarray | None = None) -> np.ndarray:
         if step is None:
-            return self.means(self.derivatives(state))
-        derivatives = self._derivatives(self.stepped(state, step))
+            return self.bin_means(self.derivatives(state))
+        derivatives = self._derivatives(self.apply_step(state, step))
         derivatives[:, 3:6] = derivatives[:, 3:6] @ _left_jacobian((self.free @ step)[3:6])
-        return self.means(derivatives @ self.free)
+        return self.bin_means(derivatives @ self.free)
 
     def covariance(self, state: MountState) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
         there, counts, apart = self._apart
-        share = self.means(self.noise_along(state)[:, 0])
-        both, errors = share[:, :, None] * share[:, None], self.means(self.errors(state))
+        share = self.bin_means(self.noise_along(state)[:, 0])
+        both, errors = share[:, :, None] * share[:, None], self.bin_means(self.pose_error_derivatives(state))
         noise = np.eye(there.shape[1]) * (share**2 / np.maximum(counts, 1))[:, :, None]
         filled = np.eye(there.shape[1]) * ~there[:, :, None]
         shifts, turns = (own @ np.swapaxes(own, 1, 2) for own in (errors[:, :, :3], errors[:, :, 3:]))
@@ -325,8 +329,8 @@ class Problem(GroupedEvidence[MountState]):
 
         return covariances
 
-    def repeated(self, state: MountState) -> tuple[int, float]:
-        """Degrees of freedom and sum of squares of the points' noise within the bins."""
+    def pool_repeats(self, state: MountState) -> tuple[int, float]:
+        """Return degrees of freedom and sum of squares of the points' noise within the bins."""
         order, starts, _, _ = self._bins
         values = (self.distances(state) / self.noise_along(state)[:, 0])[order]
         counts = np.diff(starts, append=len(order))
@@ -334,44 +338,44 @@ class Problem(GroupedEvidence[MountState]):
         return len(order) - len(starts), float(np.sum((values - means) ** 2))
 
     def pose_directions(self, state: MountState) -> list[np.ndarray]:
-        """Orthonormal bases (K, q) of all that poses, mount and artefact can do to each profile."""
+        """Return orthonormal bases (K, q) of all changes of each profile by poses, mount and artefact."""
         bases = []
-        for errors in self.means(self.errors(state)):
+        for errors in self.bin_means(self.pose_error_derivatives(state)):
             sizes = np.linalg.norm(errors, axis=0).clip(1e-30)
             basis, spans, _ = np.linalg.svd(errors / sizes, full_matrices=False)
             bases.append(basis[:, spans > _LEAST_SPAN * spans[0]])
         return bases
 
-    def plain(self, state: MountState) -> MountState:
-        """The state of least squares of all distances, which count alike."""
+    def solve_unweighted(self, state: MountState) -> MountState:
+        """Minimise the squares of all distances with equal weights."""
         return self._solved(state, Scatter(1.0, *np.full(4, _POINT_MM[0])), "linear")
 
-    def rough(self, state: MountState, scatter: Scatter) -> MountState:
-        """The state of least weighted squares with a robust loss (Cauchy's)."""
+    def solve_robustly(self, state: MountState, scatter: Scatter) -> MountState:
+        """Minimise the weighted squares with a robust loss (Cauchy)."""
         return self._solved(state, scatter, "cauchy")
 
     def _solved(self, state: MountState, scatter: Scatter, loss: str) -> MountState:
         covariances, _ = self.covariance(state)(np.log(scatter))
-        return self.stepped(state, solved_step(self, state, covariances, loss=loss))
+        return self.apply_step(state, solve_step(self, state, covariances, loss=loss))
 
 
-def in_sheet(points: Sequence[np.ndarray], sheet: np.ndarray) -> list[np.ndarray]:
-    """x and z (n, 2) in the sheet of points (n, 3) of each profile; ``sheet`` (4, 4) maps its frame to the sensor's."""
+def to_sheet(points: Sequence[np.ndarray], sheet: np.ndarray) -> list[np.ndarray]:
+    """Return coordinates x and z (n, 2) in the sheet of points (n, 3); ``sheet`` (4, 4) maps to the sensor's frame."""
     return [((each - sheet[:3, 3]) @ sheet[:3, :3])[:, [0, 2]] for each in points]
 
 
-def in_space(flat: np.ndarray) -> np.ndarray:
-    """Points or directions (n, 3) in the frame of the sheet from their x and z (n, 2)."""
+def from_sheet(flat: np.ndarray) -> np.ndarray:
+    """Return points or directions (n, 3) in the frame of the sheet from their x and z (n, 2)."""
     return np.column_stack([flat[:, 0], np.zeros(len(flat)), flat[:, 1]])
 
 
 def point_by_mount(point: np.ndarray) -> np.ndarray:
-    """Derivatives (3, 6) of a point (3,) along the platform's axes by shift and turn of the mount."""
+    """Return derivatives (3, 6) of a point (3,) along the platform's axes by shift and rotation of the mount."""
     return np.hstack([np.eye(3), np.cross(point, np.eye(3))])
 
 
 def _left_jacobian(vector: np.ndarray) -> np.ndarray:
-    """Derivative of exp(v + dv) exp(-v) by dv as a rotation vector (J. Sola and others 2018, arXiv:1812.01537, 145)."""
+    """Return the derivative of exp(v + dv) exp(-v) by dv, a rotation vector (arXiv:1812.01537, eq. 145)."""
     angle, cross = float(np.linalg.norm(vector)), np.cross(np.eye(3), vector)
     if angle < 1e-6:
         return np.eye(3) + cross / 2

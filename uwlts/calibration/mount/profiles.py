@@ -1,4 +1,4 @@
-"""The part of a profile that shows the artefact: an arc of a sphere, the line of a plane, those of a step or ring."""
+"""Detection of the artefact in a profile: arc of a sphere, line of a plane, lines of a step or ring."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,44 +13,44 @@ from uwlts.fitting.shapes import algebraic_centres
 LEAST_POINTS = 12
 """Points on the artefact that a profile needs: four for each of a circle's three parameters."""
 _TRIALS = 400
-"""Curves proposed for a profile: with a tenth of it on the artefact, and neighbours as proposals, some 40 are right."""
+"""Curves proposed for a profile: with a tenth of it on the artefact and neighbouring proposals, some 40 are right."""
 _REJECTED_BEYOND = 4.0
-"""Robust standard deviations; of normal noise six points in a hundred thousand lie farther out."""
+"""Robust standard deviations; of normal noise, six points in a hundred thousand exceed it."""
 _DOUBLINGS = 3
-"""Doublings of the distance at which points count as near, up to 30 times the noise: profilers err smoothly by less."""
-_FEW_MORE = 1.1  # ratio of the numbers of points near a curve, below which a wider distance finds no more of its own
+"""Doublings of the inlier distance, up to 30 times the noise; smooth errors of profilers are smaller."""
+_FEW_MORE = 1.1  # ratio of the numbers of inliers below which a wider distance adds no points of the curve
 _LEAST_ARC = np.radians(30)
-"""Smaller arcs are like straight lines, and their centres move by more than the noise along the sagitta."""
+"""Shorter arcs are like straight lines; their centres shift by more than the noise along the sagitta."""
 LEAST_WALL = 6
-"""Points on a ring's wall that are used: twice the three numbers of their curve."""
+"""Points on a ring's wall that are used: twice the three parameters of their curve."""
 _LARGEST_GAP = 5
-"""Times the usual distance between neighbours by which points of one wall may lie apart, in number and in space."""
+"""Largest gap within one wall, relative to the usual distance between neighbours, in number and in space."""
 _LARGEST_ROUNDS = 20
 _LINES = 4
-"""Lines sought in a profile of a step or ring: its faces, and what lies beside them."""
+"""Lines sought in a profile of a step or ring: its faces, and background beside them."""
 _PARALLEL = 2e-3
-"""By how much faces of a step may seem to be turned against each other besides noise, rad: bow of the profiler."""
-_LEAST_SEEN = 0.95  # share of its height that a step shows at least: profilers' scales err by less
-_LEAST_SEEN_COSINE = 0.5  # cosine of the angle by which the sheet may lean against a step: 60 deg
+"""Largest apparent rotation between faces of a step besides noise, rad: bow of the profiler."""
+_LEAST_SEEN = 0.95  # smallest apparent height of a step, relative to its height: scale errors of profilers are smaller
+_LEAST_SEEN_COSINE = 0.5  # cosine of the largest angle between the sheet and a step's normal: 60 deg
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Seen:
-    """Points of a profile on the artefact: their mask (N,), the surface (N,) of each (0 the first), scatter in mm."""
+class Detection:
+    """Points of a profile on the artefact: mask (N,), surface number (N,) of each (from 0), scatter in mm."""
 
     members: np.ndarray
     part: np.ndarray
     std_mm: float
 
-    def among(self, chosen: np.ndarray) -> Self:
-        """The same in the profile from which the points were chosen by a mask."""
+    def expand(self, chosen: np.ndarray) -> Self:
+        """Return the same points in the full profile; ``chosen`` is its mask of the points searched."""
         members, part = np.zeros(len(chosen), dtype=bool), np.zeros(len(chosen), dtype=int)
         members[chosen], part[chosen] = self.members, self.part
         return replace(self, members=members, part=part)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ProfileArc(Seen):
+class ProfileArc(Detection):
     """Points on a circle: its centre (2,) and radius, mm."""
 
     centre_mm: np.ndarray
@@ -58,10 +58,10 @@ class ProfileArc(Seen):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ProfileLine(Seen):
-    """Points on a line: their middle (2,), the line's direction (2,) and length, of a step or ring for the first face.
+class ProfileLine(Detection):
+    """Points on a line: middle (2,), direction (2,) and length of the line; for a step or ring, of the first face.
 
-    The points are those of both faces of a step, or of face and wall of a ring.
+    The points are on both faces of a step, or on face and wall of a ring.
     """
 
     middle_mm: np.ndarray
@@ -69,28 +69,28 @@ class ProfileLine(Seen):
     length_mm: float
 
     def with_parts(self, others: np.ndarray) -> "ProfileLine":
-        """The line with points of other surfaces, whose numbers (N,) are not 0."""
+        """Return the line with points of other surfaces, whose numbers (N,) are not 0."""
         return replace(self, members=self.members | (others > 0), part=np.where(others > 0, others, self.part))
 
 
-def noise_of(points: np.ndarray) -> float:
-    """Scatter of a profile (N, 2) from second differences across it, robust against edges, mm."""
+def estimate_noise(points: np.ndarray) -> float:
+    """Estimate the noise of a profile (N, 2) from second differences, robust against edges, mm."""
     depth = points[:, 1] - np.interp(points[:, 0], points[[0, -1], 0], points[[0, -1], 1])
-    # The variance of a second difference is 1 + 4 + 1 times that of a point.
+    # variance of a second difference: 1 + 4 + 1 times that of a point
     second = np.diff(depth, 2)
     return robust_std(second - np.median(second)) / 6**0.5
 
 
 def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generator) -> ProfileArc | None:
-    """The best supported arc of a sphere's section in a profile (N, 2), mm, in the order along it, or None.
+    """Find the best supported arc of a sphere's section in an ordered profile (N, 2), mm, or None.
 
-    Circles through three points in their order along the profile are judged by the number of points near them (RANSAC);
-    none is larger than the sphere, or than the profile where the sphere's radius is not known.
+    Circles through three points are scored by the number of points near them (RANSAC). Circles larger than the sphere
+    are excluded, or larger than the profile if the radius is unknown.
     """
     count = len(points)
     if count < LEAST_POINTS:
         return None
-    tolerance = max(_REJECTED_BEYOND * noise_of(points), 1e-4)
+    tolerance = max(_REJECTED_BEYOND * estimate_noise(points), 1e-4)
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     largest = extent if radius_mm is None else radius_mm + 2 * tolerance
     span = rng.integers(LEAST_POINTS // 2, max(count // 2, LEAST_POINTS // 2 + 1), size=_TRIALS)
@@ -102,20 +102,20 @@ def find_arc(points: np.ndarray, radius_mm: float | None, rng: np.random.Generat
         return None
     centres, radii = centres[fits], radii[fits]
     off = np.abs(np.linalg.norm(points - centres[:, None], axis=2) - radii[:, None])
-    tolerance = _widened(off, tolerance)
+    tolerance = _widen_tolerance(off, tolerance)
     if radius_mm is not None:
         largest = radius_mm + 2 * tolerance
     for best in np.argsort(-np.count_nonzero(off < tolerance, axis=1))[:5]:
-        arc = _refined_arc(points, off[best] < tolerance, tolerance)
+        arc = _refine_arc(points, off[best] < tolerance, tolerance)
         if arc is not None and arc.radius_mm < largest:
             return arc
     return None
 
 
-def _widened(off: np.ndarray, tolerance: float) -> float:
-    """Tolerance at which a wider one would find few points more, given distances (M, N) from the curves proposed.
+def _widen_tolerance(off: np.ndarray, tolerance: float) -> float:
+    """Widen the tolerance until this adds few points; ``off`` (M, N) are distances from the proposed curves.
 
-    A profiler's smooth error shifts points by more than their noise.
+    The smooth error of a profiler shifts points by more than their noise.
     """
     for _ in range(_DOUBLINGS):
         near, wider = (int(np.count_nonzero(off < each, axis=1).max()) for each in (tolerance, 2 * tolerance))
@@ -126,7 +126,7 @@ def _widened(off: np.ndarray, tolerance: float) -> float:
 
 
 def circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Centres (M, 2) and radii (M,) of circles through triples (M, 3, 2); infinite where these lie on a line."""
+    """Return centres (M, 2) and radii (M,) of circles through triples (M, 3, 2); infinite for collinear points."""
     b, c = triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         double = 2 * (b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0])
@@ -135,10 +135,10 @@ def circles_through(triples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return triples[:, 0] + away, np.linalg.norm(away, axis=1)
 
 
-def _settled(
+def _refit_inliers(
     members: np.ndarray, tolerance: float, off: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[np.ndarray, float] | None:
-    """Points (N,) on a curve, found anew until they stay the same, and their scatter; None where they are too few.
+    """Refit a curve and its inliers (N,) until they are stable; return inliers and scatter, or None if too few.
 
     ``off`` returns the distances (N,) of all points from the curve through some (N,).
     """
@@ -154,23 +154,23 @@ def _settled(
     return (members, std) if np.count_nonzero(members) >= LEAST_POINTS else None
 
 
-def _refined_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> ProfileArc | None:
+def _refine_arc(points: np.ndarray, members: np.ndarray, tolerance: float) -> ProfileArc | None:
     def off(some: np.ndarray) -> np.ndarray:
-        centre, radius = _fitted_circle(points[some])
+        centre, radius = _fit_circle(points[some])
         return np.linalg.norm(points - centre, axis=1) - radius
 
-    if (found := _settled(members, tolerance, off)) is None:
+    if (found := _refit_inliers(members, tolerance, off)) is None:
         return None
     members, std = found
-    centre, radius = _fitted_circle(points[members])
+    centre, radius = _fit_circle(points[members])
     if _arc_angle(points[members] - centre) < _LEAST_ARC:
         return None
     part = np.zeros(len(points), dtype=int)
     return ProfileArc(members=members, part=part, std_mm=std, centre_mm=centre, radius_mm=radius)
 
 
-def _fitted_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Circle with the least sum of squared distances, by Gauss-Newton steps from the algebraic one."""
+def _fit_circle(points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Fit a circle by least squares of the distances, with Gauss-Newton steps from the algebraic solution."""
     middle = points.mean(axis=0)
     centre, radius = algebraic_centres(points - middle)
     centre = middle + centre
@@ -191,17 +191,17 @@ def _arc_angle(away: np.ndarray) -> float:
 
 
 def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | None:
-    """The best supported straight line in a profile (N, 2), mm, in the order along it, or None."""
+    """Find the best supported straight line in an ordered profile (N, 2), mm, or None."""
     if len(points) < LEAST_POINTS:
         return None
-    tolerance = max(_REJECTED_BEYOND * noise_of(points), 1e-4)
+    tolerance = max(_REJECTED_BEYOND * estimate_noise(points), 1e-4)
     first, second = rng.integers(len(points), size=(2, _TRIALS))
     along = points[second] - points[first]
     length = np.linalg.norm(along, axis=1)
     proper = length > 0
     normals = np.column_stack([-along[:, 1], along[:, 0]])[proper] / length[proper, None]
     off = np.abs(points @ normals.T - np.sum(points[first[proper]] * normals, axis=1)).T
-    tolerance = _widened(off, tolerance)
+    tolerance = _widen_tolerance(off, tolerance)
     members = off[np.argmax(np.count_nonzero(off < tolerance, axis=1))] < tolerance
 
     def line(some: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -212,7 +212,7 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
         middle, direction = line(some)
         return (points - middle) @ np.array([-direction[1], direction[0]])
 
-    if (found := _settled(members, tolerance, beside)) is None:
+    if (found := _refit_inliers(members, tolerance, beside)) is None:
         return None
     members, std = found
     middle, direction = line(members)
@@ -227,14 +227,14 @@ def find_line(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
 
 
 def find_step(points: np.ndarray, height_mm: float | None, rng: np.random.Generator) -> ProfileLine | None:
-    """The two best supported parallel lines in a profile (N, 2), mm, in the order along it, or None.
+    """Find the two best supported parallel lines in an ordered profile (N, 2), mm, or None.
 
-    The first is that at smaller z. Of a step of known height they lie as far apart as a sheet shows it that leans by up
-    to 60 deg.
+    The first line is at smaller z. For a step of known height, their distance must fit an angle of at most 60 deg
+    between the sheet and the step's normal.
     """
     best: tuple[int, float, np.ndarray, np.ndarray, ProfileLine] | None = None
-    for (rows, first), (others, second) in combinations(_lines_of(points, rng), 2):
-        apart = _apart(first, second)
+    for (rows, first), (others, second) in combinations(_find_lines(points, rng), 2):
+        apart = _line_distance(first, second)
         if apart is None:
             continue
         if height_mm is not None and not _LEAST_SEEN * height_mm < abs(apart) < height_mm / _LEAST_SEEN_COSINE:
@@ -251,12 +251,12 @@ def find_step(points: np.ndarray, height_mm: float | None, rng: np.random.Genera
 
 
 def find_face(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | None:
-    """Of the best supported line in a profile (N, 2) and those parallel to it that at smallest z, mm, or None."""
-    lines = _lines_of(points, rng)
+    """Find the best supported line in a profile (N, 2), mm; return it or a parallel one at smaller z."""
+    lines = _find_lines(points, rng)
     if not lines:
         return None
     beside = [(0.0, *lines[0])]
-    beside += [(apart, *line) for line in lines[1:] if (apart := _apart(lines[0][1], line[1])) is not None]
+    beside += [(apart, *line) for line in lines[1:] if (apart := _line_distance(lines[0][1], line[1])) is not None]
     _, rows, face = min(beside, key=lambda each: each[0])
     members = np.zeros(len(points), dtype=bool)
     members[rows] = True
@@ -264,9 +264,9 @@ def find_face(points: np.ndarray, rng: np.random.Generator) -> ProfileLine | Non
 
 
 def find_walls(points: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Number (N,) of the wall on which each point of a profile (N, 2) lies, from 1; 0 for none.
+    """Return the wall number (N,) of each point of a profile (N, 2), from 1; 0 for points on no wall.
 
-    Walls are the runs of points ``near`` (N,) the artefact's wall, without those that lie beside their smooth curve.
+    Walls are contiguous runs of points ``near`` (N,) the artefact's wall, without outliers from a smooth curve.
     """
     rows = np.flatnonzero(near)
     walls, number = np.zeros(len(points), dtype=int), 0
@@ -291,8 +291,8 @@ def find_walls(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     return walls
 
 
-def _lines_of(points: np.ndarray, rng: np.random.Generator) -> list[tuple[np.ndarray, ProfileLine]]:
-    """Rows (n,) of the points on the best supported lines of a profile, and these lines."""
+def _find_lines(points: np.ndarray, rng: np.random.Generator) -> list[tuple[np.ndarray, ProfileLine]]:
+    """Return the best supported lines of a profile, each with the rows (n,) of its points."""
     lines: list[tuple[np.ndarray, ProfileLine]] = []
     left = np.arange(len(points))
     for _ in range(_LINES):
@@ -304,8 +304,8 @@ def _lines_of(points: np.ndarray, rng: np.random.Generator) -> list[tuple[np.nda
     return lines
 
 
-def _apart(first: ProfileLine, second: ProfileLine) -> float | None:
-    """How far a line lies beyond another to larger z, mm; None where they are not parallel, or are one."""
+def _line_distance(first: ProfileLine, second: ProfileLine) -> float | None:
+    """Return the distance of a line beyond another towards larger z, mm; None if not parallel, or identical."""
     normal = np.array([-first.direction[1], first.direction[0]]) * np.sign(first.direction[0] or 1.0)
     apart = float((second.middle_mm - first.middle_mm) @ normal)
     noise = max(first.std_mm, second.std_mm, 1e-4)

@@ -1,4 +1,4 @@
-"""What a sensor's calibration does to a mount that is found with it: profiles of a capture, with their derivatives."""
+"""Profiles of a capture for a mount calibration, and propagation of the sensor's uncertainty to the mount."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,9 +22,9 @@ from uwlts.stripe import find_stripes
 class CapturedProfiles:
     """Profiles of a calibrated sensor on a platform, one for each laser image of a capture.
 
-    ``profiles`` are P arrays (n, 3) in the sensor's frame, mm, ``stripes`` their profile lines and stripe centres
-    (n, 2), ``times_s`` (P,) their times. ``poses`` (M, 4, 4) are ``T_base_platform``, at ``pose_times_s`` (M,) where
-    these are known. ``known`` is the joint estimate of the sensor's calibration, if it has one.
+    ``profiles`` are P arrays (n, 3) in the sensor's frame, mm. ``stripes`` are their profile lines and stripe centres
+    (n, 2), ``times_s`` (P,) their times. ``poses`` (M, 4, 4) are ``T_base_platform``, at ``pose_times_s`` (M,) if
+    known. ``known`` is the joint estimate of the sensor's calibration, if it has one.
     """
 
     profiles: Sequence[np.ndarray]
@@ -34,30 +34,30 @@ class CapturedProfiles:
     pose_times_s: np.ndarray | None
     known: StoredEstimate | None
 
-    def selected(self, numbers: Sequence[int] | np.ndarray) -> "CapturedProfiles":
-        """Some of the profiles, each with its own pose."""
+    def select(self, numbers: Sequence[int] | np.ndarray) -> "CapturedProfiles":
+        """Return some of the profiles, each with its own pose."""
         profiles, stripes = ([each[number] for number in numbers] for each in (self.profiles, self.stripes))
         times = self.times_s[numbers]
         return replace(self, profiles=profiles, stripes=stripes, times_s=times, poses=self.poses[numbers])
 
-    def moved(self, number: int, rows: np.ndarray) -> np.ndarray:
-        """Derivatives (n, 3, Q) of rows of a profile by the parameters of the joint estimate, sensor's frame."""
+    def point_derivatives(self, number: int, rows: np.ndarray) -> np.ndarray:
+        """Return derivatives (n, 3, Q) of points of a profile by the parameters of the joint estimate, sensor frame."""
         assert self.known is not None
         found = self.known.points_by(*self.stripes[number][rows].T)
         if found is None:
-            raise CalibrationError("a stripe centre has no point by the calibration's joint estimate")
+            raise CalibrationError("a stripe centre cannot be triangulated with the calibration's joint estimate")
         return found[1][:, :, 1:]
 
 
 def profiles_of(
     capture: Capture, calibration: Calibration, poses: np.ndarray | None, pose_times_s: np.ndarray | None
 ) -> CapturedProfiles:
-    """Profiles of all laser images of a capture. The poses are those given, else the capture's own.
+    """Reconstruct the profiles of all laser images of a capture; ``poses`` replace the capture's own poses.
 
     Raises
     ------
     DescriptionError
-        Images have no pose, and none are given.
+        Images have no pose and ``poses`` is None.
     """
     check_fits(capture.header, calibration, source=capture.path.name)
     mounted = capture.header.sensor.camera.window.mounted
@@ -76,8 +76,8 @@ def profiles_of(
         pose_times_s = times
         if missing := int(np.count_nonzero(~np.isfinite(at).all(axis=(1, 2)))):
             raise DescriptionError(
-                f"{missing} of {len(laser)} laser images of {capture.path.name} have no pose of the platform: give a "
-                "table of poses, or import them"
+                f"{missing} of {len(laser)} laser images of {capture.path.name} have no platform pose: give a table of "
+                "poses, or import the poses"
             )
     known = None
     if calibration.joint is not None:
@@ -94,33 +94,34 @@ def mount_covariance(
     known: StoredEstimate | None,
     moved: Callable[[], np.ndarray],
 ) -> tuple[np.ndarray, SensorShare | None, float]:
-    """Covariance (K, K) of all values of an estimate of a mount, the sensor's share, and the factor for 95 %.
+    """Return the covariance (K, K) of a mount estimate, the sensor's contribution, and the coverage factor.
 
-    ``free`` (K, size) are steps of all values by the parameters, ``rotation`` (3, 3) the mount's; ``moved`` returns the
-    derivatives (G, K, Q) of the residuals by the parameters of the sensor's joint estimate, where that is ``known``.
+    ``free`` (K, size) maps parameters to all values, ``rotation`` (3, 3) is the mount's. ``moved`` returns the
+    derivatives (G, K, Q) of the residuals by the parameters of the sensor's joint estimate ``known``. The factor is for
+    95 %.
     """
     own = free @ estimate.covariance @ free.T
     covariance, share = own, None
     if known is not None:
-        covariance, share = _with_sensor(own, free @ estimate.by(moved()), rotation, known)
+        covariance, share = _add_sensor_uncertainty(own, free @ estimate.propagate(moved()), rotation, known)
     estimated = np.flatnonzero(np.diag(own)[:6] > 0)
     shares = (np.diag(own) / np.where(np.diag(covariance) > 0, np.diag(covariance), 1.0))[estimated]
     return (covariance + covariance.T) / 2, share, estimate.coverage_factor(shares, free[estimated])
 
 
-def _with_sensor(
+def _add_sensor_uncertainty(
     own: np.ndarray, by_parameters: np.ndarray, rotation: np.ndarray, known: StoredEstimate
 ) -> tuple[np.ndarray, SensorShare]:
-    """Covariance (K, K) of a mount and what was estimated with it, with what the sensor's calibration does to them.
+    """Add the uncertainty of the sensor's calibration to the covariance (K, K) of a mount.
 
-    Both start with shift and turn of the mount, as does ``by_parameters`` (K, Q), by the parameters of the joint
-    estimate; ``own`` (K, K) is the covariance without them, ``rotation`` (3, 3) the mount's. The mount leads from the
-    OCS, which belongs to the sensor's true sheet: its own uncertainty is part of the mount's.
+    ``own`` (K, K) is the covariance without the sensor's uncertainty, ``by_parameters`` (K, Q) the derivatives by the
+    joint estimate's parameters. Both start with shift and rotation of the mount; ``rotation`` (3, 3) is the mount's.
+    The mount maps from the sensor's frame (OCS) of the true sheet, so the uncertainty of this frame is included.
     """
     joint = known.calibration.joint
     assert joint is not None
     count = len(joint.parameters)
-    # Water that has drifted since, or another, is no part of the calibration.
+    # Uncertainty that is not part of the calibration: drift of the water's index, or another water.
     besides = known.covariance.copy()
     besides[:count, :count] -= joint.covariance_matrix()
     apart = own + by_parameters @ besides @ by_parameters.T

@@ -1,4 +1,4 @@
-"""Start values of a mount: in closed form from circles of a sphere, or by search from lines of flat artefacts."""
+"""Start values of a mount: closed form from circles of a sphere, or search from lines of flat artefacts."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -6,48 +6,48 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, SphereShape, StepShape, square_to
+from uwlts.calibration.mount.artefacts import PlaneShape, RingShape, SphereShape, StepShape, perpendicular_to
 from uwlts.calibration.mount.estimate import RestrictedEstimate
-from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, in_sheet, in_space, point_by_mount
-from uwlts.calibration.mount.profiles import ProfileArc, ProfileLine, Seen, circles_through
+from uwlts.calibration.mount.profile_evidence import MountState, Problem, Scatter, from_sheet, point_by_mount, to_sheet
+from uwlts.calibration.mount.profiles import Detection, ProfileArc, ProfileLine, circles_through
 from uwlts.errors import CalibrationError
 
-_SUBSET = 8  # poses of a random choice: 24 linear equations for 12 unknowns
-_SUBSETS = 40  # random choices: with a fifth of the poses wrong one of six has none of these
-_TRIED = 4  # of the linear solutions for a sphere, the best ones that are refined
+_SUBSET = 8  # poses of a random subset: 24 linear equations for 12 unknowns
+_SUBSETS = 40  # random subsets: with a fifth of the poses wrong, one of six subsets contains no wrong pose
+_TRIED = 4  # best linear solutions for a sphere, which are refined
 _THINNED = 9
-"""Points of each profile by which a refined start is judged."""
+"""Points of each profile in the refinement of start values."""
 _TURNS = 5000  # rotations tried for a plane, some 12 deg apart
-_TURNS_TRIED = 10  # of these the best that are refined
+_TURNS_TRIED = 10  # best rotations, which are refined
 _RADII = (1.02, 1.15, 1.5)
-"""Radius of an unknown sphere over that of its largest section."""
+"""Trial radii of an unknown sphere, relative to its largest section."""
 _REWEIGHTED = 10
 _FAR = 4.0
-"""Standard uncertainties within which points of a ring's wall are sought; poses with as many misfits are left out."""
+"""Standard uncertainties within which points of a ring's wall are sought; poses beyond as many misfits are rejected."""
 _CLEAR = 6.0
-"""Least radius over the width within which a circle's points are sought: a smaller one cannot be distinguished."""
-_CIRCLES = 3000  # circles tried: where a fifth of the points are on the wall, 24 of them are
-_JUDGED = 1500  # points by which each is judged
+"""Least ratio of a circle's radius to the search width of its points: smaller circles cannot be distinguished."""
+_CIRCLES = 3000  # circles tried: with a fifth of the points on the wall, 24 of them are right
+_JUDGED = 1500  # points for the score of a circle
 _ROUGH = Scatter(point_mm=0.1, smooth_mm=1e-4, length_mm=1.0, pose_mm=0.3, turn_rad=3e-3)
-"""Scatter for the weights of the search, whose robust loss begins beyond it."""
+"""Scatter for the weights of the search; beyond it the loss is robust."""
 
 
 class NoFit(CalibrationError):
-    """Profiles, poses and what is known of the artefact contradict each other."""
+    """Profiles, poses and the known size of the artefact contradict each other."""
 
 
 def start(
     problem: Problem,
     whole: Problem,
-    seen: Sequence[Seen],
+    seen: Sequence[Detection],
     sheet: np.ndarray,
     towards: np.ndarray | None,
     rng: np.random.Generator,
 ) -> tuple[MountState, Problem]:
-    """State near the solution from what was seen in the profiles, and the problem with all points that it shows.
+    """Estimate a state near the solution, and return it with the problem of the points that it uses.
 
-    ``whole`` holds all points of the profiles; ``sheet`` (4, 4) maps the sheet's frame to the sensor's. ``towards``
-    (3,) of the sensor's frame is nearest to the axis of a rotary table.
+    ``whole`` contains all points of the profiles; ``sheet`` (4, 4) maps the sheet's frame to the sensor's. ``towards``
+    (3,) is the direction of the sensor's frame nearest to the axis of a rotary table.
 
     Raises
     ------
@@ -72,12 +72,11 @@ def start(
 def _start_of_sphere(
     problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, rng: np.random.Generator
 ) -> MountState:
-    """State near the solution from the arcs found in the profiles; ``sheet`` (4, 4) maps the sheet's frame to the
-    sensor's.
+    """Estimate a state near the solution from the arcs in the profiles; ``sheet`` as in `start`.
 
-    Without its part across the sheet, y = +-sqrt(R2 - r2), the centre of a circle of radius r in the profile is the
-    sphere's centre in the sensor's frame, and R s + t = A^T (c - a) is linear in R's columns, t and c for poses (A, a).
-    The side of the sheet on which the centre lies follows from the solution; both sides are tried where it does not.
+    The centre of a circle of radius r in a profile is the sphere's centre without its coordinate across the sheet, y =
+    +-sqrt(R2 - r2). R s + t = A^T (c - a) is linear in R's columns, t and c for poses (A, a). The sign of y follows
+    from the solution, and both signs are tried otherwise.
     """
     rotations, positions = problem.motion(0.0)
     centres, radii = np.array([arc.centre_mm for arc in arcs]), np.array([arc.radius_mm for arc in arcs])
@@ -93,23 +92,23 @@ def _start_of_sphere(
             for state in _linear_solutions(rotations, positions, centres, depth, subset, radius):
                 found.append((_misfit(rotations, positions, centres, depth, state), state))
     found.sort(key=lambda each: each[0])
-    return _best(problem, [state for _, state in found[:_TRIED]], sheet)
+    return _refine_best(problem, [state for _, state in found[:_TRIED]], sheet)
 
 
 def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray, towards: np.ndarray) -> MountState:
-    """State near the solution from the arcs of a sphere on a rotary table; ``sheet`` as in `start`.
+    """Estimate a state near the solution from the arcs of a sphere on a rotary table; ``sheet`` as in `start`.
 
     At angle h the sphere's centre is q + a cos h + b sin h in the sensor's frame, linear in the six coordinates in the
-    sheet. As a and b have the same length and are square to each other, their parts across it are the complex root
-    a_y + i b_y = +-sqrt(|b|^2 - |a|^2 - 2 i a.b), with both lengths and the product those in the sheet. The two
-    solutions mirror each other in the sheet and fit profiles alike: that one is taken whose axis, about which the
+    sheet. Vectors a and b have the same length and are perpendicular. Their coordinates across the sheet are therefore
+    the complex root a_y + i b_y = +-sqrt(|b|^2 - |a|^2 - 2 i a.b), with lengths and product in the sheet. The two
+    solutions are mirror images and fit the profiles equally well. The solution is used whose axis, about which the
     sphere turns by the angles, points along ``towards`` (3,) of the sensor's frame.
     """
     rotations, positions = problem.motion(0.0)
     angles = -Rotation.from_matrix(rotations[0].T @ rotations).as_rotvec()[:, 2]
     centres, radii = np.array([arc.centre_mm for arc in arcs]), np.array([arc.radius_mm for arc in arcs])
     design = np.column_stack([np.ones(len(arcs)), np.cos(angles), np.sin(angles)])
-    flat = _robust(design, centres)
+    flat = _solve_robustly(design, centres)
     largest, states = float(np.quantile(radii, 0.9)), []
     root = np.sqrt(complex(flat[2] @ flat[2] - flat[1] @ flat[1], -2 * flat[1] @ flat[2]))
     for radius in [problem.shape.size_mm] if problem.shape.size_mm else [share * largest for share in _RADII]:
@@ -128,7 +127,7 @@ def _start_on_table(problem: Problem, arcs: list[ProfileArc], sheet: np.ndarray,
             translation = np.array([0.0, 0.0, height]) - rotation @ q
             place = rotations[0] @ np.array([reach, 0.0, height]) + positions[0]
             states.append(MountState(rotation, translation, np.append(place, radius)))
-    return _best(problem, states, sheet)
+    return _refine_best(problem, states, sheet)
 
 
 def _linear_solutions(
@@ -139,7 +138,7 @@ def _linear_solutions(
     subset: np.ndarray,
     radius: float,
 ) -> list[MountState]:
-    back, shift = np.swapaxes(rotations, 1, 2)[subset], _turned_back(rotations, -positions)[subset]
+    back, shift = np.swapaxes(rotations, 1, 2)[subset], _rotate_back(rotations, -positions)[subset]
     states, one = [], np.broadcast_to(np.eye(3), back.shape)
     for side in (0.0, 1.0, -1.0):
         sides = np.full(len(subset), side)
@@ -160,27 +159,27 @@ def _linear_solutions(
             )[0]
             translation, centre = both[:3], both[3:]
             if side == 0.0:
-                sides = np.sign((_turned_back(rotations, centre - positions)[subset] - translation) @ across)
+                sides = np.sign((_rotate_back(rotations, centre - positions)[subset] - translation) @ across)
         states.append(MountState(rotation, translation, np.append(centre, radius)))
     return states
 
 
-def _turned_back(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Vectors (P, 3) of the base frame along the axes of the platform."""
+def _rotate_back(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Rotate vectors (P, 3) of the base frame into the axes of the platform."""
     return np.einsum("pji,pj->pi", rotations, vectors)
 
 
 def _misfit(
     rotations: np.ndarray, positions: np.ndarray, centres: np.ndarray, depth: np.ndarray, state: MountState
 ) -> float:
-    """Median over the poses of the distance between the centre of the sphere and where the profile says it is."""
-    seen = (_turned_back(rotations, state.artefact[:3] - positions) - state.translation) @ state.rotation
+    """Return the median distance over the poses between the sphere's centre and its position from the profile."""
+    seen = (_rotate_back(rotations, state.artefact[:3] - positions) - state.translation) @ state.rotation
     off = np.hypot(*(seen[:, [0, 2]] - centres).T)
     return float(np.median(np.hypot(off, np.abs(seen[:, 1]) - depth)))
 
 
-def _in_sensor_frame(state: MountState, sheet: np.ndarray) -> MountState:
-    """The state of a sheet's frame as one of the sensor's."""
+def _to_sensor_frame(state: MountState, sheet: np.ndarray) -> MountState:
+    """Convert a state of the sheet's frame to the sensor's frame."""
     rotation = state.rotation @ sheet[:3, :3].T
     return MountState(rotation, state.translation - rotation @ sheet[:3, 3], state.artefact)
 
@@ -188,34 +187,34 @@ def _in_sensor_frame(state: MountState, sheet: np.ndarray) -> MountState:
 def _start_of_plane(
     problem: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
 ) -> MountState:
-    """State near the solution from the lines found in the profiles; ``sheet`` as in `start`.
+    """Estimate a state near the solution from the lines in the profiles; ``sheet`` as in `start`.
 
-    The lines' directions in the base are square to the plane's normal whatever the translation: of many rotations the
-    best are kept by the smallest eigenvalue of the directions' scatter, whose vector is the normal. Translation and
-    distance are linear then.
+    The lines' directions in the base are perpendicular to the plane's normal for any translation. Random rotations are
+    ranked by the smallest eigenvalue of the directions' scatter, whose eigenvector is the normal. Translation and
+    distance are then linear.
     """
     rotations, positions = problem.motion(0.0)
-    middles = in_space(np.array([line.middle_mm for line in lines]))
-    directions = in_space(np.array([line.direction for line in lines]))
+    middles = from_sheet(np.array([line.middle_mm for line in lines]))
+    directions = from_sheet(np.array([line.direction for line in lines]))
     turns = Rotation.random(_TURNS, rng=rng).as_matrix()
     seen = np.einsum("pij,tjk,pk->tpi", rotations, turns, directions)
     values, vectors = np.linalg.eigh(np.einsum("tpi,tpj->tij", seen, seen))
     states = []
     for number in np.argsort(values[:, 0])[:_TURNS_TRIED]:
         normal = vectors[number, :, 0]
-        # Half a turn about the sheet's normal leaves the directions as they are.
+        # half a turn about the sheet's normal does not change the directions
         for turn in (turns[number], turns[number] * np.array([-1.0, 1.0, -1.0])):
             places = np.einsum("pij,jk,pk->pi", rotations, turn, middles) + positions
             design = np.column_stack([np.einsum("pji,j->pi", rotations, normal), -np.ones(len(lines))])
-            solution = _robust(design, -(places @ normal)[:, None])[:, 0]
+            solution = _solve_robustly(design, -(places @ normal)[:, None])[:, 0]
             states.append(MountState(turn, solution[:3], np.append(normal, solution[3])))
-    return _best(problem, states, sheet)
+    return _refine_best(problem, states, sheet)
 
 
 def _start_of_step(
     problem: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
 ) -> MountState:
-    """State near the solution from the lines of both faces of a step: as of a plane from the first, then the height."""
+    """Estimate a state from the lines of a step: as for a plane from the first face, then the height."""
     first = [points[part == 0] for points, part in zip(problem.points, problem.part, strict=True)]
     none = [np.zeros(len(points), dtype=int) for points in first]
     state = _start_of_plane(replace(problem, points=first, part=none, shape=PlaneShape()), lines, sheet, rng)
@@ -228,56 +227,56 @@ def _start_of_step(
 def _start_of_ring(
     problem: Problem, whole: Problem, lines: list[ProfileLine], sheet: np.ndarray, rng: np.random.Generator
 ) -> tuple[MountState, Problem]:
-    """State from the lines of the face, as of a plane; then the wall is the circle on which most other points lie.
+    """Estimate a state from the lines of the face, as for a plane, then find the wall as a circle of other points.
 
-    The mount by the face alone places points along the face as well as its covariance says: so wide is the circle.
+    The face gives the mount, with an uncertainty along the face. This uncertainty is the search width of the circle.
     """
     shape, plane = problem.shape, replace(problem, shape=PlaneShape())
     state = _start_of_plane(plane, lines, sheet, rng)
     off = plane.rms_mm(state)
     noise = float(np.median([line.std_mm for line in lines]))
     scatter = Scatter(max(noise, 1e-6), noise, 1.0, max(float(np.median(off)), noise), 1e-3)
-    used = plane.selected(off < _FAR * np.median(off) + 5 * noise)
-    state = used.rough(state, scatter)
+    used = plane.select(off < _FAR * np.median(off) + 5 * noise)
+    state = used.solve_robustly(state, scatter)
     covariance = RestrictedEstimate(used, state, np.array(scatter)).covariance[:6, :6]
     middle = state.rotation @ np.vstack(used.points).mean(axis=0)
     to_point = point_by_mount(middle)
     known = float(np.sqrt(np.linalg.eigvalsh(to_point @ covariance @ to_point.T)[-1]))
     reach = _FAR * float(np.hypot(known, scatter.pose_mm))
-    base = whole.base(state)
+    base = whole.to_base(state)
     normal, distance = state.artefact[:3], state.artefact[3]
-    axes = square_to(normal)
+    axes = perpendicular_to(normal)
     height = base @ normal - distance
     beside = np.flatnonzero(np.abs(height) > reach)
-    # Every height counts alike: a table has many points, and all at one height.
+    # Weight heights equally: a table has many points, all at one height.
     heights = np.sort(height[beside])
     alike = np.searchsorted(heights, height[beside] + reach) - np.searchsorted(heights, height[beside] - reach)
     beside = rng.choice(beside, _JUDGED, p=1 / alike / np.sum(1 / alike)) if len(beside) else beside
-    circle = _circle_of_most(base[beside] @ axes.T, shape.size_mm, reach, rng)
+    circle = _find_circle(base[beside] @ axes.T, shape.size_mm, reach, rng)
     if circle is None:
         require_surfaces(problem)
     assert circle is not None
     state = replace(
         state, artefact=np.concatenate([normal, circle[:2] @ axes + distance * normal, [shape.size_mm or circle[2]]])
     )
-    flat = in_sheet(whole.points, sheet)
+    flat = to_sheet(whole.points, sheet)
     for narrower in (1.0, 3.0, 9.0):
-        problem = whole.of_seen(whole.seen_again(state, flat, max(reach / narrower, 5 * noise), rng))
+        problem = whole.select_detected(whole.detect_again(state, flat, max(reach / narrower, 5 * noise), rng))
         require_surfaces(problem)
-        state = problem.rough(state, scatter)
+        state = problem.solve_robustly(state, scatter)
     return state, problem
 
 
 def require_surfaces(problem: Problem) -> None:
-    """CalibrationError where too few profiles show a surface of the artefact; `NoFit` where its size may be wrong."""
-    if (words := problem.shape.missing(problem.part)) is not None:
+    """Raise CalibrationError if too few profiles show a surface; `NoFit` if the given size may be wrong."""
+    if (words := problem.shape.describe_missing(problem.part)) is not None:
         raise CalibrationError(words) if problem.shape.size_mm is None else NoFit(words)
 
 
-def _circle_of_most(
+def _find_circle(
     points: np.ndarray, radius_mm: float | None, reach_mm: float, rng: np.random.Generator
 ) -> np.ndarray | None:
-    """Centre and radius (3,) of the circle with most of the points (N, 2) near it, beyond those inside and outside."""
+    """Find the circle (3,) (centre, radius) with most points (N, 2) near it, less those inside and outside."""
     if not len(points):
         return None
     tried = points[rng.integers(len(points), size=(_CIRCLES, 3))]
@@ -288,18 +287,15 @@ def _circle_of_most(
     if not proper.any():
         return None
     off = np.abs(np.linalg.norm(points - centres[proper, None], axis=2) - radii[proper, None])
-    # Surfaces that are no wall fill a disc, and have as many points beside the circle.
+    # Surfaces other than walls fill a disc, with as many points beside the circle.
     near, beside = (np.count_nonzero(off < reach, axis=1) for reach in (reach_mm, 3 * reach_mm))
     score = 1.5 * near - 0.5 * beside
     best = int(np.argmax(score))
     return np.append(centres[proper][best], radii[proper][best]) if score[best] > 0 else None
 
 
-def _robust(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Solution (k, m) of linear equations, ``design`` (N, k) and ``wanted`` (N, m), of which some are wrong.
-
-    By Cauchy's weights.
-    """
+def _solve_robustly(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Solve linear equations, ``design`` (N, k) and ``wanted`` (N, m), robustly with Cauchy weights; return (k, m)."""
     weights, solution = np.ones(len(design)), np.zeros((design.shape[1], wanted.shape[1]))
     for _ in range(_REWEIGHTED):
         solution = np.linalg.lstsq(design * weights[:, None], wanted * weights[:, None], rcond=1e-10)[0]
@@ -308,11 +304,11 @@ def _robust(design: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     return solution
 
 
-def _best(problem: Problem, states: list[MountState], sheet: np.ndarray) -> MountState:
-    """The state, as one of the sensor's frame, of smallest median distance after a robust refinement from each.
+def _refine_best(problem: Problem, states: list[MountState], sheet: np.ndarray) -> MountState:
+    """Refine states robustly; return the one with the smallest median distance, in the sensor's frame.
 
-    Scale and time are left as they are.
+    Scale and time offset are not refined.
     """
-    fixed = replace(problem.thinned(_THINNED), scale=False, time=False)
-    refined = [fixed.rough(_in_sensor_frame(state, sheet), _ROUGH) for state in states]
+    fixed = replace(problem.thin(_THINNED), scale=False, time=False)
+    refined = [fixed.solve_robustly(_to_sensor_frame(state, sheet), _ROUGH) for state in states]
     return min(refined, key=lambda state: float(np.median(fixed.rms_mm(state))))

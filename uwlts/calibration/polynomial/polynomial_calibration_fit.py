@@ -1,4 +1,4 @@
-"""One polynomial for each profile line, fitted to all lines together so that it changes smoothly from line to line."""
+"""One polynomial for each profile line; a joint fit makes them vary smoothly from line to line."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,37 +24,40 @@ from uwlts.storage.capture import Capture, CaptureHeader, opened_captures
 from uwlts.stripe import StripeSettings
 
 MOST_SMOOTH = 8
-"""Degree of the coefficients over the lines."""
-_LINES_PER_DEGREE = 10  # a degree over the lines needs several lines of its own
-_DETERMINED = 1e-6  # smallest singular value over the largest: a full view has 0.1, one cut to a triangle thousandths
-_OUTLIER = 5.0  # standard deviations; of a million normal values one is farther
-_ROUNDS = 20  # of leaving out outliers; a few settle
-_RETURNING_ROUNDS = 10  # in which outliers may return; then they stay out, so that the rounds end
+"""Largest degree of the coefficients as functions of the line."""
+_LINES_PER_DEGREE = 10  # lines needed for each degree over the lines
+_DETERMINED = 1e-6  # smallest ratio of singular values: a full view has 0.1, a triangular one some thousandths
+_OUTLIER = 5.0  # standard deviations; of a million normal values, one is larger
+_ROUNDS = 20  # of outlier rejection; a few suffice
+_RETURNING_ROUNDS = 10  # rounds in which outliers may return; afterwards they stay rejected, so that the iteration ends
 
 
 @dataclass(frozen=True, eq=False)
 class LinePolynomials:
-    """Polynomials of one variable, one for each line from the first to the last one with data."""
+    """Polynomials of one variable for each line, from the first to the last one with data."""
 
     first_line: int
-    range: tuple[float, float]  # of the variable, for all lines; the Legendre polynomials' argument runs from -1 to 1
+    range: tuple[float, float]  # of the variable, for all lines; the Legendre polynomials' argument is -1 to 1
     coefficients: np.ndarray  # (L, degree + 1); Legendre coefficients of each line
-    residuals: np.ndarray  # (N,); data less polynomial, outliers included
-    used: np.ndarray  # (N,) bool; the data that were not left out as outliers
+    residuals: np.ndarray  # (N,); data minus polynomial, with outliers
+    used: np.ndarray  # (N,) bool; inliers
 
     def rms(self) -> float:
-        """Root mean square residual of the data used."""
+        """Return the root mean square residual of the inliers."""
         return float(np.sqrt(np.mean(self.residuals[self.used] ** 2)))
 
 
 def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, degree: int) -> LinePolynomials:
-    """Polynomials y(x) of all lines by least squares, their coefficients themselves polynomials of the line's number.
+    """Fit polynomials y(x) of all lines by least squares; coefficients are polynomials of the line number.
 
-    From lines (N,), x and y (N,). The model is the sum over i, j of ``a_ij P_i(line) P_j(x)`` with Legendre polynomials
-    P on the scaled ranges of the lines and of x, j up to ``degree`` and i up to `MOST_SMOOTH`. Data off by more than
-    five robust standard deviations are left out, and the fit repeated until nothing changes.
+    The data are lines (N,), x and y (N,). The model is the sum over i, j of ``a_ij P_i(line) P_j(x)`` with Legendre
+    polynomials P on scaled ranges. The index j runs to ``degree``, i to `MOST_SMOOTH`. Data beyond five robust standard
+    deviations are rejected, and the fit is repeated until convergence.
 
-    Raises CalibrationError: the data do not determine the polynomials.
+    Raises
+    ------
+    CalibrationError
+        The data do not determine the polynomials.
     """
     span = int(np.ptp(lines)) + 1 if len(lines) else 0
     smooth = min(MOST_SMOOTH, (span - 1) // _LINES_PER_DEGREE)
@@ -65,26 +68,26 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
         if np.count_nonzero(used) <= terms:
             raise CalibrationError(
                 f"{np.count_nonzero(used)} stripe points on {span} lines are too few for polynomials of degree "
-                f"{degree} with {terms} coefficients over all lines: let the stripe fall on more of the target"
+                f"{degree} with {terms} coefficients over all lines: let the stripe cover more of the target"
             )
         first, last = int(lines[used].min()), int(lines[used].max())
         low, high = float(x[used].min()), float(x[used].max())
         if not (high > low and last > first):
-            raise CalibrationError("the stripe lies at one place in all images: move the stage between them")
+            raise CalibrationError("the stripe is at the same place in all images: move the stage between them")
         design = legendre.legvander2d(
-            _scaled(lines, float(first), float(last)), _scaled(x, low, high), [smooth, degree]
+            _scale_range(lines, float(first), float(last)), _scale_range(x, low, high), [smooth, degree]
         )
-        # The triangular factor has the equations' solution and singular values and is small.
+        # The triangular factor has the same solution and singular values, and is small.
         triangle = np.asarray(np.linalg.qr(np.column_stack([design, y])[used], mode="r"))
         solution, _, _, singular = np.linalg.lstsq(triangle[:, :-1], triangle[:, -1], rcond=None)
         if singular[-1] < _DETERMINED * singular[0]:
             raise CalibrationError(
-                f"the stripe points do not determine polynomials of degree {degree}: the stripe must be seen along its "
-                "line at all depths"
+                f"the stripe points do not determine polynomials of degree {degree}: the stripe must be visible along "
+                "its line at all depths"
             )
         residuals = y - design @ solution
         spread = robust_std(residuals[used])
-        # Rounding alone must not make outliers of exact data.
+        # Rounding errors of exact data are not outliers.
         within = np.abs(residuals) <= max(_OUTLIER * spread, 1e-9 * float(np.ptp(y)))
         if rounds >= _RETURNING_ROUNDS:
             within &= used
@@ -92,17 +95,17 @@ def fit_line_polynomials(lines: np.ndarray, x: np.ndarray, y: np.ndarray, *, deg
         settled, used = np.array_equal(within, used), within
         if settled or rounds == _ROUNDS:
             break
-    over_lines = legendre.legvander(_scaled(np.arange(first, last + 1), float(first), float(last)), smooth)
+    over_lines = legendre.legvander(_scale_range(np.arange(first, last + 1), float(first), float(last)), smooth)
     coefficients = over_lines @ solution.reshape(smooth + 1, degree + 1)
     return LinePolynomials(first, (low, high), coefficients, residuals, used)
 
 
 def line_domains(lines: np.ndarray, pose: np.ndarray, centres_px: np.ndarray, *, largest_gap: int) -> np.ndarray:
-    """Range (L, 2) of the stripe positions that each line has seen, from the first to the last line with data.
+    """Return the range (L, 2) of observed stripe positions for each line, from the first to the last line with data.
 
-    The stripe points have lines (N,), numbers (N,) of their images and centres (N,) on the line. At each pose lines
-    without a centre borrow one from their neighbours on both sides, by interpolation, unless more than ``largest_gap``
-    lines in succession have none. Lines that have seen nothing get NaN.
+    The stripe points have lines (N,), image numbers (N,) and centres (N,) on the line. In each image, lines without a
+    centre are interpolated from their neighbours on both sides, unless more than ``largest_gap`` successive lines lack
+    one. Lines without data get NaN.
     """
     first, count = int(lines.min()), int(np.ptp(lines)) + 1
     domains = np.tile([np.inf, -np.inf], (count, 1))
@@ -117,26 +120,24 @@ def line_domains(lines: np.ndarray, pose: np.ndarray, centres_px: np.ndarray, *,
     return np.where(np.isfinite(domains), domains, np.nan)
 
 
-def _scaled(x: np.ndarray, low: float, high: float) -> np.ndarray:
+def _scale_range(x: np.ndarray, low: float, high: float) -> np.ndarray:
     return (2 * x - low - high) / (high - low)
 
 
 _LARGEST_REJECTED = 0.2  # outliers are few; more contradict the positions or the target
-_LARGEST_GAP = (
-    0.1  # share of the lines that may lack a centre in succession and still borrow their range from both sides
-)
-_LARGEST_MAP_SHARE = 0.004  # the map should be good to two thousandths of the circles' spacing; twice that is reported
+_LARGEST_GAP = 0.1  # fraction of the lines that may successively lack a centre and be interpolated
+_LARGEST_MAP_SHARE = 0.004  # relative to the circles' spacing; twice the expected error of the map
 _LARGEST_LINE_EXCESS = 1.5  # 1 by chance, within a few percent for thousands of points
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PolynomialResult(Brief):
-    """A polynomial calibration with everything a report shows of its making.
+    """Polynomial calibration with the data of its report.
 
     Attributes
     ----------
-    depth, along : the fits of Z(position) and of Y(Z), with the residuals of the stripe points: of all for Z, of those
-        that Z used for Y
+    depth, along : fits of Z(position) and of Y(Z), with residuals of all stripe points for Z, and of the inliers of Z
+        for Y
     """
 
     calibration: PolynomialCalibration
@@ -158,20 +159,20 @@ def calibrate_polynomials(
     Parameters
     ----------
     target : sequence of Capture or path
-        Captures of a target that stands still, square to the laser's axis, while the stage moves the sensor along Z: at
-        every stage position one image under the lamp and one with the laser.
+        Captures of a target at rest, perpendicular to the laser's axis, while the stage moves the sensor along Z. Every
+        stage position has one image with the lamp and one with the laser.
     degree : int
         Degree of the polynomials; there must be more stage positions.
     stripe : StripeOptions or dict, optional
         As for `reconstruct`.
     progress : callable, optional
-        Called with the number of images done, the number in all, and the name of the stage.
+        Called with the number of images done, the total, and the name of the stage.
 
     Returns
     -------
     PolynomialResult
         The OCS has X = 0 on the sheet, Z along the stage's motion, away from the sensor, and Y along the stripe on the
-        plate. Its origin is where the sensor as described sees the stripe next to the camera's axis.
+        plate. Its origin is where the described sensor sees the stripe nearest to the camera's axis.
 
     Raises
     ------
@@ -184,7 +185,7 @@ def calibrate_polynomials(
         The degree is less than 1.
     """
     if degree < 1:
-        raise RangeError(f"the polynomials' degree is {degree}; expected at least 1, as a rule 6")
+        raise RangeError(f"the polynomials' degree is {degree}; expected at least 1, usually 6")
     with opened_captures(target) as captures:
         header = common_header(captures)
         evidence = air_evidence(captures, stripe=stripe, progress=progress)
@@ -195,7 +196,7 @@ def calibrate_polynomials(
 def fit_polynomials(
     evidence: AirEvidence, header: CaptureHeader, *, degree: int, sources: Sequence[dict[str, str]] = ()
 ) -> PolynomialResult:
-    """Polynomials from what the captures show; ``sources`` names the captures. Errors: `calibrate_polynomials`."""
+    """Fit polynomials to gathered evidence; ``sources`` names the captures. Errors as `calibrate_polynomials`."""
     stripes, maps, warnings = stripes_on_plate(evidence, header, degree)
     warnings = [*evidence.warnings, *warnings]
     depth_mm, along_mm = object_coordinates(stripes, header)
@@ -207,8 +208,8 @@ def fit_polynomials(
     rejected = 1 - len(kept) / len(depth_mm)
     if rejected > _LARGEST_REJECTED:
         raise CalibrationError(
-            f"{100 * rejected:.0f} % of the stripe points do not lie on the polynomials of the others: check the stage "
-            "positions, and that the stripe falls on the target"
+            f"{100 * rejected:.0f} % of the stripe points are not on the polynomials of the others: check the stage "
+            "positions, and that the stripe is on the target"
         )
     sensor, camera = header.sensor, header.sensor.camera
     gap = int(_LARGEST_GAP * camera.lines())
@@ -253,12 +254,12 @@ def fit_polynomials(
     if map_rms_mm > largest:
         warnings.append(
             f"the target's points scatter by {map_rms_mm:.3f} mm about a smooth map of its plane; "
-            f"expected less than {largest:.3f} mm: is the target flat, sharp and described rightly?"
+            f"expected less than {largest:.3f} mm: is the target flat, sharp and described correctly?"
         )
     if excess > _LARGEST_LINE_EXCESS:
         warnings.append(
-            f"residuals of the same line go together, {excess:.1f} times as much as chance would have it: the laser "
-            "line has a shape that is too fine for polynomials smooth over the lines"
+            f"residuals of the same line are correlated, {excess:.1f} times more than by chance: the laser line has a "
+            "shape that is too fine for polynomials smooth over the lines"
         )
     provenance = {"source": "polynomials from captures", "captures": list(sources), "warnings": warnings}
     calibration = calibration.model_copy(update={"residuals": figures, "provenance": provenance})
@@ -266,7 +267,7 @@ def fit_polynomials(
 
 
 def _line_excess(fit: LinePolynomials, lines: np.ndarray) -> float:
-    """Scatter of the lines' means over that expected by chance: the standard deviation over sqrt(n)."""
+    """Return the scatter of the lines' means relative to its expectation by chance, std / sqrt(n)."""
     _, line, count = np.unique(lines[fit.used], return_inverse=True, return_counts=True)
     means, several, rms = np.bincount(line, fit.residuals[fit.used]) / count, count > 1, fit.rms()
     if not (several.any() and rms > 0):

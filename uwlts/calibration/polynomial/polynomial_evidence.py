@@ -1,4 +1,4 @@
-"""Maps from pixels to the target's plane by the target's points in the same image, and the stripe points on it."""
+"""Maps from pixels to the target's plane, from the target's points in the same image, and stripe points on it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ from uwlts.optics.window import RayStatus
 from uwlts.storage.capture import Capture, CaptureHeader
 from uwlts.targets.detection.ellipse_bias import circle_centre_bias
 
-# What a lens and a flat window leave of a plane beside its homography is smooth: the fifth degree describes it to a
-# micrometre over a view 200 mm wide. Fewer points than three for each coefficient would be fitted, not smoothed.
+# The deviation of a plane's image from a homography, by lens and window, is smooth: the fifth degree describes it to a
+# micrometre in a view 200 mm wide. With fewer than three points for each coefficient, noise would be fitted.
 _HIGHEST_DEGREE = 5
 _LOWEST_DEGREE = 3
 _POINTS_PER_TERM = 3
@@ -29,21 +29,21 @@ _X, _Y = np.eye(3)[:2]
 
 @dataclass(frozen=True, eq=False)
 class SmoothMap:
-    """Smooth map from one plane to another: a homography and a polynomial for what it leaves."""
+    """Smooth map from one plane to another: a homography and a correcting polynomial."""
 
     homography: np.ndarray  # (3, 3)
-    low: np.ndarray  # (2,); first corner of the box of the points it was fitted to: the polynomial's arguments are -1
+    low: np.ndarray  # (2,); first corner of the box of the fitted points: the polynomial's arguments are -1
     high: np.ndarray  # (2,); opposite corner, the arguments are 1
     degree: int  # total degree of the polynomial
     coefficients: np.ndarray  # (terms, 2); Legendre coefficients
-    residuals: np.ndarray  # (N, 2); of the points it was fitted to
+    residuals: np.ndarray  # (N, 2); of the fitted points
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Images (M, 2) of points (M, 2)."""
+        """Map points (M, 2); return (M, 2)."""
         return self.coarsely(points) + _terms(points, self.low, self.high, self.degree) @ self.coefficients
 
     def coarsely(self, points: np.ndarray) -> np.ndarray:
-        """Images (M, 2) by the homography alone, which stays sensible far outside the box."""
+        """Map points (M, 2) with the homography only, which extrapolates well."""
         return _project(self.homography, points)
 
 
@@ -51,33 +51,32 @@ class SmoothMap:
 class PlateMap(SmoothMap):
     """Map from pixels to the plane of the target (plate) in mm, fitted to the target's points.
 
-    ``hull`` (K, 3) are the sides of the points' convex hull on the plate: outward normal and offset in mm.
+    ``hull`` (K, 3) contains the sides of the points' convex hull on the plate: outward normal and offset in mm.
     """
 
     hull: np.ndarray
 
     def beyond_mm(self, pixels: np.ndarray) -> np.ndarray:
-        """Distances (M,) in mm at which pixels (M, 2) look outside the hull of the target's points; negative inside."""
+        """Return the distances (M,) in mm of pixels (M, 2) outside the hull of the target's points; negative inside."""
         return np.max(self.coarsely(pixels) @ self.hull[:, :2].T + self.hull[:, 2], axis=1)
 
     def rms_mm(self) -> float:
-        """Root mean square length of the residuals."""
+        """Return the root mean square length of the residuals."""
         return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=1))))
 
 
 def fit_plate_map(image: TargetImage, *, circle_diameter_mm: float | None = None) -> PlateMap:
-    """Map from pixels to the plate through the points of one image.
+    """Fit the map from pixels to the plate to the points of one image.
 
-    Where the points are circles of a diameter, their pixels are centres of the circles' images; the offsets from the
-    images of their centres are taken out by the map itself: refraction that stretches the image outwards shifts the
-    centres as much as perspective does.
+    For circles, the pixels are centres of the circles' images. The offsets from the images of the circles' centres are
+    corrected with the map itself, as refraction can shift the centres as much as perspective.
 
     Raises
     ------
     CalibrationError
         There are too few points, or they determine no homography.
     RangeError
-        A circle's image is no ellipse.
+        A circle's image is not an ellipse.
     """
     points, pixels = image.points_mm, image.pixels
     if circle_diameter_mm is not None:
@@ -89,20 +88,23 @@ def fit_plate_map(image: TargetImage, *, circle_diameter_mm: float | None = None
 
 
 def fit_smooth_map(start: np.ndarray, end: np.ndarray) -> SmoothMap:
-    """Smooth map from points (N, 2) to points (N, 2), by least squares.
+    """Fit a smooth map from points (N, 2) to points (N, 2) by least squares.
 
-    Raises CalibrationError: there are too few points, or they determine no homography.
+    Raises
+    ------
+    CalibrationError
+        There are too few points, or they determine no homography.
     """
     counts = {d: (d + 1) * (d + 2) // 2 for d in range(_LOWEST_DEGREE, _HIGHEST_DEGREE + 1)}
     degree = max((d for d, count in counts.items() if _POINTS_PER_TERM * count <= len(start)), default=None)
     if degree is None:
         raise CalibrationError(
-            f"only {len(start)} points of the target are seen; at least {_POINTS_PER_TERM * counts[_LOWEST_DEGREE]} "
-            "are needed to find where on the target the stripe lies"
+            f"{len(start)} points of the target were found; at least {_POINTS_PER_TERM * counts[_LOWEST_DEGREE]} "
+            "are needed to find the stripe's place on the target"
         )
     found = cv2.findHomography(np.ascontiguousarray(start), np.ascontiguousarray(end), method=0)[0]
     if found is None or not np.isfinite(found).all():
-        raise CalibrationError(f"the {len(start)} points of the target determine no homography of image and target")
+        raise CalibrationError(f"the {len(start)} points of the target determine no homography from image to target")
     low, high = start.min(axis=0), start.max(axis=0)
     left, terms = end - _project(found, start), _terms(start, low, high, degree)
     coefficients = np.linalg.lstsq(terms, left, rcond=None)[0]
@@ -115,7 +117,7 @@ def _project(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _terms(points: np.ndarray, low: np.ndarray, high: np.ndarray, degree: int) -> np.ndarray:
-    """Products of Legendre polynomials in both coordinates up to a total degree, (M, terms)."""
+    """Return products of Legendre polynomials in both coordinates up to a total degree, (M, terms)."""
     first, second = ((2 * points - low - high) / (high - low)).T
     products = legendre.legvander2d(first, second, [degree, degree])
     powers = np.add.outer(np.arange(degree + 1), np.arange(degree + 1)).ravel()
@@ -124,29 +126,32 @@ def _terms(points: np.ndarray, low: np.ndarray, high: np.ndarray, degree: int) -
 
 _SAME_POSITION_MM = 1e-6  # rounding of positions stored as floating-point numbers
 _ALONG_Z = 0.9  # cosine of the angle between the stage's direction and the laser's axis
-_ORIGIN_POINTS = 100  # stripe points about the camera's axis on which the origin of the OCS rests
+_ORIGIN_POINTS = 100  # stripe points near the camera's axis that define the origin of the OCS
 
 
 @dataclass(frozen=True, eq=False)
 class PlateStripes:
-    """Stripe points of all images on the plate: N points."""
+    """Stripe points of all images on the plate (N points)."""
 
     pixels: np.ndarray  # (N, 2)
     lines: np.ndarray  # (N,) int; profile line of each point
     centres_px: np.ndarray  # (N,); stripe's centre on the line
     plate_mm: np.ndarray  # (N, 2); place on the plate, in the target's frame
     pose: np.ndarray  # (N,) int; number of the image
-    stage_mm: np.ndarray  # (N,); where the stage stood
+    stage_mm: np.ndarray  # (N,); stage position
 
 
 def common_header(captures: Sequence[Capture]) -> CaptureHeader:
-    """The first capture's header.
+    """Return the first capture's header.
 
-    Raises CalibrationError: there is no capture, one has no target, the others describe another arrangement, or the
-    stage does not move along Z.
+    Raises
+    ------
+    CalibrationError
+        There is no capture, one has no target, the captures differ in their arrangement, or the stage does not move
+        along Z.
     """
     if not captures:
-        raise CalibrationError("no capture of a target is given: the polynomials are fitted to nothing else")
+        raise CalibrationError("no capture of a target is given: polynomials are fitted to these")
     first = captures[0]
 
     def arrangement(capture: Capture) -> dict[str, Any]:
@@ -163,11 +168,11 @@ def common_header(captures: Sequence[Capture]) -> CaptureHeader:
 
     for capture in captures:
         if capture.header.target is None:
-            raise CalibrationError(f"{capture.path.name} does not describe its target: its header has none")
+            raise CalibrationError(f"{capture.path.name} does not describe its target in its header")
         for (name, own), other in zip(arrangement(capture).items(), arrangement(first).values(), strict=True):
             if own != other:
                 raise CalibrationError(
-                    f"{capture.path.name} does not belong to {first.path.name}: {name} is {own} against {other}"
+                    f"{capture.path.name} does not match {first.path.name}: {name} is {own} instead of {other}"
                 )
     direction = first.header.stage_direction
     if abs(direction[2]) < _ALONG_Z:
@@ -180,12 +185,15 @@ def common_header(captures: Sequence[Capture]) -> CaptureHeader:
 def stripes_on_plate(
     evidence: AirEvidence, header: CaptureHeader, degree: int
 ) -> tuple[PlateStripes, list[PlateMap], list[str]]:
-    """Stripe points on the plate among or next to the target's points in the same image, the maps, and warnings.
+    """Return stripe points on the plate near the target's points in the same image, the maps, and warnings.
 
-    A point counts up to one spacing outside the hull of the target's points in the image, and up to half of one outside
-    the pattern. Images without such points have no map.
+    Points are used up to one spacing outside the hull of the target's points in the image, and up to half a spacing
+    outside the pattern. Images without such points have no map.
 
-    Raises CalibrationError: there are fewer positions than a polynomial of this degree has coefficients.
+    Raises
+    ------
+    CalibrationError
+        There are fewer positions than coefficients of a polynomial of this degree.
     """
     target = evidence.target
     spacing, extent = target.spacing_mm, target.extent_mm
@@ -207,7 +215,7 @@ def stripes_on_plate(
             maps.append(plate_map)
             parts.append((pixels[on_plate], plate[on_plate], number, image.stage_mm))
         else:
-            warnings.append(f"stage position {image.stage_mm:g} mm: left out, the stripe does not fall on the target")
+            warnings.append(f"stage position {image.stage_mm:g} mm: left out, the stripe is not on the target")
     positions = np.sort([stage for *_, stage in parts])
     different = int(np.count_nonzero(np.diff(positions) > _SAME_POSITION_MM)) + 1 if len(positions) else 0
     if evidence.no_stripe:
@@ -231,11 +239,11 @@ def stripes_on_plate(
 
 
 def object_coordinates(stripes: PlateStripes, header: CaptureHeader) -> tuple[np.ndarray, np.ndarray]:
-    """Z and Y (N,) of the stripe points in the OCS.
+    """Return Z and Y (N,) of the stripe points in the OCS.
 
-    The plate stands still, so in the OCS it moves against the stage. Y runs along the stripe on the plate, in the sense
-    in which the described fan runs through the image. The origin is where the sensor as described sees the stripe
-    points next to its camera's axis.
+    The plate is at rest, so in the OCS it moves opposite to the stage. Y is along the stripe on the plate, with the
+    sign of the described fan in the image. The origin is where the described sensor sees the stripe points nearest to
+    its camera's axis.
     """
     camera = header.sensor.camera
     direction = np.array(header.stage_direction)
@@ -257,16 +265,15 @@ def object_coordinates(stripes: PlateStripes, header: CaptureHeader) -> tuple[np
     known = np.flatnonzero(seen.status == RayStatus.OK)
     if not len(known):
         raise CalibrationError(
-            "the sensor as described sees the sheet at none of the stripe points: check baseline, angle and "
-            "stripe_along"
+            "the described sensor sees the sheet at none of the stripe points: check baseline, angle and stripe_along"
         )
     _, along_nominal, depth_nominal = seen.points_mm[known].T
     nominal_motion, motion = (values - np.median(values) for values in (depth_nominal, depth[known]))
     if np.sum(nominal_motion * motion) <= 0:
         raise CalibrationError(
-            "the stripe moves through the image the other way than the stage's positions say: check the sign of the "
-            f"captures' stage_direction, {header.stage_direction}, on which side the laser stands, and that the images "
-            "are not turned by 180 deg or mirrored"
+            "the stripe moves through the image opposite to the stage positions: check the sign of the captures' "
+            f"stage_direction, {header.stage_direction}, the laser's side, and that the images are not rotated by 180 "
+            "deg or mirrored"
         )
     from_axis = np.hypot(*(stripes.pixels[known] - camera.principal_point()).T)
     middle = np.argsort(from_axis, kind="stable")[:_ORIGIN_POINTS]

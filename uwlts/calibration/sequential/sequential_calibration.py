@@ -15,7 +15,13 @@ from uwlts._version import __version__
 from uwlts.calibration.camera.camera_parameters import CameraOptions
 from uwlts.calibration.camera.lens import LensCalibration, LensChoice, calibrate_lens, half_doubt, jackknife
 from uwlts.calibration.camera.target_poses import CameraSolution, Poses, refuse_turned_travel, solve_camera
-from uwlts.calibration.capture_evidence import AirEvidence, StepEvidence, air_evidence, no_stripe_in, step_evidence
+from uwlts.calibration.capture_evidence import (
+    AirEvidence,
+    StepEvidence,
+    air_evidence,
+    explain_missing_stripe,
+    step_evidence,
+)
 from uwlts.calibration.sequential.sheet_fit import (
     SheetSolution,
     StripePoints,
@@ -33,8 +39,8 @@ from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture, source_of
 from uwlts.stripe import StripeSettings
 
-_FEWEST_LEFT_OUT = 4  # images; of fewer the jackknife says little
-_CLEARLY_LESS = 0.7  # of the misses: so much less with a free direction of the stage is no chance
+_FEWEST_LEFT_OUT = 4  # images; with fewer, the jackknife is unreliable
+_CLEARLY_LESS = 0.7  # ratio of residuals: a smaller one with a free stage direction is significant
 _LARGEST_USUAL_TURN = np.radians(5)  # design values are rough, so only larger deviations are reported
 
 
@@ -44,18 +50,20 @@ class CalibrationOptions:
 
     Attributes
     ----------
-    refractions : 2: a pane of glass of known thickness and index; the images in air are taken without the window. 1: a
-        single interface; the images in air are taken with the window in place, whose effect goes into the distortion
+    refractions : 2: glass plate of known thickness and index; the images in air are taken without the window. 1: single
+        interface; the images in air are taken through the window, with its effect included in the distortion
     poses : as for `solve_camera`
-    camera : camera parameters that are estimated
-    lens : in place of ``camera``: choose the lens from the images, and leave doubtful points and images out. The joint
-        calibration takes only coefficients from it
-    correct_circles : take out the offset between a circle's image and the image of its centre
+    camera : camera parameters to estimate
+    lens : in place of ``camera``: select the lens model from the images, and reject outlier points and images. The
+        joint calibration takes only coefficients from it
+    correct_circles : correct the offset between a circle's image and the image of its centre
     medium_index : replaces the index of the medium of the step images
-    same_water : jointly: whether scans were taken in the same water as the target, not only in one described alike
-    sizes_known : jointly: whether diameters and spacings of what was scanned count as calibrated where their
-        uncertainty is stated; they are estimated otherwise
-    strict : jointly: refuse images that do not fit, in place of leaving them out or stating an error of the model
+    same_water : jointly: whether scans were taken in the same water as the target, not only in water with the same
+        description
+    sizes_known : jointly: whether diameters and spacings of scanned objects are known if their uncertainty is stated;
+        otherwise they are estimated
+    strict : jointly: raise an error for images that do not fit, instead of rejecting them or stating an error of the
+        model
     """
 
     refractions: Literal[1, 2] = 2
@@ -72,11 +80,11 @@ class CalibrationOptions:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """A calibration with everything a report shows of its making.
+    """Calibration with the data of its report.
 
     Attributes
     ----------
-    steps : those used for the window, in the order of its figures
+    steps : step images used for the window, in the order of its figures
     """
 
     calibration: Calibration
@@ -91,16 +99,16 @@ class CalibrationResult:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """All that the captures of a calibration show.
+    """Evidence from the captures of a calibration.
 
     Attributes
     ----------
-    sensor : as the captures of the target describe it
-    medium_kind : kind of the medium in which the target was seen
-    stage_direction : (3,); nominal direction of the stage before the target, in the OCS
-    approaching : whether the stage moves the sensor towards the target; None where that does not matter
-    window : description of the camera's window before the step standard; None without step captures
-    sources : what the captures say of themselves, for the calibration's provenance
+    sensor : as described by the captures of the target
+    medium_kind : kind of the medium of the target's images
+    stage_direction : (3,); nominal direction of the stage for the target, in the OCS
+    approaching : whether the stage moves the sensor towards the target; None if irrelevant
+    window : description of the camera's window for the step standard; None without step captures
+    sources : origin of the captures, for the calibration's provenance
     """
 
     sensor: Sensor
@@ -121,15 +129,21 @@ def calibrate_sequentially(
     options: CalibrationOptions | None = None,
     progress: ProgressListener = unheard,
 ) -> CalibrationResult:
-    """Calibrate a sensor from its captures; without step captures for use in the medium of the target's images only.
+    """Calibrate a sensor from its captures; without step captures, for the medium of the target's images only.
 
     Parameters
     ----------
-    air : a target in air, moved along by the stage; each capture a placement of its own. Images with the laser off show
-        the target, those with the laser on, at the same stage positions, the stripe on it. Seen through the window in
-        another medium, and without step captures, they give the calibration of a single viewpoint: refraction goes into
-        focal length and distortion.
-    steps : a step standard in the medium of use
+    air
+        Captures of a target in air, moved by the stage; each capture is a separate placement. Images with the laser off
+        show the target, those with the laser on, at the same stage positions, the stripe on it. In another medium
+        through the window and without step captures, they give a single-viewpoint calibration: refraction is included
+        in focal length and distortion.
+    steps
+        Captures of a step standard in the medium of use.
+    options
+        Settings of the calibration.
+    progress
+        Called with the number of images done, the total, and the name of the stage.
 
     Raises
     ------
@@ -149,16 +163,16 @@ def gather(
     options: CalibrationOptions,
     progress: ProgressListener = unheard,
 ) -> Evidence:
-    """Find the target, the stripes on it and on the step standard in all images; errors as `calibrate_sequentially`.
+    """Find the target, and the stripes on it and on the step standard, in all images.
 
-    CalibrationError also where a capture is given twice.
+    Raises errors as `calibrate_sequentially`, and CalibrationError if a capture is given twice.
     """
     sensor = common_sensor([*air, *steps])
     media = {capture.header.medium.kind for capture in air}
     if len(media) > 1 or (steps and media != {"air"}):
         raise CalibrationError(
             f"the target was seen in {' and '.join(sorted(media))}: take all images of it in air if a step standard "
-            "is to find the window, else all in the medium of use"
+            "determines the window, else all in the medium of use"
         )
     sources = sources_of(air, steps)
     found = air_evidence(air, stripe=options.stripe, progress=progress)
@@ -170,7 +184,7 @@ def gather(
         )
         warnings += left_out
         if not on_steps:
-            raise CalibrationError(no_stripe_in(steps))
+            raise CalibrationError(explain_missing_stripe(steps))
     return Evidence(
         sensor=sensor,
         medium_kind=air[0].header.medium.kind,
@@ -185,9 +199,9 @@ def gather(
 
 
 def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolution | None = None) -> CalibrationResult:
-    """Calibrate from what the captures show, near ``start`` if it is given; errors as `calibrate_sequentially`."""
+    """Calibrate from gathered evidence, optionally near ``start``; errors as `calibrate_sequentially`."""
     sensor = evidence.sensor
-    seen = _camera_of(evidence, options, start)
+    seen = _calibrate_camera(evidence, options, start)
     camera, found = seen.camera, seen.air
     if found.no_stripe:
         raise CalibrationError(found.no_stripe)
@@ -199,11 +213,11 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
     figures, apart = {"camera": camera.figures()}, None
     warnings = [*evidence.warnings, *seen.warnings]
     if seen.lens is not None:
-        sheet, apart = _by_images(sheet, seen.lens, found), _halves_apart_rad(sheet, seen.lens, found)
+        sheet, apart = _add_image_uncertainty(sheet, seen.lens, found), _angle_between_halves(sheet, seen.lens, found)
         figures["camera"] |= _lens_figures(seen.lens, found)
         warnings += seen.lens.half_doubts()
         if apart is not None:
-            words = f"their sheets are {np.degrees(apart):.3f} deg apart"
+            words = f"their sheets differ by {np.degrees(apart):.3f} deg"
             warnings += half_doubt(words, apart=apart, std=sheet.normal_std_rad)
     figures["sheet"] = sheet.figures(stripe_points, apart)
     warnings += _turn_warnings(camera, sheet, evidence)
@@ -240,8 +254,8 @@ def solve(evidence: Evidence, *, options: CalibrationOptions, start: CameraSolut
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """A camera, the lens it was chosen with or None, the images it rests on, and what speaks against it."""
+class _CameraResult:
+    """Camera, selected lens or None, used images, and warnings."""
 
     camera: CameraSolution
     lens: LensCalibration | None
@@ -249,8 +263,8 @@ class _Seen:
     warnings: list[str]
 
 
-def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSolution | None) -> _Seen:
-    """The camera from the images of the target, near ``start`` if that is given, or with a lens that is chosen."""
+def _calibrate_camera(evidence: Evidence, options: CalibrationOptions, start: CameraSolution | None) -> _CameraResult:
+    """Calibrate the camera from the images of the target, near ``start`` if given, or with lens selection."""
     air = evidence.air
     width_px, height_px = evidence.sensor.camera.width_px, evidence.sensor.camera.height_px
     approaching = evidence.approaching is not False
@@ -260,7 +274,7 @@ def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSol
     )
     if options.lens is None:
         estimated = options.camera.described(evidence.sensor.camera)
-        return _Seen(solved(air.images, poses=options.poses, options=estimated, start=start), None, air, [])
+        return _CameraResult(solved(air.images, poses=options.poses, options=estimated, start=start), None, air, [])
     lens = calibrate_lens(
         air.images,
         width_px=width_px,
@@ -284,12 +298,12 @@ def _camera_of(evidence: Evidence, options: CalibrationOptions, start: CameraSol
         freer = solved(used.images, poses="stage", options=lens.options)
         if freer.stage_tilt_rad is not None and freer.sigma_px <= _CLEARLY_LESS * camera.sigma_px:
             unsquare = solved(used.images, poses=options.poses, options=replace(lens.options, pixel_aspect=None))
-            warnings.append(_leaning(camera, freer, unsquare, tilt_rad=freer.stage_tilt_rad))
-    return _Seen(camera, lens, used, warnings)
+            warnings.append(_describe_stage_tilt(camera, freer, unsquare, tilt_rad=freer.stage_tilt_rad))
+    return _CameraResult(camera, lens, used, warnings)
 
 
 def _lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonValue]:
-    """Models tried and images used, of ``found`` those alone, as files hold them; None for what is missing."""
+    """Return compared models and used images for files; None for missing values."""
     rms = lens.solution.image_rms_px()
     columns = zip(found.names(), found.images, rms, lens.moved, found.stripes, found.outliers, strict=True)
     table: list[JsonValue] = [
@@ -317,9 +331,15 @@ def _lens_figures(lens: LensCalibration, found: AirEvidence) -> dict[str, JsonVa
 
 
 def common_sensor(captures: Sequence[Capture]) -> Sensor:
-    """The first capture's sensor; CalibrationError where another has other optics, or there is none."""
+    """Return the first capture's sensor.
+
+    Raises
+    ------
+    CalibrationError
+        Another capture has other optics, or there is no capture.
+    """
     if not captures:
-        raise CalibrationError("no capture is given: a calibration starts with one of a target")
+        raise CalibrationError("no capture is given: a calibration needs one of a target")
     sensor = captures[0].header.sensor
 
     def optics(capture: Capture) -> dict[str, object]:
@@ -333,24 +353,24 @@ def common_sensor(captures: Sequence[Capture]) -> Sensor:
     for capture in captures[1:]:
         own, other = optics(capture), optics(captures[0])
         differ = ", ".join(
-            f"its {name} is {own[name]} against {other[name]}" for name in own if own[name] != other[name]
+            f"its {name} is {own[name]} instead of {other[name]}" for name in own if own[name] != other[name]
         )
         if differ:
             camera = capture.header.sensor.camera
             turned = (camera.height_px, camera.width_px) == (sensor.camera.width_px, sensor.camera.height_px)
             raise CalibrationError(
-                f"{capture.path.name} comes from another sensor than {captures[0].path.name}: {differ}"
-                + ("; the images of one are turned by a quarter turn" if turned and "size" in differ else "")
+                f"{capture.path.name} is from another sensor than {captures[0].path.name}: {differ}"
+                + ("; the images of one are rotated by 90 deg" if turned and "size" in differ else "")
             )
     return sensor
 
 
 def _approaching(air: Sequence[Capture]) -> bool:
-    """Whether the stage moves the sensor towards the target, which stands square to the OCS's Z before the sensor."""
+    """Return whether the stage moves the sensor towards the target, which is perpendicular to the OCS's Z."""
     along = {capture.header.stage_direction[2] / np.linalg.norm(capture.header.stage_direction) for capture in air}
     if min(map(abs, along)) < 0.9 or min(along) * max(along) < 0:
         raise CalibrationError(
-            "the stage must move the sensor along the laser's axis (OCS Z), the same way in all captures; "
+            "the stage must move the sensor along the laser's axis (OCS Z), in the same direction in all captures; "
             f"the captures' stage_direction has the Z component {', '.join(f'{z:.2f}' for z in sorted(along))}: use "
             "poses='free' with a tilted target"
         )
@@ -359,31 +379,32 @@ def _approaching(air: Sequence[Capture]) -> bool:
 
 def _window_warnings(air: Sequence[Capture], steps: Sequence[Capture], options: CalibrationOptions) -> list[str]:
     if not all(capture.header.sensor.camera.window.mounted for capture in steps):
-        raise CalibrationError("a step capture says its camera has no window: there is no distance to find")
+        raise CalibrationError("a step capture has no window (window.mounted): its distance cannot be determined")
     if not steps:
         return []
     mounted = [capture.header.sensor.camera.window.mounted for capture in air]
     if options.refractions == 2 and any(mounted):
         return [
-            "the window stood before the camera in air, so its shift of the rays went into the camera's parameters: "
-            "with two refractions take the images in air without it, or use refractions=1"
+            "the window was mounted in air, so its shift of the rays is included in the camera's parameters: with two "
+            "refractions, take the images in air without it, or use refractions=1"
         ]
     if options.refractions == 1 and not all(mounted):
-        return ["the window was removed in air and is one interface in the medium: its thickness appears nowhere"]
+        return ["the window was removed in air and is one interface in the medium: its thickness is ignored"]
     return []
 
 
-def _by_images(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> SheetSolution:
-    """The sheet with the uncertainty of its normal as it follows from leaving out one image after the other.
+def _add_image_uncertainty(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> SheetSolution:
+    """Estimate the uncertainty of the sheet's normal by leaving out one image at a time.
 
-    Camera and poses are those without the image, so that their errors, which the points of one image share, count.
+    Camera and poses are those without the image, so that errors common to its points are included.
     """
     normal = np.array(sheet.model.normal)
     changes = [
         other - normal
         for number, solution in enumerate(lens.without)
         if len(found.stripes[number])
-        and (other := _normal_by(solution, np.delete(np.arange(len(found.stripes)), number), normal, found)) is not None
+        and (other := _estimate_normal(solution, np.delete(np.arange(len(found.stripes)), number), normal, found))
+        is not None
     ]
     if len(changes) < _FEWEST_LEFT_OUT:
         return sheet
@@ -391,10 +412,10 @@ def _by_images(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) 
     return replace(sheet, normal_std_rad=max(sheet.normal_std_rad, std))
 
 
-def _normal_by(
+def _estimate_normal(
     solution: CameraSolution | None, numbers: np.ndarray, near: np.ndarray, found: AirEvidence
 ) -> np.ndarray | None:
-    """Normal (3,) of the sheet by a camera that was solved from some of the images; None where it determines none."""
+    """Return the sheet's normal (3,) with a camera from some of the images; None if they do not determine it."""
     if solution is None:
         return None
     stripes = [found.stripes[number] for number in numbers]
@@ -404,28 +425,31 @@ def _normal_by(
     return None
 
 
-def _halves_apart_rad(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> float | None:
-    """Angle between the normals of the sheets by two halves of the images, each with its own camera."""
+def _angle_between_halves(sheet: SheetSolution, lens: LensCalibration, found: AirEvidence) -> float | None:
+    """Return the angle between the sheet normals of two halves of the images, each with its own camera."""
     numbers, near = np.arange(len(found.stripes)), np.array(sheet.model.normal)
-    one, two = (_normal_by(half, numbers[first::2], near, found) for first, half in enumerate(lens.halves))
+    one, two = (_estimate_normal(half, numbers[first::2], near, found) for first, half in enumerate(lens.halves))
     return None if one is None or two is None else float(np.arccos(np.clip(one @ two, -1.0, 1.0)))
 
 
-def _leaning(camera: CameraSolution, freer: CameraSolution, unsquare: CameraSolution, *, tilt_rad: float) -> str:
-    """What speaks against a stage that moves along the target's normal: one that moves freely, or other pixels.
+def _describe_stage_tilt(
+    camera: CameraSolution, freer: CameraSolution, unsquare: CameraSolution, *, tilt_rad: float
+) -> str:
+    """Describe that a free stage direction, or another pixel shape, fits better than motion along the normal.
 
-    Images of one pose, moved along the stage, hardly tell the two apart.
+    Images of one pose that is moved by the stage barely distinguish the two.
     """
     tilt, f, other_f = np.degrees(tilt_rad), camera.model.fx_px, freer.model.fx_px
     warning = (
-        f"the stage moves {tilt:.2f} deg beside the target's normal: with poses 'stage' the points miss by "
-        f"{freer.sigma_px:.3f} in place of {camera.sigma_px:.3f} px, and f is {other_f:.1f} in place of {f:.1f} px"
+        f"the stage moves at {tilt:.2f} deg to the target's normal: with poses 'stage' the residuals are "
+        f"{freer.sigma_px:.3f} instead of {camera.sigma_px:.3f} px, and f is {other_f:.1f} instead of {f:.1f} px"
     )
     if unsquare.sigma_px <= _CLEARLY_LESS * camera.sigma_px:
         model = unsquare.model
         warning += (
-            f"; or pixels are not of the shape described: free, they miss by {unsquare.sigma_px:.3f} px, with fx "
-            f"{model.fx_px:.1f} and fy {model.fy_px:.1f} px. Views of the target turned by 20 deg and more would tell"
+            f"; or the pixels' shape is not as described: with free pixels, residuals are {unsquare.sigma_px:.3f} px, "
+            f"fx {model.fx_px:.1f} and fy {model.fy_px:.1f} px. Views of the target tilted by "
+            "20 deg or more would show which"
         )
     return warning
 
@@ -445,9 +469,12 @@ def _turn_warnings(camera: CameraSolution, sheet: SheetSolution, evidence: Evide
 
 
 def sources_of(air: Sequence[Capture], steps: Sequence[Capture], scans: Sequence[Capture] = ()) -> dict[str, JsonValue]:
-    """Captures, software and date of a calibration, for its provenance.
+    """Return captures, software and date of a calibration, for its provenance.
 
-    CalibrationError where one is given twice, so that its noise would count as two independent ones.
+    Raises
+    ------
+    CalibrationError
+        A capture is given twice, so its noise would count twice.
     """
     kinds = {"air_captures": air, "step_captures": steps, "scan_captures": scans}
     sources = {kind: [source_of(capture) for capture in captures] for kind, captures in kinds.items()}

@@ -1,4 +1,4 @@
-"""The laser sheet as a plane: stripe points on the target at known poses, the plane through them, and the OCS."""
+"""Laser sheet as a plane: stripe points on the target at known poses, the plane through them, and the OCS."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,21 +14,21 @@ from uwlts.fitting.shapes import fit_plane
 from uwlts.model.calibration import CameraModel, SheetModel, rigid_transform
 from uwlts.optics.camera import directions
 
-# Spread of the points along the shorter direction of the sheet over their scatter across it, and over their spread
-# along the longer one: below, the scatter turns the plane. A single stripe scatters within the target's plane, which
-# would pass for the sheet.
+# Smallest spread of the points along the shorter direction of the sheet, relative to their scatter across it, and
+# to their spread along the longer direction: below, the scatter rotates the plane. A single stripe scatters within
+# the target's plane, which could be mistaken for the sheet.
 _LEAST_SPREAD = 20.0
 _LEAST_SHAPE = 0.01
-_LARGEST_REJECTED = 0.2  # outliers are few; where more points leave the plane, there is none
-_LARGEST_TURN = np.radians(60)  # descriptions are rough; beyond this axes are exchanged or signs wrong
+_LARGEST_REJECTED = 0.2  # outliers are few; if more points are off the plane, there is none
+_LARGEST_TURN = np.radians(60)  # descriptions are rough; beyond this, axes are exchanged or signs wrong
 _OTHER_UNIT = 5.0  # descriptions are rough, but not by this factor
-_LEAST_OFFSET_MM = 10.0  # nearer to the camera than this the sheet's distance shows no factor
-_CROSSING = 0.3  # cosine from which it is of use to say where the sheet crosses an axis
+_LEAST_OFFSET_MM = 10.0  # for a smaller offset from the camera, the factor is meaningless
+_CROSSING = 0.3  # cosine above which the sheet's intersection with an axis is reported
 
 
 @dataclass(frozen=True, eq=False)
 class StripePoints:
-    """Stripe points on the target: (N, 3) in mm, camera frame, and the number (N,) of the image of each."""
+    """Stripe points on the target: (N, 3) in mm, camera frame, and the image number (N,) of each."""
 
     points_mm: np.ndarray
     image: np.ndarray
@@ -36,19 +36,19 @@ class StripePoints:
 
 @dataclass(frozen=True, eq=False)
 class SheetSolution:
-    """A calibrated sheet."""
+    """Calibrated sheet."""
 
     model: SheetModel
     residuals_mm: np.ndarray  # (N,); signed distances of all points from the plane
-    used: np.ndarray  # (N,) bool; the points that were not left out as outliers
-    rms_mm: float  # over the points used
-    max_mm: float  # over the points used
-    rejected_share: float  # share of the points left out
+    used: np.ndarray  # (N,) bool; inliers
+    rms_mm: float  # over the inliers
+    max_mm: float  # over the inliers
+    rejected_share: float  # fraction of rejected points
     normal_std_rad: float  # largest standard deviation of the normal's direction
     turn_rad: float  # angle between the normal and the nominal one
 
     def figures(self, points: StripePoints, halves_apart_rad: float | None) -> dict[str, JsonValue]:
-        """Distances of the stripe points from the sheet, as files hold them; the angle between the sheets of halves."""
+        """Return distances of the stripe points from the sheet, and the angle between half-sample sheets, for files."""
         return {
             "images": len(np.unique(points.image)),
             "points": len(points.points_mm),
@@ -64,16 +64,15 @@ class SheetSolution:
 def points_on_target(
     camera: CameraModel, stripes: Sequence[np.ndarray], target_poses: np.ndarray, *, plate_mm: np.ndarray
 ) -> StripePoints:
-    """Points where the camera rays of stripe pixels meet the target's plane (thesis, section 4.8).
+    """Intersect the camera rays of stripe pixels with the target's plane (thesis, section 4.8).
 
-    ``stripes`` (N, 2) are the pixels (u, v) of each image, ``target_poses`` (F, 4, 4) its ``T_camera_target``. The
-    target is known to fill the convex hull of ``plate_mm`` (V, 2), points (x, y) of its plane: a stripe outside lies
-    elsewhere.
+    ``stripes`` (N, 2) are the pixels (u, v) of each image, ``target_poses`` (F, 4, 4) its ``T_camera_target``. Points
+    outside the convex hull of ``plate_mm`` (V, 2), points (x, y) of the target's plane, are not on the target.
 
     Raises
     ------
     CalibrationError
-        No stripe pixel falls on the target, or a pose is not finite.
+        No stripe pixel is on the target, or a pose is not finite.
     RangeError
         A pixel is not finite.
     """
@@ -95,8 +94,8 @@ def points_on_target(
         raise CalibrationError(f"no stripe was found in any of {len(stripes)} images of the target")
     if not sum(map(len, kept)):
         raise CalibrationError(
-            f"none of the stripes in {len(stripes)} images falls on the target: check the target's description and the "
-            f"stage positions"
+            f"none of the stripes in {len(stripes)} images is on the target: check the target's description and the "
+            "stage positions"
         )
     return StripePoints(np.vstack(kept), np.concatenate(images))
 
@@ -108,13 +107,16 @@ def fit_sheet(
     nominal_offset_mm: float | None = None,
     largest_rejected: float = _LARGEST_REJECTED,
 ) -> SheetSolution:
-    """Plane through points (N, 3) by orthogonal distances, without those beyond five robust standard deviations.
+    """Fit a plane to points (N, 3) by orthogonal distances, without outliers (five robust standard deviations).
 
-    The normal is turned to the side of ``nominal_normal`` (3,), a unit vector, all in the camera frame;
-    ``largest_rejected`` is the share of the points that may lie elsewhere.
+    The normal is oriented to the side of ``nominal_normal`` (3,), a unit vector, all in the camera frame.
+    ``largest_rejected`` is the permitted fraction of outliers.
 
-    Raises CalibrationError: the points do not determine a plane, do not lie on one, its normal is far from the nominal
-    one, or its distance from the camera is so many times ``nominal_offset_mm`` that units were mistaken.
+    Raises
+    ------
+    CalibrationError
+        The points do not determine a plane or are not on one, its normal is far from the nominal one, or its distance
+        from the camera differs from ``nominal_offset_mm`` by a factor that indicates wrong units.
     """
     try:
         robust = fit_robustly(lambda points: fit_plane(points, towards=nominal_normal), points_mm)
@@ -124,27 +126,27 @@ def fit_sheet(
     longer, shorter = np.sqrt(np.mean(((points_mm[used] - plane.point_mm) @ plane.axes.T) ** 2, axis=0))
     if shorter < max(_LEAST_SPREAD * plane.std_mm, _LEAST_SHAPE * longer):
         raise CalibrationError(
-            f"the stripe points reach only {shorter:.3g} mm (rms) along the shorter side of the sheet, against "
+            f"the stripe points extend only {shorter:.3g} mm (rms) along the shorter side of the sheet, with "
             f"{longer:.3g} mm along the longer one and a scatter of {plane.std_mm:.3g} mm: move the target further "
-            f"between the images"
+            "between the images"
         )
     if robust.rejected_share > largest_rejected:
         raise CalibrationError(
-            f"{100 * robust.rejected_share:.0f} % of the stripe points do not lie on the plane of the others: check "
-            f"the stage positions, and that the stripe falls on the target"
+            f"{100 * robust.rejected_share:.0f} % of the stripe points are not on the plane of the others: check "
+            "the stage positions, and that the stripe is on the target"
         )
     offset = float(plane.normal @ plane.point_mm)
     turn = float(np.arccos(np.clip(plane.normal @ nominal_normal, -1, 1)))
     advice = None
     if how := turned_like(plane.normal, nominal_normal, either_way=True):
         advice = (
-            f", as it is where the images are {how}, or the laser stands on the camera's other side: turn the images, "
-            "or correct the description"
+            f". This occurs if the images are {how}, or the laser is on the camera's other side: correct the images, "
+            "or the description"
         )
     elif turn > _LARGEST_TURN:
-        advice = ": check stripe_along, where the laser stands, and whether the images are turned or mirrored"
+        advice = ": check stripe_along, the laser's position, and whether the images are rotated or mirrored"
     if advice:
-        found = f"the sheet that was found has the normal {np.round(plane.normal, 3).tolist()}"
+        found = f"the sheet found has the normal {np.round(plane.normal, 3).tolist()}"
         axis = int(np.argmax(np.abs(plane.normal[:2])))
         if abs(plane.normal[axis]) > _CROSSING:
             found += f" and crosses the camera's {'xy'[axis]} axis at {offset / plane.normal[axis]:.0f} mm"
@@ -156,15 +158,15 @@ def fit_sheet(
         times = offset / nominal_offset_mm
         if times < 0:
             raise CalibrationError(
-                f"the sheet passes the camera at {offset:.1f} mm, by the sensor's description at "
-                f"{nominal_offset_mm:.1f} mm, on the other side: the images are turned by 180 deg or mirrored, or the "
-                "laser stands on the camera's other side; turn the images, or correct the description"
+                f"the sheet passes the camera at {offset:.1f} mm; expected {nominal_offset_mm:.1f} mm from the "
+                "sensor's description, on the other side: the images are turned by 180 deg or mirrored, or the laser "
+                "is on the camera's other side; correct the images, or the description"
             )
         if not 1 / _OTHER_UNIT < times < _OTHER_UNIT:
             raise CalibrationError(
-                f"the sheet passes the camera at {offset:.1f} mm, by the sensor's description at "
-                f"{nominal_offset_mm:.1f} mm: the target's measures must be in mm (not cm, m or inches), and the "
-                "laser's place that of this sensor"
+                f"the sheet passes the camera at {offset:.1f} mm; expected {nominal_offset_mm:.1f} mm from the "
+                "sensor's description: the target's measures must be in mm (not cm, m or inches), and the laser's "
+                "position must be that of this sensor"
             )
     return SheetSolution(
         model=SheetModel(normal=tuple(plane.normal.tolist()), offset_mm=offset),
@@ -179,18 +181,22 @@ def fit_sheet(
 
 
 def object_frame(sheet: SheetModel, *, laser_axis: np.ndarray) -> np.ndarray:
-    """``T_camera_object`` (4, 4) of the OCS that belongs to a sheet.
+    """Return ``T_camera_object`` (4, 4) of the OCS of a sheet.
 
-    X is the sheet's normal, Z the laser's axis (3,), camera frame, made square to it, Y = Z x X; the origin is where
-    the camera's axis meets the sheet.
+    X is the sheet's normal, Z the laser's axis (3,), camera frame, made perpendicular to X, and Y = Z x X. The origin
+    is the intersection of the camera's axis with the sheet.
 
-    Raises CalibrationError: the laser's axis runs along the normal, or the camera's axis does not meet the sheet in
-    front of the camera.
+    Raises
+    ------
+    CalibrationError
+        The laser's axis is parallel to the normal, or the camera's axis does not meet the sheet in front of the camera.
     """
     x = np.array(sheet.normal)
     z = laser_axis - (laser_axis @ x) * x
     if np.linalg.norm(z) < 0.1 * np.linalg.norm(laser_axis):
-        raise CalibrationError("the laser's nominal axis runs across the calibrated sheet: check the description")
+        raise CalibrationError(
+            "the laser's nominal axis is perpendicular to the calibrated sheet: check the description"
+        )
     z = z / np.linalg.norm(z)
     if not (abs(x[2]) > 1e-9 and sheet.offset_mm / x[2] > 0):
         raise CalibrationError("the camera's axis does not meet the calibrated sheet in front of the camera")

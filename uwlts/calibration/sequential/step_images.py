@@ -1,4 +1,4 @@
-"""Images of a step standard: the faces in each, and how far the standard is turned from facing the laser."""
+"""Images of a step standard: the faces in each, and the standard's rotation from facing the laser."""
 
 import math
 from collections.abc import Sequence
@@ -16,22 +16,21 @@ from uwlts.model.sensor import Uncertainty
 from uwlts.optics.triangulation import points_on_sheet
 
 _FEWEST_PLACES = 3  # images of a face: fewer do not show that it is a plane
-_LEAST_TRAVEL_MM = 5.0  # of the stage across the stripe between them: nearer ones do not show that it is a plane
+_LEAST_TRAVEL_MM = 5.0  # travel of the stage across the stripe: less does not show that the face is a plane
 _STOOD_STILL = 2.0
-"""Times the scatter about their lines by which points may scatter about one plane of all images: the standard stood
-still then."""
-_STAGE_MM = 0.05  # error of a stage that comes in addition
-_SCALE_STD = 0.05  # relative, of profiles by a window that is only described
+"""Largest ratio of the scatter about a common plane to that about single lines for a standard at rest."""
+_STAGE_MM = 0.05  # additional error of a stage
+_SCALE_STD = 0.05  # relative, of profiles with a window that is only described
 _OF_SQUARE = np.sqrt(3) / 2
-"""Root mean square of a²/2 over the variance of a normally distributed angle a, as 1 / cos(a) is 1 + a²/2."""
+"""Root mean square of a²/2 divided by the variance of a normal angle a, as 1 / cos(a) is about 1 + a²/2."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StepImage(StepEvidence):
-    """A stripe on a step standard with the `StepFace` (N,) of every pixel.
+    """Stripe on a step standard with the `StepFace` (N,) of every pixel.
 
-    Within the sheet the step is ``lengthened`` times as high as along its normal, with the relative standard
-    uncertainty ``lengthened_std``: where the standard is turned by a about the stripe, 1 / cos(a) times.
+    Within the sheet, the height is ``lengthened`` times the height along the normal, with the relative standard
+    uncertainty ``lengthened_std``. A rotation by a about the stripe gives 1 / cos(a).
     """
 
     labels: np.ndarray
@@ -39,11 +38,11 @@ class StepImage(StepEvidence):
     lengthened_std: float = 0.0
 
     def height_mm(self) -> float:
-        """The step's calibrated height within the sheet."""
+        """Return the calibrated height of the step within the sheet."""
         return self.lengthened * self.standard.height_mm
 
     def height_std_mm(self, known: Uncertainty) -> float:
-        """Standard uncertainty of that height: of the certificate, or as usually known, and of the turn."""
+        """Return the standard uncertainty of that height, from the certificate (or a usual value) and the rotation."""
         stated = self.standard.height_uncertainty_mm
         return math.hypot(stated / 2 if stated else known.step_height_mm, self.standard.height_mm * self.lengthened_std)
 
@@ -51,16 +50,19 @@ class StepImage(StepEvidence):
 def step_profile(
     calibration: Calibration, window: WindowModel | None, pixels: np.ndarray, *, medium_index: float
 ) -> np.ndarray:
-    """Points (N, 2) of a profile, Y and Z of the OCS in mm, seen through a window; NaN where a ray has no point."""
+    """Return points (N, 2) of a profile, Y and Z of the OCS in mm, through a window; else NaN."""
     seen = points_on_sheet(calibration.model_copy(update={"window": window}), pixels, medium_index=medium_index)
     object_from_camera = np.linalg.inv(calibration.object_transform())
     return seen.points_mm @ object_from_camera[1:3, :3].T + object_from_camera[1:3, 3]
 
 
 def label_step(calibration: Calibration, window: WindowModel | None, step: StepEvidence) -> StepImage:
-    """Separate the faces at the window's nominal distance, where the profile is true to a few percent.
+    """Separate the faces with the window's nominal distance: the profile is accurate to a few percent.
 
-    Raises EvaluationError: the profile does not show two faces.
+    Raises
+    ------
+    EvaluationError
+        The profile does not show two faces.
     """
     points = step_profile(calibration, window, step.pixels, medium_index=step.medium_index)
     found = np.isfinite(points).all(axis=1)
@@ -71,11 +73,11 @@ def label_step(calibration: Calibration, window: WindowModel | None, step: StepE
 
 @dataclass(frozen=True)
 class StandardTurn:
-    """How far a step standard is turned from facing the laser, in rad.
+    """Rotation of a step standard from facing the laser, rad.
 
-    ``aside`` (root mean square of the images) is about the sheet's normal, which profiles show, and which does not
-    change a height; ``about_stripe`` with its standard uncertainty ``std`` does. Where that does not show, it is None,
-    and ``std`` what it is taken to be: as large as the other.
+    ``aside`` (root mean square over the images) is about the sheet's normal; it is visible in profiles and does not
+    change heights. ``about_stripe``, with the standard uncertainty ``std``, changes heights. If it is unknown, it is
+    None, and ``std`` is assumed to be as large as ``aside``.
     """
 
     aside: float
@@ -83,37 +85,37 @@ class StandardTurn:
     std: float
 
     def lengthened(self) -> tuple[float, float]:
-        """Height within the sheet over that along the normal, and its standard uncertainty."""
+        """Return the height within the sheet relative to that along the normal, and its standard uncertainty."""
         turn = self.about_stripe or 0.0
         return float(1 / np.cos(turn)), float(np.hypot(np.tan(turn) * self.std, _OF_SQUARE * self.std**2))
 
     def doubt(self, *, height_mm: float, std_mm: float) -> str:
-        """What it may do to a height, in words; empty where that is less than the height's standard uncertainty."""
+        """Describe the effect on a height; empty if less than the height's standard uncertainty."""
         angle = self.aside if self.about_stripe is None else abs(self.about_stripe)
         share = 1 / np.cos(angle) - 1
         if share * height_mm <= std_mm:
             return ""
-        higher = f"seems higher by {100 * share:.2f} % or {share * height_mm:.3f} mm"
-        said = "the standard does not face the laser: it is turned by"
+        higher = f"appears higher by {100 * share:.2f} % or {share * height_mm:.3f} mm"
+        said = "the standard does not face the laser: it is rotated by"
         if self.about_stripe is None:
             return (
-                f"{said} {np.degrees(angle):.1f}° about the sheet's normal. That changes no height, but turned as "
-                f"much about the stripe, which these images do not show, it {higher}: let it face the laser, or let "
-                "the stage move the sensor across the stripe between three images or more"
+                f"{said} {np.degrees(angle):.1f}° about the sheet's normal. This does not change the height. But with "
+                f"the same rotation about the stripe, which these images do not show, it {higher}: make it face "
+                "the laser, or let the stage move the sensor across the stripe between three or more images"
             )
         return (
             f"{said} {np.degrees(angle):.1f} +- {np.degrees(self.std):.1f}° about the stripe and so {higher}, which is "
-            "taken into account: let it face the laser"
+            "taken into account: make it face the laser"
         )
 
 
 def label_steps(
     calibration: Calibration, window: WindowModel | None, steps: Sequence[StepEvidence], *, uncertainty: Uncertainty
 ) -> tuple[list[StepImage | None], list[str]]:
-    """Each image with its faces separated and its standard's turn, as far as that shows; None without two faces.
+    """Separate the faces of each image and estimate the standard's rotation; None for an image without two faces.
 
-    Where the stage moves the sensor across the stripe while the standard stands still, the images of a capture show its
-    turn about the stripe. Warnings tell which images are left out, and which standards do not face the laser.
+    If the stage moves the sensor across the stripe and the standard is at rest, the images of a capture show its
+    rotation about the stripe. Warnings list rejected images, and standards that do not face the laser.
     """
     found: list[StepImage | None] = []
     warnings = []
@@ -127,7 +129,7 @@ def label_steps(
                 warnings.append(f"{step.source}: left out, {error}")
         seen = [image for image in labelled if image is not None]
         if seen:
-            turn, standard = _turn(calibration, window, seen, uncertainty), seen[0].standard
+            turn, standard = _estimate_turn(calibration, window, seen, uncertainty), seen[0].standard
             stated = standard.height_uncertainty_mm
             std_mm = stated / 2 if stated else uncertainty.step_height_mm
             if doubt := turn.doubt(height_mm=standard.height_mm, std_mm=std_mm):
@@ -140,10 +142,10 @@ def label_steps(
     return found, warnings
 
 
-def _turn(
+def _estimate_turn(
     calibration: Calibration, window: WindowModel | None, images: Sequence[StepImage], uncertainty: Uncertainty
 ) -> StandardTurn:
-    """Turn of a standard from the lower face in images of one capture: a line in each, a plane in all together."""
+    """Estimate the rotation of a standard from the lower face in images of one capture: lines, and a common plane."""
     faces = []
     for image in images:
         pixels = image.pixels[image.labels == StepFace.LOWER]

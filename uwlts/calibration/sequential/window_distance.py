@@ -14,34 +14,33 @@ from uwlts.evaluation.step_faces import StepFace, step_height
 from uwlts.model.calibration import Calibration, WindowModel
 from uwlts.model.sensor import Uncertainty
 
-_CURVE_POINTS = 31  # the curve has one valley, several points wide
-_SEARCHED = (0.2, 2.5)  # shares of the described distance, which is measured to better than half
-# Over the whole range of distances the height must change by this many times its scatter, and by more than rounding.
+_CURVE_POINTS = 31  # the curve has one minimum, several points wide
+_SEARCHED = (0.2, 2.5)  # fractions of the described distance, which is measured to better than half
+# Over the whole range of distances, the height must change by this factor of its scatter, and by more than rounding.
 _LEAST_CHANGE = 10.0
 _ROUNDING_MM = 1e-6
 _INDEX_STEP = 1e-5  # for the derivative by the index
 _USUALLY_KNOWN = Uncertainty()
-_AT_BOUND = 1e-3  # share of the range; least squares within bounds stop as close to them
+_AT_BOUND = 1e-3  # fraction of the range; least squares with bounds stop this close to them
 
 
 @dataclass(frozen=True, eq=False)
 class WindowSolution:
-    """The window at the distance that explains the steps best.
+    """Window at the distance that fits the steps best.
 
     Attributes
     ----------
     heights_mm, errors_mm, height_std_mm : (S,); height of the step in every image, its error, and its standard
         deviation from the scatter of the points
-    slopes : (S,); change of each height with the distance
-    std_mm : standard deviation of the distance from the height errors left over; None with a single image
-    scatter_std_mm : standard deviation that the scatter of the points alone gives
-    per_height : shift of the distance per shift of the calibrated height, if all images use the same step
-    per_index : shift of the distance per shift of the index, if all images are taken in the same medium
-    uncertainty_mm : standard uncertainty of the distance, from the errors left over, or the scatter of a single image,
-        and those of the calibrated height and the medium's index, which all images share
-    image_distances_mm : (S,); distance that each image alone gives (thesis, Table 4); NaN where none within the bounds
-        does.
-    curve_mm : (C, 2); tried distances and root mean square height error, NaN where a point cannot be reconstructed
+    slopes : (S,); derivative of each height by the distance
+    std_mm : standard deviation of the distance from the remaining height errors; None with a single image
+    scatter_std_mm : standard deviation from the scatter of the points only
+    per_height : derivative of the distance by the calibrated height, if all images use the same step
+    per_index : derivative of the distance by the index, if all images are taken in the same medium
+    uncertainty_mm : standard uncertainty of the distance, from the remaining errors (or the scatter of a single image),
+        the calibrated height and the medium's index, which are common to all images
+    image_distances_mm : (S,); distance from each single image (thesis, Table 4); NaN outside the bounds
+    curve_mm : (C, 2); tested distances and root mean square height error, NaN if a point cannot be reconstructed
     bounds_mm : (2,)
     """
 
@@ -60,7 +59,7 @@ class WindowSolution:
     bounds_mm: tuple[float, float]
 
     def figures(self, steps: Sequence[StepImage]) -> dict[str, JsonValue]:
-        """Step heights and their errors, the distance's standard deviations, the curve, as files hold them."""
+        """Return step heights with errors, standard deviations of the distance, and the curve, for files."""
         return {
             "images": [step.source for step in steps],
             "distance_mm": self.model.distance_mm,
@@ -90,18 +89,18 @@ def solve_window(
     bounds_mm: tuple[float, float] | None = None,
     known: Uncertainty = _USUALLY_KNOWN,
 ) -> WindowSolution:
-    """Window distance that minimises the mean square height error over all step images.
+    """Find the window distance that minimises the mean square height error over all step images.
 
-    A coarse scan finds the valley, Gauss-Newton within the bounds its bottom. The calibration's camera, sheet and OCS
-    are used, not its window; of ``window`` everything but the distance stays. ``bounds_mm`` (low, high) are the
-    distances to search, by default 0.2 to 2.5 times the nominal one. ``known`` says how well heights are known that
-    have no certificate.
+    A coarse scan finds the valley, and Gauss-Newton steps within the bounds find the minimum. Only the calibration's
+    camera, sheet and OCS are used. ``window`` gives all window parameters except the distance. ``bounds_mm`` (low,
+    high) are the distances to search (default: 0.2 to 2.5 times the nominal one). ``known`` is the uncertainty of
+    heights without a certificate.
 
     Raises
     ------
     CalibrationError
-        No step image, a height that is not positive, the best distance lies at a bound, or the heights hardly depend
-        on the distance.
+        There is no step image, a height is not positive, the best distance is at a bound, or the heights depend too
+        little on the distance.
     RangeError
         A pixel or the medium's index is not finite.
     """
@@ -123,10 +122,10 @@ def solve_window(
     usable = np.isfinite(mean_error)
     if np.count_nonzero(usable) < 3:
         raise CalibrationError(
-            f"the step cannot be reconstructed with a window {low:.1f} to {high:.1f} mm from the pinhole: it would lie "
-            f"behind the step"
+            f"the step cannot be reconstructed with a window {low:.1f} to {high:.1f} mm from the pinhole: the window "
+            "would be behind the step"
         )
-    # The points that can be reconstructed form one range: a window before the nearest point.
+    # Distances with reconstructed points form one range: the window is in front of the nearest point.
     low, high = float(tried[usable][0]), float(tried[usable][-1])
     margin = _AT_BOUND * (high - low)
     best = least_squares(
@@ -144,14 +143,15 @@ def solve_window(
     change, scatter = (np.sqrt(np.mean(v**2)) for v in (np.ptp(scanned[usable], axis=0), height_std))
     if change < max(_LEAST_CHANGE * scatter, _ROUNDING_MM):
         raise CalibrationError(
-            f"the step's height hardly depends on the window's distance: it changes by {change:.3g} mm from {low:.1f} "
-            f"to {high:.1f} mm and scatters by {scatter:.3g} mm; take images in the medium, of a higher step"
+            f"the step's height depends too little on the window's distance: it changes by {change:.3g} mm from "
+            f"{low:.1f} to {high:.1f} mm, with a scatter of {scatter:.3g} mm; take images in the medium of a "
+            "higher step"
         )
     if not low + margin < distance < high - margin:
         raise CalibrationError(
             f"the step's height fits best at the bound of the searched window distances, {low:.1f} to {high:.1f} mm: "
             "check the medium's index, the step's height and the window's described distance, and that the images are "
-            "not turned or mirrored"
+            "not rotated or mirrored"
         )
     own = zip(steps, scanned[usable].T - true[:, None], strict=True)
     squares, freedom = float(slopes @ slopes), len(steps) - 1
@@ -176,7 +176,7 @@ def solve_window(
             scatter_std if std is None else std, per_height * height_std_mm, per_index * index_std
         ),
         image_distances_mm=np.array(
-            [_own_distance(calibration, window, step, tried[usable], scan, distance) for step, scan in own]
+            [_solve_single_distance(calibration, window, step, tried[usable], scan, distance) for step, scan in own]
         ),
         curve_mm=np.column_stack([tried, mean_error]),
         bounds_mm=(low, high),
@@ -184,9 +184,9 @@ def solve_window(
 
 
 def _heights(calibration: Calibration, window: WindowModel, steps: Sequence[StepImage], distance: float) -> np.ndarray:
-    """Height of the step in every image and its standard deviation, mm: (S, 2).
+    """Return the height of the step in every image and its standard deviation, mm: (S, 2).
 
-    NaN where a point of a tread has no reconstruction.
+    NaN if a point of a tread cannot be reconstructed.
     """
     at_distance = window.model_copy(update={"distance_mm": float(distance)})
     heights = np.full((len(steps), 2), np.nan)
@@ -204,12 +204,12 @@ def _heights(calibration: Calibration, window: WindowModel, steps: Sequence[Step
     return heights
 
 
-def _own_distance(
+def _solve_single_distance(
     calibration: Calibration, window: WindowModel, step: StepImage, tried: np.ndarray, errors: np.ndarray, near: float
 ) -> float:
-    """Distance at which one image shows the true height, the one next to ``near``; NaN where there is none.
+    """Return the distance near ``near`` that gives the true height in one image, else NaN.
 
-    ``errors`` are those of the height at the distances tried.
+    ``errors`` are the height errors at the tested distances.
     """
     changes = np.flatnonzero(errors[:-1] * errors[1:] <= 0)
     if not len(changes):

@@ -89,7 +89,7 @@ def test_tangential_distortion_that_is_not_needed_is_known_to_be_small():
 
     auto, none, free = found("auto", 5e-4), found(("k1", "k2"), 5e-4), found(("k1", "k2", "p1", "p2"), 5e-4)
     assert auto.name == "k1 k2, square pixels" and {"p1", "p2"} <= auto.std().keys() and "p1" not in none.std()
-    # Something is known before, so they are known better than images tell, and zero is not known for sure.
+    # Prior knowledge makes them more certain than from images alone, and zero is not known exactly.
     for name in ("p1", "p2"):
         assert auto.std()[name] < min(5e-4, free.std()[name])
         assert abs(auto.values()[name]) < abs(free.values()[name])
@@ -107,7 +107,7 @@ def test_an_image_of_another_board_is_left_out_and_named():
     images = views(5)
     images[7] = replace(images[7], points_mm=images[7].points_mm * [1.04, 1.0, 1.0])
     found = lens(images, distortion=("k1", "k2"), pixels="square")
-    assert list(found.left_out) == [7] and "of its points do not lie where" in found.left_out[7]
+    assert list(found.left_out) == [7] and "of its points are not where" in found.left_out[7]
     assert abs(found.solution.model.fx_px - F) < 5 * found.std()["f"]
 
 
@@ -151,14 +151,14 @@ def test_misplaced_points_are_left_out():
 
 @pytest.mark.slow
 def test_stated_uncertainties_hold_where_the_misses_of_an_image_go_together():
-    """Boards that bow by another amount in every image: points err together, which one by one they do not show."""
+    """Boards with a different bow in every image: point errors are correlated, which single points do not show."""
     errors, stated, independent = [], [], []
     for seed in range(30):
         found = lens(views(100 + seed, count=12, bent=0.15), distortion=("k1", "k2"), pixels="square")
         errors.append(found.solution.model.fx_px - F)
         stated.append(found.std()["f"])
         independent.append(found.solution.std()["f"])
-    # The mean square of 30 normal numbers lies between 0.31 and 2.2 but once in ten thousand times; the stated standard
+    # The mean square of 30 normal numbers is between 0.31 and 2.2 except once in ten thousand times. The standard
     # uncertainties, from twelve images each, scatter by a fifth as well: 1.8 was measured, 14 by independent points.
     ratio = np.mean((np.array(errors) / stated) ** 2)
     assert 0.2 < ratio < 4.0

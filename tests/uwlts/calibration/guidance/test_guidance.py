@@ -78,7 +78,7 @@ def setting(thesis_as_built: Sensor) -> Setting:
 
 
 def seen(setting: Setting, pose: np.ndarray, rng: np.random.Generator) -> TargetView:
-    """What a camera as built finds of a target at a pose."""
+    """Detect a target at a pose with the camera as built."""
     points = setting.target.points_mm
     columns, rows = np.meshgrid(np.arange(setting.target.columns), np.arange(setting.target.rows))
     pixels = lens_of(setting.sensor).pixels(points @ pose[:3, :3].T + pose[:3, 3])
@@ -149,8 +149,8 @@ def test_motion_and_sameness_are_reported_in_pixels(small):
     shifted = PLATE.detect(drawn_lamp(small, PLATE, target_pose(middle_mm=(1.0, 0.0, 378.0))))
     assert way_px(first, again) < 0.1 and judge_motion(first, again) == ()
     assert way_px(first, shifted) == pytest.approx(lens_of(small).fx / 378, rel=0.03)
-    assert judge_motion(first, shifted)[0].startswith("moved: the target went 3.")
-    assert judge_novelty(again, [shifted, first])[0].startswith("too similar to image 2: 0.")
+    assert judge_motion(first, shifted)[0].startswith("moved: the target moved 3.")
+    assert judge_novelty(again, [shifted, first])[0].startswith("too similar to image 2: differs by 0.")
     moved = PLATE.detect(drawn_lamp(small, PLATE, target_pose(tilt_deg=(20, 0))))
     assert judge_novelty(moved, [first, shifted]) == ()
     none_in_common = replace(first, indices=first.indices + 100)
@@ -201,7 +201,7 @@ def test_tilts_are_those_of_the_poses():
     poses = [target_pose(tilt_deg=(20, 0)), target_pose(tilt_deg=(0, -15), middle_mm=(0, 0, 420.0))]
     np.testing.assert_allclose(np.degrees(tilts_rad(poses[0])), (20, 0), atol=1e-9)
     np.testing.assert_allclose(np.degrees(tilts_rad(poses[1])), (0, -15), atol=1e-9)
-    # What is said to be farther is: the target's right end, and its upper end.
+    # The instructions name the farther sides: the target's right end, and its upper end.
     assert (poses[0] @ [50, 0, 0, 1])[2] > (poses[0] @ [-50, 0, 0, 1])[2]
     assert (poses[1] @ [0, -50, 0, 1])[2] > (poses[1] @ [0, 50, 0, 1])[2]
 
@@ -215,7 +215,7 @@ def led(setting: Setting, wanted: Wanted, rng: np.random.Generator, *, most: int
     state = state_of([], setting, wanted)
     while missing(state) and len(poses) < most:
         wish = best_pose(state)
-        # What is held as it was wished is what is wanted, and there is nothing more to say.
+        # The advised pose itself needs no further instruction.
         assert format_pose_advice(wish, state, wish.candidate.pose) == "hold it still, just like this"
         pose = wish.candidate.pose.copy()
         pose[:3, :3] = cv2.Rodrigues(rng.normal(0, 0.05, 3))[0] @ pose[:3, :3]
@@ -271,7 +271,7 @@ def test_an_image_seen_again_gains_little(setting):
     again = seen(setting, state.poses[-1], np.random.default_rng(1))
     other = seen(setting, wish.candidate.pose, np.random.default_rng(1))
     assert gain_of(state, other, wish.candidate.pose) == pytest.approx(wish.gain, rel=0.2)
-    # Seen twice, the same points scatter less, by the square root of two; new ones tell of something else.
+    # The same points seen twice reduce the scatter by the square root of two; new points add other information.
     assert gain_of(state, again, state.poses[-1]) < 0.4 * wish.gain
 
 
@@ -367,7 +367,7 @@ def test_the_step_standard_is_judged(thesis):
         return judge_step(image, calibration, window, standard, medium_index=WATER, full_dn=FULL)
 
     good = judge(step_image(thesis, step_profile(0.0)))
-    # The origin of the OCS is the stand-off in air, 265 mm / tan 35 deg from the pupil; the base lies there, the block
+    # The origin of the OCS is the stand-off in air, 265 mm / tan 35 deg from the pupil; the base is there, the block
     # 23 mm before it, and nearly half of the line on either.
     base = 265 / np.tan(np.radians(35)) - window.distance_mm - window.thickness_mm
     assert good.reasons == () and base - 25 < good.depth_mm < base + 2

@@ -13,12 +13,12 @@ pytestmark = pytest.mark.slow
 
 WET, DRY = 16, 8
 BY_CHANCE = 1e-4
-"""How often a test of a correct uncertainty fails; where all campaigns are drawn by the same seeds, never again."""
+"""Probability that a test of a correct uncertainty fails."""
 
 
 @pytest.fixture(scope="module")
 def outcomes():
-    """What all campaigns found."""
+    """Results of all campaigns."""
     return [run_campaign(Campaign(seed, wet=seed < WET)) for seed in range(WET + DRY)]
 
 
@@ -34,9 +34,10 @@ def measured(outcomes):
 
 @pytest.mark.parametrize("quantity", ["spacing", "diameter"])
 def test_95_percent_intervals_hold_the_truth(measured, quantity):
-    """Two scans of each campaign: 48 spacings, and as many pairs of diameters, which may err alike.
+    """Two scans of each campaign: 48 spacings, and as many pairs of diameters, which can be correlated.
 
-    Were the standard uncertainties half of what they should be, 67 % would be held, so that 95 of 100 such tests fail.
+    If the standard uncertainties were half of the correct ones, 67 % would be inside, so that 95 of 100 such tests
+    fail.
     """
     found = measured[quantity]
     scans = 2 * (WET + DRY)
@@ -58,10 +59,10 @@ def test_errors_are_as_large_as_stated(measured, quantity):
 
 
 def test_the_covariance_is_that_of_the_errors(outcomes):
-    """Errors of lens, window, water, stage, target and step, whitened by their covariance: some 400 of variance one.
+    """Errors of lens, window, water, stage, target and step, whitened by their covariance: some 400 with unit variance.
 
-    Their mean square lies within 0.77 and 1.26. A covariance too large by a factor of 1.5 makes it 0.67, one too small
-    by that factor 1.5.
+    Their mean square is within 0.77 and 1.26. A covariance too large by a factor of 1.5 gives 0.67, one too small by
+    that factor 1.5.
     """
     pulls = np.concatenate([outcome.pulls for outcome in outcomes])
     assert len(pulls) == 20 * WET + 18 * DRY

@@ -1,25 +1,25 @@
-"""Number of independent residuals among correlated ones, on drawn residuals for which it is known."""
+"""Number of independent residuals among correlated ones, for random residuals with a known number."""
 
 import numpy as np
 import pytest
 
-from uwlts.calibration.joint.estimate import judged
+from uwlts.calibration.joint.estimate import estimate_noise
 from uwlts.calibration.joint.residuals import TARGET, Residuals
 
 IMAGES = 9
 
 
 def together(images):
-    """How many residuals count as one, by the points (n, 2) of images and their residuals (n, 2).
+    """Return the variance factor for the points (n, 2) of images and their residuals (n, 2).
 
-    Each image shows points of its own, a little beside those of the others.
+    Each image shows its own points, slightly beside those of the others.
     """
     places = [np.column_stack([at + 0.01 * number, np.zeros(len(at))]) for number, (at, _) in enumerate(images)]
     parts = [
         Residuals(TARGET, found.ravel(), np.empty((found.size, 0)), np.empty((found.size, 0)), np.arange(0), number)
         for number, (_, found) in enumerate(images)
     ]
-    return judged(TARGET, parts, places).together
+    return estimate_noise(TARGET, parts, places).together
 
 
 def lattice(columns, rows):
@@ -29,9 +29,10 @@ def lattice(columns, rows):
 
 @pytest.mark.parametrize(("columns", "rows", "expected"), [(10, 10, 10.0), (20, 10, 20.0), (6, 4, 1.0)])
 def test_what_a_cubic_describes_says_as_much_as_its_ten_coefficients(columns, rows, expected):
-    """n points of an image that err by a polynomial of third order are as good as ten; 24 are too few to tell.
+    """n points of an image with errors from a polynomial of third order are equivalent to ten; 24 are too few to
+    decide.
 
-    4 x^3 - 3 x and x (2 y^2 - 1), whose sizes vary so little that none is taken for an outlier.
+    The polynomials 4 x^3 - 3 x and x (2 y^2 - 1) vary so little that none of the points is an outlier.
     """
     at = lattice(columns, rows)
     x, y = at.T / 100.0

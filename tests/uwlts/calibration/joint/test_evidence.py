@@ -10,7 +10,7 @@ from uwlts.calibration.joint.residuals import SeenSheet
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 
 FEWEST = 5000
-"""Pixels from which there is a table."""
+"""Number of pixels from which a table is used."""
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +35,7 @@ def seen(problem, pixels) -> SeenSheet:
 
 
 def test_points_by_a_table_are_those_of_each_pixel(problem, pixels):
-    """The table errs by 1e-7 mm, and by 1e-7 of the largest derivative; ten times as much between its nodes."""
+    """The table's error is 1e-7 mm, and 1e-7 of the largest derivative; ten times as much between its nodes."""
     sheet = seen(problem, pixels)
     assert sheet.table is not None
     some = np.random.default_rng(3).choice(len(pixels), 300, replace=False)
@@ -55,7 +55,7 @@ def test_few_pixels_or_pixels_between_lines_have_no_table(problem, pixels):
 
 
 def test_rays_that_meet_no_sheet_have_no_points(problem, pixels):
-    """Pixels far outside the image, where the lens has no inverse, many and few."""
+    """Pixels far outside the image, where the lens cannot be inverted, many and few."""
     for some in (pixels, pixels[:10]):
         sheet = seen(problem, some + [0.0, 1e6])
         assert sheet.points() is None

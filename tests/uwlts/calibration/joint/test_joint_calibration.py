@@ -8,7 +8,7 @@ import pytest
 from tests.uwlts.calibration_views import WATER, built_sensor
 from tests.uwlts.joint_views import Noise, assert_derivatives, gathered, lit_points, step_views, target_series
 from tests.uwlts.simulated_campaign import ModelErrors, drawn_reality, evidence
-from uwlts.calibration.joint.initial import series_start
+from uwlts.calibration.joint.initial import estimate_series_start
 from uwlts.calibration.joint.observability import estimate_in, lengths_over, regions
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.procedure import solve_jointly
@@ -68,8 +68,8 @@ def pulls(result):
 def test_the_sheet_is_where_fermat_sees_the_fan(medium_index, tilt_deg, bow):
     """Bow and turned window, to the ends of the fan at 22.5 deg.
 
-    The glass shifts the sheet by t d (1 - 1 / g) = 35 um for a degree between beam and normal, a tenth of that more at
-    the ends of the fan.
+    The glass shifts the sheet by t d (1 - 1 / g) = 35 um for a degree between beam and normal. At the ends of the fan,
+    the shift is a tenth larger.
     """
     turn = np.radians(tilt_deg)
     window = BUILT.laser.window.model_copy(update={"tilt_y_deg": tilt_deg})
@@ -106,7 +106,7 @@ def at_truth(view):
     sheet = DescribedSheet(pose.normal, pose.axis, middle, pose.origin_mm, pose.origin_mm + 36.0 * pose.axis)
     series = target_series(BUILT, medium=view.medium, window=view.window, positions=IN_WATER[:4])
     window = nominal.window
-    start = series_start([series], BUILT, window, [WATER], options=OPTIONS)
+    start = estimate_series_start([series], BUILT, window, [WATER], options=OPTIONS)
     normal = np.array(window.normal) / window.normal[2]
     known = {
         "window_distance": window.distance_mm,
@@ -136,10 +136,11 @@ def at_truth(view):
 @pytest.mark.parametrize("view", [ViewMedium(False, None), ViewMedium(True, None), ViewMedium(True, 0)], ids=str)
 @pytest.mark.parametrize("kind", [TargetEvidence, StepProfileEvidence])
 def test_every_derivative_is_what_differences_say(view, kind):
-    """By differences of the residuals' numerators: a residual is scaled by a derivative that is taken as constant.
+    """Compare with differences of the residuals' numerators: a residual is scaled by a derivative assumed constant.
 
-    Where a residual is r, its scale's change adds r times a relative change: the pixels are therefore moved to where
-    the residuals vanish. Then central differences are exact to the square of the step and to rounding over it.
+    For a residual r, the change of its scale adds r times a relative change. The pixels are therefore moved to
+    positions with zero residuals. Central differences are then exact to the square of the step, and to rounding divided
+    by it.
     """
     parameters, global_values, start = at_truth(view)
     rng = np.random.default_rng(0)
@@ -168,7 +169,7 @@ def test_every_derivative_is_what_differences_say(view, kind):
     assert sum(len(part.values) for part in found) >= 30
     assert max(np.abs(part.values).max() for part in found) < 1e-8
     assert_derivatives(evidence, parameters, global_values, local, within=1e-5)
-    # What is known before is linear, and of none of these other than zero.
+    # Prior residuals are linear, and zero for other parameters.
     off, by_local = evidence.known_before(local, BUILT.uncertainty)
     assert len(off) == (len(local) - 6 if kind is TargetEvidence else 0)
     assert by_local @ local == pytest.approx(off, rel=1e-12)
@@ -229,7 +230,7 @@ def test_stated_uncertainties_hold_over_many_calibrations(thesis):
             target_series(BUILT, medium=0, positions=IN_WATER[::2], bow=BOW, noise=noise, columns=15),
         ]
         found.append(list(pulls(solve_jointly(gathered(thesis, series), options=OPTIONS)).values()))
-    # Some parameters are where their priors say, so the root mean square lies below one; of 72 pulls, many correlated,
+    # Some parameters are at their priors, so the root mean square is below one; of 72 pulls, many correlated,
     # it stays below 1.3.
     assert 0.5 < np.sqrt(np.mean(np.square(found))) < 1.3
     assert np.abs(found).max() < 4.5
@@ -250,7 +251,7 @@ def test_free_poses_are_refused_where_the_stage_moves_as_in_a_mirror(noise, thes
     rotation, free = camera_from_object(thesis)[:3, :3], replace(OPTIONS, poses="free")
     mirrored = rotation.T @ ([1.0, -1.0, 1.0] * rotation[:, 2])
     solve_jointly(gathered(thesis, [replace(series, directions=[(0.0, 0.0, 1.0)])]), options=free)
-    with pytest.raises(CalibrationError, match="turned by 180 deg or mirrored top to bottom: turn the images back"):
+    with pytest.raises(CalibrationError, match="turned by 180 deg or mirrored top to bottom: correct the images"):
         solve_jointly(gathered(thesis, [replace(series, directions=[tuple(mirrored)])]), options=free)
 
 
@@ -293,7 +294,7 @@ def test_images_that_no_camera_explains_are_refused_and_the_worst_named(thesis):
 
     images = [replace(each, pixels=each.pixels + off(number, each)) for number, each in enumerate(air.found.images)]
     spoilt = replace(air, found=replace(air.found, images=images))
-    with pytest.raises(CalibrationError, match="no camera explains the target images in air: .* in target, frame 3: "):
+    with pytest.raises(CalibrationError, match="no camera fits the target images in air: .* in target, frame 3: "):
         solve_jointly(gathered(thesis, [spoilt]), options=OPTIONS)
 
 
@@ -309,10 +310,10 @@ def test_a_target_without_stripes_is_refused(in_water, thesis):
     ids=["saddle", "stretch"],
 )
 def test_a_target_of_another_form_is_noticed_and_taken_for_uncertain(thesis, errors, key):
-    """Far more than the 0.02 mm and 2e-5 that are stated. Which of rows and columns is right, images do not tell.
+    """Far more than the stated 0.02 mm and 2e-5.
 
-    The stretch is found to 3e-4. So one of 2e-3 is noticed, from 0.7e-3 on, but once in 100,000; found to be a hundred
-    times as large as stated, it is refused.
+    Images do not show which of rows and columns is right. The stretch is determined to 3e-4, so a stretch of 2e-3 is
+    noticed (from 0.7e-3 on) except once in 100,000. A stretch a hundred times as large as stated is an error.
     """
     real = drawn_reality(thesis, np.random.default_rng(3), errors=errors)
     try:
@@ -321,7 +322,7 @@ def test_a_target_of_another_form_is_noticed_and_taken_for_uncertain(thesis, err
         assert key is TargetParameter.STRETCH_X and key.quantity.words in str(refusal)
         return
     (warning,) = (each for each in calibration.origin().warnings if key.quantity.words in each)
-    assert "taken for as uncertain" in warning
+    assert "its uncertainty was enlarged" in warning
     place = list(calibration.joint.parameters).index(key)
     true = {TargetParameter.SADDLE: real.target_saddle_mm, TargetParameter.STRETCH_X: real.stretch[0]}[key]
     assert abs(calibration.joint.values[place] - true) < 4 * calibration.joint.std[place]

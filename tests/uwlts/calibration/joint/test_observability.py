@@ -1,4 +1,4 @@
-"""What is said of weak directions; what is predicted of a further shot, against calibrations that have that shot."""
+"""Messages on weak directions; predictions for a further image, compared with calibrations that include it."""
 
 from dataclasses import replace
 
@@ -85,7 +85,7 @@ def test_two_that_cannot_be_distinguished_are_named_together():
     assert "window distance and index of water cannot be separated" in said or (
         "index of water and window distance cannot be separated" in said
     )
-    assert "together they cost 0.020 mm in a length of 100 mm along Z" in said
+    assert "together they add 0.020 mm in a length of 100 mm along Z" in said
 
 
 def test_what_cancels_in_every_length_is_not_named():
@@ -93,18 +93,18 @@ def test_what_cancels_in_every_length_is_not_named():
     covariance = np.array([[1.0, -0.9999999, 0.0], [-0.9999999, 1.0, 0.0], [0.0, 0.0, 1.0]])
     found = weaknesses(lengths([[0.01, 0.01, 0.002]]), keys("window_distance", "f", "glass_index"), covariance)
     assert [each.parameters for each in found] == [(WindowParameter.GLASS_INDEX,)]
-    assert "index of the window's glass is known too little; it costs 0.002 mm" in found[0].words()
+    assert "index of the window's glass is not known well enough; this adds 0.002 mm" in found[0].words()
 
 
 def test_independent_ones_are_not_called_confused():
     found = weaknesses(lengths([[0.01, 0.01]]), keys("window_distance", "glass_index"), np.eye(2))
     assert not found[0].confused
-    assert "are known too little; together they cost 0.014 mm" in found[0].words()
+    assert "are not known well enough; together they add 0.014 mm" in found[0].words()
 
 
 def test_less_than_a_micrometre_is_said_to_be_nothing():
     assert weaknesses(lengths([[0.0009, 0.0]]), keys("window_distance", "f"), np.eye(2)) == []
-    assert "nothing" in format_weaknesses([])[0]
+    assert format_weaknesses([])[0].startswith("no weakly determined parameter")
 
 
 def test_a_height_that_is_the_cause_is_named_though_it_moves_no_point():
@@ -148,7 +148,7 @@ def without(known, key):
     ],
 )
 def test_steps_alone_leave_the_window_open(thesis, height_mm, pair):
-    """A step's height follows from window distance and turned sheet alike; knowing one of the pair really helps."""
+    """A step's height depends on window distance and sheet rotation in the same way; knowing one of them helps."""
     calibration = from_steps(thesis, height_mm=height_mm)
     known, over, found = of_calibration(calibration)
     assert set(found[0].parameters[:2]) == pair
@@ -235,7 +235,7 @@ def shot(sensor, pose, view, spoilt):
 
 @pytest.mark.slow
 def test_the_advised_shot_does_what_was_predicted(from_water, in_water, thesis):
-    """The uncertainty after it within 20 %, as noise, and so the weights, is estimated anew from all residuals."""
+    """Predicted uncertainty within 20 %, as noise, and so the weights, is estimated again from all residuals."""
     outlooks = next_shots(from_water)
     best = outlooks[0]
     assert best.pose is not None

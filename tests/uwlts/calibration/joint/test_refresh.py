@@ -60,7 +60,7 @@ def earlier(thesis):
 
 @cache
 def tread(depth_mm, *, index, between=None, beyond=None):
-    """Pixels on a plane across the sheet at an OCS depth, where |Y| is less or more than so many mm; without noise."""
+    """Pixels on a plane across the sheet at an OCS depth, with |Y| within limits in mm; without noise."""
     frame = camera_from_object(BUILT)
     lit = lit_points(BUILT, normal=frame[:3, 2], point=frame[:3, 3] + depth_mm * frame[:3, 2], index=index, count=600)
     across = np.abs((lit - frame[:3, 3]) @ frame[:3, 1])
@@ -70,7 +70,7 @@ def tread(depth_mm, *, index, between=None, beyond=None):
 
 
 def steps(thesis, *, index=INDEX, depths_mm=(15.0,), medium=WARM, height_mm=STEP_MM, seed=1):
-    """What step captures would give: a standard of 23.17 mm, certified to 1 um, in water that is said to be warm."""
+    """Evidence of step captures: a standard of 23.17 mm, certified to 1 um, in water described as warm."""
     found, rng = [], np.random.default_rng(seed)
     standard = StepStandard(height_mm=height_mm, height_uncertainty_mm=0.002)
     for depth in depths_mm:
@@ -89,7 +89,7 @@ def refreshed(earlier, evidence, **options):
 
 
 def length_error(calibration):
-    """How wrong a plane 80 mm beyond the stand-off is wide in the cold water, mm."""
+    """Return the width error of a plane 80 mm beyond the stand-off in the cold water, mm."""
     frame = camera_from_object(BUILT)
     lit = lit_points(BUILT, normal=frame[:3, 2], point=frame[:3, 3] + 80.0 * frame[:3, 2], index=INDEX)[[20, -21]]
     pixels = seen(BUILT, lit, index=INDEX, window=True)
@@ -100,7 +100,9 @@ def length_error(calibration):
 
 
 def test_one_step_gives_the_index_of_colder_water(earlier, thesis):
-    """Water of 18 degC said to have 25: an index wrong by 6.4e-4. An image of 23 mm known to 1 um tells it to 4e-4."""
+    """Water of 18 degC described as 25 degC: an index error of 6.4e-4. An image of 23 mm known to 1 um gives it to
+    4e-4.
+    """
     result = refreshed(earlier, steps(thesis), index_std=POORLY_KNOWN)
     change = result.changes[0]
     assert change.index_before == pytest.approx(WARM.refractive_index(WAVELENGTH), abs=1e-12)
@@ -117,7 +119,7 @@ def test_one_step_gives_the_index_of_colder_water(earlier, thesis):
 
 
 def test_water_whose_steps_are_left_out_is_not_said_to_be_measured(earlier, thesis):
-    """Two waters, in one of which the stripe lies on the lower tread alone."""
+    """Two waters; in one of them the stripe is on the lower tread only."""
     evidence = steps(thesis)
     flat = replace(evidence.steps[0][0], pixels=tread(15.0, index=INDEX, beyond=31.0))
     evidence = replace(
@@ -138,7 +140,7 @@ def test_steps_near_and_far_bring_lengths_back(earlier, thesis):
 
 @pytest.mark.slow
 def test_stated_uncertainties_of_the_index_hold(thesis):
-    """Pulls of independent calibrations and steps: the mean square of 5 lies within 0.04 and 4.1 (chi2, 99.8 %)."""
+    """Pulls of independent calibrations and steps: the mean square of 5 is within 0.04 and 4.1 (chi2, 99.8 %)."""
     pulls = []
     for seed in range(5):
         change = refreshed(
@@ -233,7 +235,7 @@ def test_what_was_held_is_as_the_calibration_says(earlier):
 
 
 def test_correlations_of_the_earlier_estimate_count(earlier, thesis):
-    """With its variances alone a step would be said to tell other things, and lengths would be known worse."""
+    """With variances only, a step would change other parameters, and lengths would be less certain."""
     covariance = tuple(map(tuple, np.diag(np.diag(earlier.joint.covariance)).tolist()))
     loose = earlier.model_copy(update={"joint": earlier.joint.model_copy(update={"covariance": covariance})})
     full, alone = (
@@ -275,14 +277,14 @@ def test_the_file_holds_old_and_new_water(earlier, thesis, tmp_path):
 @pytest.mark.parametrize("wrong", [{"height_mm": 23.4}, {"index": 1.3385}])
 def test_a_step_that_contradicts_its_description_is_refused(earlier, thesis, wrong):
     """A certificate of another step, or sea water said to be fresh."""
-    with pytest.raises(CalibrationError, match="the steps say that the index of water 2 is 1.3") as caught:
+    with pytest.raises(CalibrationError, match="from the steps, the index of water 2 is 1.3") as caught:
         refreshed(earlier, steps(thesis, **wrong))
-    assert "from the 1.33122 +- 0.000" in str(caught.value)
-    assert "described: check the step's height" in str(caught.value)
+    assert "from the described 1.33122 +- 0.000" in str(caught.value)
+    assert ": check the step's height" in str(caught.value)
 
 
 def moved_since(calibration, name, by):
-    """A calibration of a sensor of which something was otherwise then."""
+    """Return a calibration of the sensor before a parameter changed."""
     joint = calibration.joint
     values = list(joint.values)
     values[joint.parameters.index(parameter_of(name))] += by
@@ -290,7 +292,7 @@ def moved_since(calibration, name, by):
 
 
 def test_a_sensor_that_has_changed_is_noticed(earlier, thesis):
-    """Steps at three depths, in water of which nothing is known: no index accounts for a shifted sheet or new focus."""
+    """Steps at three depths, in unknown water: no index explains a shifted sheet or new focus."""
     evidence = steps(thesis, depths_mm=(-45.0, 15.0, 85.0))
     with pytest.raises(CalibrationError, match=r"contradicts itself: height of the 23.17 mm step found 23\.[2-4]"):
         refreshed(moved_since(earlier, "sheet_offset", 0.45), evidence, index_std=0.02)
@@ -347,7 +349,7 @@ def test_the_command_refreshes_and_says_what_changed(drawn):
     assert "exists already" in again.stderr
     twice = uwlts("refresh", folder / "calibration.refreshed.json", "--step", capture)
     assert twice.returncode == 2
-    assert "was made from step.h5 already: take a new image" in twice.stderr
+    assert "step.h5 was already used for this calibration: take a new image" in twice.stderr
 
 
 def renamed(sensor, **changes):
@@ -367,7 +369,7 @@ def renamed(sensor, **changes):
         (
             lambda s: {"sensor": renamed(s, laser=renamed(s.laser, wavelength_nm=s.laser.wavelength_nm + 3.0))},
             CalibrationError,
-            "with a laser of 638 nm, the calibration is for 635 nm",
+            "with a laser of 638 nm; the calibration is for 635 nm",
         ),
         (
             lambda s: {"sensor": renamed(s, laser=renamed(s.laser, wavelength_nm=520.0))},
@@ -407,7 +409,7 @@ def test_an_unsuitable_calibration_is_refused(drawn, earlier):
         refresh(nominal_calibration(sensor), [])
     with pytest.raises(CalibrationError, match="has no window"):
         refresh(earlier.model_copy(update={"window": None}), [])
-    with pytest.raises(CalibrationError, match="no capture is given"):
+    with pytest.raises(CalibrationError, match="is empty: give at least one image of a step"):
         refresh(earlier, [])
     with Capture(step_capture(folder, sensor, "again.h5")) as capture, pytest.raises(RangeError, match="be positive"):
         refresh(read_calibration(folder / "calibration.json"), [capture], index_std=0.0)

@@ -29,7 +29,7 @@ def test_a_lens_that_is_not_centred_is_found(thesis):
     """Its points are off by pixels without p1; that k3 is given too happens by chance."""
     lens = altered(BUILT, {"camera": {"distortion": {"p1": -0.005}}})
     result = solve_jointly(gathered(thesis, [few_views(lens, stripe_px=0.1)]), options=OPTIONS)
-    assert any(said.startswith("the lens was given p1, p2") for said in result.warnings)
+    assert any(said.startswith("p1, p2 were added to the lens") for said in result.warnings)
     found = result.estimate.values[result.estimate.parameters.keys.index(LensParameter.P1)]
     assert abs(found + 0.005) < 4.5 * result.estimate.std()[LensParameter.P1]
 
@@ -43,13 +43,13 @@ def test_a_wrong_spacing_is_not_taken_for_pixels_that_are_not_square(thesis):
     images = [replace(image, points_mm=image.points_mm * [1.003, 1.0, 1.0]) for image in series.found.images]
     wide = replace(series, found=replace(series.found, images=images))
     result = solve_jointly(gathered(thesis, [wide]), options=OPTIONS)
-    assert any("images show something that the model lacks" in said for said in result.warnings)
+    assert any("images show systematic deviations from the model" in said for said in result.warnings)
     camera = result.calibration.camera
     assert camera.fy_px / camera.fx_px == pytest.approx(1.0, abs=1e-12)
 
 
 def target_in_air_and_water(sensor, *, columns_wider=1.0):
-    """Four images each of a target whose columns are described so many times too far apart."""
+    """Four images each of a target whose described column spacing is too large by a factor."""
     noise = Noise(circles_px=0.03, stripe_px=0.1, stage_mm=0.003, rng=np.random.default_rng(8))
     air = target_series(sensor, window=False, positions=np.linspace(-200.0, 60.0, 4), noise=noise, columns=13)
     water = target_series(sensor, medium=0, positions=np.linspace(-120.0, 60.0, 4), noise=noise, columns=13)
@@ -62,12 +62,12 @@ def target_in_air_and_water(sensor, *, columns_wider=1.0):
 @pytest.mark.parametrize(("aspect", "columns_wider"), [(1.003, 1.0), (1.0, 1.003)])
 @pytest.mark.parametrize("alignment_deg", [0.15, 0.4])
 def test_pixels_of_another_shape_look_like_a_stretched_target(thesis, aspect, columns_wider, alignment_deg):
-    """Where the stage does not tell them apart, both are estimated: the focal lengths are within what is stated."""
+    """If the stage cannot separate them, both are estimated: the focal lengths are within the stated uncertainties."""
     built = altered(BUILT, {"camera": {"pixel_aspect": aspect}})
     known = altered(thesis, {"uncertainty": {"stage_alignment_deg": alignment_deg}})
     evidence = gathered(known, list(target_in_air_and_water(built, columns_wider=columns_wider)))
     result = solve_jointly(evidence, options=OPTIONS)
-    assert any("or pixels are of another shape than described: both are estimated" in said for said in result.warnings)
+    assert any("or the pixels' shape is not as described: both are estimated" in said for said in result.warnings)
     camera, std = result.calibration.camera, result.estimate.std()
     focal_px = built.camera.focal_length_px()
     assert abs(camera.fx_px - focal_px) < 4.5 * std[LensParameter.FX]

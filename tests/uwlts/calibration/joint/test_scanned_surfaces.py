@@ -12,7 +12,7 @@ from tests.uwlts.scan_views import NONE, SLOPE, VIEW, Body, scan_of, square_sens
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
 from uwlts.calibration.joint.estimate import estimate
 from uwlts.calibration.joint.gathering import scan_stripes
-from uwlts.calibration.joint.initial import surface_scan, surface_scans
+from uwlts.calibration.joint.initial import build_all_scan_evidence, build_scan_evidence
 from uwlts.calibration.joint.parameters import DescribedSheet, Parameters, Prior
 from uwlts.calibration.joint.procedure import JointProblem, solve_jointly
 from uwlts.calibration.joint.residuals import STEP, Residuals
@@ -76,11 +76,11 @@ def parameters(**std):
 
 
 def evidence_of(kind, *, stage_mm=STAGE, sizes_known=True, artefact=None, noise=NONE):
-    """Evidence as `surface_scan` makes it by the sensor as built and the stage as described, and its start."""
+    """Evidence as `build_scan_evidence` makes it by the sensor as built and the stage as described, and its start."""
     bodies, described = KINDS[kind]
     stripes, _ = scan_of(SENSOR, bodies, artefact or described, stage_mm=stage_mm, count=700, noise=noise)
     nominal = nominal_calibration(SENSOR)
-    return surface_scan(stripes, nominal, SENSOR, medium_index=WATER, sizes_known=sizes_known, image=0)
+    return build_scan_evidence(stripes, nominal, SENSOR, medium_index=WATER, sizes_known=sizes_known, image=0)
 
 
 def true_own(kind, evidence):
@@ -108,7 +108,7 @@ def true_own(kind, evidence):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_scans_by_fermat_lie_on_the_surface_and_every_derivative_is_what_differences_say(kind):
-    """Where residuals vanish, the scale of a residual does not matter; see the other evidence's test.
+    """If residuals vanish, the scale of a residual does not matter; see the other evidence's test.
 
     Crossings by Fermat are exact to 1e-9 mm, a hundred-millionth of a pixel's 0.2 mm.
     """
@@ -138,7 +138,7 @@ def test_known_sizes_are_off_by_their_standard_uncertainties():
         moved = local.copy()
         moved[place] += 1e-4
         assert surface.sizes(moved).residuals()[0] - off == pytest.approx(column * 1e-4, abs=1e-6)
-    assert len(surface.of_unknown_size().sizes(local).residuals()[0]) == 0
+    assert len(surface.free_sizes().sizes(local).residuals()[0]) == 0
 
 
 class _Held:
@@ -166,7 +166,7 @@ class _Held:
 
 
 def asked(found, **std):
-    """What scans alone say of the parameters that have a standard uncertainty: errors and stated uncertainties."""
+    """Return errors and stated uncertainties of the parameters with a standard uncertainty, from scans only."""
     model, global_values = parameters(**std)
     lens = len(model.intrinsics.names)
     evidence, local = zip(*found, strict=True)
@@ -195,7 +195,7 @@ def test_round_spheres_tell_the_stage_and_the_water(known):
     errors, std, result = asked([scan], **dict.fromkeys(SLOPE_NAMES, 0.01), index_of_water=2e-3)
     for name, error in errors.items():
         assert abs(error) < 4 * std[name], name
-        # That points on a sphere err together is stated, so that the uncertainty is far from what 0.02 px alone leave.
+        # The stated uncertainty includes errors common to a sphere's points, so it is far above that of 0.02 px noise.
         assert std[name] < 3e-3, name
     assert np.abs(result.local[0][6:8]).max() < (0.01 if known else 0.1)
     assert result.noise[Spheres.kind].besides > 10
@@ -345,7 +345,9 @@ def test_a_size_described_a_millimetre_wrong_is_refused_by_its_name(
 
 def test_sizes_that_are_all_off_by_the_same_share_may_be_the_targets_fault(thesis, target_in_water):
     larger = {"diameters_mm": (50.5, 52.52), "spacings_mm": (1.01 * SPACING,)}
-    with pytest.raises(CalibrationError, match=r"all known sizes are off by the same -0\.99 %: check the target's"):
+    with pytest.raises(
+        CalibrationError, match=r"all known sizes are off by the same -0\.99 %: also check the target's"
+    ):
         solved(thesis, target_in_water, scanned("spheres", **larger, **CERTIFIED["spheres"]))
 
 
@@ -393,7 +395,7 @@ def test_scans_that_do_not_show_what_they_say_are_left_out():
     few = replace(
         stripes, **{name: getattr(stripes, name)[::4] for name in ("frame", "line", "centre_px", "width_px", "slopes")}
     )
-    found, warnings = surface_scans(
+    found, warnings = build_all_scan_evidence(
         [wrong, few, stripes], nominal_calibration(SENSOR), SENSOR, [WATER], sizes_known=True
     )
     assert len(found) == 1
@@ -407,17 +409,17 @@ def test_scans_along_different_directions_are_refused():
     stripes, _ = scan_of(SENSOR, bodies, plane, stage_mm=STAGE[:3])
     other = replace(stripes, stage_direction=np.array([0.0, 1.0, 0.0]))
     with pytest.raises(CalibrationError, match="different directions"):
-        surface_scans([stripes, other], nominal_calibration(SENSOR), SENSOR, [WATER], sizes_known=True)
+        build_all_scan_evidence([stripes, other], nominal_calibration(SENSOR), SENSOR, [WATER], sizes_known=True)
 
 
 @pytest.mark.parametrize(
     ("artefact", "pose", "error", "says"),
     [
-        (None, None, DescriptionError, "does not say what it shows"),
+        (None, None, DescriptionError, "does not describe what it shows"),
         ({"kind": "step", "height_mm": 20.0}, None, DescriptionError, "shows a step"),
         ({"kind": "pipe"}, None, DescriptionError, "diameter_mm"),
         ({"kind": "plane"}, None, CaptureError, "no stripe"),
-        ({"kind": "plane"}, np.eye(4), CalibrationError, "carry poses"),
+        ({"kind": "plane"}, np.eye(4), CalibrationError, "contains poses"),
     ],
 )
 def test_captures_that_are_no_scan_of_a_known_surface(tmp_path, artefact, pose, error, says):
@@ -449,14 +451,14 @@ def test_what_blur_and_the_sheets_thickness_leave_is_common_to_all_points():
     nominal, rng = nominal_calibration(SENSOR), np.random.default_rng(4)
     blur, slopes = rng.normal(0, 0.05, len(stripes.line)), rng.normal(0, 0.05, len(stripes.line))
     given = {"medium_index": WATER, "sizes_known": True, "image": 0}
-    plain, _ = surface_scan(replace(stripes, blur_px=blur, slopes=0 * slopes), nominal, SENSOR, **given)
+    plain, _ = build_scan_evidence(replace(stripes, blur_px=blur, slopes=0 * slopes), nominal, SENSOR, **given)
     kept = np.searchsorted(stripes.frame * 1e6 + stripes.line, plain.frame * 1e6 + plain.pixels[:, 0])
     np.testing.assert_allclose(plain.common_px, np.abs(blur[kept]) / np.sqrt(3), rtol=1e-9)
     common = {}
     for thickness in (0.1, 0.3):
         known = SENSOR.uncertainty.model_copy(update={"sheet_thickness": thickness})
         sensor = SENSOR.model_copy(update={"uncertainty": known})
-        found, _ = surface_scan(replace(stripes, blur_px=0 * blur, slopes=slopes), nominal, sensor, **given)
+        found, _ = build_scan_evidence(replace(stripes, blur_px=0 * blur, slopes=slopes), nominal, sensor, **given)
         common[thickness] = found.common_px
     np.testing.assert_allclose(common[0.3], 3 * common[0.1], rtol=1e-9)
     moved_z = np.abs(nominal.object_transform()[:3, 2] @ found.beside_mm)

@@ -10,9 +10,15 @@ import pytest
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import target_series
 from uwlts.calibration.camera.camera_parameters import CameraOptions, Intrinsics
-from uwlts.calibration.joint.consistency import Findings, deviations, findings, format_deviation, understated
+from uwlts.calibration.joint.consistency import (
+    Findings,
+    check_consistency,
+    deviations,
+    estimate_birge_ratio,
+    format_deviation,
+)
 from uwlts.calibration.joint.estimate import UNSETTLED, Estimate, Noise
-from uwlts.calibration.joint.initial import series_start
+from uwlts.calibration.joint.initial import estimate_series_start
 from uwlts.calibration.joint.next_shot import Outlook
 from uwlts.calibration.joint.parameters import DescribedSheet, EarlierEstimate, Parameters, Prior, ViewMedium
 from uwlts.calibration.joint.refresh import LengthChange, WaterChange
@@ -61,7 +67,7 @@ def estimate_of(known=None, *, images=(), noise=None, lens=LENS, earlier=None, *
 
 
 def found_of(*args, **kwargs):
-    return findings(*estimate_of(*args, **kwargs), sensor=SENSOR)
+    return check_consistency(*estimate_of(*args, **kwargs), sensor=SENSOR)
 
 
 def white(sigma_px, seed, count=600):
@@ -70,7 +76,7 @@ def white(sigma_px, seed, count=600):
 
 
 def images_of(kind, scatter_px, *, others=9, usual_px=0.1):
-    """One image that scatters so much among nine others."""
+    """One image with a given scatter among nine others."""
     return [(kind, "odd", white(scatter_px, 0)), *((kind, f"usual {n}", white(usual_px, 1 + n)) for n in range(others))]
 
 
@@ -101,7 +107,7 @@ def test_a_kind_that_is_too_noisy_throughout_is_a_misfit(kind, largest_px):
     assert found_of(images=within) == Findings([], {}, {}, [])
     (words,) = found_of(images=beyond).misfits.values()
     scatter, noise = re.match(
-        rf"the {kind} is (.*) px off \(rms\) in most images, noise .* for (.*) px;", words
+        rf"the {kind} is (.*) px off \(rms\) in most images; noise explains (.*) px;", words
     ).groups()
     assert float(scatter) == pytest.approx(1.1 * largest_px, rel=0.05)
     assert float(noise) == pytest.approx(1.1 * largest_px, rel=0.05)
@@ -127,8 +133,8 @@ def test_waves_are_doubtful_beyond_8_lines_and_wrong_beyond_20(together, wrong):
     said = [*found.misfits.values()] if wrong else found.doubts
     assert len(said) == (0 if wrong is None else 1)
     for words in said:
-        assert f"(0.12 px rms, as good as one independent value in {together:.0f} lines)" in words
-        assert "along itself" in words
+        assert f"(0.12 px rms, equivalent to one independent value in {together:.0f} lines)" in words
+        assert "along the stripe" in words
 
 
 def test_many_outliers_and_a_scatter_that_does_not_settle_are_doubts():
@@ -165,7 +171,7 @@ def test_descriptions_that_are_all_too_sure_are_noticed(count, off, factor):
     """Six squares exceed 22.5 once in a thousand times: 13.5 do not, 37.5 do."""
     keys = [*WindowParameter, SheetParameter.BOW][:count]
     known = {key: ((0.0, 1.0), ((-1) ** n * off, 1e-3)) for n, key in enumerate(keys)}
-    assert understated(estimate_of(known)[0]) == pytest.approx(factor, rel=1e-3)
+    assert estimate_birge_ratio(estimate_of(known)[0]) == pytest.approx(factor, rel=1e-3)
 
 
 @pytest.mark.parametrize(("share", "wrong"), [(0.07, None), (0.09, False), (-0.09, False), (-0.21, True), (0.21, True)])
@@ -173,7 +179,7 @@ def test_a_focal_length_far_from_the_lens_is_told(share, wrong):
     found = found_of(lens=LENS * np.where(np.arange(len(LENS)) == 0, 1 + share, 1.0))
     said = found.contradictions if wrong else found.doubts
     assert len(said) == (0 if wrong is None else 1)
-    assert all(f"the focal length is {LENS[0] * (1 + share):.1f} px, by the description" in words for words in said)
+    assert all(f"the focal length is {LENS[0] * (1 + share):.1f} px; expected " in words for words in said)
 
 
 @pytest.mark.parametrize(("off", "wrong"), [(3.9, None), (4.1, False), (-6.2, True)])
@@ -185,14 +191,16 @@ def test_new_evidence_against_an_earlier_estimate_is_told_by_what_moved_farthest
     said = found.contradictions if wrong else found.doubts
     assert len(said) == (0 if wrong is None else 1)
     for words in said:
-        assert f"by {abs(off):.1f} standard uncertainties, most in the column of the principal point: " in words
+        assert f"by {abs(off):.1f} standard uncertainties, mostly in the column of the principal point: " in words
 
 
 @pytest.fixture(scope="module")
 def staged():
     """A target on the stage in six images, and the start of its local parameters."""
     series = target_series(SENSOR, window=False, positions=np.arange(6) * 40.0 - 180.0, columns=7)
-    start = series_start([series], SENSOR, None, [], options=CalibrationOptions(poses="stage", correct_circles=False))
+    start = estimate_series_start(
+        [series], SENSOR, None, [], options=CalibrationOptions(poses="stage", correct_circles=False)
+    )
     return start.evidence[0], start.local[0]
 
 
@@ -200,9 +208,9 @@ def staged():
     ("tilt_deg", "errors_mm", "said"),
     [
         (2.9, [0, 0, 0, 0, 0], None),
-        (-3.1, [0, 0, 0, 0, 0], "target: the stage moves 3.1 deg off the target's normal, described as within 0.5 deg"),
+        (-3.1, [0, 0, 0, 0, 0], "target: the stage moves 3.1 deg off the target's normal; expected within 0.5 deg"),
         (0, [0, 0, 0.029, 0, 0], None),
-        (0, [0, 0, -0.031, 0, 0], "target, frame 3: the stage stood -0.031 mm from where it said"),
+        (0, [0, 0, -0.031, 0, 0], "target, frame 3: the stage was -0.031 mm from its stated position"),
         (0, [0.02, -0.02, 0.02, -0.02, 0.0], "target: the stage's positions scatter by 0.018 mm, stated uncertainty"),
         (0, [0.015, -0.015, 0.015, -0.015, 0.0], None),
     ],
@@ -210,12 +218,12 @@ def staged():
 def test_a_stage_that_does_not_move_as_described_is_told(staged, tilt_deg, errors_mm, said):
     """0.5 deg and 0.005 mm are stated: six of these are too much, three of the mean square of all positions.
 
-    Also where other evidence, which has no stage, comes first.
+    Also if other evidence, without a stage, comes first.
     """
     piece, local = staged
     local = np.concatenate([local[:6], [np.tan(np.radians(tilt_deg)), 0.0], errors_mm])
     result, other = estimate_of(local=[np.empty(0), local], residuals=[[], []])
-    found = findings(result, [*other, piece], sensor=SENSOR).contradictions
+    found = check_consistency(result, [*other, piece], sensor=SENSOR).contradictions
     assert len(found) == (0 if said is None else 1)
     assert all(words.startswith(said) for words in found)
 
@@ -224,7 +232,7 @@ def test_a_step_that_seems_too_high_may_not_face_the_laser():
     """cos(4.23 deg) = 23.17 / 23.2333."""
     high, low = (format_deviation(StepHeight(23.17), 23.17 + d, 23.17, 0.01, sigmas=6.3) for d in (0.0633, -0.0633))
     assert high.endswith(
-        "which standard it is, and whether it faces the laser: turned by 4.2° about the stripe it seems so high"
+        "which standard it is, and whether it faces the laser: a rotation by 4.2° about the stripe explains the height"
     )
     assert low.endswith("check which standard it is")
 
@@ -239,11 +247,11 @@ def test_a_refresh_tells_expanded_uncertainties_before_and_after(longer_mm, word
     length = LengthChange(length_mm=247.3, before_mm=0.185, after_mm=0.0312, longer_mm=longer_mm)
     index, said = WaterChange("water 2", 1.33122, 0.00032, 1.3325, 0.00011, length).lines()
     assert index == (
-        "index of water 2: 1.33122 ± 0.00032 before, 1.33250 ± 0.00011 by the step (standard uncertainties)"
+        "index of water 2: 1.33122 ± 0.00032 before, 1.33250 ± 0.00011 from the step (standard uncertainties)"
     )
     assert said == (
-        "a length of 247 mm, the one known worst: ± 0.3700 mm before, ± 0.0624 mm now (k = 2, by the calibration); it "
-        f"is measured 0.0123 mm {word}"
+        "least certain length, 247 mm: ± 0.3700 mm before, ± 0.0624 mm now (k = 2, from the calibration); its measured "
+        f"value is 0.0123 mm {word}"
     )
     assert len(WaterChange("water 2", 1.33, 1e-4, 1.33, 1e-4, None).lines()) == 1
 
@@ -251,6 +259,6 @@ def test_a_refresh_tells_expanded_uncertainties_before_and_after(longer_mm, word
 def test_a_shot_is_advised_where_it_lowers_the_uncertainty_by_a_twentieth():
     shot = Outlook("a shot", 0.1, 0.0949, np.eye(1), VIEW)
     assert shot.advice() == (
-        "a shot would lower the standard uncertainty of lengths over the volume from 0.1000 to 0.0949 mm"
+        "a shot would reduce the standard uncertainty of lengths over the volume from 0.1000 to 0.0949 mm"
     )
-    assert replace(shot, after_mm=0.0951).advice().startswith("no further shot alone would lower")
+    assert replace(shot, after_mm=0.0951).advice().startswith("no single further image would reduce")

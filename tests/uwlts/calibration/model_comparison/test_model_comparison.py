@@ -11,16 +11,16 @@ from tests.uwlts.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.procedure import joint_problem, solve_jointly
 from uwlts.calibration.joint.residuals import STRIPE, TARGET
 from uwlts.calibration.joint.stored_estimate import found_estimate
-from uwlts.calibration.model_comparison.comparison import Comparison, choice_of, choose, tally
+from uwlts.calibration.model_comparison.comparison import Comparison, choice_of, choose, sum_errors
 from uwlts.calibration.model_comparison.held_out import (
     INSIDE,
     OUTSIDE,
     Candidate,
     Misses,
     Prediction,
+    apply_candidate,
     predict,
-    recast,
-    splits,
+    split_images,
 )
 from uwlts.calibration.sequential.sequential_calibration import CalibrationOptions
 from uwlts.errors import CalibrationError
@@ -65,7 +65,7 @@ def plain_choice(plain):
 @pytest.fixture(scope="module")
 def tilted_choice(thesis):
     problem = problem_of(thesis, sensor_with(window_tilt_deg=0.2, laser_tilt_deg=0.0), bow=0.0, seed=0)
-    ways = splits(problem)
+    ways = split_images(problem)
     models = (Candidate(), Candidate(window_tilt=False), Candidate(bow=False))
     return choice_of(
         {model: {where: predict(problem, model, held) for where, held in ways.items()} for model in models},
@@ -87,10 +87,10 @@ def test_where_nothing_is_tilted_or_bowed_the_simplest_model_is_chosen(plain_cho
 
 
 def test_a_tilted_window_is_found_to_be_needed(tilted_choice):
-    """A tilt t shifts rays by t (n - 1) times the distance to the object: 0.2 deg and 400 mm make 0.46 mm.
+    """A tilt t shifts rays by t (n - 1) times the distance to the object: 0.2 deg and 400 mm give 0.46 mm.
 
-    Poses and principal point take up most of it; what remains is 2 to 6 µm by the noise drawn, of which a dozen
-    images held out tell a quarter to a third.
+    Poses and principal point absorb most of it. The remaining 2 to 6 µm depend on the noise; a dozen held-out images
+    determine them to a quarter or a third.
     """
     assert tilted_choice.simplest().window_tilt
     assert Candidate(window_tilt=False) not in tilted_choice.as_good()
@@ -126,7 +126,7 @@ def test_misses_on_the_object_are_those_in_the_image_times_its_distance(plain):
 
 
 def test_the_outermost_images_are_held_out_outside_and_never_inside(plain):
-    ways = splits(plain)
+    ways = split_images(plain)
     assert list(ways) == [INSIDE, OUTSIDE]
     inside, outside = ways.values()
     for number, positions in enumerate((AIR, IN_WATER)):
@@ -140,8 +140,8 @@ def test_the_outermost_images_are_held_out_outside_and_never_inside(plain):
 
 def test_too_few_images_are_refused(thesis):
     series = target_series(built_sensor(), medium=0, positions=IN_WATER[::3], columns=15)
-    with pytest.raises(CalibrationError, match="too few images with a stripe to hold some out"):
-        splits(joint_problem(gathered(thesis, [series]), options=OPTIONS))
+    with pytest.raises(CalibrationError, match="too few images with a stripe"):
+        split_images(joint_problem(gathered(thesis, [series]), options=OPTIONS))
 
 
 def test_a_target_held_by_hand_is_predicted_from_its_own_points(thesis):
@@ -174,7 +174,7 @@ def test_what_a_model_adds_is_distinguished_from_noise_and_outliers_do_not_count
         ]
         return Prediction(misses, None, None, None)
 
-    found = tally([made(np.zeros(12)), made(more), made(np.full(12, 1e-4))])
+    found = sum_errors([made(np.zeros(12)), made(more), made(np.full(12, 1e-4))])
     assert found.score(0).px["stripes"] == pytest.approx(0.1, rel=0.03)
     assert found.score(0).all_mm == pytest.approx(0.02, rel=0.03)
     difference, std = found.beyond(1, 0)
@@ -186,7 +186,7 @@ def test_what_a_model_adds_is_distinguished_from_noise_and_outliers_do_not_count
 
 
 def test_a_parameter_without_uncertainty_is_held_and_read_back(thesis):
-    """With tilts and bow known exactly there is nothing to estimate of them; the file tells them all the same."""
+    """If tilts and bow are known exactly, they are not estimated, but the file contains them."""
     known = thesis.uncertainty.model_copy(update={"window_tilt_deg": 0.0, "bow_deg": 0.0})
     window = thesis.camera.window.model_copy(update={"tilt_x_deg": 0.3})
     camera = thesis.camera.model_copy(update={"window": window})
@@ -206,12 +206,12 @@ def test_every_candidate_has_the_parameters_its_name_says(plain):
     def names_of(problem):
         return {key.text for key in problem.parameters.keys}
 
-    usual = names_of(recast(plain, Candidate()))
+    usual = names_of(apply_candidate(plain, Candidate()))
     usually = {"p1", "p2", "target_saddle", "target_stretch_x", "target_stretch_y", "target_stripe"}
     assert usual == names_of(plain) - usually
 
     def lacking(**changes):
-        names = names_of(recast(plain, Candidate(**changes)))
+        names = names_of(apply_candidate(plain, Candidate(**changes)))
         return usual - names, names - usual
 
     assert lacking(window_tilt=False) == ({"window_slope_x", "window_slope_y"}, set())

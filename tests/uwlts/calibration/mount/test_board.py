@@ -9,7 +9,7 @@ from tests.uwlts.joint_views import MEDIUM
 from tests.uwlts.sensor_profiles import half_way, joint_estimate, largest_parts
 from tests.virtual_sensors import scene_of
 from twin import render
-from uwlts.calibration.mount.board import BoardEvidence, BoardImage, agreeing_images, posed_board
+from uwlts.calibration.mount.board import BoardEvidence, BoardImage, estimate_board_pose, select_agreeing_images
 from uwlts.errors import CalibrationError, DescriptionError
 from uwlts.model.calibration import KnownMedium
 from uwlts.model.mount import BoardFound
@@ -45,7 +45,7 @@ def views(count, rng):
 
 
 def simulated(rng, *, count=12, position_mm=0.05, turn_rad=3e-4, wrong=()):
-    """Images whose poses err by their covariance, of a platform whose positions and turns scatter."""
+    """Images with pose errors from their covariance, and a platform with scatter of positions and rotations."""
     images = []
     std = np.array([0.02, 0.02, 0.15, 2e-3, 2e-3, 2e-4])
     for number, seen in enumerate(views(count, rng)):
@@ -74,7 +74,7 @@ def test_the_covariance_is_that_of_the_errors():
     rng = np.random.default_rng(5)
     inside, ratios = [], []
     for _ in range(20):
-        estimate, _ = agreeing_images(BoardEvidence(simulated(rng), CAMERA, MIDDLE))
+        estimate, _ = select_agreeing_images(BoardEvidence(simulated(rng), CAMERA, MIDDLE))
         std = np.sqrt(np.diag(estimate.covariance)[:6])
         error = errors_of(estimate.state[0])
         inside.append(np.abs(error) < 2.0 * std)
@@ -104,7 +104,7 @@ def test_the_axis_of_a_rotary_table_is_found():
     """Direction and place have two coordinates each; their chi-square with four degrees is below 36 but once in 3e6."""
     images, table = table_images(np.random.default_rng(2), np.radians(np.linspace(-40, 40, 12)))
     problem = BoardEvidence(images, CAMERA, MIDDLE, table=True)
-    estimate, kept = agreeing_images(problem)
+    estimate, kept = select_agreeing_images(problem)
     state = estimate.state
     assert kept.all() and problem.size == 10
     # Of the true axis in the table's frame as found, at the height of the sensor: what is free is zero there.
@@ -121,7 +121,9 @@ def test_the_axis_of_a_rotary_table_is_found():
 
 
 def test_wrong_poses_are_left_out():
-    estimate, kept = agreeing_images(BoardEvidence(simulated(np.random.default_rng(1), wrong=(3, 7)), CAMERA, MIDDLE))
+    estimate, kept = select_agreeing_images(
+        BoardEvidence(simulated(np.random.default_rng(1), wrong=(3, 7)), CAMERA, MIDDLE)
+    )
     assert np.flatnonzero(~kept).tolist() == [3, 7]
     assert np.linalg.norm(errors_of(estimate.state[0])[:3]) < 0.3
 
@@ -170,7 +172,7 @@ def test_wrong_evidence_is_refused(thesis, capture_path):
     calibration = nominal(thesis, medium="water")
     with Capture(capture_path) as capture:
         poses = capture.pose[:]
-    with pytest.raises(DescriptionError, match="there are 6 poses for 7 images"):
+    with pytest.raises(DescriptionError, match="found 6 poses for 7 images"):
         uwlts.calibrate_mount(capture_path, poses[:6], calibration=calibration)
     with pytest.raises(CalibrationError, match="T_base_platform"):
         uwlts.calibrate_mount(capture_path, np.linalg.inv(poses), calibration=calibration)
@@ -194,7 +196,9 @@ def test_a_target_s_pose_follows_the_sensor(thesis, capture_path):
                 "media": (KnownMedium(medium=MEDIUM, index=known.parameters.medium_index(values, known.view)),),
             }
         )
-        return posed_board("", image, target, changed, known, changed.window, changed.index_of(MEDIUM), np.eye(4))
+        return estimate_board_pose(
+            "", image, target, changed, known, changed.window, changed.index_of(MEDIUM), np.eye(4)
+        )
 
     own = posed(known.values)
     middle, checked = target.points_mm.mean(axis=0), 0

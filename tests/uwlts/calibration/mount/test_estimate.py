@@ -10,9 +10,9 @@ from uwlts.calibration.mount.estimate import NotSettled, settle
 
 @dataclass(frozen=True)
 class TwoReadings:
-    """Two readings of one number, at -1 and at 1; the first counts with a weight that depends on the number itself.
+    """Two readings of one number, at -1 and at 1; the first has a weight that depends on the number itself.
 
-    Where the weight is ``share`` the solution is 1 - 2 share.
+    For the weight ``share``, the solution is 1 - 2 share.
     """
 
     slope: float
@@ -22,7 +22,7 @@ class TwoReadings:
     def bounds(self):
         return np.array([(1.0, 1.0)])
 
-    def stepped(self, state, step):
+    def apply_step(self, state, step):
         return state + float(step[0])
 
     def residuals(self, state, step=None):
@@ -36,7 +36,7 @@ class TwoReadings:
         both = np.array([1 / share, 1 / (1 - share)]).reshape(2, 1, 1)
         return lambda logs: (both, np.zeros((1, 2, 1, 1)))
 
-    def repeated(self, state):
+    def pool_repeats(self, state):
         return 0, 0.0
 
     def pose_directions(self, state):
@@ -51,5 +51,7 @@ def test_steps_that_overshoot_are_damped():
 
 def test_an_estimate_that_cannot_settle_is_an_error():
     """A weight that jumps where the number crosses 0.3 leaves no state that is its own solution."""
-    with pytest.raises(NotSettled, match=r"does not settle: after \d+ rounds it still moves by .* Record more poses"):
+    with pytest.raises(
+        NotSettled, match=r"does not converge: after \d+ rounds it still changes by .* Record more poses"
+    ):
         settle(TwoReadings(slope=1e6), [(-0.9, np.ones(1)), (0.9, np.ones(1))])

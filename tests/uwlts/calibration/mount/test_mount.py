@@ -35,7 +35,7 @@ def mount_of(campaign: Campaign, **options) -> Mount:
 
 
 def within(mount: Mount, *, factor: float = 5.0) -> None:
-    """Errors below ``factor`` standard uncertainties; beyond 5 lies one normal error in 1.7 million."""
+    """Errors are below ``factor`` standard uncertainties; one normal error in 1.7 million exceeds 5."""
     errors = np.concatenate(errors_of(mount.transform()))
     assert (np.abs(errors) < factor * mount.std()).all(), errors / mount.std()
 
@@ -100,9 +100,9 @@ def least_scatter_mm(campaign: Campaign) -> float:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("radius", [RADIUS_MM, None])
 def test_smooth_errors_of_the_profiler_are_weighed(seed, radius):
-    """2,000 points with little noise, along which the profiler errs smoothly by more, as real ones do.
+    """2,000 points with little noise, and with a larger smooth error of the profiler, as in real ones.
 
-    Points that count as independent outweigh the robot then: the estimate flips between states millimetres apart.
+    If the points counted as independent, they would outweigh the robot, and the estimate would jump by millimetres.
     """
     campaign = sphere_campaign(
         np.random.default_rng([5, seed]),
@@ -142,7 +142,7 @@ def test_a_plane_and_a_robot_that_scatters_give_the_mount():
 
 @pytest.mark.parametrize("height", [12.0, None])
 def test_a_step_gives_the_mount(rng, height):
-    """Two faces 12 mm apart; errors as of `within`, and the height as well known as it says."""
+    """Two faces with a step of 12 mm; errors as in `within`, and the height within its stated uncertainty."""
     mount = mount_of(step_campaign(rng, height_mm=12.0), artefact="step", height_mm=height)
     within(mount)
     assert (mount.std()[:3] < 0.3).all() and (np.degrees(mount.std()[3:]) < 0.05).all()
@@ -171,7 +171,7 @@ def test_a_step_of_another_height_is_not_found(rng):
     ],
 )
 def test_a_ring_gives_the_mount(rng, options, radius):
-    """Bore or outside, with a table or without, z growing away from the sensor or towards it; errors as of `within`."""
+    """Bore or outside, with or without a table, z away from the sensor or towards it; errors as in `within`."""
     mount = mount_of(ring_campaign(rng, **options), artefact="ring", radius_mm=radius)
     within(mount)
     ideal = "robot_mm" not in options
@@ -263,10 +263,10 @@ def test_usual_mistakes_are_named(rng, radius, says):
 @pytest.mark.slow
 @pytest.mark.parametrize(("robot_mm", "campaigns"), [(0.0, 20), (0.05, 40)])
 def test_intervals_hold_as_often_as_stated(robot_mm, campaigns):
-    """At least 92 % of the six values of a campaign lie within their 95 % intervals.
+    """At least 92 % of the six values of a campaign are within their 95 % intervals.
 
-    The six are correlated: the gate is for the campaigns alone. Were each held with probability 0.95, fewer than the
-    limit would be in them in one run of 10,000.
+    The six are correlated, so the limit is for the campaigns. If each interval contained its value with probability
+    0.95, one run of 10,000 would be below the limit.
     """
     held = 0.0
     for seed in range(campaigns):
@@ -331,7 +331,7 @@ def test_a_description_names_everything(tmp_path, rng):
     (tmp_path / "mount.toml").write_text(text.replace("FORMAT", "euler-ZYX-deg"))
     within(uwlts.calibrate_mount(tmp_path / "mount.toml"))
     (tmp_path / "wrong.toml").write_text(text.replace("FORMAT", "euler-zyx-deg"))
-    with pytest.raises(CalibrationError, match="Is their format right .Euler angles about moved axes, such as ZYX"):
+    with pytest.raises(CalibrationError, match="their format .Euler angles about moved axes, such as ZYX"):
         uwlts.calibrate_mount(tmp_path / "wrong.toml")
 
 
@@ -435,7 +435,7 @@ def test_the_axis_of_a_rotary_table_is_found(tmp_path, rng):
     mount.save(tmp_path / "mount.json")
     assert read_mount(tmp_path / "mount.json") == mount
     # The same profiles fit the table that is mirrored in the sheet, y -> -y: its axis, an axial vector, is
-    # (-x, y, -z), which lies 2 arccos |y| from the true one. Two errors of at most 5 standard deviations are apart.
+    # (-x, y, -z), at 2 arccos |y| from the true one, apart from two errors of at most 5 standard deviations.
     mirrored = uwlts.calibrate_mount(profiles, poses, radius_mm=RADIUS_MM, axis="z")
     assert mirrored.rms_mm == pytest.approx(mount.rms_mm, rel=0.01)
     apart = 2 * np.arccos(abs(table[1, 2]))

@@ -37,11 +37,11 @@ from uwlts.targets import CircleTarget
 
 DEPTHS = np.arange(-60.0, 101.0, 10.0)
 FAR_OFF = 7.0
-"""Stage position at which the plate stands at Z = 0."""
+"""Stage position of the plate at Z = 0."""
 
-# What the thesis's volume demands of a smooth description. Z(position) is nearly A / (pole - position) with a pole five
+# Smoothness in the thesis's volume. Z(position) is nearly A / (pole - position) with a pole five
 # half ranges from the middle: the sixth degree leaves 2 A / rho**7 with A = 3 m and rho = 10, 0.5 um. Lens and window
-# leave 16 mm times (view angle 0.27)**n of the plate's coordinates at degree n: 5 um at the sixth, of which a fit over
+# leave 16 mm times (view angle 0.27)**n of the plate's coordinates at degree n: 5 um at the sixth; a fit over
 # the view leaves a quarter.
 CLOSE_MM = 2e-3
 
@@ -99,9 +99,9 @@ TARGET = CircleTarget(
 
 
 def evidence_of(sensor, *, towards=1.0, spin=0.02, noise_px=0.0, seed=0, without=()):
-    """What captures of the plate show, turned by ``spin`` in its plane, with the stripe on every fourth line.
+    """Evidence from captures of the plate, turned by ``spin`` in its plane, with the stripe on every fourth line.
 
-    Lines in ``without`` have no stripe; those between the fourth ones borrow as dark lines do.
+    Lines in ``without`` lack a stripe; lines between the fourth ones are interpolated, as dark lines are.
     """
     rng = np.random.default_rng(seed)
     images, stripes = [], []
@@ -183,7 +183,7 @@ def test_signs(along, towards, spin):
 
 
 def test_stage_against_the_header(sensor, evidence):
-    with pytest.raises(CalibrationError, match="the other way than the stage's positions say"):
+    with pytest.raises(CalibrationError, match="opposite to the stage positions"):
         fit_polynomials(evidence, header_of(sensor, direction=(0.0, 0.0, -1.0)), degree=6)
 
 
@@ -300,7 +300,7 @@ def test_stripes_that_contradict_each_other(sensor, evidence):
     still = [
         np.where((s[:, :1] % 3 == 0), np.column_stack([s[:, 0], np.full(len(s), 500.0)]), s) for s in evidence.stripes
     ]
-    with pytest.raises(CalibrationError, match="do not lie on the polynomials of the others"):
+    with pytest.raises(CalibrationError, match="are not on the polynomials of the others"):
         fit_polynomials(replace(evidence, stripes=still), header_of(sensor), degree=6)
 
 
@@ -317,7 +317,7 @@ def test_stripe_beside_the_plate(sensor, evidence):
     """A plate seen in one corner only, the stripe elsewhere."""
     corner = [replace(i, points_mm=i.points_mm[:35], pixels=i.pixels[:35]) for i in evidence.images]
     away = [s[s[:, 0] > 1100] for s in evidence.stripes]
-    with pytest.raises(CalibrationError, match="together at 0 stage positions.*does not fall on the target"):
+    with pytest.raises(CalibrationError, match="together at 0 stage positions.*is not on the target"):
         fit_polynomials(replace(evidence, images=corner, stripes=away), header_of(sensor), degree=6)
 
 
@@ -359,7 +359,7 @@ def test_plate_map_needs_points(sensor, evidence):
     few = replace(
         evidence.images[0], points_mm=evidence.images[0].points_mm[:20], pixels=evidence.images[0].pixels[:20]
     )
-    with pytest.raises(CalibrationError, match="only 20 points .* at least 30"):
+    with pytest.raises(CalibrationError, match="20 points .* at least 30"):
         fit_plate_map(few)
 
 
@@ -544,7 +544,7 @@ def test_captures_to_cloud(files, small):
 
 
 def test_commands(files, tmp_path, monkeypatch, capsys):
-    """The file that one command writes serves the next; what is lost is told."""
+    """The file that one command writes is input of the next; losses are reported."""
     out, cloud = tmp_path / "polynomials.json", tmp_path / "scan.ply"
     for line in (
         ["polynomials", "--target", files["target"], "--degree", "4", "--out", out],
@@ -602,7 +602,7 @@ def test_captures_that_are_refused(files, tmp_path):
     with (
         Capture(files["target"]) as a,
         Capture(wet) as b,
-        pytest.raises(CalibrationError, match="medium is .* against"),
+        pytest.raises(CalibrationError, match="medium is .* instead of"),
     ):
         calibrate_polynomials([a, b])
     with (

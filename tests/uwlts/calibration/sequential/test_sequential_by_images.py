@@ -72,16 +72,16 @@ def test_halves_of_the_images_with_different_sheets_are_noticed():
     )
     assert calibrated(images, poses, seed=3).warnings == []
     (warning,) = calibrated(images, poses, seed=3, spread_px=2.0).warnings
-    assert warning.startswith("two halves of the images disagree: their sheets are 0.")
+    assert warning.startswith("two halves of the images disagree: their sheets differ by 0.")
 
 
 def test_a_stage_beside_the_normal_is_noticed_and_taken_for_no_other_lens():
     images, poses = staged(2, stage_tilt=(0.004, -0.003))
     normal = calibrated(images, poses, seed=2)
     (warning,) = normal.warnings
-    assert warning.startswith("the stage moves 0.29 deg beside the target's normal: with poses 'stage'")
+    assert warning.startswith("the stage moves at 0.29 deg to the target's normal: with poses 'stage'")
     assert normal.calibration.figures("camera")["lens_model"] == "k1 k2, square pixels"
-    # What the model lacks widens what it states, though not as far as it is off.
+    # An incomplete model enlarges the stated uncertainty, though less than its error.
     by_points = calibrated(*staged(2), seed=2)
     assert normal.camera.std()["f"] > 3 * by_points.camera.std()["f"]
     freer = calibrated(images, poses, seed=2, poses="stage")
@@ -94,7 +94,7 @@ def test_pixels_of_another_shape_are_named_beside_a_leaning_stage():
     images, poses = staged(2)
     stretched = [replace(image, pixels=image.pixels * [1.0, 1.002]) for image in images]
     (warning,) = calibrated(stretched, poses, seed=2).warnings
-    assert warning.startswith("the stage moves ") and "; or pixels are not of the shape described" in warning
+    assert warning.startswith("the stage moves ") and "; or the pixels' shape is not as described" in warning
     fx, fy = map(float, re.findall(r"fx ([\d.]+) and fy ([\d.]+) px", warning)[0])
     assert fy / fx == pytest.approx(1.002, abs=2e-4) and fx == pytest.approx(lens_of(BARE).fx, abs=1.0)
 

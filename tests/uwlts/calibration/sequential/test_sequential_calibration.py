@@ -205,7 +205,7 @@ def test_contradictory_captures_are_refused(files, air_frames, tmp_path):
     with pytest.raises(CalibrationError, match="along the laser's axis"):
         run(aside)
     away = write(tmp_path / "away.h5", frames=air_frames[:3], target=PLATE, stage_direction=(0.0, 0.0, -1.0))
-    with pytest.raises(CalibrationError, match="mirrored against the stage"):
+    with pytest.raises(CalibrationError, match="mirrored relative to the stage"):
         run(away)
     with pytest.raises(CalibrationError, match="no image with the laser on"):
         run(write(tmp_path / "lamps.h5", frames=air_frames[:5], target=PLATE))

@@ -85,7 +85,7 @@ def test_outliers_are_left_out_and_counted():
     solution = fit_sheet(points, nominal_normal=LASER.normal)
     assert not solution.used[stray].any()
     assert solution.rejected_share == pytest.approx(0.05, abs=2e-3)
-    # 5 % fewer points move the plane by a small share of its standard deviation.
+    # 5 % fewer points move the plane by a small fraction of its standard deviation.
     assert angle(np.array(solution.model.normal), np.array(clean.model.normal)) < clean.normal_std_rad
     assert solution.max_mm < 10 * solution.rms_mm
     assert np.abs(solution.residuals_mm[stray]).min() > solution.max_mm
@@ -110,8 +110,8 @@ def test_undetermined_sheets_are_refused():
     rng = np.random.default_rng(3)
     for noise in (0.0, 0.15):
         single = stripe_points(positions=np.array([50.0]), noise_px=noise, rng=rng).points_mm
-        # Noise moves the points within the target's plane, which they would all lie on.
-        with pytest.raises(CalibrationError, match="one line|reach only"):
+        # Noise moves the points within the target's plane, so all are on this plane.
+        with pytest.raises(CalibrationError, match="one line|extend only"):
             fit_sheet(single, nominal_normal=LASER.normal)
     points = stripe_points().points_mm
     with pytest.raises(CalibrationError, match="turned by"):
@@ -119,7 +119,7 @@ def test_undetermined_sheets_are_refused():
     with pytest.raises(CalibrationError, match="not finite"):
         fit_sheet(np.vstack([points, [0.0, np.nan, 400.0]]), nominal_normal=LASER.normal)
     both = np.vstack([points, points[: len(points) // 2] + 15 * LASER.normal])
-    with pytest.raises(CalibrationError, match="do not lie|reach only"):
+    with pytest.raises(CalibrationError, match="are not on|extend only"):
         fit_sheet(both, nominal_normal=LASER.normal)
 
 
@@ -131,7 +131,9 @@ def test_measures_in_other_units_are_noticed():
     for factor in (0.1, 10.0):
         with pytest.raises(CalibrationError, match="measures must be in mm"):
             fit_sheet(factor * points, nominal_normal=normal, nominal_offset_mm=120.0)
-    with pytest.raises(CalibrationError, match="at -120.0 mm, by .* at 120.0 mm, on the other side: the images are"):
+    with pytest.raises(
+        CalibrationError, match="at -120.0 mm; expected 120.0 mm from .* on the other side: the images are"
+    ):
         fit_sheet(-points, nominal_normal=normal, nominal_offset_mm=120.0)
 
 
@@ -144,7 +146,7 @@ def test_mirrored_images_show_where_the_laser_stands_beside_the_cameras_axes(how
     points = stripe_points().points_mm
     given = {"nominal_normal": LASER.normal, "nominal_offset_mm": float(LASER.normal @ LASER.origin_mm)}
     if how == "top to bottom":
-        said = "the images are turned by 180 deg or mirrored top to bottom, or the laser stands"
+        said = "the images are turned by 180 deg or mirrored top to bottom, or the laser is on"
         with pytest.raises(CalibrationError, match=said):
             fit_sheet(points * MIRRORED[how], **given)
     else:
@@ -153,7 +155,7 @@ def test_mirrored_images_show_where_the_laser_stands_beside_the_cameras_axes(how
     aside = turn(z=np.radians(35.0))
     given["nominal_normal"] = aside @ LASER.normal
     assert fit_sheet(points @ aside.T, **given).turn_rad < np.radians(2)
-    with pytest.raises(CalibrationError, match=f"where the images are mirrored {how}, or the laser stands"):
+    with pytest.raises(CalibrationError, match=f"if the images are mirrored {how}, or the laser is on"):
         fit_sheet(points @ aside.T * MIRRORED[how], **given)
 
 
@@ -165,7 +167,7 @@ def test_a_laser_nearly_along_the_camera_shows_mirrored_images_by_its_side():
     points = 80.0 * normal + across * np.array([1.0, 0.0, 0.0]) + (400.0 + reach) * along
     given = {"nominal_normal": normal, "nominal_offset_mm": 80.0}
     assert fit_sheet(points, **given).turn_rad < 1e-6
-    with pytest.raises(CalibrationError, match="at -80.0 mm, .* on the other side: the images are turned"):
+    with pytest.raises(CalibrationError, match="at -80.0 mm; .* on the other side: the images are turned"):
         fit_sheet(points * MIRRORED["top to bottom"], **given)
 
 
@@ -185,7 +187,9 @@ def test_a_stage_that_moves_as_in_a_mirror_is_refused(found, how):
     if not how:
         refuse_turned_travel(found, described)
         return
-    with pytest.raises(CalibrationError, match=f"along \\[0.6, 0.0, 0.8\\], as it is where the images are {how}: turn"):
+    with pytest.raises(
+        CalibrationError, match=f"along \\[0.6, 0.0, 0.8\\]. This occurs if the images are {how}: correct"
+    ):
         refuse_turned_travel(found, described)
 
 
@@ -210,7 +214,7 @@ def test_the_object_frame_belongs_to_the_sheet():
     assert rotation[:, 2] @ [0.0, 0.5, 0.9] > 0.9
     assert origin @ normal == pytest.approx(210.0)
     assert tuple(origin[:2]) == (0, 0)
-    with pytest.raises(CalibrationError, match="axis runs across"):
+    with pytest.raises(CalibrationError, match="axis is perpendicular"):
         object_frame(sheet, laser_axis=normal)
     with pytest.raises(CalibrationError, match="in front"):
         object_frame(SheetModel(normal=tuple(normal), offset_mm=-210.0), laser_axis=np.array([0.0, 0.5, 0.9]))

@@ -8,7 +8,7 @@ import pytest
 from tests.uwlts.calibration_views import STEP_MM, WATER, built_sensor, step_profile, through_window
 from tests.uwlts.joint_views import gathered
 from uwlts.calibration.capture_evidence import StepEvidence
-from uwlts.calibration.joint.initial import step_profiles
+from uwlts.calibration.joint.initial import build_step_evidence
 from uwlts.calibration.joint.parameters import Prior, ViewMedium
 from uwlts.calibration.sequential.step_images import StandardTurn, label_steps
 from uwlts.calibration.sequential.window_distance import solve_window
@@ -27,9 +27,9 @@ TURN = np.radians(6.0)
 
 
 def turned_step(capture, *, about_stripe=0.0, aside=0.0, travel_mm=(-10.0, 0.0, 10.0), depth_mm=15.0, moved_mm=None):
-    """Images of a standard at rest, turned about both axes, while the stage moves the sensor along X.
+    """Images of a standard at rest, rotated about both axes, while the stage moves the sensor along X.
 
-    ``moved_mm`` are depths by which somebody moves the standard between the images besides.
+    ``moved_mm`` are additional shifts of the standard in depth between the images.
     """
     images, rng = [], np.random.default_rng(3)
     for number, travel in enumerate(travel_mm):
@@ -56,9 +56,9 @@ def test_a_turn_about_the_stripe_shows_along_the_stage_and_is_taken_into_account
     for image in images:
         assert image.lengthened == pytest.approx(1 / np.cos(TURN), abs=2 * image.lengthened_std)
         assert image.lengthened_std == pytest.approx(np.tan(TURN) * np.radians(0.58), rel=0.1)
-    assert said.startswith("step.h5: the standard does not face the laser: it is turned by ")
-    assert float(said.split("turned by ")[1].split(" ")[0]) == pytest.approx(6.0, abs=0.5)
-    assert "about the stripe and so seems higher by 0.5" in said
+    assert said.startswith("step.h5: the standard does not face the laser: it is rotated by ")
+    assert float(said.split("rotated by ")[1].split(" ")[0]) == pytest.approx(6.0, abs=0.5)
+    assert "about the stripe and so appears higher by 0.5" in said
     assert said.count("taken into account") == 1
 
 
@@ -77,7 +77,7 @@ def test_the_windows_distance_is_that_of_the_turned_step():
 
 
 def test_a_standard_that_faces_the_laser_is_not_doubted():
-    """What the turn may be at most is known from the stage's direction, to 0.5° or 7e-5 of the height."""
+    """The stage's direction limits the rotation to 0.5° or 7e-5 of the height."""
     images, warnings = labelled(turned_step("step.h5"))
     assert warnings == []
     assert images[0].lengthened == pytest.approx(1.0, abs=1e-5)
@@ -96,8 +96,8 @@ def test_a_standard_that_faces_the_laser_is_not_doubted():
 def test_one_profile_shows_the_other_turn_only(steps):
     """Seen from the slope of the faces; the turn about the stripe is taken to be as large, and doubles nothing else."""
     images, (said,) = labelled(turned_step("step.h5", aside=-0.05, **steps))
-    assert "turned by 2.9° about the sheet's normal" in said
-    assert "seems higher by 0.13 % or 0.029 mm" in said
+    assert "rotated by 2.9° about the sheet's normal" in said
+    assert "appears higher by 0.13 % or 0.029 mm" in said
     assert "let the stage move the sensor across the stripe" in said
     for image in images:
         assert image.lengthened == 1.0
@@ -110,7 +110,7 @@ def test_the_joint_estimate_knows_a_height_as_well_as_its_turn():
     steps = [*turned_step("one.h5", about_stripe=TURN), *turned_step("two.h5")]
     described = SENSOR.model_copy(update={"uncertainty": Uncertainty()})
     seen = gathered(described, [], [(step, ViewMedium(True, 0)) for step in steps])
-    evidence, heights, warnings = step_profiles(seen, AIR, DESCRIBED)
+    evidence, heights, warnings = build_step_evidence(seen, AIR, DESCRIBED)
     images, said = labelled(steps)
     assert warnings == said
     assert [piece.lengthened for piece in evidence] == [image.lengthened for image in images]
