@@ -33,7 +33,7 @@ def nominal(sensor: str | Path | Sensor, *, medium: str) -> Calibration:
         The sensor cannot work.
     """
     described = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
-    return nominal_calibration(described, described.medium(medium))
+    return nominal_calibration(described, described.medium(medium)).model_copy(update={"medium_name": medium})
 
 
 def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibration:
