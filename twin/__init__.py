@@ -1,10 +1,10 @@
 """Digital twin of an underwater laser triangulation sensor: renders captures with Mitsuba 3.
 
-`render` renders a scene into arrays, `simulate` into capture and truth files, `serve` plays it as camera and stage,
-`record` renders a campaign of many captures, `dataset` a data set with labels, which `load_dataset` reads, `sweep`
-searches the design of a sensor, `demo` runs the whole chain of commands, and `reproduce` the evaluation of the thesis.
-The stub beside this file lists them. Each is imported when it is first used, as Mitsuba must not be imported before its
-libLLVM is chosen.
+`render` renders a scene to arrays, and `simulate` to capture and truth files. `serve` provides a scene as camera and
+stage hardware. `record` renders a campaign of captures. `dataset` renders a data set with labels, and `load_dataset`
+reads it. `sweep` searches the best design of a sensor. `demo` runs the whole chain of commands, and `reproduce` the
+evaluation of the thesis. The stub file lists all names. Each name is imported at its first use, because libLLVM must be
+selected before Mitsuba is imported.
 """
 
 import lazy_loader

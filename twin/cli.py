@@ -1,6 +1,6 @@
-"""The ``twin`` command: renders virtual recordings.
+"""Command ``twin``: renders virtual recordings.
 
-Commands are functions of `twin` on the command line: parameters, defaults and descriptions are the functions' own.
+Each command calls a function of `twin`; its options, defaults and help texts are those of the function.
 """
 
 import sys
@@ -29,12 +29,12 @@ def simulate(call: Call) -> None:
 
 @derived(app, twin, "serve")
 def serve(call: Call) -> None:
-    """The command serves until Ctrl-C.
+    """Stop with Ctrl-C.
 
     Example: twin serve plane --placement near --fault drop@20
     """
     with call() as served:
-        print("\n".join([*served.lines(), "serving; Ctrl-C ends it"]), flush=True)
+        print("\n".join([*served.lines(), "serving; stop with Ctrl-C"]), flush=True)
         served.wait_for_end()
     print(f"ended after {served.rates()}")
 
@@ -64,7 +64,7 @@ def demo(call: Call) -> None:
 
 
 def _run_others(call: Call) -> None:
-    """Do what runs other commands, and exit as the one that fails, which has printed why."""
+    """Call a function that runs other commands; exit with the status of a failed one, which has printed its error."""
     try:
         call()
     except CommandFailed as error:
@@ -98,5 +98,5 @@ def scenes() -> None:
 
 
 def main() -> None:
-    """Entry point."""
+    """Run the command."""
     sys.exit(run(app))

@@ -1,7 +1,7 @@
-"""Options of rendering: samples, seed, the effects and flaws that are shown, and Mitsuba's variant.
+"""Rendering options: samples, seed, effects, flaws, and Mitsuba's variant.
 
-Call `use_variant` before importing any module of the twin that renders: Mitsuba and Dr.Jit look for libLLVM when they
-are imported.
+Call `use_variant` before importing any rendering module of the twin, because Mitsuba and Dr.Jit search for libLLVM
+during import.
 """
 
 from collections.abc import Sequence
@@ -18,35 +18,35 @@ Variant = Literal["llvm_ad_mono", "cuda_ad_mono"]
 
 @dataclass(frozen=True)
 class Effects:
-    """Which effects are rendered. Geometry, refraction and extinction are always there."""
+    """Rendered effects. Geometry, refraction and extinction are always rendered."""
 
     defocus: bool = True
-    """The lens's finite pupil: blur before and behind the focused plane, and the window's own aberration."""
+    """Finite pupil of the lens: defocus blur, and the window's aberration."""
     haze: bool = True
-    """Light that the water scatters once out of the sheet towards the camera."""
+    """Light of the sheet that is scattered once in the water towards the camera."""
     multiple_scattering: bool = True
-    """Light scattered on the laser's and on the camera's way, once or more often."""
+    """Light that is scattered once or more on the laser's or the camera's path."""
     secondary_light: bool = True
-    """Light that goes from one surface to another, and the images in mirrors."""
+    """Light that is reflected between surfaces, and images in mirrors."""
     gloss: bool = True
-    """Glossy, metallic and mirror finishes; without it every surface is diffuse."""
+    """Glossy, metallic and mirror finishes; without it, all surfaces are diffuse."""
     motion: bool = True
-    """The stage's travel during an exposure and the rows' delay of a rolling shutter."""
+    """Motion of the stage during an exposure, and the row delay of a rolling shutter."""
     ambient: bool = True
-    """Daylight on top of the laser's light."""
+    """Daylight in addition to the laser's light."""
     speckle: bool = True
-    """Grain of the coherent light."""
+    """Speckle of coherent light."""
     fixed_pattern: bool = True
-    """Differences between the detector's pixels."""
+    """Fixed differences between the detector's pixels."""
     noise: bool = True
     """Shot noise, dark noise and read noise."""
 
     def names(self) -> list[str]:
-        """The effects that are rendered, as a user writes them."""
-        return [_written(f.name) for f in fields(self) if getattr(self, f.name)]
+        """Return the names of the rendered effects, as in commands."""
+        return [_option_name(f.name) for f in fields(self) if getattr(self, f.name)]
 
     def without(self, *names: str) -> "Effects":
-        """The same with some effects left out; DescriptionError for an unknown name."""
+        """Return the effects without some of them; DescriptionError for an unknown name."""
         known = ALL.names()
         for name in names:
             if name not in known:
@@ -60,58 +60,58 @@ def _flaw(*, off: float, typical: float, least: float, most: float) -> Any:
 
 @dataclass(frozen=True)
 class Flaws:
-    """Effects of real recordings that are rendered only where they are asked for, most with a strength.
+    """Effects of real recordings that are rendered only on request, most of them with a strength.
 
-    DescriptionError where a strength is out of its range.
+    Raises DescriptionError if a strength is out of its range.
     """
 
     glare: float = _flaw(off=0.0, typical=0.02, least=0.0, most=0.5)
-    """Share of an image's light that lens and window spread widely over it: veiling glare (ISO 9358)."""
+    """Fraction of an image's light that lens and window spread over it: veiling glare (ISO 9358)."""
     vignetting: float = _flaw(off=0.0, typical=0.4, least=0.0, most=0.99)
-    """Relative loss of light at the image's farthest corner, beyond that by the cosine's fourth power."""
+    """Relative loss of light at the image's farthest corner, in addition to the cosine-fourth law."""
     uneven_lamp: float = _flaw(off=0.0, typical=0.6, least=0.0, most=0.99)
-    """Relative loss of the lamp's light half the view's diagonal away from its spot, which lies beside the middle."""
+    """Relative loss of the lamp's light at half the view's diagonal from its spot, which is off-centre."""
     particles: float = _flaw(off=0.0, typical=1000.0, least=0.0, most=1e5)
-    """Grains of marine snow larger than 0.1 mm in a litre, each seen on its own in the laser's sheet."""
+    """Number of grains of marine snow above 0.1 mm per litre, rendered individually in the laser's sheet."""
     bubbles: float = _flaw(off=0.0, typical=200.0, least=0.0, most=1e5)
-    """Air bubbles larger than 0.1 mm in diameter in a litre, which glint in the sheet."""
+    """Number of air bubbles above 0.1 mm in diameter per litre, which glint in the sheet."""
     caustics: float = _flaw(off=0.0, typical=0.3, least=0.0, most=1.0)
-    """Strength of the pattern that a wavy water surface makes of the daylight on surfaces."""
+    """Strength of the daylight's pattern on surfaces under a wavy water surface."""
     dirt: float = _flaw(off=0.0, typical=0.1, least=0.0, most=0.9)
-    """Share of the camera's window that is covered with spots, which take light in blurred patches of the image."""
+    """Fraction of the camera's window that is covered with spots, which darken blurred patches of the image."""
     lamp_and_laser: bool = False
-    """Lamp and laser on in every image: stripe and board in one."""
+    """Lamp and laser are on in every image, so that it shows stripe and board."""
     pixel_aspect: float = _flaw(off=1.0, typical=1.002, least=0.9, most=1.1)
-    """Focal length in px along y over that along x: pixels so much wider than high."""
+    """Width of a pixel divided by its height: ratio of the focal lengths in px along y and x."""
     tangential: float = _flaw(off=0.0, typical=1e-3, least=-0.1, most=0.1)
-    """Added to the tangential distortion p1 of the lens as built."""
+    """Increment of the tangential distortion p1 of the lens as built."""
     rolling_shutter: float = _flaw(off=0.0, typical=10.0, least=0.0, most=1000.0)
-    """Delay in us from row to row of a rolling shutter, which shows while the stage moves."""
+    """Delay in us between rows of a rolling shutter; visible while the stage moves."""
     jpeg: int = _flaw(off=0, typical=90, least=1, most=100)
-    """Quality of lossy compression; 8-bit images only."""
+    """Quality of JPEG compression; 8-bit images only."""
     colour_filter: bool = False
-    """A colour image sensor (RGGB) in place of a grey one; its red channel is recorded."""
+    """Colour image sensor (RGGB) instead of a monochrome one; its red channel is recorded."""
     camera_3d: int = _flaw(off=0, typical=16, least=1, most=32)
-    """Steps per pixel of a 3D camera, which finds the stripe itself: laser images are recorded as centre lines."""
+    """Steps per pixel of a 3D camera, which detects the stripe itself: laser images are recorded as centre lines."""
 
     def __post_init__(self) -> None:
         for each in fields(self):
             value, (least, most) = getattr(self, each.name), each.metadata.get("range", (False, True))
             if value != each.default and not least <= value <= most:
-                raise DescriptionError(f"{_written(each.name)} is {value:g}; it must be from {least:g} to {most:g}")
+                raise DescriptionError(f"{_option_name(each.name)} is {value:g}; it must be from {least:g} to {most:g}")
 
     def names(self) -> list[str]:
-        """The flaws that are rendered, as a user writes them."""
+        """Return the names of the rendered flaws, as in commands."""
         present = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) != f.default}
-        return [_written(name) + ("" if value is True else f"={value:.9g}") for name, value in present.items()]
+        return [_option_name(name) + ("" if value is True else f"={value:.9g}") for name, value in present.items()]
 
     @classmethod
     def of(cls, *texts: str) -> "Flaws":
-        """Flaws written as NAME, of typical strength, or NAME=STRENGTH.
+        """Parse flaws from NAME, with typical strength, or NAME=STRENGTH.
 
-        DescriptionError for an unknown name, or a strength that is no number, out of its range, or not asked for.
+        Raises DescriptionError if a name is unknown, or a strength is not a number, out of its range, or not allowed.
         """
-        known = {_written(each.name): each for each in fields(cls)}
+        known = {_option_name(each.name): each for each in fields(cls)}
         strengths: dict[str, Any] = {}
         for text in texts:
             name, equals, value = text.partition("=")
@@ -131,8 +131,8 @@ class Flaws:
         return cls(**strengths)
 
 
-def _written(field_name: str) -> str:
-    """The name of an effect as a user writes it."""
+def _option_name(field_name: str) -> str:
+    """Return the name of an effect as in commands."""
     return field_name.replace("_", "-")
 
 
@@ -142,7 +142,7 @@ NONE = ALL.without(*ALL.names())
 
 @dataclass(frozen=True)
 class Options:
-    """Rendering options: samples per lit pixel, seed of all that is random, and what the images show."""
+    """Rendering options: samples per lit pixel, seed of all random numbers, effects and flaws."""
 
     spp: int = 16
     seed: int = 0
@@ -157,21 +157,21 @@ class Options:
 
     @classmethod
     def chosen(cls, *, spp: int, seed: int, effects: Sequence[str], without: Sequence[str], ideal: bool) -> "Options":
-        """Options with flaws added by ``effects``, and some effects, or with ``ideal`` all of them, left out."""
+        """Make options with the flaws ``effects``, without the effects ``without``; ``ideal``: without all effects."""
         return cls(spp, seed, (NONE if ideal else ALL).without(*without), Flaws.of(*effects))
 
     def names(self) -> list[str]:
-        """All that is rendered beside geometry, refraction and extinction, as a user writes it."""
+        """Return the names of all rendered effects and flaws, as in commands."""
         return [*self.effects.names(), *self.flaws.names()]
 
 
 def use_variant(name: str = CPU) -> str:
-    """Select a monochromatic variant, ``llvm_ad_mono`` or ``cuda_ad_mono``; returns its name.
+    """Select a monochromatic variant, ``llvm_ad_mono`` or ``cuda_ad_mono``, and return its name.
 
     Raises
     ------
     SetupError
-        libLLVM is missing or too old, there is no CUDA device, or the variant is not one of the two.
+        libLLVM is missing or too old, no CUDA device is available, or the variant is not supported.
     """
     if name not in (CPU, GPU):
         raise SetupError(f"variant '{name}' is not supported; use {CPU} or {GPU}")

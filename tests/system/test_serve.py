@@ -154,7 +154,7 @@ def test_at_rest_only_the_noise_is_new(served, stage, camera):
     rates = served.rates()
     assert (rates.frames - before.frames, rates.rendered - before.rendered) == (5, 1)
     assert all(not np.array_equal(a, b) for a, b in pairwise(images))
-    assert re.fullmatch(r"\d+ frames, \d+ rendered at .* frames/s, \d+ of the same place at .* frames/s", str(rates))
+    assert re.fullmatch(r"\d+ frames, \d+ rendered at .* frames/s, \d+ at the same position at .* frames/s", str(rates))
 
 
 def test_a_laser_that_breaks_leaves_the_dark(served, stage, camera):
@@ -192,13 +192,15 @@ def test_the_motion_lies_in_the_middle_of_the_travel_or_where_it_is_wanted(serve
 
 def test_a_detector_of_more_bits_is_refused(board, sensor):
     finer = sensor.model_copy(update={"detector": sensor.detector.model_copy(update={"bits": 10})})
-    with pytest.raises(DesignError, match=r"gives 8 bit, .* detector 10"), serve(board, sensor=finer):
+    with pytest.raises(DesignError, match=r"has 8 bits, .* detector 10"), serve(board, sensor=finer):
         pass
 
 
 def test_lamp_and_laser_at_once_are_refused(board, sensor):
     with (
-        pytest.raises(DescriptionError, match="lamp-and-laser cannot be served, as the controller switches the laser"),
+        pytest.raises(
+            DescriptionError, match="lamp-and-laser cannot be served, because the controller switches the laser"
+        ),
         serve(board, sensor=sensor, effects=["lamp-and-laser"]),
     ):
         pass
@@ -214,9 +216,9 @@ def test_faults_are_read():
     assert parse_fault("stall@3") == Fault("stall", None, 3)
     assert len(NAMES) == 16
     for wrong, message in [
-        ("fire", "'fire' is no fault: .* break-laser"),
-        ("drop@0", "no fault"),
-        ("drop@x", "no fault"),
+        ("fire", "'fire' is not a fault: .* break-laser"),
+        ("drop@0", "not a fault"),
+        ("drop@x", "not a fault"),
         ("stall:2", "stall takes no argument"),
         ("drop:1.5", "'1.5', not a whole number"),
         ("delay:soon", "'soon', not a number of seconds"),

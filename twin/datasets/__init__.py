@@ -1,6 +1,6 @@
-"""Data sets of rendered images with labels, for training and testing: description, generation, files and reading.
+"""Data sets of rendered, labelled images for training and testing: description, generation, files and reading.
 
-`load` is `twin.load_dataset` by its short name.
+`load` is a short name of `twin.load_dataset`.
 """
 
 from twin.datasets.loading import load_dataset as load

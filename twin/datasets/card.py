@@ -1,4 +1,4 @@
-"""Data card of a data set: what it holds and how it was made, as JSON, as Markdown and as a page with pictures."""
+"""Data card of a data set: content and origin, as JSON, as Markdown, and as a page with images."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ from uwlts.pages.toolkit import BLUE, new_figure, plain_text, png_data_uri, rend
 README = "README.md"
 PAGE = "dataset.html"
 _SHOWN = 12
-"""Frames that the page shows."""
+"""Number of frames on the page."""
 _SHOWN_WIDTH_PX = 480
 _GAMMA = 0.5
-"""Exponent of the shown brightness, which makes haze visible beside the stripe."""
+"""Exponent of the displayed brightness, which makes haze visible."""
 _OVERLAY = {
     Mask.HAZE: (70, 110, 200),
     Mask.SECONDARY: (230, 150, 40),
@@ -53,7 +53,7 @@ _OVERLAY = {
 
 @dataclass
 class _Collected:
-    """What is counted over all frames, in memory that does not grow with the images."""
+    """Statistics of all frames; their memory does not grow with the size of the images."""
 
     drawn: dict[str, list[Value]] = field(default_factory=dict)
     status: Counter[int] = field(default_factory=Counter)
@@ -65,9 +65,9 @@ class _Collected:
 def write_card(
     folder: Path, description: DataSetDescription, shards: Sequence[tuple[Path, Split, int]], plan: dict[str, JsonValue]
 ) -> DataCard:
-    """Write the card of a data set whose shards (path, split and number of frames) are complete, in all three forms.
+    """Write the card of a data set in all three forms, and its masks as COCO annotations.
 
-    Masks are written as COCO annotations too.
+    ``shards`` are path, split and number of frames of the complete shards.
     """
     per_scene, versions = description.frames_per_scene(), plan["versions"]
     frames: dict[Split, int] = {split: sum(count for _, own, count in shards if own == split) for split in SPLITS}
@@ -122,7 +122,7 @@ def _collected(samples: DataSet) -> _Collected:
     for sample in samples:
         info = sample["info"]
         for path, value in info["drawn"].items():
-            # What all frames of a scene share counts once.
+            # Values that all frames of a scene share count once.
             if info["frame"] == 0 or path == "frame.exposure":
                 found.drawn.setdefault(path, []).append(value)
         if info["attempt"]:
@@ -167,9 +167,10 @@ def _markdown(card: DataCard, description: DataSetDescription) -> str:
             "| --- | --- | --- |",
             *varied,
             "",
-            f"Everything else is as in `{CARD}`. {card.redrawn} scenes were drawn anew: the sensor could not see them.",
+            f"All other values are in `{CARD}`. {card.redrawn} scenes were drawn again, because the sensor could not "
+            "measure the first draw.",
             "",
-            "## What each sample holds",
+            "## Content of a sample",
             "",
             "- `image`: grey values (height, width)",
             *(f"- `{name}`: {words}" for name, words in card.labels.items()),
@@ -190,7 +191,7 @@ def _size(card: DataCard) -> str:
 
 
 def _varied(card: DataCard, description: DataSetDescription) -> list[tuple[str, str, str]]:
-    """Path, distribution and what was drawn, of all that varies, as text."""
+    """Return path, distribution and drawn values of all varied paths as texts."""
     rows = []
     for path, distribution in description.vary.items():
         match distribution:
@@ -247,7 +248,7 @@ def _page(card: DataCard, description: DataSetDescription, found: _Collected, sa
 
 
 def _pictures(sample: dict[str, Any], *, along: str) -> tuple[str, str, str]:
-    """The image and its labels as addresses of pictures, and words for them."""
+    """Return the image and its labels as data URIs, and a caption."""
     image, info = sample["image"], sample["info"]
     full = 255 if image.dtype == np.uint8 else max(int(image.max()), 1)
     grey = (255 * (image / full) ** _GAMMA).astype(np.uint8)
@@ -267,7 +268,7 @@ def _pictures(sample: dict[str, Any], *, along: str) -> tuple[str, str, str]:
 
 
 def _address(picture: np.ndarray) -> str:
-    """A small copy (RGB) of a picture as an address that holds it."""
+    """Return a reduced copy of an RGB image as a data URI."""
     height = max(1, round(picture.shape[0] * _SHOWN_WIDTH_PX / picture.shape[1]))
     small = picture
     if picture.shape[1] > _SHOWN_WIDTH_PX:
@@ -276,7 +277,7 @@ def _address(picture: np.ndarray) -> str:
 
 
 def _histograms(drawn: dict[str, list[Value]] | dict[str, list[float]]) -> Markup | None:
-    """Histograms of values, three beside each other; None if there are none."""
+    """Draw histograms of values in three columns; None without values."""
     if not drawn:
         return None
     columns = min(3, len(drawn))

@@ -1,8 +1,8 @@
-"""Masks of a data set as COCO annotations, one JSON file for each split, which any tool for segmentation reads.
+"""Masks of a data set as COCO annotations, one JSON file per split, for segmentation tools.
 
-Every kind of mask is a category, and every one that an image shows is an annotation of the image: a compressed run
-length encoding of the whole mask with its box and area (https://cocodataset.org/#format-data). ``file_name`` is the
-image's name in the data set: ``train-000000.tar/000012-00.png`` in an archive, ``train-000000.h5/000012-00`` in HDF5.
+Each kind of mask is a category. Each kind that is present in an image is an annotation: a compressed run-length
+encoding of the mask with its box and area (https://cocodataset.org/#format-data). ``file_name`` is the image's name in
+the data set: ``train-000000.tar/000012-00.png`` in an archive, ``train-000000.h5/000012-00`` in HDF5.
 """
 
 import json
@@ -18,14 +18,14 @@ from uwlts.files.writing import written_aside
 
 
 def coco_path(folder: Path, split: str) -> Path:
-    """Path of the annotations of a split."""
+    """Return the path of the annotations of a split."""
     return folder / f"coco-{split}.json"
 
 
 def write_coco(folder: Path, card: DataCard) -> list[Path]:
-    """Write the annotations of every split with images, whose samples hold masks; the files' paths.
+    """Write the annotations of each split with images, from samples with masks; return the paths.
 
-    Images are read one at a time, and annotations written as they come: memory does not grow with the data set.
+    Images are read and annotations written one at a time, so that memory does not grow with the data set.
     """
     paths = [coco_path(folder, split) for split in SPLITS if card.frames[split]]
     for path, split in zip(paths, (split for split in SPLITS if card.frames[split]), strict=True):
@@ -54,7 +54,7 @@ def _images(folder: Path, card: DataCard, split: Any) -> Iterator[dict[str, Any]
 
 
 def _names(card: DataCard, split: Any) -> list[str]:
-    """Name of the shard of each image of a split."""
+    """Return the name of the shard of each image of a split."""
     return [shard.name for shard in card.shards if shard.split == split for _ in range(shard.frames)]
 
 
@@ -75,10 +75,11 @@ def _annotations(folder: Path, card: DataCard, split: Any) -> Iterator[dict[str,
 
 
 def encoded(mask: np.ndarray) -> str:
-    """Compressed run length encoding of a mask (H, W), bool, as the COCO API's ``maskApi.c`` writes it.
+    """Return the compressed run-length encoding of a mask (H, W), bool, as in the COCO API's ``maskApi.c``.
 
-    Lengths of runs down the columns, of unset pixels first. From the third on the difference from the one two before
-    is written, in groups of five bits, the lowest first, each with a bit for more to come, as characters from "0" on.
+    Runs are counted along columns and start with unset pixels. From the third run on, the difference from the run two
+    before is encoded, in groups of five bits, the lowest first. Each group has a continuation bit and is written as a
+    character, starting at "0".
     """
     flat = np.concatenate([[False], mask.ravel(order="F")])
     starts = np.flatnonzero(flat[1:] != flat[:-1])

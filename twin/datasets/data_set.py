@@ -1,4 +1,4 @@
-"""Description of a data set: a base scene and sensor, what varies in them and how, labels, splits and files."""
+"""Description of a data set: base scene and sensor, their random variations, labels, splits and files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from uwlts.model.sensor import Description, Positive, Sensor
 
 FOLDER = "datasets"
 ROOTS = ("sensor", "as_built", "scene", "effects")
-"""First keys of the paths that vary with the scene; `EXPOSURE` alone varies with the frame."""
+"""First keys of paths that vary between scenes; only `EXPOSURE` varies between frames."""
 EXPOSURE = "frame.exposure"
 _ONE_FOR_ALL = ("camera.width_px", "camera.height_px", "camera.stripe_along", "detector.bits", "motion.count")
 _PRINT_ERRORS = ("centre_std_mm", "bow_mm", "detection_std_px")
@@ -31,14 +31,14 @@ Label = Literal["centre", "quality", "points", "masks", "light", "depth", "targe
 
 
 class LineStatus(IntEnum):
-    """What a profile line shows of the stripe; the true centre is known of all but the lines without one."""
+    """State of the stripe on a profile line."""
 
     VISIBLE = 0
-    """The stripe is there, and its brightest pixel stands out of the noise."""
+    """The stripe is visible: its brightest pixel is well above the noise."""
     NOT_CROSSED = 1
-    """The line sees no surface at the sheet's middle: the stripe lies outside the image, or is hidden."""
+    """No visible surface at the sheet's middle: the stripe is outside the image, or hidden."""
     SHADOWED = 2
-    """The line sees a surface at the sheet's middle, but none of the laser's light falls on it."""
+    """There is a visible surface at the sheet's middle, but it is in the laser's shadow."""
     FAINT = 3
     """The brightest pixel's signal is below three standard deviations of its noise."""
     SATURATED = 4
@@ -51,56 +51,56 @@ class Mask(IntFlag):
     """Bits of the mask of an image."""
 
     STRIPE = 1
-    """Light straight from the lit surface is at least 1/e2 of the largest on the profile line, and an electron."""
+    """Direct light of the lit surface is at least 1/e^2 of its maximum on the profile line, and one electron."""
     SATURATED = 2
-    """The grey value is the largest."""
+    """The pixel is saturated."""
     HAZE = 4
-    """Light that the water scattered once exceeds the standard deviation of the pixel's noise."""
+    """Light scattered once in the water exceeds the standard deviation of the pixel's noise."""
     SECONDARY = 8
-    """Light on longer ways exceeds it: from one surface to another, or scattered more often."""
+    """Light on longer paths exceeds the noise: reflections between surfaces, and multiple scattering."""
     PARTICLES = 16
-    """Light of grains and bubbles in the sheet exceeds it."""
+    """Light of grains and bubbles in the sheet exceeds the noise."""
 
 
 FAINT_BELOW = 3.0
-"""A stripe some 4 px wide has twice the signal to noise of its brightest pixel, and 5 to 6 is what detection takes
-(A. Rose, J. Opt. Soc. Am. 38, 196, 1948)."""
+"""Limit of the signal-to-noise ratio of the brightest pixel. A stripe about 4 px wide has twice this ratio, and
+detection requires 5 to 6 (A. Rose, J. Opt. Soc. Am. 38, 196, 1948)."""
 
 
 class Distribution(Description, ABC):
-    """Base of all distributions; `at` is the inverse of the distribution function."""
+    """Base of all distributions; `at` is the inverse of the cumulative distribution function."""
 
     @abstractmethod
     def at(self, share: float) -> Value:
-        """The value below which the given share (0 to 1) of all values lies."""
+        """Return the quantile of a probability from 0 to 1."""
 
 
 class Constant(Distribution):
-    """Always the same value."""
+    """Constant value."""
 
     kind: Literal["constant"]
     value: Value
 
     def at(self, share: float) -> Value:
-        """The value."""
+        """Return the value."""
         return self.value
 
 
 class OneOf(Distribution):
-    """One of some values, each as probable as its weight says, all equally unless given."""
+    """One of several values, with probabilities proportional to ``weights``, by default equal."""
 
     kind: Literal["choice"]
     values: Annotated[tuple[Value, ...], Field(min_length=1)]
     weights: tuple[Positive, ...] | None = None
 
     @model_validator(mode="after")
-    def _weighted(self) -> Self:
+    def _check_weights(self) -> Self:
         if self.weights is not None and len(self.weights) != len(self.values):
             raise ValueError(f"{len(self.weights)} weights for {len(self.values)} values: give one for each")
         return self
 
     def at(self, share: float) -> Value:
-        """The value whose part of all weights holds the share."""
+        """Return the value at a cumulative probability."""
         weights = self.weights or (1.0,) * len(self.values)
         left = share * math.fsum(weights)
         for value, weight in zip(self.values, weights, strict=True):
@@ -111,46 +111,46 @@ class OneOf(Distribution):
 
 
 class Between(Distribution):
-    """Base of distributions between two ends."""
+    """Base of distributions on a range."""
 
     least: float
     most: float
 
     @model_validator(mode="after")
-    def _ordered(self) -> Self:
+    def _check_order(self) -> Self:
         if not self.least < self.most:
             raise ValueError(f"least {self.least:g} must be smaller than most {self.most:g}")
         return self
 
 
 class Uniform(Between):
-    """Every number of a range equally probable."""
+    """Uniform distribution on a range."""
 
     kind: Literal["uniform"]
 
     def at(self, share: float) -> float:
-        """The value at a share of the range."""
+        """Return the quantile of a probability."""
         return self.least + share * (self.most - self.least)
 
 
 class LogUniform(Between):
-    """Every factor of a range equally probable: the logarithm is uniform."""
+    """Log-uniform distribution on a range: the logarithm is uniform."""
 
     kind: Literal["log_uniform"]
 
     @model_validator(mode="after")
-    def _positive(self) -> Self:
+    def _check_positive(self) -> Self:
         if self.least <= 0:
-            raise ValueError(f"a logarithm needs a least above 0, found {self.least:g}")
+            raise ValueError(f"least of a log_uniform distribution is {self.least:g}; it must be above 0")
         return self
 
     def at(self, share: float) -> float:
-        """The value at a share of the range of logarithms."""
+        """Return the quantile of a probability."""
         return self.least * (self.most / self.least) ** share
 
 
 class Normal(Distribution):
-    """Normal with a mean and a standard deviation, cut off below ``least`` and above ``most`` if they are given."""
+    """Normal distribution, truncated to ``least`` and ``most`` if they are given."""
 
     kind: Literal["normal"]
     mean: float
@@ -159,17 +159,17 @@ class Normal(Distribution):
     most: float | None = None
 
     @model_validator(mode="after")
-    def _holds_values(self) -> Self:
+    def _check_range(self) -> Self:
         low, high = self._ends()
         if high - low < 1e-6:
             raise ValueError(
-                f"less than a millionth of normal values about {self.mean:g} with std {self.std:g} lies between least "
-                f"{self.least} and most {self.most}: widen them"
+                f"less than a millionth of the normal distribution with mean {self.mean:g} and std {self.std:g} is "
+                f"between least {self.least} and most {self.most}: widen the range"
             )
         return self
 
     def at(self, share: float) -> float:
-        """The value below which the share of the values between the ends lies."""
+        """Return the quantile of a probability."""
         low, high = self._ends()
         return float(self.mean + self.std * ndtri(low + share * (high - low)))
 
@@ -185,35 +185,39 @@ AnyDistribution = Annotated[Constant | OneOf | Uniform | LogUniform | Normal, Fi
 
 
 class Splits(Description):
-    """Shares of the scenes in each split; all frames of a scene are in the same one."""
+    """Fractions of the scenes in each split; all frames of a scene are in the same split."""
 
     train: Annotated[float, Field(ge=0, le=1)] = 0.8
     validation: Annotated[float, Field(ge=0, le=1)] = 0.1
     test: Annotated[float, Field(ge=0, le=1)] = 0.1
 
     @model_validator(mode="after")
-    def _whole(self) -> Self:
+    def _check_sum(self) -> Self:
         if not math.isclose(total := self.train + self.validation + self.test, 1.0, abs_tol=1e-9):
             raise ValueError(f"train, validation and test add up to {total:g}; expected 1")
         return self
 
 
 class DataSetDescription(Description):
-    """A data set as read from TOML.
+    """Data set as read from TOML.
 
-    Each of the ``scenes`` is the base ``scene`` seen by the base ``sensor`` with values drawn for what ``vary`` names;
-    its frames are the images of the scene's motion, or of ``motion`` if it is given. The ``sensor`` is what is
-    described to those who measure, ``as_built`` what is rendered, the same unless given. Scene and sensors are given by
-    name or path.
+    Each of the ``scenes`` is the base ``scene``, recorded by the base ``sensor``. The paths in ``vary`` have random
+    values. The frames of a scene are the images of its motion, or of ``motion`` if it is given. ``sensor`` is the
+    nominal description, and ``as_built`` the rendered sensor, by default the same. Scene and sensors are given by name
+    or path.
 
-    ``vary`` gives a distribution for each path: ``sensor.`` and a path of the sensor's description, which changes what
-    is described and what is built; ``as_built.``, which changes only what is built; ``scene.`` and a path of the
-    scene's description; ``effects.`` and the name of an effect to add, by its strength (`twin.options.Flaws`); and
-    ``frame.exposure``, a factor of the time of exposure that is drawn anew for every frame. Places in lists count from
-    0. Numbers that the description counts are rounded.
+    ``vary`` maps paths to distributions:
 
-    ``spp``, ``effects`` and ``without`` are those of `twin.simulate`. ``labels`` are what is stored with each image.
-    Files of ``format`` "webdataset" are tar archives, of "hdf5" HDF5 files, each with ``scenes_per_shard`` scenes.
+    - ``sensor.`` and a path of the sensor's description: changes the nominal and the rendered sensor.
+    - ``as_built.`` and such a path: changes only the rendered sensor.
+    - ``scene.`` and a path of the scene's description.
+    - ``effects.`` and the name of an effect: its strength (`twin.options.Flaws`).
+    - ``frame.exposure``: a factor of the exposure time, drawn for each frame.
+
+    Indices in lists start at 0. Values of integers are rounded.
+
+    ``spp``, ``effects`` and ``without`` are those of `twin.simulate`. ``labels`` are the arrays stored with each image.
+    ``format`` is "webdataset" (tar archives) or "hdf5"; each file has ``scenes_per_shard`` scenes.
     """
 
     title: str
@@ -237,22 +241,22 @@ class DataSetDescription(Description):
 
     @field_validator("sensor", "as_built", mode="before")
     @classmethod
-    def _sensor_found(cls, value: object) -> object:
+    def _load_sensor(cls, value: object) -> object:
         return load_sensor(value) if isinstance(value, str) else value
 
     @field_validator("scene", mode="before")
     @classmethod
-    def _scene_found(cls, value: object) -> object:
+    def _load_scene(cls, value: object) -> object:
         return load_scene(value) if isinstance(value, str) else value
 
     @field_validator("scene")
     @classmethod
-    def _scene_moved(cls, scene: Scene, info: ValidationInfo) -> Scene:
+    def _apply_motion(cls, scene: Scene, info: ValidationInfo) -> Scene:
         motion = info.data.get("motion")
         return scene if motion is None else scene.model_copy(update={"motion": motion})
 
     @model_validator(mode="after")
-    def _can_be_drawn(self) -> Self:
+    def _check_vary(self) -> Self:
         self.options(seed=0)
         whole = set()
         for path, distribution in self.vary.items():
@@ -271,28 +275,32 @@ class DataSetDescription(Description):
                 raise ValueError("the label 'target' is for scenes with a calibration target: leave it out")
             varied = {path.rpartition(".")[2] for path in self.vary}
             if any(getattr(one, error) for one in printed for error in _PRINT_ERRORS) or varied & set(_PRINT_ERRORS):
-                raise ValueError("the label 'target' knows no errors of print, plate and detection: leave them out")
+                raise ValueError(
+                    "the label 'target' does not include errors of print, plate and detection: remove them"
+                )
         if EXPOSURE in self.vary and self.scene.motion.moves():
-            raise ValueError(f"{EXPOSURE} leaves a moving stage's blur as it is: vary sensor.exposure.laser_ms instead")
+            raise ValueError(
+                f"{EXPOSURE} does not change the blur by a moving stage: vary sensor.exposure.laser_ms instead"
+            )
         self._whole = frozenset(whole)
         return self
 
     def frames_per_scene(self) -> int:
-        """Images of each scene's motion."""
+        """Return the number of images of each scene."""
         return self.scene.motion.images()
 
     def options(self, *, seed: int, strengths: dict[str, Value] | None = None) -> Options:
-        """Options of rendering a scene; ``strengths`` are those drawn of effects to add, by their names."""
+        """Return the options for rendering a scene; ``strengths`` are the drawn strengths of effects by name."""
         drawn = [f"{name}={value}" for name, value in (strengths or {}).items()]
         return Options(self.spp, seed, Effects().without(*self.without), Flaws.of(*self.effects, *drawn))
 
     def drawn(self, path: str, share: float) -> Value:
-        """The value of a path at a share from 0 to 1 of its distribution, rounded where the description counts."""
+        """Return the quantile of a path's distribution at a probability from 0 to 1, rounded for integers."""
         value = self.vary[path].at(share)
         return round(value) if path in self._whole and not isinstance(value, str) else value
 
     def _base_value(self, path: str) -> Value | None:
-        """The value that a path has without being varied; DescriptionError where there is no such path."""
+        """Return the value of a path in the base description; DescriptionError if the path is unknown."""
         root, _, rest = path.partition(".")
         if path == EXPOSURE:
             return 1.0
@@ -306,7 +314,7 @@ class DataSetDescription(Description):
             case "effects":
                 strength = getattr(Flaws.of(rest), rest.replace("-", "_"))
                 if isinstance(strength, bool):
-                    raise DescriptionError(f"vary '{path}': {rest} has no strength; name it in effects")
+                    raise DescriptionError(f"vary '{path}': {rest} does not have a strength; name it in effects")
                 return strength
             case _:
                 known = ", ".join(f"{each}." for each in ROOTS)
@@ -316,9 +324,10 @@ class DataSetDescription(Description):
 def load_description(
     given: str | Path | DataSetDescription, *, scenes: int | None = None, seed: int | None = None
 ) -> DataSetDescription:
-    """Description of a data set by name (``stripe-clean``) or path; scene and sensors beside it are found by file name.
+    """Load the description of a data set by name (``stripe-clean``) or path, or check a given one.
 
-    ``scenes`` and ``seed`` replace the description's own. DescriptionError where it is not valid.
+    Scene and sensors can be names of files in the description's folder. ``scenes`` and ``seed`` replace the values of
+    the description. Raises DescriptionError if the description is not valid.
     """
     if isinstance(given, DataSetDescription):
         path, table = Path("the description"), given.model_dump()

@@ -1,7 +1,7 @@
-"""Scenes of a data set: what each number draws for its sensor, its objects and its frames.
+"""Scenes of a data set: values drawn for sensor, objects and frames.
 
-Every path of every scene has random numbers of its own, which depend on the seed, the scene's number and the path's
-name only: a data set of more scenes begins with those of a smaller one, and a path added leaves the others' values.
+Each path of each scene has its own random numbers, which depend only on the seed, the scene's number and the path's
+name. More scenes do not change the first ones, and an additional path does not change the values of others.
 """
 
 from dataclasses import dataclass
@@ -17,15 +17,15 @@ from uwlts.model.library import validated
 from uwlts.model.sensor import Sensor
 
 _GOLDEN = (5**0.5 - 1) / 2
-"""Multiples of the golden section, without their whole part, are spread evenly however many of them there are."""
+"""Golden ratio conjugate: the fractional parts of its first n multiples are evenly spread for every n."""
 
 
 @dataclass(frozen=True)
 class DrawnScene:
-    """One scene of a data set, ready to be rendered.
+    """Scene of a data set, ready to be rendered.
 
-    ``values`` are those drawn, by their paths, ``exposures`` (frames,) the factors of the frames' times of exposure.
-    ``attempt`` counts from 0 how often it had to be drawn anew.
+    ``values`` are the drawn values by path. ``exposures`` (frames,) are factors of the frames' exposure times.
+    ``attempt`` is the number of earlier draws that were rejected.
     """
 
     number: int
@@ -40,19 +40,19 @@ class DrawnScene:
 
 
 def split_of(description: DataSetDescription, scene: int) -> Split:
-    """The split of a scene, which more scenes do not change."""
+    """Return the split of a scene; it does not depend on the number of scenes."""
     start = np.random.default_rng([description.seed, *b"splits"]).random()
     place = (start + scene * _GOLDEN) % 1.0
     for name in SPLITS:
         place -= getattr(description.splits, name)
         if place < 0:
             return name
-    # The shares add up to 1 but for rounding.
+    # The fractions can sum to less than 1 because of rounding.
     return max(SPLITS, key=lambda name: getattr(description.splits, name))
 
 
 def draw_scene(description: DataSetDescription, scene: int, *, attempt: int = 0) -> DrawnScene:
-    """A scene by its number; DescriptionError where its values make no description of a scene or sensor."""
+    """Draw a scene by its number; DescriptionError if its values are not valid for a scene or sensor."""
 
     def share(path: str, frame: int = 0) -> float:
         return float(np.random.default_rng([description.seed, scene, attempt, frame, *path.encode()]).random())
@@ -76,7 +76,7 @@ def draw_scene(description: DataSetDescription, scene: int, *, attempt: int = 0)
         options = description.options(seed=seed, strengths=by_root["effects"])
     except Error as error:
         text = ", ".join(f"{path} = {value}" for path, value in values.items())
-        raise type(error)(f"{error}\n  drawn were {text}: narrow what vary says of them") from error
+        raise type(error)(f"{error}\n  drawn: {text}; narrow the distributions of these paths in vary") from error
     motion = drawn.motion
     exposures = (1.0,) * motion.images()
     if EXPOSURE in description.vary:

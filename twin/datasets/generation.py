@@ -1,7 +1,7 @@
-"""Generation of data sets: scenes drawn from a description, rendered with their labels, shard by shard.
+"""Generation of data sets: draw scenes from a description and render them with labels, one shard at a time.
 
-A shard is written by one process and appears whole. Everything random in it depends on the seed and on the numbers of
-its scenes, so that any number of processes write the same files, and a run that was interrupted goes on with the next
+A shard is written atomically by one process. Its random numbers depend only on the seed and on the numbers of its
+scenes. The files are therefore independent of the number of processes, and an interrupted run continues with the next
 shard.
 """
 
@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from twin.scene.motion import Shot
 
 MOST_ATTEMPTS = 20
-"""A scene that the sensor cannot measure is drawn anew; where so many in a row are, the description is at fault."""
+"""Largest number of draws of a scene until the sensor can measure it; more indicate an error in the description."""
 _PATIENCE_S = 30.0
-"""Other runs hold the plan for a moment at their beginning."""
+"""Waiting time for the plan, which other runs lock briefly at their start."""
 _OUTPUT = re.compile(
     rf"({'|'.join(SPLITS)})-\d{{6}}\.(tar|h5)|coco-({'|'.join(SPLITS)})\.json|{re.escape(CARD)}|{re.escape(README)}|{re.escape(PAGE)}|{re.escape(PLAN)}"
 )
@@ -59,11 +59,11 @@ def dataset(
     variant: Variant = CPU,
     progress: ProgressListener = unheard,
 ) -> Path:
-    """Render a data set of images with labels, for training and testing, from a description of what varies and how.
+    """Render a data set of labelled images, for training and testing, from a description of its random variations.
 
-    Run again, it goes on where it was interrupted; run at the same time, also on other machines that share the folder,
-    each run takes shards that no other one is writing, and ends when all are there. The folder is returned;
-    `load_dataset` reads it.
+    An interrupted run continues when it is run again. Several runs can share the folder at the same time, also from
+    other machines: each run renders shards that no other run is writing, and ends when all shards are complete. The
+    folder is returned; `load_dataset` reads it.
 
     Parameters
     ----------
@@ -72,13 +72,13 @@ def dataset(
     out
         Folder for the data set: shards, dataset.json, README.md and dataset.html.
     scenes
-        Number of scenes, in place of the description's.
+        Number of scenes; default: the description's.
     seed
-        Number from which everything random is drawn, in place of the description's.
+        Seed of all random numbers; default: the description's.
     workers
-        Shards rendered at a time; as many as there are processors unless given. It does not change the frames.
+        Number of shards that are rendered at the same time; default: one per processor. The frames do not depend on it.
     overwrite
-        Remove the data set that the folder holds, and start afresh.
+        Remove an existing data set from the folder first.
     variant
         As for `simulate`.
     progress
@@ -87,9 +87,9 @@ def dataset(
     Raises
     ------
     DescriptionError
-        The description is not valid, or the folder holds another data set.
+        The description is not valid, or the folder contains another data set.
     DesignError
-        The sensor cannot measure the scenes that are drawn.
+        The sensor cannot measure the drawn scenes.
     OutputError
         A file cannot be written.
     SetupError
@@ -119,7 +119,7 @@ def dataset(
         done += 1
         progress(done, total)
 
-    # What others are writing is left to them at first, and then waited for: should they fail, it is done here.
+    # First skip shards that other runs are writing, then wait for them and render those that failed.
     for patience_s in (0.0, math.inf):
         waiting = [job for job in waiting if not job.path.is_file()]
         work_through(partial(_render_shard, patience_s), waiting, workers=workers, on_message=count)
@@ -131,7 +131,7 @@ def dataset(
 
 @dataclass(frozen=True)
 class _Job:
-    """A shard to write: its scenes, all of one split."""
+    """Shard to write; all its scenes belong to one split."""
 
     description: DataSetDescription
     path: Path
@@ -145,7 +145,7 @@ class _Job:
 
 
 def _jobs(description: DataSetDescription, folder: Path, variant: str) -> list[_Job]:
-    """All shards, in the order of their first scenes."""
+    """Return all shards, sorted by first scene."""
     members: dict[Split, list[int]] = {split: [] for split in SPLITS}
     for scene in range(description.scenes):
         members[split_of(description, scene)].append(scene)
@@ -165,13 +165,13 @@ def _jobs(description: DataSetDescription, folder: Path, variant: str) -> list[_
 
 
 def _plan(description: DataSetDescription, variant: str) -> dict[str, JsonValue]:
-    """What the frames follow from."""
+    """Return the settings that determine the frames."""
     versions: dict[str, JsonValue] = {package: version(package) for package in ("uwlts", "mitsuba", "drjit")}
     return {"description": description.model_dump(mode="json"), "variant": variant, "versions": versions}
 
 
 def _prepare(folder: Path, jobs: list[_Job], plan: dict[str, JsonValue], *, overwrite: bool) -> None:
-    """Make the folder ready for a plan; OutputError where another run is at work in what is to be replaced."""
+    """Prepare the folder for a plan; OutputError if another run is writing files that are to be replaced."""
     try:
         for job in jobs:
             refuse_other_writer(job.path)
@@ -186,16 +186,16 @@ def _prepare(folder: Path, jobs: list[_Job], plan: dict[str, JsonValue], *, over
 
 
 def _clear(folder: Path, *, all_of_it: bool) -> None:
-    """Remove what a killed run has left unfinished, and with ``all_of_it`` the data set itself; other files stay."""
+    """Remove temporary files of a killed run, and with ``all_of_it`` the data set; other files stay."""
     for path in folder.iterdir():
         if path.is_file() and (_UNFINISHED.fullmatch(path.name) or (all_of_it and _OUTPUT.fullmatch(path.name))):
             path.unlink()
 
 
 def _render_shard(patience_s: float, job: _Job, report: Callable[[None], None]) -> None:
-    """Render the scenes of a shard into its file; calls ``report`` after every frame.
+    """Render the scenes of a shard to its file, and call ``report`` after each frame.
 
-    A shard that another process is still writing after ``patience_s`` is left to it.
+    The shard is skipped if another process is still writing it after ``patience_s``.
     """
     try:
         with one_writer(job.path, patience_s=patience_s):
@@ -204,7 +204,7 @@ def _render_shard(patience_s: float, job: _Job, report: Callable[[None], None]) 
                 return
     except OtherWriterError:
         return
-    # Another process has written it meanwhile.
+    # Another process has written the shard.
     for _ in range(job.frames):
         report(None)
 
@@ -215,7 +215,7 @@ def _render(job: _Job, report: Callable[[None], None]) -> None:
     import mitsuba as mi
 
     dr.set_thread_count(1)
-    # Mitsuba takes the rounding of turned cylinders for shear, and says so of every scene.
+    # Mitsuba warns of shear in every scene, because of rounding errors of rotated cylinders.
     mi.set_log_level(mi.LogLevel.Error)
     with written_shard(job.path, job.description.format, frames=job.frames) as writer:
         for scene in job.scenes:
@@ -229,7 +229,7 @@ def _render(job: _Job, report: Callable[[None], None]) -> None:
 
 
 def _measurable(description: DataSetDescription, scene: int) -> tuple[DrawnScene, Studio]:
-    """A scene as first drawn so that the sensor can measure it, and the sensor before it."""
+    """Draw a scene until the sensor can measure it; return the scene and its studio."""
     from twin.recording.studio import Studio
 
     why = None
@@ -240,15 +240,15 @@ def _measurable(description: DataSetDescription, scene: int) -> tuple[DrawnScene
         except DesignError as error:
             why = error
     raise DesignError(
-        f"scene {scene} of '{description.title}' was drawn {MOST_ATTEMPTS} times, and the sensor can measure none of "
-        f"them: narrow what vary says. The last one: {why}"
+        f"scene {scene} of '{description.title}' was drawn {MOST_ATTEMPTS} times, but the sensor can measure none of "
+        f"the draws: narrow the distributions in vary. The last one: {why}"
     ) from why
 
 
 def _known(
     description: DataSetDescription, drawn: DrawnScene, studio: Studio, shot: Shot, taken: Exposed, index: int
 ) -> dict[str, Any]:
-    """What is known of a frame, as a table of JSON."""
+    """Return the metadata of a frame as a JSON table."""
     known: dict[str, Any] = {
         "scene": drawn.number,
         "frame": index,

@@ -1,7 +1,7 @@
-"""Labels of rendered images: what is known of every profile line and every pixel.
+"""Labels of rendered images: ground truth of profile lines and pixels.
 
-`MEANINGS` explains the arrays of a frame by their names; they are NaN where there is nothing.
-Of several lit crossings on a line the brightest is labelled.
+`MEANINGS` explains the arrays of a frame by name; missing values are NaN. If a line has several lit points of the
+sheet, the labels belong to the brightest.
 """
 
 from __future__ import annotations
@@ -21,33 +21,33 @@ if TYPE_CHECKING:
     from twin.scene.motion import Shot
 
 _WINDOW_PX = 96
-"""Pixels to either side of a centre in which its stripe is looked for; wider ones are cut off there."""
+"""Half width of the window around a centre; wider stripes are truncated."""
 _LEAST_E = 1e-6
-"""Electrons below which a pixel counts as dark: the smallest numbers are zero on some processors and threads."""
+"""Electrons below which a pixel counts as dark, because some processors and threads flush tiny numbers to zero."""
 _LARGEST_HALF = 65504.0
-"""Largest number of float16; brighter pixels are clipped to it, far above any full well of use."""
+"""Largest number of float16; brighter pixels are clipped to it. It is above the full well of usual sensors."""
 NO_OBJECT = 255
 MEANINGS = {
     "centre_px": "(lines,) float32: true centre of the stripe on each profile line, in px across it; NaN without one",
     "status": "(lines,) uint8: " + ", ".join(f"{one.value} {one.name.lower()}" for one in LineStatus),
     "width_px": "(lines,) float32: full width at half maximum of the stripe across it, in px",
-    "snr": "(lines,) float32: signal over noise of the stripe's brightest pixel, speckle left out",
-    "bound_px": "(lines,) float32: Cramér-Rao bound of the centre's standard deviation, in px, speckle left out",
-    "point_mm": "(lines, 3) float32: surface at the centre, in scene coordinates",
-    "normal": "(lines, 3) float32: unit normal of the surface there",
-    "object": "(lines,) int16: number of the object there, -1 for none",
-    "target_px": "(points, 2) float32: where the points of the calibration target are seen; NaN where they are not",
+    "snr": "(lines,) float32: signal-to-noise ratio of the stripe's brightest pixel, without speckle",
+    "bound_px": "(lines,) float32: Cramér-Rao bound of the centre's standard deviation, in px, without speckle",
+    "point_mm": "(lines, 3) float32: surface point at the centre, in scene coordinates",
+    "normal": "(lines, 3) float32: unit normal of the surface at the point",
+    "object": "(lines,) int16: number of the object at the point, -1 for none",
+    "target_px": "(points, 2) float32: image points of the calibration target; NaN if not visible",
     "mask": "(height, width) uint8: sum of " + ", ".join(f"{one.value} {str(one.name).lower()}" for one in Mask),
-    "light_e": "(5, height, width) float16: mean photo-electrons of light straight from the lit surface, scattered "
-    "once, on longer ways, by grains and bubbles, and of lamp and day; without speckle and noise",
-    "depth_mm": "(height, width) float32: depth in the camera frame of what each pixel's middle sees; NaN for nothing",
-    "object_map": "(height, width) uint8: number of the object that each pixel's middle sees, 255 for none",
+    "light_e": "(5, height, width) float16: mean photo-electrons without speckle and noise, from: direct light of the "
+    "lit surface, light scattered once, longer paths, grains and bubbles, lamp and daylight",
+    "depth_mm": "(height, width) float32: depth in the camera frame at each pixel's centre; NaN without a surface",
+    "object_map": "(height, width) uint8: number of the object at each pixel's centre, 255 for none",
 }
 """Meaning of the arrays of a sample."""
 
 
 def labelled(studio: Studio, shot: Shot, taken: Exposed, wanted: tuple[Label, ...]) -> dict[str, np.ndarray]:
-    """The wanted arrays of a shot that was taken by a studio, by their names."""
+    """Return the wanted arrays of a shot by name."""
     from twin.recording.frame_truth import seen_surfaces
 
     arrays: dict[str, np.ndarray] = {}
@@ -76,7 +76,7 @@ def labelled(studio: Studio, shot: Shot, taken: Exposed, wanted: tuple[Label, ..
 
 
 def _line_labels(studio: Studio, shot: Shot, taken: Exposed, noise: np.ndarray) -> dict[str, np.ndarray]:
-    """All labels of the profile lines of a shot."""
+    """Return all labels of the profile lines of a shot."""
     from twin.recording.frame_truth import brightest, crossings, lit_dimmest_first, no_stripe
 
     camera, detector = studio.sensor.camera, studio.sensor.detector
@@ -100,7 +100,7 @@ def _line_labels(studio: Studio, shot: Shot, taken: Exposed, noise: np.ndarray) 
 
 
 def _target_points(studio: Studio, shot: Shot) -> np.ndarray:
-    """Image points (N, 2), float32, of the points of the scene's first calibration target."""
+    """Return the image points (N, 2), float32, of the scene's first calibration target."""
     from twin.recording.frame_truth import image_points
 
     things = zip(studio.scene.objects, studio.scene.object_poses(), strict=True)
@@ -110,10 +110,10 @@ def _target_points(studio: Studio, shot: Shot) -> np.ndarray:
 
 
 def noise_std_e(taken: Exposed, detector: Detector) -> np.ndarray:
-    """Standard deviation (H, W) in electrons of a pixel's noise from image to image (EMVA 1288 release 4, Eq. 13).
+    """Return the standard deviation (H, W) in electrons of the temporal noise of pixels (EMVA 1288 release 4, Eq. 13).
 
-    Shot noise of light and dark current, noise of the readout, and rounding, whose variance is a twelfth of a grey
-    value squared. Speckle is none of it, nor is what differs from pixel to pixel.
+    It includes shot noise of light and dark current, read noise, and quantisation with a variance of 1/12 of a grey
+    value squared. It does not include speckle and differences between pixels.
     """
     dark = 1e-3 * taken.exposure_ms * detector.dark_current_e_per_s * detector.dark_current_growth()
     constant = dark + detector.read_noise_e**2 + 1 / (12 * detector.gain_dn_per_e() ** 2)
@@ -122,9 +122,10 @@ def noise_std_e(taken: Exposed, detector: Detector) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LineQuality:
-    """Of the stripe on L profile lines: width, signal to noise, least standard deviation of its centre, all (L,).
+    """Quality of the stripe on L profile lines: width, signal-to-noise ratio and Cramér-Rao bound of its centre, (L,).
 
-    ``clipped`` (L,) says whether pixels within its full width at half maximum are saturated. NaN where no stripe is.
+    ``clipped`` (L,) marks stripes with saturated pixels within the full width at half maximum. Values are NaN without a
+    stripe.
     """
 
     width_px: np.ndarray
@@ -136,13 +137,24 @@ class LineQuality:
 def stripe_quality(
     direct: np.ndarray, noise: np.ndarray, centre: np.ndarray, *, informative: np.ndarray, clipped: np.ndarray
 ) -> LineQuality:
-    """Quality of the stripe about true centres (L,), from images of its own light and of the noise, in electrons.
+    """Evaluate the stripe at true centres.
 
-    Images are (A, L), A being the pixels across the stripe. The stripe is the run of lit pixels that holds the centre.
-    Its width lies between the places where the light passes half of its maximum, linear between pixels; NaN where the
-    image cuts it. The bound is that of Cramér and Rao for a profile s of known shape that moves across independent
-    noise: 1 / sqrt(sum (ds/dx)^2 / std^2) over ``informative`` pixels (Kay, Fundamentals of Statistical Signal
-    Processing: Estimation Theory, 1993, Eq. 3.14, with a variance for each pixel).
+    The stripe is the run of lit pixels that contains the centre. Its width is the full width at half maximum, with
+    linear interpolation between pixels; NaN if the stripe is cut by the image's border. The bound is the Cramér-Rao
+    bound for the position of a profile s of known shape in independent noise: 1 / sqrt(sum (ds/dx)^2 / std^2) over
+    ``informative`` pixels (Kay, Fundamentals of Statistical Signal Processing: Estimation Theory, 1993, Eq. 3.14, with
+    a variance for each pixel).
+
+    Parameters
+    ----------
+    direct : (A, L)
+        Direct light of the stripe in electrons: A pixels across the stripe, L profile lines.
+    noise : (A, L)
+        Standard deviation of the noise in electrons.
+    centre : (L,)
+        True centres, NaN without one.
+    informative, clipped : (A, L) bool
+        Pixels that count for the bound, and saturated pixels.
     """
     lines, across = np.flatnonzero(np.isfinite(centre)), len(direct)
     columns = np.arange(len(lines))
@@ -170,7 +182,7 @@ def stripe_quality(
         to_last = (half - signal[end, columns]) / fall
         width = np.where(whole, end - start - from_first - to_last, np.nan)
     window_noise = noise[row, lines].astype(float)
-    # Five points know the slope of a stripe of 1 px standard deviation to some percent, two to 15 %.
+    # Five-point derivative: for a stripe of 1 px standard deviation, its error is a few percent; two points give 15 %.
     padded = np.pad(signal, ((2, 2), (0, 0)))
     slope = (padded[:-4] - 8 * padded[1:-3] + 8 * padded[3:-1] - padded[4:]) / 12
     known = inside & informative[row, lines] & (signal > 0)
@@ -192,7 +204,7 @@ def stripe_quality(
 
 
 def mask_of(taken: Exposed, noise: np.ndarray, *, saturation: int, along_width: bool) -> np.ndarray:
-    """Bits of `Mask` (H, W), uint8, with the noise (H, W) of every pixel in electrons."""
+    """Return the bits of `Mask` (H, W), uint8; ``noise`` (H, W) is the pixels' standard deviation in electrons."""
     brightest = taken.direct.max(axis=0 if along_width else 1, keepdims=True)
     bits = {
         Mask.STRIPE: taken.direct >= np.maximum(math.exp(-2) * brightest, 1.0),

@@ -1,4 +1,4 @@
-"""Reading of data sets, sample by sample, with NumPy alone; what it returns is a map-style data set to PyTorch too."""
+"""Reading of data sets by sample, with NumPy only; the result is also a map-style data set for PyTorch."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CARD_VERSION = 1
 
 
 class Shard(Description):
-    """One file of a data set, its split, its frames, and the hash of its content in hexadecimal."""
+    """File of a data set: name, split, number of frames, and SHA-256 of its content."""
 
     name: str
     split: Split
@@ -29,11 +29,12 @@ class Shard(Description):
 
 
 class DataCard(Description):
-    """What is in a data set: the content of its ``dataset.json``.
+    """Content of a data set's ``dataset.json``.
 
-    ``description`` is all that it was made from, ``labels`` say what each stored array is, ``drawn`` the least, mean
-    and largest value of each path that varies (or how often each word was drawn), and ``status`` how many profile lines
-    of all frames show what. ``redrawn`` scenes were drawn more than once, as a sensor cannot measure all that is drawn.
+    ``description`` is the complete description, and ``labels`` the meaning of each stored array. ``drawn`` contains the
+    least, mean and largest value of each varied path, or the counts of texts. ``status`` is the number of profile lines
+    in all frames by `LineStatus`. ``redrawn`` is the number of scenes that were drawn more than once, because the
+    sensor could not measure the first draw.
     """
 
     title: str
@@ -54,16 +55,16 @@ class DataCard(Description):
 
 
 class DataSet(Sequence[dict[str, Any]]):
-    """Samples of a data set in a folder, or of one split of it, in the order of their scenes and frames.
+    """Samples of a data set in a folder, or of one of its splits, sorted by scene and frame.
 
-    A sample is a dict: "key" (text), "image" (H, W), uint8 or uint16, the labels' arrays by their names, and "info",
-    the table of everything else that is known of the frame. `len`, indexing and iterating are all that PyTorch's
-    DataLoader needs of it. It can be sent to other processes.
+    A sample is a dict: "key" (text), "image" (H, W), uint8 or uint16, the labels' arrays by name, and "info", the
+    frame's metadata. It has the interface that PyTorch's DataLoader needs: `len`, indexing and iteration. It can be
+    sent to other processes.
 
     Attributes
     ----------
     card
-        What the data set holds (`twin.datasets.loading.DataCard`).
+        Content of the data set (`twin.datasets.loading.DataCard`).
     """
 
     def __init__(self, folder: Path, card: DataCard, split: Split | None, names: tuple[str, ...] | None):
@@ -76,7 +77,7 @@ class DataSet(Sequence[dict[str, Any]]):
         return self._ends[-1] if self._ends else 0
 
     def __getitem__(self, index: Any) -> Any:
-        """A sample by its number, which may count from the end; a list of samples by a slice."""
+        """Return a sample by its number (negative: from the end), or a list of samples by a slice."""
         if isinstance(index, slice):
             return [self[number] for number in range(*index.indices(len(self)))]
         number = index + len(self) if index < 0 else index
@@ -87,29 +88,29 @@ class DataSet(Sequence[dict[str, Any]]):
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         for reader in self._readers:
-            # Of its own, whose table of contents is gone after it.
+            # A temporary reader, so that its table of contents does not stay in memory.
             own = ShardReader(reader.path, reader.format, frames=reader.frames)
             yield from (own.sample(number, self._names) for number in range(own.frames))
 
 
 def load_dataset(folder: str | Path, *, split: Split | None = None, names: Sequence[str] | None = None) -> DataSet:
-    """Open a data set that `dataset` has written, to be indexed or iterated.
+    """Open a data set that was written by `dataset`, for indexing and iteration.
 
     Parameters
     ----------
     folder
         The data set's folder.
     split
-        "train", "validation" or "test"; everything unless given.
+        "train", "validation" or "test"; default: all.
     names
-        Names of what is read of each sample, such as ["image", "centre_px"]; everything unless given.
+        Names of the arrays to read, such as ["image", "centre_px"]; default: all.
 
     Raises
     ------
     CaptureError
-        The folder holds no data set, or one that is not complete; or, later, a file is damaged.
+        The folder does not contain a complete data set; or, when samples are read, a file is damaged.
     DescriptionError
-        The split is unknown, or nothing has one of the names.
+        The split or a name is unknown.
 
     Examples
     --------
@@ -130,10 +131,12 @@ def load_dataset(folder: str | Path, *, split: Split | None = None, names: Seque
     except CaptureError as error:
         raise CaptureError(f"{error}{advice}") from error
     for shard in card.shards:
-        # A name with a path could lead anywhere.
+        # Only plain file names are allowed, because a path could lead outside the folder.
         if Path(shard.name).name != shard.name or Path(shard.name).suffix != SUFFIXES[card.file_format]:
-            raise CaptureError(f"{folder / CARD} names a shard '{shard.name}', which is no file of a data set")
+            raise CaptureError(f"{folder / CARD} names a shard '{shard.name}', which is not a file of a data set")
     known = {"image", "info", *card.labels}
     if names is not None and (unknown := set(names) - known):
-        raise DescriptionError(f"the data set has no {', '.join(sorted(unknown))}; it has {', '.join(sorted(known))}")
+        raise DescriptionError(
+            f"unknown {', '.join(sorted(unknown))}; the data set contains {', '.join(sorted(known))}"
+        )
     return DataSet(folder, card, split, None if names is None else tuple(names))

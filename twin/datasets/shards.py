@@ -1,9 +1,11 @@
-"""Files of a data set: tar archives as the webdataset library reads them, and HDF5 files; every frame is one sample.
+"""Files of a data set: tar archives for the webdataset library, or HDF5 files; each frame is a sample.
 
-In a tar archive the files of a sample stand together and share the name up to its first dot, ``000123-00`` for frame 0
-of scene 123: ``.png`` is the image, ``.mask.png`` and ``.object_map.png`` are pictures of 8 bit, ``.json`` holds what
-is known of the frame, and each further array is a ``.npy`` of its name. In an HDF5 file every array is a dataset of
-that name with the frames along its first axis; ``image``, ``json`` and ``key`` are further ones.
+In a tar archive, the files of a sample are consecutive and share the name up to the first dot, such as ``000123-00``
+for frame 0 of scene 123. ``.png`` is the image, and ``.mask.png`` and ``.object_map.png`` are 8-bit images. ``.json``
+contains the metadata. Each further array is a ``.npy`` file with its name.
+
+In an HDF5 file, each array is a dataset with the frames along its first axis; further datasets are ``image``, ``json``
+and ``key``.
 """
 
 from __future__ import annotations
@@ -28,12 +30,12 @@ Format = Literal["webdataset", "hdf5"]
 SUFFIXES: dict[Format, str] = {"webdataset": ".tar", "hdf5": ".h5"}
 _PICTURES = ("mask", "object_map")
 _PNG_EFFORT = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-"""Noise cannot be packed: more effort makes the files some percent smaller, in several times the time."""
+"""Level of compression. Noise is incompressible: higher levels save a few percent and take several times longer."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One frame: its key, the image (H, W), arrays by their names, and what is known of it as a table of JSON."""
+    """Frame: its key, image (H, W), arrays by name, and metadata as a JSON table."""
 
     key: str
     image: np.ndarray
@@ -42,7 +44,7 @@ class Sample:
 
 
 class ShardWriter(Protocol):
-    """Takes the samples of one shard in their order."""
+    """Writer of the samples of a shard, in order."""
 
     def add(self, sample: Sample) -> None:
         """Write a sample."""
@@ -51,7 +53,7 @@ class ShardWriter(Protocol):
 
 @contextmanager
 def written_shard(path: Path, format: Format, *, frames: int) -> Iterator[ShardWriter]:
-    """A shard of so many frames, which appears at ``path`` when the body ends without an exception."""
+    """Open a shard with a number of frames; it appears at ``path`` if the body ends without an exception."""
     with written_aside(path, overwrite=True) as aside:
         match format:
             case "webdataset":
@@ -79,7 +81,7 @@ class _TarWriter:
         self._put(f"{sample.key}.json", json.dumps(sample.info, allow_nan=False).encode())
 
     def _put(self, name: str, content: bytes) -> None:
-        # Owner and time stay 0, so that equal samples make equal files.
+        # Owner and time stay 0, so that equal samples give equal files.
         member = tarfile.TarInfo(name)
         member.size = len(content)
         self._archive.addfile(member, io.BytesIO(content))
@@ -120,9 +122,9 @@ def _npy(values: np.ndarray) -> bytes:
 
 
 class ShardReader:
-    """Samples of one shard in any order, read when they are asked for; the file is open only meanwhile.
+    """Reader of the samples of a shard in any order; the file is open only during a read.
 
-    CaptureError where the file is missing, damaged, or holds another number of frames than ``frames``.
+    Raises CaptureError if the file is missing, damaged, or has another number of frames than ``frames``.
     """
 
     def __init__(self, path: Path, format: Format, *, frames: int):
@@ -131,7 +133,7 @@ class ShardReader:
         self._places: list[tuple[str, dict[str, tuple[int, int]]]] | None = None
 
     def sample(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
-        """A sample as arrays by their names, with "key", "image" and, as "info", its table; only ``names`` if given."""
+        """Read a sample: arrays by name, with "key", "image" and "info", its metadata; only ``names`` if given."""
         try:
             match self.format:
                 case "webdataset":
@@ -157,21 +159,21 @@ class ShardReader:
         return sample
 
     def _found_places(self) -> list[tuple[str, dict[str, tuple[int, int]]]]:
-        """Key of each sample, with the offset and size of each of its files by what follows the key's dot."""
+        """Return the key of each sample, with offset and size of its files by their endings."""
         found: dict[str, dict[str, tuple[int, int]]] = {}
         with tarfile.open(self.path, "r:") as archive:
             for member in archive:
                 key, _, ending = member.name.partition(".")
                 found.setdefault(key, {})[ending] = member.offset_data, member.size
         if len(found) != self.frames:
-            raise ValueError(f"it holds {len(found)} frames, expected {self.frames}")
+            raise ValueError(f"it contains {len(found)} frames, expected {self.frames}")
         return list(found.items())
 
     def _from_hdf5(self, number: int, names: tuple[str, ...] | None) -> dict[str, Any]:
         with h5py.File(self.path, "r") as file:
             datasets: dict[str, Any] = {str(name): each for name, each in file.items()}
             if len(datasets["key"]) != self.frames:
-                raise ValueError(f"it holds {len(datasets['key'])} frames, expected {self.frames}")
+                raise ValueError(f"it contains {len(datasets['key'])} frames, expected {self.frames}")
             sample: dict[str, Any] = {"key": datasets.pop("key")[number].decode()}
             text = datasets.pop("json")
             sample |= {name: each[number] for name, each in datasets.items() if names is None or name in names}
@@ -186,6 +188,6 @@ def _decoded(ending: str, content: bytes) -> Any:
     if ending.endswith("png"):
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
         if image is None:
-            raise ValueError("a picture cannot be decoded")
+            raise ValueError("an image cannot be decoded")
         return image
     return np.load(io.BytesIO(content), allow_pickle=False)

@@ -1,1 +1,1 @@
-"""Design studies: which sensor to build. Screens designs by formulas and verifies the chosen ones by rendering."""
+"""Design studies: find the sensor to build by formulas, and verify the chosen designs by rendering."""

@@ -1,5 +1,7 @@
-"""Choice of the design to build: the Pareto front, the best design, its refinement along the gradient of the objective,
-which Dr.Jit derives from the formulas of all designs, and others to look at."""
+"""Choice of the design to build: Pareto front, best design, and its refinement.
+
+The refinement follows the gradient of the objective, which Dr.Jit derives from the same formulas.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +23,21 @@ from uwlts.errors import DesignError, Error, EvaluationError, RangeError
 
 
 def pareto(values: np.ndarray) -> np.ndarray:
-    """Which of N designs lie on the front of M values to minimise.
+    """Return a mask (N,) of the designs on the Pareto front of M values to minimise.
 
-    A design lies on it if no other is at least as good in all values and better in one; equal designs stand or fall
-    together. Two values take a sort, more a pass over the designs for every design of the front (Kung et al. 1975).
+    A design is on the front if no other design is at least as good in all values and better in one. Equal designs have
+    the same result. A design with a NaN is neither on the front nor compared with others. Up to two values need one
+    sort; more values need a pass over the designs for each design of the front (Kung et al. 1975).
 
-    Smaller is better. A design with a value NaN is no candidate: it is not on the front and beats no other. (N,) bool
-    from ``values`` (N, M); RangeError where they are no table with at least one column.
+    Parameters
+    ----------
+    values : (N, M)
+        Values of the designs; smaller is better.
+
+    Raises
+    ------
+    RangeError
+        The values are not a table with at least one column.
     """
     values = np.asarray(values, dtype=np.float64)
     if values.ndim != 2 or values.shape[1] == 0:
@@ -40,7 +50,10 @@ def pareto(values: np.ndarray) -> np.ndarray:
 
 
 def _front_of_two(values: np.ndarray) -> np.ndarray:
-    """The front of one or two values: of equal first ones the least second, if it is less than all before."""
+    """Return the front of one or two values.
+
+    Sorted by the first value, a design is on the front if its second value is smaller than all before.
+    """
     first, second = values[:, 0], values[:, -1]
     order = np.lexsort((second, first))
     first, second = first[order], second[order]
@@ -53,7 +66,7 @@ def _front_of_two(values: np.ndarray) -> np.ndarray:
 
 
 def _front_of_many(values: np.ndarray) -> np.ndarray:
-    """The front by elimination: nothing beats the lexicographically first of those that are left."""
+    """Return the front by elimination: the lexicographically first of the remaining designs is always on it."""
     left = np.lexsort(values.T[::-1])
     front = np.zeros(len(values), dtype=bool)
     while len(left):
@@ -65,7 +78,7 @@ def _front_of_many(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A study and the columns of its N judged designs, perhaps none; EvaluationError for those of another study."""
+    """Study and columns of its N evaluated designs, possibly none; EvaluationError for columns of another study."""
 
     study: Study
     columns: Columns
@@ -74,61 +87,66 @@ class Judged:
         expected = ["design", "violation", "failure", *self.study.free(), *(o.figure for o in self.study.objectives)]
         if self.columns and (missing := [name for name in expected if name not in self.columns]):
             raise EvaluationError(
-                f"the results have no {', '.join(missing)}, but {', '.join(self.columns)}: they are of another study"
+                f"the results lack the columns {', '.join(missing)}; found {', '.join(self.columns)}: "
+                "use the results of this study"
             )
 
     def __len__(self) -> int:
         return len(self.columns["design"]) if self.columns else 0
 
     def figure(self, name: str) -> np.ndarray:
-        """A figure of all designs, (N,) float; NaN where it is unknown."""
+        """Return a figure (N,) of all designs; NaN if it is unknown."""
         return np.asarray(self.columns.get(name, np.full(len(self), np.nan)), dtype=np.float64)
 
     def cost(self, place: int = 0) -> np.ndarray:
-        """An objective of all designs, (N,), turned so that smaller is better."""
+        """Return an objective (N,) of all designs, with its sign changed if larger is better."""
         objective = self.study.objectives[place]
         return self.figure(objective.figure) * (1 if objective.goal == "minimise" else -1)
 
     @cached_property
     def failures(self) -> list[str]:
-        """Reasons why designs cannot work, "" for those that do."""
+        """Reasons why designs cannot work, "" for working designs."""
         return [text or "" for text in self.columns["failure"].tolist()] if self.columns else []
 
     @cached_property
     def works(self) -> np.ndarray:
-        """Designs (N,) that work and whose first objective is known."""
+        """Mask (N,) of the designs that work and have a finite first objective."""
         return np.array([not text for text in self.failures], dtype=bool) & np.isfinite(self.cost())
 
     @cached_property
     def feasible(self) -> np.ndarray:
-        """Designs (N,) that work and meet all constraints."""
+        """Mask (N,) of the designs that work and meet all constraints."""
         return self.works & (self.figure("violation") <= 0)
 
     @cached_property
     def best_first(self) -> np.ndarray:
-        """Places of the designs that work: those that miss the constraints least, then those of the best objective."""
+        """Indices of the working designs, sorted by constraint violation, then by the first objective."""
         order = np.lexsort((self.cost(), self.figure("violation")))
         return order[self.works[order]]
 
     def front(self, among: np.ndarray) -> np.ndarray:
-        """Designs (N,) that no other one ``among`` (N,) some beats in all objectives."""
+        """Return a mask (N,) of the Pareto front of the objectives ``among`` (N,) some designs."""
         costs = np.column_stack([self.cost(k) for k in range(len(self.study.objectives))])
         return pareto(np.where(among[:, None], costs, np.nan))
 
     @property
     def of_interest(self) -> np.ndarray:
-        """Designs (N,) that meet all constraints, or all that work if none does."""
+        """Mask (N,) of the designs that meet all constraints, or of all working designs if none does."""
         return self.feasible if self.feasible.any() else self.works
 
     def marked(self, place: int, words: str) -> Marked:
-        """A design with its sensor as built, to point out in ``words``."""
+        """Return a design with its sensor as built and a label that starts with ``words``."""
         design = row_of(self.columns, place)
         return Marked(f"{words} (design {design.number})", built(self.study, design.again()), design)
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """The base sensor if it works, then the best design, then the refined one if it is better: the last one wins."""
+    """Chosen designs and notes.
+
+    ``marked`` contains the base sensor if it works, the best design, and the refined design if it is better; the last
+    one is the winner. ``further`` are other designs to render.
+    """
 
     marked: tuple[Marked, ...]
     further: tuple[Marked, ...]
@@ -136,10 +154,11 @@ class Chosen:
 
 
 def choose(study: Study, columns: Columns) -> Chosen:
-    """The best design by the first objective among those that meet the constraints, and others to be looked at.
+    """Choose the best design by the first objective among those that meet the constraints, and further designs.
 
-    Where none meets them, the one that misses them least is taken, and said so. ``further`` are designs spread over
-    the Pareto front, as many as the study wants rendered beside the best. DesignError where no design works.
+    If no design meets the constraints, the one with the smallest violation is chosen, with a note. The further designs
+    are spread over the Pareto front; their number is that of the study's designs to render, less one. Raises
+    DesignError if no design works.
     """
     marked, notes = [], []
     base, found = study.sensor, Judged(study, columns)
@@ -160,7 +179,7 @@ def choose(study: Study, columns: Columns) -> Chosen:
     marked.append(winner)
 
     def better(design: Design) -> bool:
-        """A design beats the best one by the same formulas."""
+        """Return whether a design is better than the best one of the sweep."""
         one, known = Judged(study, judged(study, [design])), found.cost()[best]
         missed = one.figure("violation")[0]
         return bool(missed <= winner.design.violation and one.cost()[0] < known - 1e-6 * abs(known))
@@ -178,23 +197,23 @@ def choose(study: Study, columns: Columns) -> Chosen:
 # --- refinement -------------------------------------------------------------------------------------------------------
 
 _STEPS = 40
-"""At most: a search that does not converge ends."""
+"""Largest number of iterations."""
 _TOLERANCE = 1e-7
-"""Relative change of the objective at which the search ends: far below what can be built."""
+"""Relative change of the objective that ends the search: far below manufacturing tolerances."""
 _HALVINGS = 12
-"""Of a step that is no better; a smaller one changes nothing that can be built."""
+"""Largest number of halvings of a step; smaller steps are below manufacturing tolerances."""
 
 Mean = Callable[..., Array]
 Smooth = Callable[[ModuleType, SensorArrays, Field, Mean], Array]
 
 
 def _rms(name: str, depth: int | None = None) -> Smooth:
-    """Root mean square of a quantity over the points in view, all or those at one depth."""
+    """Return a function for the root mean square of a quantity over all points, or over those at one depth."""
     return lambda xp, p, f, mean: xp.sqrt(mean(getattr(f, name) ** 2, depth))
 
 
 def _largest(xp: ModuleType, values: Array) -> Array:
-    """The largest value: one of them where several are alike, of which a maximum would add up the derivatives."""
+    """Return the largest value; of equal values only one, because a maximum would sum their derivatives."""
     return xp.gather(type(values), values, int(np.argmax(values.numpy())))
 
 
@@ -222,11 +241,11 @@ SMOOTH: dict[str, Smooth] = {
     "baseline_mm": lambda xp, p, f, mean: p.baseline_mm,
     "coverage": _coverage,
 }
-"""Figures that can be derived. For coverage the laser counts as reaching whatever the camera sees."""
+"""Differentiable figures. For coverage, the laser is assumed to reach everything in the camera's view."""
 
 
 class DerivedFigures:
-    """Figures of a design as functions of those of its free numbers, ``paths``, that can be derived."""
+    """Figures of a design and their derivatives with respect to its continuous free numbers, ``paths``."""
 
     def __init__(self, study: Study, design: Design, figures: list[str]):
         use_variant()
@@ -242,14 +261,14 @@ class DerivedFigures:
         self._shares, self._places = Float64(shares.ravel()), Float64(places.ravel() * (1 - 1e-9))
 
     def at(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Figures (F,) at values (K,) of the free numbers, and derivatives (F, K) by these, in the paths' own units."""
-        found = [self._derived(values, number) for number in range(len(self.paths))]
+        """Return figures (F,) and derivatives (F, K) at values (K,) of the free numbers, in the units of the paths."""
+        found = [self._differentiate(values, number) for number in range(len(self.paths))]
         return np.array(found[-1][0]), np.array([change for _, change in found]).T
 
-    def _derived(self, values: np.ndarray, number: int) -> tuple[list[float], list[float]]:
-        """Figures, and their derivatives by one number."""
+    def _differentiate(self, values: np.ndarray, number: int) -> tuple[list[float], list[float]]:
+        """Return the figures, and their derivatives with respect to one number."""
         dr = self._dr
-        # All numbers carry derivatives, of which one is not 0, and neither is compiled in: one kernel serves all.
+        # All numbers have gradients, all but one of them 0. They are opaque, so that one kernel serves all.
         numbers = [self._float(float(v) * PARAMETER_OF[path][1]) for path, v in zip(self.paths, values, strict=True)]
         seeds = [self._float(float(k == number)) for k in range(len(numbers))]
         dr.make_opaque(numbers, seeds)
@@ -268,7 +287,7 @@ class DerivedFigures:
         outputs = [self._float(SMOOTH[name](dr, p, f, mean)) for name in self._figures]
         dr.set_grad(numbers, seeds)
         dr.enqueue(dr.ADMode.Forward, numbers)
-        # Figures may share intermediate results: their gradients are kept.
+        # Figures can share intermediate results, so that gradients are kept.
         dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearEdges)
         changes = [dr.grad(output) for output in outputs]
         dr.eval(outputs, changes)
@@ -277,11 +296,11 @@ class DerivedFigures:
 
 
 def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> Design | None:
-    """The design moved along the gradient until the first objective is best within ranges and constraints.
+    """Optimise the first objective of a design within ranges and constraints; return None without an improvement.
 
-    Sequential quadratic programming (Kraft 1988). Constraints without a derivative are left to ``accepts``, which
-    returns whether a design is better than the start; where it rejects the end, the step is halved. None if nothing has
-    a derivative, or nothing better is found.
+    The method is sequential quadratic programming (Kraft 1988). ``accepts`` returns whether a design is better than the
+    start, including constraints without a derivative. If it rejects the result, the step is halved. The result is also
+    None if the objective is not differentiable.
     """
     objective, bounds = study.objectives[0], [bound for bound in study.bounds() if bound[0] in SMOOTH]
     if objective.figure not in SMOOTH:
@@ -296,7 +315,7 @@ def refined(study: Study, design: Design, accepts: Callable[[Design], bool]) -> 
     known: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
     def at(shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Figures, and derivatives by the shares of the ranges."""
+        """Return figures, and derivatives with respect to the normalised variables (0 to 1)."""
         clipped = np.clip(shares, 0, 1)
         if (key := clipped.tobytes()) not in known:
             values, gradient = figures.at(low + clipped * wide)

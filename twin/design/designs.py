@@ -1,4 +1,4 @@
-"""Designs of a study: how they are chosen, the sensors that they describe, and their figures by formulas."""
+"""Designs of a study: sampling, descriptions of their sensors, and figures by formulas."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from uwlts.model.library import validated
 from uwlts.model.sensor import Sensor
 
 Columns = dict[str, np.ndarray]
-"""A study's results by column: "design", what is free, `Figures`, "violation" and "failure", one row per design."""
+"""Results of a study, one row per design: "design", free variables, `Figures`, "violation" and "failure"."""
 
 
 @dataclass(frozen=True)
 class Design:
-    """One design: its number in the study, and the value of everything that is free."""
+    """Design: its number in the study, and the values of all free variables."""
 
     number: int
     values: dict[str, Value]
@@ -42,11 +42,11 @@ class Design:
 
 @dataclass(frozen=True)
 class EvaluatedDesign:
-    """A design with what the formulas say of it.
+    """Design with its results by formulas.
 
-    ``number`` is -1 for a sensor that is none of the study's designs; ``values`` are those of what is free, ``figures``
-    those of `Figures`, NaN where the design fails. ``violation`` is by how much the constraints are missed together (0:
-    not at all), ``failure`` why the design cannot work ("" if it can).
+    ``number`` is -1 for a sensor that is not a design of the study. ``values`` are those of the free variables.
+    ``figures`` are those of `Figures`, NaN if the design fails. ``violation`` is the total violation of the constraints
+    (0: all met), and ``failure`` the reason why the design cannot work ("" if it works).
     """
 
     number: int
@@ -56,23 +56,23 @@ class EvaluatedDesign:
     failure: str
 
     def table(self) -> dict[str, Value | None]:
-        """All columns of a study's results for this design."""
+        """Return all columns of a study's results for this design."""
         ends = {"violation": self.violation, "failure": self.failure}
         return {"design": self.number} | self.values | self.figures | ends
 
     def again(self) -> Design:
-        """The design alone, to be evaluated again."""
+        """Return the design without its results."""
         return Design(self.number, {name: value for name, value in self.values.items() if value is not None})
 
     def number_of(self, name: str) -> float:
-        """A number by the name of its column, NaN where the design has none."""
+        """Return the number in a column; NaN if it is missing or not a number."""
         value = self.table().get(name)
         return math.nan if value is None or isinstance(value, str) else value
 
 
 @dataclass(frozen=True)
 class Marked:
-    """A design to point out: its label, its sensor as built, and its values and figures."""
+    """Highlighted design: its label, its sensor as built, and its values and figures."""
 
     label: str
     sensor: Sensor
@@ -80,9 +80,9 @@ class Marked:
 
 
 def sensor_of(study: Study, design: Design, *, described: dict[str, Any] | None = None) -> Sensor:
-    """The design's sensor, before anything follows the stand-off; errors where the values make no description.
+    """Return a design's sensor without adjustments to the stand-off; DescriptionError if it is not valid.
 
-    ``described`` is the study's sensor as a table, which many designs share.
+    ``described`` is the study's sensor as a table, for repeated calls.
     """
     changes: dict[str, Value] = {}
     for name, value in design.values.items():
@@ -92,7 +92,7 @@ def sensor_of(study: Study, design: Design, *, described: dict[str, Any] | None 
 
 
 def built(study: Study, design: Design) -> Sensor:
-    """The design's sensor as it is to be built, with everything set that follows the stand-off."""
+    """Return a design's sensor as built, with all adjustments to the stand-off."""
     sensor = sensor_of(study, design)
     found = followed(np, parameters_of([sensor], [study.medium_of(sensor)]), study.follow)
     numbers = {
@@ -105,10 +105,10 @@ def built(study: Study, design: Design) -> Sensor:
 
 
 def judged(study: Study, designs: Sequence[Design]) -> Columns:
-    """Results of the formulas for N designs, as columns (N,).
+    """Evaluate N designs by formulas; return columns (N,).
 
-    "design" is the number; the values of what is free and all `Figures` follow by their names, then "violation" and
-    "failure", see `EvaluatedDesign`. A design that fails has figures NaN and an infinite violation.
+    The columns are "design" (the number), the free variables, all `Figures`, "violation" and "failure", see
+    `EvaluatedDesign`. A design that fails has NaN figures and an infinite violation.
     """
     parameters, places, failures = _parameters(study, designs)
     columns = failed(study, designs, failures)
@@ -124,10 +124,10 @@ def judged(study: Study, designs: Sequence[Design]) -> Columns:
 
 
 def _parameters(study: Study, designs: Sequence[Design]) -> tuple[SensorArrays | None, np.ndarray, list[str]]:
-    """Parameters of those M of N designs that are valid descriptions, their places (M,), and why each other is none.
+    """Return the parameters of the M valid designs of N, their indices (M,), and the reasons (N,) of the others.
 
-    Designs that differ only in numbers of `PARAMETER_OF` are checked together, at all corners of the box that these
-    numbers fill: a description takes its sensor 0.1 ms to check.
+    Designs that differ only in numbers of `PARAMETER_OF` are validated together, at all corners of the box of these
+    numbers. This saves time: the validation of one description takes 0.1 ms.
     """
     described = study.sensor.model_dump(exclude_none=True)
     alone = [path for path in parameters_alone(study.sensor) if path in study.continuous()]
@@ -178,7 +178,7 @@ def _parameters(study: Study, designs: Sequence[Design]) -> tuple[SensorArrays |
 
 
 def failed(study: Study, designs: Sequence[Design], reasons: Sequence[str]) -> Columns:
-    """Columns (N,) of N designs that fail for these reasons: figures NaN, and an infinite violation."""
+    """Return the columns (N,) of N failed designs with their reasons: NaN figures and infinite violation."""
     columns = {"design": np.array([design.number for design in designs])}
     columns |= {name: np.array([design.values[name] for design in designs]) for name in study.free()}
     columns |= {name: np.full(len(designs), math.nan) for name in FIGURES}
@@ -186,8 +186,10 @@ def failed(study: Study, designs: Sequence[Design], reasons: Sequence[str]) -> C
 
 
 def described(study: Study, label: str, sensor: Sensor) -> EvaluatedDesign:
-    """A sensor that is not one of the study's designs, evaluated; nothing in it follows the stand-off. DesignError
-    where the sensor cannot work."""
+    """Evaluate a sensor that is not a design of the study, without adjustments to the stand-off.
+
+    Raises DesignError if the sensor cannot work.
+    """
     numbers = parameters_of([sensor], [study.medium_of(sensor)])
     figures, (reason,) = figures_of(numbers, reflectance=study.reflectance, water_depth_m=study.water_depth_m)
     if reason:
@@ -198,7 +200,7 @@ def described(study: Study, label: str, sensor: Sensor) -> EvaluatedDesign:
 
 
 def row_of(columns: Columns, place: int) -> EvaluatedDesign:
-    """One design of a study's columns."""
+    """Return one design from a study's columns."""
     row = {name: one[place].item() if one.dtype != object else one[place] for name, one in columns.items()}
     values = {name: value for name, value in row.items() if name not in (*FIGURES, *OTHER_COLUMNS)}
     figures = {name: value for name, value in row.items() if name in FIGURES}
@@ -206,7 +208,7 @@ def row_of(columns: Columns, place: int) -> EvaluatedDesign:
 
 
 def violations(study: Study, figures: Figures) -> np.ndarray:
-    """By how much designs (N,) miss the constraints together, in parts of the bounds; 0 where all hold."""
+    """Return the total violation (N,) of the constraints, each relative to its bound; 0 if all are met."""
     total = np.zeros(len(figures.coverage))
     for name, sign, bound in study.bounds():
         values = getattr(figures, name)
@@ -216,14 +218,17 @@ def violations(study: Study, figures: Figures) -> np.ndarray:
 
 
 def number_of_designs(study: Study) -> int:
-    """Number of designs that a study judges."""
+    """Return the number of designs of a study."""
     if study.sampling.kind != "grid":
         return study.sampling.designs
     return math.prod(len(variable.grid()) for variable in study.free().values())
 
 
 def designs_of(study: Study, first: int, count: int) -> list[Design]:
-    """Designs ``first`` to ``first + count - 1`` of a grid (the last variable runs fastest), random or Sobol study."""
+    """Return designs ``first`` to ``first + count - 1`` of a grid, random or Sobol study.
+
+    In a grid, the last variable changes fastest.
+    """
     numbers = range(first, min(first + count, number_of_designs(study)))
     free = study.free()
     if study.sampling.kind == "grid":
@@ -237,12 +242,11 @@ def designs_of(study: Study, first: int, count: int) -> list[Design]:
         else:
             sequence = qmc.Sobol(variables, rng=np.random.default_rng(seed))
             with warnings.catch_warnings():
-                # A part of the sequence need not be a power of two long: the whole counts.
+                # The warning asks for a power of two as length, which does not apply to a part of the sequence.
                 warnings.simplefilter("ignore", UserWarning)
                 if numbers.start > 0:
                     sequence.fast_forward(numbers.start)
                 shares = sequence.random(len(numbers))
         columns = [v.drawn(s) for v, s in zip(free.values(), shares.reshape(-1, variables).T, strict=True)]
-    # Tuples of values, one after the other: names are put to them last.
     rows = zip(*columns, strict=True)
     return [Design(number, dict(zip(free, row, strict=True))) for number, row in zip(numbers, rows, strict=True)]

@@ -1,4 +1,4 @@
-"""Figures of merit of designs by formulas, for many designs at once, from the stripe at points of the sheet."""
+"""Figures of merit of many designs by formulas, based on a model of the stripe at points of the sheet."""
 
 from __future__ import annotations
 
@@ -37,28 +37,28 @@ from twin.sensor.detector import PLANCK_TIMES_LIGHT
 from uwlts.errors import RangeError
 
 DEPTHS = 5
-"""Depths of the measuring volume that are judged, evenly from end to end of what the camera sees of it."""
+"""Number of evaluated depths, evenly spaced over the part of the measuring volume in the camera's view."""
 PLACES = 7
-"""Places along the stripe at each depth."""
+"""Number of evaluated points along the stripe at each depth."""
 _EDGE_STEPS = 5
 _MANY = 200
-"""Designs from which the time to compile the formulas for them comes back."""
+"""Least number of designs that is worth the time to compile the formulas."""
 _BLOCK = 1000
-"""Designs that compiled formulas take at once."""
+"""Number of designs in a block of the compiled formulas."""
 _NEAREST_MM = 1.0
-"""The sheet enters the image no nearer to the window's outer face: what lies closer is no measuring volume."""
+"""Least distance of the sheet's entry into the image from the window's outer face."""
 _FARTHEST_MM = 1e6
-"""It leaves the image no farther from the pupil: farther than any water is clear."""
+"""Largest distance of the sheet's exit from the image, from the pupil; no water is transparent as far."""
 _BRIGHT_LINES = 2.05
-"""Automatic exposure lets 2 % of the profile lines be brighter: standard deviations of speckle above the mean."""
+"""Level of automatic exposure in standard deviations of speckle above the mean: 2 % of the lines are brighter."""
 _UNMODELLED = 0.02
-"""Part of the height by which stripes differ from the Gaussian that is fitted to them; it limits the flanks' weight."""
+"""Deviation of a stripe from the fitted Gaussian, relative to its height; it limits the weight of the flanks."""
 _FLANK = 4.0
-"""Standard deviations up to which the stripe's profile is summed: beyond lies less than 1e-4 of its light."""
+"""Limit of the sum over the stripe's profile in standard deviations; less than 1e-4 of the light is outside."""
 _NODES = 16
-"""Places of the sum on either side."""
+"""Number of nodes of the sum on either side."""
 _DIFFRACTION = 0.42
-"""Standard deviation of the Gaussian that is closest to an Airy pattern, in wavelengths times f-number."""
+"""Standard deviation of the Gaussian closest to an Airy pattern, divided by wavelength times f-number."""
 
 
 # --- the stripe -------------------------------------------------------------------------------------------------------
@@ -66,10 +66,11 @@ _DIFFRACTION = 0.42
 
 @dataclass(frozen=True)
 class StripeModel:
-    """The stripe on a diffuse plate square to the laser's axis.
+    """Stripe on a diffuse plate normal to the laser's axis.
 
-    ``sigma_px`` is the image's standard deviation across, ``blur_px`` the lens's part of it; ``rate_e_per_ms`` is the
-    brightest pixel's, ``background_e_per_ms`` what other light adds to it.
+    ``sigma_px`` is the standard deviation of the stripe's image across the stripe, and ``blur_px`` the contribution of
+    the lens. ``rate_e_per_ms`` is the rate of photo-electrons of the brightest pixel, and ``background_e_per_ms`` the
+    rate because of other light.
     """
 
     sigma_px: Array
@@ -88,12 +89,29 @@ def stripe_at(
     *,
     reflectance: float,
 ) -> StripeModel:
-    """The stripe at points of the sheet.
+    """Model the stripe at points of the sheet.
 
-    Across the sheet the light is a Gaussian of standard deviation w / 2 with w^2 = w0^2 (1 + ((s - s0) / zR)^2)
-    (Siegman, Lasers, Eqs. 17.5 and 17.6). The lens's pupil of radius R blurs what is out of focus evenly over a disc,
-    whose standard deviation in one direction is R / 2; a pupil offset b shifts the image by b / a - ds/dP b, a being
-    the focus distance and ds/dP how the image moves with the point. Light that the medium scatters counts as lost.
+    Across the sheet, the light is a Gaussian of standard deviation w / 2 with w^2 = w0^2 (1 + ((s - s0) / zR)^2)
+    (Siegman, Lasers, Eqs. 17.5 and 17.6). Defocus blurs the image uniformly over a disc. An offset b in the pupil
+    shifts the image by b / a - ds/dP b. Here a is the focus distance and ds/dP the derivative of the image with respect
+    to the point. In one direction, a pupil of radius R has the standard deviation R / 2. Scattered light is lost.
+
+    Parameters
+    ----------
+    xp : module
+        NumPy or Dr.Jit.
+    p : SensorArrays
+        Parameters of the designs.
+    pose : LaserFan
+        Pose of the laser.
+    window : WindowGeometry
+        The camera's window.
+    point : Vector
+        Points of the sheet, camera frame.
+    view : ImagePoints
+        Images of the points.
+    reflectance : float
+        Diffuse reflectance of the plate.
     """
     xa, xb, ya, yb = view.jacobian
     across = p.across((xa, ya)), p.across((xb, yb))
@@ -101,7 +119,7 @@ def stripe_at(
     away = xp.sqrt(dot(from_laser, from_laser))
     rayleigh = math.pi * p.waist_mm * p.waist_mm * p.medium_index / (p.beam_quality * p.wavelength_mm)
     sheet = 0.5 * p.waist_mm * xp.sqrt(1 + ((away - p.waist_distance_mm) / rayleigh) ** 2)
-    # On a profile line, where the pixel along the stripe is given.
+    # Width on a profile line, for a constant pixel along the stripe.
     by_x, by_y = (pixels_per_mm(view, window, direction) for direction in (pose.normal, pose.fan))
     thick = abs(p.across(by_x) - p.across(by_y) * p.along(by_x) / p.along(by_y)) * sheet
 
@@ -121,7 +139,7 @@ def stripe_at(
     fan = path_to(xp, laser_window, from_laser)
     side = dot(from_laser, pose.fan)
     angle = xp.atan(fan.slope) * side / xp.sqrt(side * side + 1e-18)
-    lit = _lit(xp, p, angle)
+    lit = _relative_power(xp, p, angle)
     per_mm = p.power_w * lit / (2 * p.fan_half_rad) / ((1 + fan.slope * fan.slope) * fan.growth_mm)
     back = length_outside_mm(xp, window, view.path)
     passed = xp.exp(-p.extinction_per_mm * (length_outside_mm(xp, laser_window, fan) + back))
@@ -139,13 +157,14 @@ def stripe_at(
 
 
 def centre_noise_px(xp: ModuleType, p: SensorArrays, stripe: StripeModel, exposure_ms: Array) -> Array:
-    """Standard uncertainty of the stripe's centre in px, found by a fit that weighs pixels by their noise.
+    """Return the standard uncertainty of the stripe's centre in px, for a fit that weights pixels by their noise.
 
-    With the mean signal m = A exp(-x^2 / 2 s^2), its derivative m' and weights m' / W the fit's variance is
-    sum(m'^2 V / W^2) / sum(m'^2 / W)^2. V is the pixels' variance, m + (C m)^2 + read, dark, background and rounding
-    noise: photons and speckle, whose contrast C allows for what neighbours have in common. W is what the fit takes for
-    V: it knows of no neighbours, and adds how far real profiles may be from Gaussian ones, without which the dark
-    flanks of a stripe under pure speckle would count ever more.
+    With the mean signal m = A exp(-x^2 / 2 s^2), its derivative m' and weights m' / W, the variance of the fit is
+    sum(m'^2 V / W^2) / sum(m'^2 / W)^2. V is the variance of a pixel: m + (C m)^2 plus read, dark, background and
+    rounding noise. The speckle contrast C includes the correlation between neighbouring pixels.
+
+    W is the variance that the fit assumes. It ignores the correlation and adds a deviation of real profiles from
+    Gaussian ones. Without this term, the weight of the dark flanks would grow without limit under pure speckle.
     """
     height = stripe.rate_e_per_ms * exposure_ms
     true, taken = p.centre_contrast(xp, stripe.sigma_px) ** 2 + p.prnu**2, p.pixel_contrast(xp) ** 2 + p.prnu**2
@@ -164,20 +183,20 @@ def centre_noise_px(xp: ModuleType, p: SensorArrays, stripe: StripeModel, exposu
 
 
 def exposure_ms(xp: ModuleType, p: SensorArrays, brightest_e_per_ms: Array) -> tuple[Array, Array]:
-    """Exposure that brings the brightest light to the wanted level, and the exposure that the sensor then uses."""
+    """Return the exposure for the wanted level of the brightest light, and the exposure that the sensor uses."""
     level = p.exposure_level * p.full_well_e / (1 + _BRIGHT_LINES * p.pixel_contrast(xp))
     required = level / brightest_e_per_ms
     automatic = xp.minimum(required, p.longest_ms)
     return required, where(xp, xp.isnan(p.exposure_ms), automatic, p.exposure_ms)
 
 
-def _lit(xp: ModuleType, p: SensorArrays, angle: Array) -> Array:
-    """Power per angle over the mean one; 0 outside the fan where that is not needed smooth."""
+def _relative_power(xp: ModuleType, p: SensorArrays, angle: Array) -> Array:
+    """Return the power per angle divided by its mean; outside the fan, only tabulated profiles are 0."""
     gauss = xp.exp(-2 * (angle / p.fan_half_rad) ** 2) * 2 / (math.sqrt(math.pi / 2) * math.erf(math.sqrt(2)))
     lit = p.gaussian_fan * gauss + (1 - p.gaussian_fan) * (1 - p.tabulated_fan)
     nodes, powers = p.fan_nodes_rad, p.fan_powers
     if len(nodes) > 1:
-        # Between the nodes of a table: a sum of ramps that begin at the nodes.
+        # Linear interpolation of a table as a sum of ramps that start at the nodes.
         total, slope_before = powers[0] + 0.0 * angle, 0.0
         for k in range(len(nodes) - 1):
             slope = (powers[k + 1] - powers[k]) / xp.maximum(nodes[k + 1] - nodes[k], 1e-12)
@@ -192,11 +211,11 @@ def _lit(xp: ModuleType, p: SensorArrays, angle: Array) -> Array:
 
 @dataclass(frozen=True)
 class Field:
-    """Quantities over the measuring volume, arrays that go with (N, DEPTHS, PLACES).
+    """Quantities over the measuring volume, as arrays that broadcast with (N, DEPTHS, PLACES).
 
-    ``y_mm`` and ``z_mm`` are coordinates in the sheet about the stand-off. The sigmas are standard uncertainties by the
-    stripe's noise. ``lit`` is where the fan has a line in view of the image's other sides, ``in_view`` where the
-    camera sees it.
+    ``y_mm`` and ``z_mm`` are coordinates in the sheet about the stand-off. The sigmas are standard uncertainties
+    because of the stripe's noise. ``lit`` marks points that the laser illuminates and that are in view along the
+    stripe. ``in_view`` marks those that are in view across the stripe, too.
     """
 
     y_mm: Array
@@ -218,10 +237,10 @@ class Field:
 
 
 def depths_in_view(xp: ModuleType, p: SensorArrays) -> tuple[Array, Array]:
-    """Beginning and end of the part of the measuring volume that the camera sees, in the middle of the line.
+    """Return the ends of the part of the measuring volume in the camera's view, in the middle of the line.
 
-    Depths from the window's outer face. Where the sheet leaves the image follows from Newton's method in the inverse of
-    the depth, in which the pixel is nearly linear (exactly so without a window).
+    The depths are measured from the window's outer face. Newton's method finds the depths at the image's edges. Its
+    unknown is the inverse of the depth: the pixel is a nearly linear function of it, exactly linear without a window.
     """
     pose, window, lens = p.pose(xp), p.window(xp), p.lens()
     standoff, outer = standoff_mm(pose), p.outer_mm(xp)
@@ -242,10 +261,10 @@ def depths_in_view(xp: ModuleType, p: SensorArrays) -> tuple[Array, Array]:
 
 
 def field_of(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Array, *, reflectance: float) -> Field:
-    """Designs' sheets at depths from the window's outer face and ``places`` (-1 to 1) along the stripe.
+    """Evaluate designs at depths from the window's outer face and ``places`` (-1 to 1) along the stripe.
 
-    A stripe's centre that is off by d px on its profile line is a point of the sheet that is off by (dY, dZ) =
-    J^-1 (d, 0), J being how the pixel across and along the stripe changes with Y and Z.
+    An error d of the stripe's centre on its profile line causes the error (dY, dZ) = J^-1 (d, 0) of the point. J is the
+    Jacobian of the pixel across and along the stripe with respect to Y and Z.
     """
     pose, window, lens = p.pose(xp), p.window(xp), p.lens()
     standoff = standoff_mm(pose)
@@ -280,7 +299,7 @@ def field_of(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Array, *,
     lit = (half > 0) & (height > laser_window.outer_mm) & xp.isfinite(u)
     inside = lit & (u >= -0.5) & (u <= p.across((p.width_px, p.height_px)) - 0.5)
     rate = where(xp, lit, stripe.rate_e_per_ms, 0.0)
-    # Of one design, as it is derived, all points stand in one row.
+    # For derivatives of a single design, all points are in one dimension.
     brightest = xp.max(rate, axis=(1, 2))[:, None, None] if len(rate.shape) == 3 else xp.max(rate)
     brightest = where(xp, brightest > 0, brightest, math.nan)
     required, used = exposure_ms(xp, p, brightest)
@@ -308,7 +327,7 @@ def field_of(xp: ModuleType, p: SensorArrays, depth_mm: Array, places: Array, *,
 
 
 def _figure(words: str, unit: str = "mm") -> Any:
-    """A field of `Figures`, with its words and its unit on pages."""
+    """Return a field of `Figures` with its label and unit for pages."""
     return field(metadata={"words": words, "unit": unit})
 
 
@@ -316,11 +335,13 @@ def _figure(words: str, unit: str = "mm") -> Any:
 class Figures:
     """Figures of merit of N designs, one array (N,) each.
 
-    Depths are counted along the camera's axis from the window's outer face. Sigmas are standard uncertainties: the
-    largest in the part of the measuring volume that the camera sees, and ``sigma_z_rms_mm`` the root mean square over
-    it; near, middle and far are the ends and the middle of that part. Z runs along the laser's axis, Y along the
-    stripe, X across the sheet, along the stage. Sigma X comes from the stage's resolution alone, the others from the
-    stripe's noise; what is given per pixel holds in the middle of the volume.
+    Depths are measured along the camera's axis from the window's outer face. Z runs along the laser's axis, Y along the
+    stripe, and X across the sheet, along the stage.
+
+    Sigmas are standard uncertainties. They refer to the part of the measuring volume in the camera's view: the largest
+    value in it, the root mean square over it (``sigma_z_rms_mm``), and the values at its near end, middle and far end.
+    Sigma X follows from the stage's resolution, the others from the stripe's noise. Values per pixel belong to the
+    middle of the volume.
     """
 
     sigma_x_mm: np.ndarray = _figure("σ X, by the stage")
@@ -358,12 +379,14 @@ class Figures:
 FIGURES: dict[str, tuple[str, str]] = {
     one.name: (one.metadata["words"], one.metadata["unit"]) for one in fields(Figures)
 }
-"""Words and unit of every figure of merit, by its name."""
+"""Label and unit of each figure of merit, by name."""
 
 
 def scatter_at(p: SensorArrays, z_mm: np.ndarray, half_line_mm: np.ndarray, *, reflectance: float) -> np.ndarray:
-    """Root mean square of sigma Z (K,) along the stripe of one design, where Z is ``z_mm`` (K,), from the stand-off on.
-    The stripe is counted up to ``half_line_mm`` (K,) on both sides, or as far as it is in view."""
+    """Return the root mean square of sigma Z (K,) along the stripe of one design at ``z_mm`` (K,) from the stand-off.
+
+    The stripe is evaluated up to ``half_line_mm`` (K,) on both sides, within the view.
+    """
     with np.errstate(all="ignore"):
         pose = p.pose(np)
         depth = standoff_mm(pose) - p.outer_mm(np) + pose.axis[2] * z_mm.reshape(1, -1, 1)
@@ -377,7 +400,10 @@ def scatter_at(p: SensorArrays, z_mm: np.ndarray, half_line_mm: np.ndarray, *, r
 def figures_of(
     p: SensorArrays, *, reflectance: float, water_depth_m: float, follow: Sequence[Follow] = ()
 ) -> tuple[Figures, list[str]]:
-    """Figures of N designs, and why each of those fails that cannot work ("" for the others, whose figures hold)."""
+    """Return the figures of N designs, and for each the reason why it cannot work ("" if it works).
+
+    The figures of a design that cannot work are not meaningful.
+    """
     if not 0 < reflectance <= 1:
         raise RangeError(f"reflectance is {reflectance:g}; expected a number above 0, up to 1")
     with np.errstate(all="ignore"):
@@ -403,7 +429,7 @@ def _over_volume(
     shares: Array = _SHARES,
     places: Array = _PLACES,
 ) -> tuple[dict[str, Array], Array, Array, dict[str, Array]]:
-    """What follows the stand-off, the ends of the volume in view, and the `Field` over it; tables of arrays by name."""
+    """Return the adjusted parameters by name, the near and far ends of the volume in view, and its `Field` by name."""
     followers = following(xp, p, follow)
     p = replace(p, **followers)
     near, far = depths_in_view(xp, p)
@@ -414,10 +440,10 @@ def _over_volume(
 def _compiled_over_volume(
     xp: ModuleType, p: SensorArrays, follow: tuple[Follow, ...], reflectance: float
 ) -> tuple[dict[str, Array], Array, Array, dict[str, Array]]:
-    """The same by Dr.Jit in a fifth of the time, for two designs or more, in one thread: sweeps have one per core.
+    """Evaluate `_over_volume` with Dr.Jit in a fifth of the time, for two or more designs.
 
-    What Dr.Jit records holds for one number of designs and none else, so that they go in blocks of one size, the last
-    one filled up with the last design.
+    It uses one thread, because sweeps have one process per core. A recording of Dr.Jit is valid for one number of
+    designs only. Therefore the designs are split into blocks of equal size; the last block repeats the last design.
     """
     prepare_llvm()
     import drjit as dr
@@ -444,7 +470,7 @@ def _compiled_over_volume(
 
 
 def _aligned(values: np.ndarray) -> np.ndarray:
-    """A copy at a multiple of 64 bytes: for every other mix of aligned arrays Dr.Jit would compile its kernels anew."""
+    """Return a copy aligned to 64 bytes; Dr.Jit would compile kernels again for each other alignment of its arrays."""
     room = np.empty(values.size + 8)
     first = -room.ctypes.data % 64 // 8
     copy = room[first : first + values.size].reshape(values.shape)
@@ -454,19 +480,19 @@ def _aligned(values: np.ndarray) -> np.ndarray:
 
 @cache
 def _frozen(follow: tuple[Follow, ...], reflectance: float) -> Callable[..., Any]:
-    """`_over_volume`, whose operations Dr.Jit records at the first call and replays for other numbers."""
+    """Return `_over_volume` as a function that Dr.Jit records at the first call and replays for other values."""
     import drjit as dr
 
     return dr.freeze(lambda given, *at: _over_volume(dr, SensorArrays(**given), follow, reflectance, *at))
 
 
 def _each(values: Array, designs: int) -> np.ndarray:
-    """One number (N,) per design."""
+    """Return one number (N,) for each design."""
     return np.broadcast_to(np.asarray(values, dtype=float).reshape(-1), (designs,)).copy()
 
 
 def _reduced(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray, *, water_depth_m: float) -> Figures:
-    """Figures of N designs from their fields (N, DEPTHS, PLACES) and the share of the volume's depth in view."""
+    """Return the figures of N designs from their fields (N, DEPTHS, PLACES) and the fraction of the depth in view."""
     n, middle, inside = len(f["z_mm"]), DEPTHS // 2, f["lit"] > 0
     one = partial(_each, designs=n)
 
@@ -508,7 +534,7 @@ def _reduced(p: SensorArrays, f: dict[str, np.ndarray], share: np.ndarray, *, wa
 
 
 def _reasons(p: SensorArrays, figures: Figures, f: dict[str, np.ndarray]) -> list[str]:
-    """The first reason why each of N designs cannot work, "" for those that can."""
+    """Return for each of N designs the first reason why it cannot work, "" if it works."""
     n = len(figures.coverage)
     one = partial(_each, designs=n)
     corner = np.hypot(p.width_px, p.height_px / p.pixel_aspect) / 2 * p.pixel_mm / p.focal_mm
@@ -527,22 +553,21 @@ def _reasons(p: SensorArrays, figures: Figures, f: dict[str, np.ndarray]) -> lis
     }
     flat = np.fmax(figures.depth_per_px_mm, figures.along_per_px_mm)
     checks = {
-        "the lens would be focused within its focal length": one(p.focus_mm - p.focal_mm) <= 0,
+        "the focus distance is not larger than the focal length": one(p.focus_mm - p.focal_mm) <= 0,
         "the sheet crosses the camera's axis {crossing:.0f} mm behind the window's outer face, not in front of it": (
             ~(figures.standoff_mm > 0) | ~(figures.standoff_mm < 1e5)
         ),
         "the measuring volume would begin {begins:.0f} mm behind the window's outer face": ~(figures.near_mm > 0),
-        "the cone of view is {cone:.0f} mm wide at the window's outer face, wider than its opening": (
+        "the cone of view is {cone:.0f} mm wide at the window's outer face, wider than the aperture": (
             cone > one(p.window_aperture_mm)
         ),
-        "the laser's fan is {fan:.0f} mm wide at its window, wider than its opening": (
+        "the laser's fan is {fan:.0f} mm wide at its window, wider than the aperture": (
             fan > one(p.laser_window_aperture_mm)
         ),
         "camera and laser reach no point of the measuring volume": ~(figures.coverage > 0),
         "the stripe saturates: at the given exposure it has {fullest:.1f} times the full well": fullest > 1,
-        "the stripe hardly moves with depth, or runs along the image's other side: turn the camera or the laser": (
-            ~(flat < 0.5 * figures.standoff_mm)
-        ),
+        "the stripe's image is nearly independent of depth, or runs along the other side of the image: "
+        "turn the camera or the laser": (~(flat < 0.5 * figures.standoff_mm)),
     }
     reasons = [""] * n
     for text, failed in checks.items():
@@ -561,20 +586,21 @@ _CLASS_3B_W = 0.5
 
 _GRAVITY = 9.81
 _WATER_KG_PER_M3 = 1030.0
-"""Sea water, the heavier one."""
-# As in the thesis, Eq. 3.2.
+"""Density of sea water."""
+# As in thesis Eq. 3.2.
 _SILICA_STRENGTH_MPA = 60.0
 _CLAMPED = 0.75
 _SAFETY = 4.0
 
 
 def laser_class(p: SensorArrays) -> np.ndarray:
-    """Class after IEC 60825-1:2014 as a number, see `CLASS_NAMES`: an estimate for a design, not a classification.
+    """Estimate the laser class after IEC 60825-1:2014 as a number, see `CLASS_NAMES`; this is not a classification.
 
-    Limits for continuous visible light from a point source (Tables 3 to 8): class 1 up to 0.39 mW above 500 nm,
-    0.039 mW below 450 nm and C3 = 10^(0.02 (nm - 450)) times that between; class 2 up to 1 mW, 3R up to 5 mW, 3B up to
-    500 mW. What counts is the power through 7 mm at 100 mm from the line optics (condition 3), of a line that is
-    spread by its fan in air, where the fan is brightest per angle. Every laser counts alone.
+    The limits are those for continuous visible light from a point source (Tables 3 to 8). Class 1 extends to 0.39 mW
+    above 500 nm, to 0.039 mW below 450 nm, and to 0.039 mW times C3 = 10^(0.02 (nm - 450)) in between. Class 2 extends
+    to 1 mW, 3R to 5 mW, and 3B to 500 mW. The limits apply to the power through an aperture of 7 mm at 100 mm from the
+    line optics in air (condition 3). The aperture is at the angle with the highest power. Each laser is classified
+    separately.
     """
     seen = 2 * math.atan(0.5 * _PUPIL_MM / _AWAY_MM) / (2 * p.fan_half_rad)
     gaussian = 2 / (math.sqrt(math.pi / 2) * math.erf(math.sqrt(2)))
@@ -588,7 +614,10 @@ def laser_class(p: SensorArrays) -> np.ndarray:
 
 
 def window_needed_mm(p: SensorArrays, *, water_depth_m: float) -> np.ndarray:
-    """Thickness of a clamped round window of fused silica, t = A / 2 sqrt(K f P / S) (Harris 1999, thesis Eq. 3.2)."""
+    """Return the thickness of a clamped round window of fused silica, t = A / 2 sqrt(K f P / S).
+
+    Source: Harris 1999, thesis Eq. 3.2.
+    """
     pressure_mpa = 1e-6 * _GRAVITY * _WATER_KG_PER_M3 * water_depth_m
     opening = np.where(np.isfinite(p.window_aperture_mm), p.window_aperture_mm, 0.0)
     return 0.5 * opening * math.sqrt(_CLAMPED * _SAFETY * pressure_mpa / _SILICA_STRENGTH_MPA)

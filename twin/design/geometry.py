@@ -1,9 +1,8 @@
-"""Geometry of camera and sheet: rays through flat windows, distortion, and how the image moves with points.
+"""Geometry of camera and sheet: rays through flat windows, distortion, and derivatives of the image of a point.
 
-The formulas are written for arrays of any kind that has sqrt, sin and cos in its namespace ``xp``: NumPy, for many
-designs at once, or Dr.Jit, which differentiates them. Everything lies in the camera frame (mm); vectors are tuples of
-three arrays. The renderer has its own method, tracing rays through real faces, so that one can be checked against the
-other.
+The formulas accept arrays of any library ``xp`` with sqrt, sin and cos: NumPy, for many designs at once, or Dr.Jit,
+which differentiates them. All quantities are in the camera frame, in mm; vectors are tuples of three arrays. The
+renderer uses another method, ray tracing through real faces, so that each can be checked against the other.
 """
 
 from __future__ import annotations
@@ -17,41 +16,41 @@ import numpy as np
 from uwlts.model.sensor import Camera, Medium, Window
 
 Array = Any
-"""A NumPy or Dr.Jit array, or a number that goes with one."""
+"""NumPy array, Dr.Jit array, or number."""
 Vector = tuple[Array, Array, Array]
 
 _NEWTON_STEPS = 4
 _UNDISTORTING_STEPS = 100
-"""Strong distortion converges slowly."""
+"""Largest number of iterations; strong distortion converges slowly."""
 _UNDISTORTED_PX = 1e-3
-"""What may be left: far below what a drawing shows."""
+"""Tolerance of undistorted points, sufficient for a drawing."""
 _TINY_MM = 1e-9
-"""Keeps the direction of a point on the window's normal defined; far below anything that matters."""
+"""Offset that avoids an undefined direction for a point on the window's normal; negligible."""
 
 
 def where(xp: ModuleType, mask: Array, true: Array, false: Array) -> Array:
-    """Elements of two arrays by a mask."""
+    """Select elements of two arrays by a mask."""
     return (xp.where if xp is np else xp.select)(mask, true, false)
 
 
 def dot(a: Vector, b: Vector) -> Array:
-    """Inner product."""
+    """Return the inner product of two vectors."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def scaled(a: Vector, factor: Array) -> Vector:
-    """Vector times a number."""
+    """Multiply a vector by a number."""
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
 def added(a: Vector, b: Vector) -> Vector:
-    """Sum of two vectors."""
+    """Add two vectors."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @dataclass(frozen=True)
 class LaserFan:
-    """The laser's fan: its origin, and unit vectors along its axis, along the stripe and across the sheet."""
+    """Laser fan: origin, and unit vectors along its axis, along the stripe and across the sheet."""
 
     origin: Vector
     axis: Vector
@@ -60,8 +59,11 @@ class LaserFan:
 
 
 def pose_at(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: Array, towards: Vector) -> LaserFan:
-    """Fan of a laser placed by baseline and triangulation angle; ``towards`` is the baseline's direction, (x, y, 0).
-    As `uwlts.model.placement.laser_pose`, in a form that can be derived."""
+    """Return the fan of a laser that is placed by baseline and triangulation angle.
+
+    ``towards`` is the baseline's direction, (x, y, 0). The result is that of `uwlts.model.placement.laser_pose`, but
+    differentiable.
+    """
     sine, cosine = xp.sin(angle_rad), xp.cos(angle_rad)
     axis = (-sine * towards[0], -sine * towards[1], cosine)
     across = (cosine * towards[0], cosine * towards[1], sine)
@@ -73,13 +75,13 @@ def pose_at(xp: ModuleType, *, baseline_mm: Array, angle_rad: Array, roll_rad: A
 
 
 def standoff_mm(pose: LaserFan) -> Array:
-    """Depth at which the sheet crosses the camera's axis, from the entrance pupil."""
+    """Return the depth of the sheet on the camera's axis, from the entrance pupil."""
     return dot(pose.normal, pose.origin) / pose.normal[2]
 
 
 @dataclass(frozen=True)
 class WindowGeometry:
-    """A window: unit normal away from the module, distance to its inner face along the normal, thickness, indices."""
+    """Window: unit normal away from the module, distance of the inner face along the normal, thickness, indices."""
 
     normal: Vector
     distance_mm: Array
@@ -89,7 +91,7 @@ class WindowGeometry:
 
     @classmethod
     def of(cls, window: Window, medium: Medium, wavelength_nm: float, rotation: np.ndarray) -> WindowGeometry:
-        """A mounted window before a medium; ``rotation`` (3, 3) leads from its module's frame to the one wanted."""
+        """Make a mounted window; ``rotation`` (3, 3) rotates from its module's frame to the frame of the result."""
         normal = rotation @ window.normal()
         distance = window.distance_mm * float(rotation[:, 2] @ normal)
         indices = window.index(wavelength_nm), medium.refractive_index(wavelength_nm)
@@ -97,11 +99,11 @@ class WindowGeometry:
 
     @property
     def outer_mm(self) -> Array:
-        """Distance of the outer face along the normal."""
+        """Distance of the outer face along the normal, mm."""
         return self.distance_mm + self.thickness_mm
 
     def layers(self, height_mm: Array) -> tuple[tuple[Array, Array], ...]:
-        """Extents along the normal up to a height, and indices, of the air, the glass and the medium."""
+        """Return the extent along the normal up to a height, and the index, of air, glass and medium."""
         return (
             (self.distance_mm, 1.0),
             (self.thickness_mm, self.glass_index),
@@ -113,11 +115,20 @@ class WindowGeometry:
 class Path:
     """Rays from a module's origin through its window to points outside.
 
-    ``slope`` is the tangent of the angle to the window's normal in air, ``slope_outside`` that in the medium,
-    ``across`` the unit vector square to the normal in which the ray leans, ``height_mm`` the point's distance from the
-    origin along the normal. ``apparent_mm`` is the ray's distance across over its slope in air, the distance from which
-    it seems to come sideways; ``growth_mm`` is the change of the distance across by the slope, the distance from which
-    a bundle seems to come in the plane of incidence.
+    Attributes
+    ----------
+    slope, slope_outside
+        Tangent of the angle to the window's normal, in air and in the medium.
+    across : Vector
+        Unit vector of the ray's lateral direction, perpendicular to the normal.
+    height_mm
+        Distance of the point from the origin along the normal.
+    apparent_mm
+        Lateral distance of the point divided by the slope in air: apparent distance perpendicular to the plane of
+        incidence.
+    growth_mm
+        Derivative of the lateral distance with respect to the slope in air: apparent distance in the plane of
+        incidence.
     """
 
     slope: Array
@@ -129,19 +140,24 @@ class Path:
 
 
 def snell_root(xp: ModuleType, index: Array, slope: Array) -> Array:
-    """The root sqrt(n^2 + (n^2 - 1) p^2) by which Snell's law divides the slope p that a ray has in air. From n sin(b)
-    = sin(a) with p = tan(a): tan(b) = p / sqrt(n^2 + (n^2 - 1) p^2)."""
+    """Return sqrt(n^2 + (n^2 - 1) p^2), the ratio of a ray's slope p in air to its slope in a medium of index n.
+
+    From n sin(b) = sin(a) with p = tan(a) follows tan(b) = p / sqrt(n^2 + (n^2 - 1) p^2).
+    """
     return xp.sqrt(index * index + (index * index - 1) * slope * slope)
 
 
 def across_mm(xp: ModuleType, window: WindowGeometry, height_mm: Array, slope: Array) -> Array:
-    """Distance from the normal through the origin that a ray of some slope in air has at a height along the normal."""
+    """Return the lateral distance, at a height along the normal, of rays with a slope in air."""
     return sum(extent * slope / snell_root(xp, n, slope) for extent, n in window.layers(height_mm))
 
 
 def traced(window: WindowGeometry, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3, 3) where rays (N, 3) start and meet both faces of a window, and their directions behind it; NaN for
-    rays that lead away from the window."""
+    """Trace rays (N, 3) from an origin through a window.
+
+    Return the points (N, 3, 3) of the rays at the origin and at both faces, and the directions behind the window. Rays
+    away from the window are NaN.
+    """
     normal = np.array(window.normal)
     with np.errstate(invalid="ignore", divide="ignore"):
         ahead = directions @ normal
@@ -156,11 +172,11 @@ def traced(window: WindowGeometry, origin: np.ndarray, directions: np.ndarray) -
 
 
 def path_to(xp: ModuleType, window: WindowGeometry, point: Vector) -> Path:
-    """The ray to points beyond a window, by Snell's law, with the module's origin at 0.
+    """Return the rays from the module's origin, 0, to points beyond a window, by Snell's law.
 
-    A ray of slope p in air has in a layer of index n the slope p S(n), S(n) = 1 / sqrt(n^2 + (n^2 - 1) p^2), so that it
-    goes p M(p) across, M being the sum of every layer's extent times its S. Newton's method solves p M = rho; its
-    derivative is the sum of extent times n^2 S^3.
+    A ray of slope p in air has the slope p S(n) in a layer of index n. Here S(n) = 1 / sqrt(n^2 + (n^2 - 1) p^2). Its
+    lateral distance is p M(p), where M is the sum over the layers of extent times S. Newton's method solves
+    p M = rho. The derivative of p M is the sum of extent times n^2 S^3.
     """
     height = dot(point, window.normal)
     sideways = added(point, scaled(window.normal, -height))
@@ -183,19 +199,19 @@ def path_to(xp: ModuleType, window: WindowGeometry, point: Vector) -> Path:
 
 
 def direction_outside(xp: ModuleType, window: WindowGeometry, path: Path) -> Vector:
-    """Unit vectors of rays in the medium, away from the module."""
+    """Return the unit vectors of rays in the medium, away from the module."""
     p = path.slope_outside
     return scaled(added(window.normal, scaled(path.across, p)), 1 / xp.sqrt(1 + p * p))
 
 
 def length_outside_mm(xp: ModuleType, window: WindowGeometry, path: Path) -> Array:
-    """Path length of rays through the medium."""
+    """Return the path length of rays in the medium."""
     return (path.height_mm - window.outer_mm) * xp.sqrt(1 + path.slope_outside * path.slope_outside)
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole with distortion as in `uwlts.model.sensor.Distortion`: focal lengths and principal point in px."""
+    """Pinhole with the distortion of `uwlts.model.sensor.Distortion`; focal lengths and principal point in px."""
 
     fx_px: Array
     fy_px: Array
@@ -212,11 +228,11 @@ class Lens:
 
     @classmethod
     def of(cls, camera: Camera) -> Lens:
-        """That of a camera's description."""
+        """Make the lens of a camera's description."""
         return cls(*camera.focal_lengths_px(), *camera.principal_point(), *camera.distortion.model_dump().values())
 
     def radial(self, r2: Array) -> tuple[Array, Array]:
-        """Radial factor of the distortion at squares of the radius, and twice its derivative by them."""
+        """Return the radial factor at squared radii, and twice its derivative with respect to them."""
         below = 1 + r2 * (self.k4 + r2 * (self.k5 + r2 * self.k6))
         factor = (1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))) / below
         slope = self.k1 + r2 * (2 * self.k2 + r2 * 3 * self.k3)
@@ -225,8 +241,10 @@ class Lens:
 
 @dataclass(frozen=True)
 class ImagePoints:
-    """Points as the camera sees them: pixels x, y, the ray there and its slopes (a, b) in air, before distortion; in
-    ``jacobian`` how these change the pixels: dx/da, dx/db, dy/da, dy/db in px."""
+    """Images of points: pixels x and y, rays, and their slopes (a, b) in air before distortion.
+
+    ``jacobian`` contains the derivatives of the pixels, dx/da, dx/db, dy/da, dy/db in px.
+    """
 
     x: Array
     y: Array
@@ -236,7 +254,7 @@ class ImagePoints:
 
 
 def distorted(lens: Lens, a: Array, b: Array) -> tuple[Array, Array, Array]:
-    """Image points (x, y) of slopes (a, b), and the radial factor; distortion in OpenCV's form."""
+    """Return image points (x, y) of slopes (a, b), and the radial factor; OpenCV's distortion model."""
     r2 = a * a + b * b
     radial, _ = lens.radial(r2)
     x = a * radial + 2 * lens.p1 * a * b + lens.p2 * (r2 + 2 * a * a)
@@ -245,7 +263,7 @@ def distorted(lens: Lens, a: Array, b: Array) -> tuple[Array, Array, Array]:
 
 
 def directions_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
-    """Rays (N, 3) of pixels (N, 2); distortion undone by fixed-point steps. NaN where they do not converge."""
+    """Return the rays (N, 3) of pixels (N, 2), undistorted by fixed-point iteration; NaN without convergence."""
     wanted = (pixels - (lens.cx, lens.cy)) / (lens.fx_px, lens.fy_px)
     found = wanted.copy()
     missed = np.full(len(found), np.inf)
@@ -260,7 +278,7 @@ def directions_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
 
 
 def seen(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> ImagePoints:
-    """Pixels at which points beyond the window appear."""
+    """Project points beyond the window into the image."""
     path = path_to(xp, window, point)
     ray = added(window.normal, scaled(path.across, path.slope))
     a, b = ray[0] / ray[2], ray[1] / ray[2]
@@ -278,10 +296,10 @@ def seen(xp: ModuleType, lens: Lens, window: WindowGeometry, point: Vector) -> I
 
 
 def slopes_per_mm(view: ImagePoints, window: WindowGeometry, along: Vector) -> tuple[Array, Array]:
-    """Change of the image point's slopes (a, b) per mm that a point moves along a direction.
+    """Return the derivatives of the slopes (a, b) per mm of a point's motion along a direction.
 
-    From p M(p, h) = rho: the slope p changes by (d rho - p S dh) / growth, h being the point's height; and what goes
-    square to the plane of incidence is seen from the apparent distance M.
+    In the plane of incidence, p M(p, h) = rho gives dp = (d rho - p S dh) / growth, where h is the point's height.
+    Motion perpendicular to it is divided by the apparent distance M.
     """
     path = view.path
     up = dot(along, window.normal)
@@ -296,7 +314,7 @@ def slopes_per_mm(view: ImagePoints, window: WindowGeometry, along: Vector) -> t
 
 
 def pixels_per_mm(view: ImagePoints, window: WindowGeometry, along: Vector) -> tuple[Array, Array]:
-    """Change of the pixels (x, y) per mm that a point moves along a direction."""
+    """Return the derivatives of the pixels (x, y) per mm of a point's motion along a direction."""
     da, db = slopes_per_mm(view, window, along)
     xa, xb, ya, yb = view.jacobian
     return xa * da + xb * db, ya * da + yb * db

@@ -1,4 +1,4 @@
-"""Parameters of designs for the formulas: plain arrays, one value per design, taken from sensor descriptions."""
+"""Parameters of designs for the formulas: arrays with one value per design, from sensor descriptions."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from uwlts.model.sensor import Medium, Sensor
 Follow = Literal["focus", "waist", "volume"]
 
 _DIFFUSE_ROUGHNESS_UM = 5.0
-"""Rms height of a diffuse surface, for the loss of speckle contrast in light of some line width."""
+"""Rms height of a diffuse surface, for the reduction of speckle contrast by the line width."""
 _GRAINS_PX = (0.02, 64.0)
-"""Speckle grains for which the averaging over pixels is known; others count as these."""
+"""Range of tabulated speckle grain sizes for averaging over pixels; other sizes are clipped to it."""
 
 PARAMETER_OF: dict[str, tuple[str, float]] = {
     "laser.baseline_mm": ("baseline_mm", 1.0),
@@ -56,22 +56,22 @@ PARAMETER_OF: dict[str, tuple[str, float]] = {
     "volume.near_mm": ("near_mm", 1.0),
     "volume.far_mm": ("far_mm", 1.0),
 }
-"""Numbers of the description that are a parameter of their own, times a factor, and no part of another one.
+"""Numbers of the description that each determine one parameter only, with the factor between them.
 
-The description's rules for them are bounds of each and of the difference of two, so that numbers between such as keep
-them keep them, too."""
+The description's rules for these numbers limit single numbers or the difference of two. If two values keep a rule,
+every value between them keeps it, too."""
 
 _OF_BASELINE = ("laser.baseline_mm", "laser.triangulation_angle_deg", "laser.roll_deg")
-"""Numbers without a meaning for a laser that is placed by its axis."""
+"""Numbers that do not apply to a laser that is placed by its axis."""
 
 
 @dataclass(frozen=True)
 class SensorArrays:
-    """One array of numbers per quantity, all of the same shape or 1; units are part of the names.
+    """Parameters of designs: one array per quantity, all of the same shape or of size 1; units are in the names.
 
-    ``placed`` is the pose (origin, axis, fan, normal) of lasers that are placed by their axis, NaN for those placed by
-    baseline and angle. ``distortion`` is k1 k2 p1 p2 k3 k4 k5 k6. ``along_width`` is 1 where the stripe runs along the
-    image's width, else 0. ``fan_nodes_rad`` and ``fan_powers`` hold tabulated profiles (relative power per angle).
+    ``placed`` is the pose (origin, axis, fan, normal) of lasers that are placed by their axis, NaN for others.
+    ``distortion`` is k1 k2 p1 p2 k3 k4 k5 k6. ``along_width`` is 1 if the stripe runs along the image's width, else 0.
+    ``fan_nodes_rad`` and ``fan_powers`` contain tabulated profiles (relative power per angle).
     """
 
     baseline_mm: Array
@@ -134,7 +134,7 @@ class SensorArrays:
     far_mm: Array
 
     def at(self, places: np.ndarray) -> SensorArrays:
-        """Parameters of the sensors at some places (M,) of arrays (N, 1, 1), as arrays (M, 1, 1)."""
+        """Select sensors by indices (M,) from arrays (N, 1, 1); return arrays (M, 1, 1)."""
 
         def taken(values: Array) -> Array:
             return tuple(map(taken, values)) if isinstance(values, tuple) else values[places]
@@ -142,7 +142,7 @@ class SensorArrays:
         return SensorArrays(**{name: taken(values) for name, values in vars(self).items()})
 
     def pose(self, xp: ModuleType) -> LaserFan:
-        """Fan of the laser in the camera frame."""
+        """Return the laser's fan in the camera frame."""
         towards = (1.0 - self.along_width, -self.along_width, 0.0 * self.along_width)
         baseline, angle, roll = self.baseline_mm, self.angle_rad, self.roll_rad
         by_angle = pose_at(xp, baseline_mm=baseline, angle_rad=angle, roll_rad=roll, towards=towards)
@@ -151,58 +151,59 @@ class SensorArrays:
         return LaserFan(*(tuple(where(xp, xp.isfinite(own), own, other) for own, other in pair) for pair in pairs))
 
     def along(self, pixels: tuple[Array, Array]) -> Array:
-        """The one of a pair for x and y that belongs to the pixel along the stripe."""
+        """Return the element of a pair (x, y) that belongs to the direction along the stripe."""
         return self.along_width * pixels[0] + (1 - self.along_width) * pixels[1]
 
     def across(self, pixels: tuple[Array, Array]) -> Array:
-        """The one of a pair for x and y that belongs to the pixel across the stripe."""
+        """Return the element of a pair (x, y) that belongs to the direction across the stripe."""
         return self.along_width * pixels[1] + (1 - self.along_width) * pixels[0]
 
     def lens(self) -> Lens:
-        """The camera's lens."""
+        """Return the camera's lens."""
         fx = self.focal_mm / self.pixel_mm
         return Lens(fx, self.pixel_aspect * fx, *self.principal_px, *self.distortion)
 
     def _normal(self, xp: ModuleType) -> Vector:
-        """Unit normal of the camera's window, as `uwlts.model.sensor.Window.normal`."""
+        """Return the unit normal of the camera's window, as `uwlts.model.sensor.Window.normal`."""
         x, y = self.window_tilt_x_rad, self.window_tilt_y_rad
         return xp.cos(x) * xp.sin(y), -xp.sin(x), xp.cos(x) * xp.cos(y)
 
     def window(self, xp: ModuleType) -> WindowGeometry:
-        """The camera's window; unmounted one of no thickness in the pupil, with nothing but air behind it."""
+        """Return the camera's window; if it is not mounted, one of zero thickness in the pupil, with air behind it."""
         normal, mounted = self._normal(xp), self.window_mounted
         distance, thickness = mounted * self.window_distance_mm * normal[2], mounted * self.window_thickness_mm
         return WindowGeometry(normal, distance, thickness, self.window_index, self.medium_index)
 
     def outer_mm(self, xp: ModuleType) -> Array:
-        """Depth on the camera's axis from which the volume counts: of the window's outer face, mounted or not."""
+        """Return the depth of the window's outer face on the camera's axis, mounted or not: origin of the volume."""
         return self.window_distance_mm + self.window_thickness_mm / self._normal(xp)[2]
 
     def laser_window(self, axis: Vector) -> WindowGeometry:
-        """The laser's window, taken as square to its axis."""
+        """Return the laser's window, assumed normal to its axis."""
         distance, thickness = self.laser_window_distance_mm, self.laser_window_thickness_mm
         return WindowGeometry(axis, distance, thickness, self.laser_window_index, self.medium_index)
 
     def window_passes(self, xp: ModuleType) -> Array:
-        """Share of light that passes the camera's window (Beer and Lambert)."""
+        """Return the transmittance of the camera's window (faces, and Beer-Lambert law)."""
         return self.window_faces_pass * xp.exp(-self.window_absorption_per_mm * self.window_thickness_mm)
 
     def laser_window_passes(self, xp: ModuleType) -> Array:
-        """Share of light that passes the laser's window."""
+        """Return the transmittance of the laser's window."""
         return self.laser_window_faces_pass * xp.exp(
             -self.laser_window_absorption_per_mm * self.laser_window_thickness_mm
         )
 
     def pixel_contrast(self, xp: ModuleType) -> Array:
-        """Speckle contrast of a pixel, averaged over its area and two polarisations that do not interfere."""
+        """Return the speckle contrast of a pixel, averaged over its area and two incoherent polarisations."""
         return self._averaged(xp, _pixel_series()) * self.speckle_coherence / math.sqrt(2)
 
     def centre_contrast(self, xp: ModuleType, sigma_px: Array) -> Array:
-        """Contrast with the same effect if neighbours across a stripe erred independently.
+        """Return the effective contrast: the one with the same effect for uncorrelated neighbours across the stripe.
 
-        Speckle is alike in neighbours where grains are as large as pixels. A stripe of standard deviation s is shifted
-        by what changes across it at the frequency f = 1 / (2 pi s). Of the squared contrast, summed over all
-        neighbours, the lens's and the pixel's transfer functions OTF(f g) and sinc^2(f) leave that part.
+        Speckle is correlated between neighbouring pixels if grains are as large as pixels. A stripe of standard
+        deviation s is shifted by variations at the spatial frequency f = 1 / (2 pi s). The squared contrast at this
+        frequency is that summed over all neighbours, times the transfer functions OTF(f g) of the lens and sinc^2(f) of
+        the pixel.
         """
         frequency = 1 / (2 * math.pi * sigma_px)
         v = xp.minimum(frequency * self.grain_px(), 0.999)
@@ -212,11 +213,11 @@ class SensorArrays:
         return whole * xp.sqrt(lens) * pixel
 
     def grain_px(self) -> Array:
-        """Size of speckle grains, lambda N (1 + m), in px; along y, too, where pixels are not square."""
+        """Return the size of speckle grains, lambda N (1 + m), in px along x; it is also used along y."""
         return self.wavelength_mm * self.working_f_number() / self.pixel_mm
 
     def _averaged(self, xp: ModuleType, series: Chebyshev) -> Array:
-        """The exponential of a series in the logarithm of the grain."""
+        """Return the exponential of a Chebyshev series in the logarithm of the grain size."""
         grain = xp.log(self.grain_px())
         shift, scale = map(float, series.mapparms())
         t = shift + scale * xp.minimum(xp.maximum(grain, math.log(_GRAINS_PX[0])), math.log(_GRAINS_PX[1]))
@@ -227,49 +228,55 @@ class SensorArrays:
         return xp.exp(t * ahead + (float(series.coef[0]) - beyond))
 
     def working_f_number(self) -> Array:
-        """N (1 + m) with the magnification m at the focus distance."""
+        """Return N (1 + m) with the magnification m at the focus distance."""
         return self.f_number * (1 + self.focal_mm / (self.focus_mm - self.focal_mm))
 
 
 def parameters_alone(sensor: Sensor) -> list[str]:
-    """Paths of a sensor's numbers that are parameters of their own: `PARAMETER_OF`, as far as its laser has them."""
+    """Return the paths of `PARAMETER_OF` that apply to a sensor's laser."""
     by_axis = sensor.laser.origin_mm is not None
     return [path for path in PARAMETER_OF if not (by_axis and path in _OF_BASELINE)]
 
 
 def parameters_of(sensors: Sequence[Sensor], media: Sequence[Medium]) -> SensorArrays:
-    """Parameters of N sensors, each in its medium, as float64 arrays (N, 1, 1); errors as `numbers_of`."""
+    """Return parameters of N sensors, each in its medium, as float64 arrays (N, 1, 1); errors as in `numbers_of`."""
     return stacked([numbers_of(sensor, medium) for sensor, medium in zip(sensors, media, strict=True)])
 
 
 def stacked(rows: Sequence[SensorArrays]) -> SensorArrays:
-    """Parameters of N sensors, each of plain numbers, as arrays (N, 1, 1)."""
+    """Stack parameters of N sensors, given as numbers, to arrays (N, 1, 1)."""
     columns = {name: [vars(row)[name] for row in rows] for name in vars(rows[0])}
     for name in ("fan_nodes_rad", "fan_powers"):
         nodes = max(map(len, columns[name]))
-        # Short tables are filled up with their last node, which adds nothing.
+        # Short tables are padded with their last node, which changes nothing.
         columns[name] = [(*table, *table[-1:] * (nodes - len(table))) for table in columns[name]]
     return SensorArrays(**{name: _columns(values) for name, values in columns.items()})
 
 
 def _columns(values: Sequence[Array]) -> Array:
-    """Arrays (N, 1, 1) of N numbers, or of N tuples of numbers in a tuple of the same kind."""
+    """Return an array (N, 1, 1) of N numbers, or a tuple of arrays for N tuples of numbers."""
     if isinstance(values[0], tuple):
         return tuple(_columns(parts) for parts in zip(*values, strict=True))
     return np.array(values, dtype=np.float64).reshape(-1, 1, 1)
 
 
 def numbers_of(sensor: Sensor, medium: Medium) -> SensorArrays:
-    """Parameters of one sensor in a medium, as plain numbers.
+    """Return the parameters of one sensor in a medium as numbers.
 
-    DescriptionError where a window is left out although the medium is not air, RangeError for a wavelength outside the
-    tables of a medium or glass, DesignError for a laser placed by its axis that has no sheet.
+    Raises
+    ------
+    DescriptionError
+        A window is not mounted although the medium is not air.
+    RangeError
+        The wavelength is outside the tables of a medium or glass.
+    DesignError
+        The axis of a laser runs along the baseline.
     """
     camera, laser, detector, exposure = sensor.camera, sensor.laser, sensor.detector, sensor.exposure
     window, wavelength = camera.window, laser.wavelength_nm
     index = medium.refractive_index(wavelength)
     if not (window.mounted and laser.window.mounted) and index != 1:
-        raise DescriptionError("a window is left out although the medium is not air: mount it, or choose air")
+        raise DescriptionError("a window is not mounted although the medium is not air: mount it, or choose air")
     by_axis = laser.origin_mm is not None
     placed: Array = ((math.nan,) * 3,) * 4
     if by_axis:
@@ -280,7 +287,7 @@ def numbers_of(sensor: Sensor, medium: Medium) -> SensorArrays:
     lit = (-half, half) if not table else (math.radians(table[0][0]), math.radians(table[-1][0]))
     angle, speckle = laser.triangulation_angle_deg, 1.0
     if (width := laser.linewidth_nm) > 0:
-        # The contrast that the line width leaves on a diffuse surface.
+        # Reduction of contrast on a diffuse surface by the line width.
         speckle = coherence(_DIFFUSE_ROUGHNESS_UM, linewidth_nm=width, wavelength_nm=wavelength, index=index)
     numbers = {
         "baseline_mm": math.nan if by_axis or laser.baseline_mm is None else laser.baseline_mm,
@@ -327,7 +334,7 @@ def numbers_of(sensor: Sensor, medium: Medium) -> SensorArrays:
     }
     for name, one in (("window", window), ("laser_window", laser.window)):
         glass = one.index(wavelength) if one.mounted else 1.0
-        # The light that passes both faces, square to them (Fresnel).
+        # Transmittance of both faces at normal incidence (Fresnel).
         faces = (1 - ((glass - 1) / (glass + 1)) ** 2) * (1 - ((glass - index) / (glass + index)) ** 2)
         numbers |= {
             f"{name}_distance_mm": one.distance_mm,
@@ -337,7 +344,7 @@ def numbers_of(sensor: Sensor, medium: Medium) -> SensorArrays:
             f"{name}_absorption_per_mm": one.absorption_per_mm() if one.mounted else 0.0,
             f"{name}_aperture_mm": one.aperture_diameter_mm if one.mounted else math.inf,
         }
-    # Powers per rad that integrate to 1.
+    # Power per rad, normalised to the integral 1.
     angles, powers = (
         np.radians([a for a, _ in table or ((0.0, 0.0),)]),
         np.array([p for _, p in table or ((0.0, 0.0),)]),
@@ -355,22 +362,21 @@ def numbers_of(sensor: Sensor, medium: Medium) -> SensorArrays:
 
 @cache
 def _pixel_series() -> Chebyshev:
-    """Logarithm of the contrast that averaging over a pixel leaves, by that of the grain in px; good to 0.5 %."""
+    """Return the log contrast after averaging over a pixel, as a series in the log grain size in px (error 0.5 %)."""
     grains = np.geomspace(*_GRAINS_PX, 60)
     return Chebyshev.fit(np.log(grains), np.log([pixel_contrast(float(grain)) for grain in grains]), 12)
 
 
 @cache
 def _line_series() -> Chebyshev:
-    """Half the logarithm of the squared contrast summed over the neighbours across the stripe, by that of the grain.
+    """Return half the log of the squared contrast, summed over neighbours across the stripe, by log grain size.
 
-    The sum over the lags of the correlation of pixels' averages is the correlation's integral over all lags across, and
-    its mean over pairs of points of a pixel along: (4 / pi) g^2 int OTF(f g) sinc^2(f) df, since the correlation
-    |2 J1(z) / z|^2 has the spectrum (4 / pi) g^2 OTF, with OTF(v) = 2 / pi (acos v - v sqrt(1 - v^2)) up to v = 1
-    (Goodman, Speckle Phenomena in Optics, Ch. 4).
+    The correlation |2 J1(z) / z|^2 of speckle is summed over pixel lags across the stripe and averaged within a pixel
+    along it. The result is (4 / pi) g^2 int OTF(f g) sinc^2(f) df. The correlation has the spectrum (4 / pi) g^2 OTF
+    with OTF(v) = 2 / pi (acos v - v sqrt(1 - v^2)) up to v = 1 (Goodman, Speckle Phenomena in Optics, Ch. 4).
     """
     grains = np.geomspace(*_GRAINS_PX, 60)
-    # Gauss-Legendre over 0 to 1 in v, in pieces, for sinc^2 swings 1 / g times.
+    # Piecewise Gauss-Legendre quadrature over v from 0 to 1, because sinc^2 oscillates 1 / g times.
     nodes, weights = np.polynomial.legendre.leggauss(16)
     pieces = 200
     v = ((np.arange(pieces)[:, None] + 0.5 * (nodes + 1)) / pieces).ravel()
@@ -381,15 +387,15 @@ def _line_series() -> Chebyshev:
 
 
 def followed(xp: ModuleType, parameters: SensorArrays, follow: Sequence[Follow]) -> SensorArrays:
-    """Parameters with what is adjusted on the bench set to the stand-off, see `following`."""
+    """Return the parameters with bench adjustments to the stand-off, see `following`."""
     return replace(parameters, **following(xp, parameters, follow))
 
 
 def following(xp: ModuleType, parameters: SensorArrays, follow: Sequence[Follow]) -> dict[str, Array]:
-    """Parameters, by their names, that are adjusted to the stand-off on the bench.
+    """Return the parameters, by name, that are adjusted to the stand-off as on the bench.
 
-    "focus" focuses the lens where the stand-off appears to be through window and medium; "waist" focuses the laser on
-    it; "volume" moves the measuring volume, in its own depth, so that it lies about the stand-off as it did.
+    "focus" focuses the lens on the apparent position of the stand-off through window and medium. "waist" focuses the
+    laser on the stand-off. "volume" centres the measuring volume on the stand-off, with its depth unchanged.
     """
     pose, window = parameters.pose(xp), parameters.window(xp)
     depth = standoff_mm(pose)

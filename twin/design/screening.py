@@ -1,8 +1,8 @@
-"""Judging of all designs of a study by formulas, a batch at a time, into parts from which a stopped sweep continues.
+"""Evaluation of all designs of a study by formulas, in batches, with results in parts that a stopped sweep reuses.
 
-Results are Parquet parts in a folder, each with the rows of a batch of designs and named after its first design. A part
-appears whole, and a part that two machines have written is the same part: nothing is lost when one of them is stopped,
-and nothing counts twice. An optimised study gets its designs from NSGA-II (Deb et al. 2002).
+Results are Parquet files in a folder. Each part contains a batch of designs and has the number of its first design in
+its name. Parts are written atomically. Two machines that evaluate the same batch write the same part, so that nothing
+is lost or counted twice. An optimised study gets its designs from NSGA-II (Deb et al. 2002).
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ _MOST_PART_BYTES = 2**28
 
 
 def part_path(folder: Path, first: int, *, lost: bool = False) -> Path:
-    """The part that begins with a design, or what stands for it while it is lost with the process that made it."""
+    """Return the path of the part with a first design; ``lost``: of its placeholder after its worker has died."""
     return folder / f"{'lost' if lost else 'part'}-{first:09d}.parquet"
 
 
 def as_part(columns: Columns) -> bytes:
-    """A batch's columns as the content of a part."""
+    """Return the columns of a batch as the content of a part."""
     sink = pa.BufferOutputStream()
     pq.write_table(pa.table(columns), sink)
     return sink.getvalue().to_pybytes()
 
 
 def write_part(folder: Path, first: int, content: bytes, *, lost: bool = False) -> None:
-    """Write a part, replacing what another run has written of the same batch."""
+    """Write a part and replace an older one of the same batch."""
     with written_aside(part_path(folder, first, lost=lost), overwrite=True) as aside:
         aside.write_bytes(content)
     if not lost:
@@ -57,13 +57,13 @@ def write_part(folder: Path, first: int, content: bytes, *, lost: bool = False) 
 
 
 def parts(folder: Path) -> list[Path]:
-    """All parts in a folder, by their first designs, and lost ones that have not been made since."""
+    """Return all parts in a folder, sorted by first design, including placeholders of lost parts."""
     lost = [path for path in folder.glob("lost-*.parquet") if not path.with_name(f"part{path.name[4:]}").exists()]
     return sorted([*folder.glob("part-*.parquet"), *lost], key=lambda path: path.name[5:])
 
 
 def rows_in(path: Path) -> int:
-    """Number of designs in a part, 0 if there is none or it is damaged."""
+    """Return the number of designs in a part; 0 if it is missing or damaged."""
     try:
         return pq.read_metadata(path).num_rows if path.is_file() else 0
     except (pa.ArrowInvalid, OSError):
@@ -71,19 +71,21 @@ def rows_in(path: Path) -> int:
 
 
 def read_parts(folder: Path) -> Columns:
-    """Columns of all designs of a folder, in the order of their numbers; empty where there are none. CaptureError where
-    a part is damaged or foreign."""
+    """Read the columns of all designs in a folder, sorted by number; empty if there are none.
+
+    Raises CaptureError if a part is damaged or belongs to another study.
+    """
     tables = []
     for path in parts(folder):
         require_regular_file(path, most_bytes=_MOST_PART_BYTES, called="part of a sweep")
         try:
             table = pq.read_table(path)
-            # Names of columns are decoded when they are asked for.
+            # Column names are decoded here, which can fail.
             if "design" not in table.column_names:
-                raise pa.ArrowInvalid("it has no numbers of designs")
+                raise pa.ArrowInvalid("the column 'design' is missing")
             tables.append(table)
         except (pa.ArrowException, OSError, UnicodeDecodeError, KeyError) as error:
-            advice = "remove it, and the sweep judges its designs anew"
+            advice = "remove it and run the sweep again"
             raise CaptureError(f"{path} is damaged: {error}; {advice}") from error
     if not tables:
         return {}
@@ -101,7 +103,7 @@ def _columns(table: pa.Table) -> Columns:
 
 
 def write_csv(path: Path, columns: Columns) -> None:
-    """Write columns as CSV, replacing an older file."""
+    """Write columns as CSV and replace an older file."""
     with written_aside(path, overwrite=True) as aside, open(aside, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
@@ -114,10 +116,10 @@ _POPULATION = 64
 
 
 def _open_search(study: Study, folder: Path) -> optuna.Study:
-    """The optimiser, whose memory lies in a journal in the study's folder, which several machines may share."""
+    """Open the optimiser, with its history in a journal in the study's folder, which several machines can share."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     journal = JournalStorage(JournalFileBackend(str(folder / JOURNAL)))
-    # Several machines must not propose the same designs: the seed is for the first of them only.
+    # Only the first machine uses the seed, so that different machines propose different designs.
     seed = None if _NAME in optuna.get_all_study_names(journal) else study.sampling.seed
     return optuna.create_study(
         storage=journal,
@@ -129,7 +131,7 @@ def _open_search(study: Study, folder: Path) -> optuna.Study:
 
 
 def _report(search: optuna.Study, study: Study, columns: Columns) -> None:
-    """Report columns of designs to the optimiser; those reported before are left alone."""
+    """Report the results of designs to the optimiser, except those that were reported before."""
     trials = {trial.number: trial for trial in search.get_trials(deepcopy=False)}
     for place, number in enumerate(columns["design"].tolist()):
         if number not in trials or trials[number].state != TrialState.RUNNING:
@@ -145,12 +147,12 @@ def _report(search: optuna.Study, study: Study, columns: Columns) -> None:
 
 PARTS = "screen"
 _FREE_TO_CHANGE = ("verify", "verify_tolerance", "refine", "title")
-"""Settings that may differ when a sweep is resumed, besides the number of random, Sobol or optimised designs."""
+"""Settings that can differ when a sweep is continued, as can the number of random, Sobol or optimised designs."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Designs to judge together, the first of which names the part."""
+    """Designs that are evaluated together; the number of the first one names the part."""
 
     study: Study
     designs: tuple[Design, ...] | None
@@ -158,23 +160,29 @@ class Batch:
     count: int
 
     def all(self) -> list[Design]:
-        """The designs."""
+        """Return the designs."""
         return designs_of(self.study, self.first, self.count) if self.designs is None else list(self.designs)
 
 
 def judged_part(batch: Batch) -> bytes:
-    """Results of the formulas for a batch, as the content of its part."""
+    """Evaluate a batch by formulas; return the content of its part."""
     return as_part(judged(batch.study, batch.all()))
 
 
 def screen(study: Study, folder: Path, workers: Workers, *, progress: ProgressListener = unheard) -> None:
-    """Judge all designs of a study that are not judged yet, into parts below ``folder``.
+    """Evaluate all remaining designs of a study and write the parts below ``folder``.
 
-    DescriptionError where the folder holds another study, OutputError where a part cannot be written, SetupError where
-    the workers' cluster is gone.
+    Raises
+    ------
+    DescriptionError
+        The folder contains another study.
+    OutputError
+        A part cannot be written.
+    SetupError
+        The workers' cluster does not respond.
     """
     made_folder(folder)
-    # Hidden files are being written by another machine that has just begun, or were by one that is gone.
+    # Hidden files are temporary files of another machine, running or stopped.
     keep_to_plan(folder, _plan(study), set(), recorded="[!.]*", called="files", overwrite=False)
     place = made_folder(folder / PARTS)
     if study.sampling.kind == "optimise":
@@ -183,7 +191,7 @@ def screen(study: Study, folder: Path, workers: Workers, *, progress: ProgressLi
     total, size = number_of_designs(study), study.sampling.batch
     batches = [Batch(study, None, first, min(size, total - first)) for first in range(0, total, size)]
     waiting = [batch for batch in batches if rows_in(part_path(place, batch.first)) < batch.count]
-    # Several machines begin at different places, and look before each batch whether another has done it.
+    # Machines work in different orders, and check before each batch whether another machine has done it.
     random.shuffle(waiting)
     done = total - sum(batch.count for batch in waiting)
     progress(done, total)
@@ -203,7 +211,7 @@ def screen(study: Study, folder: Path, workers: Workers, *, progress: ProgressLi
 
 
 def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progress: ProgressListener) -> None:
-    """Judge what the optimiser proposes, a generation at a time, shared among the workers."""
+    """Evaluate the optimiser's designs, one generation at a time, distributed over the workers."""
     search, free = _open_search(study, folder), study.free()
     space: dict[str, BaseDistribution] = {
         name: FloatDistribution(*variable.ends(), log=variable.scale == "log")
@@ -214,7 +222,7 @@ def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progres
     if known := read_parts(place):
         _report(search, study, known)
     total = study.sampling.designs
-    # Other machines may add designs of their own.
+    # Other machines can add designs, too.
     while (done := sum(map(rows_in, parts(place)))) < total:
         progress(done, total)
         trials = [search.ask(space) for _ in range(min(study.sampling.batch, total - done))]
@@ -231,14 +239,14 @@ def _optimise(study: Study, folder: Path, place: Path, workers: Workers, progres
 
 
 def _content(batch: Batch, result: bytes | Lost) -> bytes:
-    """A part's content; of a batch whose worker died, all designs fail with the reason, until it is tried again."""
+    """Return the content of a part; if the worker has died, a placeholder with failed designs and the reason."""
     if not isinstance(result, Lost):
         return result
     return as_part(failed(batch.study, batch.all(), [result.reason] * batch.count))
 
 
 def _plan(study: Study) -> dict[str, JsonValue]:
-    """What the results of a study follow from."""
+    """Return the settings that determine the results of a study."""
     plan = study.model_dump(mode="json", exclude=set(_FREE_TO_CHANGE))
     del plan["sampling"]["designs"]
     return plan | {"sensor": study.sensor.model_dump(mode="json")}

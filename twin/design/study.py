@@ -1,4 +1,4 @@
-"""Description of a study: a base sensor, free variables, objectives, constraints, and the choice of designs."""
+"""Description of a study: base sensor, free variables, objectives, constraints, and sampling of designs."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from uwlts.model.sensor import Description, Medium, NotNegative, Sensor
 
 FOLDER = "studies"
 OTHER_COLUMNS = ("design", "violation", "failure")
-"""Columns of results besides values and figures."""
+"""Columns of results in addition to values and figures."""
 FOLLOWING: dict[Follow, str] = {"focus": "camera.focus_distance_mm", "waist": "laser.waist_distance_mm"}
-"""Parameters that follow the stand-off and could be free as well."""
+"""Paths that `Study.follow` sets; they must not be free at the same time."""
 MOST_DESIGNS = 10**8
 
 
 class Variable(Description):
-    """A free number of the sensor's description: from ``least`` to ``most``, or one of ``values``.
+    """Free number of the sensor's description: from ``least`` to ``most``, or one of ``values``.
 
-    A grid takes ``steps`` of a range, evenly spaced, in their logarithm where ``scale`` is "log". ``whole`` rounds to
-    whole numbers; numbers that the description counts, such as pixels, are whole anyway.
+    A grid has ``steps`` values of a range, evenly spaced on the ``scale``. ``whole`` rounds to integers; numbers that
+    are integers in the description, such as pixels, are always rounded.
     """
 
     least: float | None = None
@@ -40,15 +40,15 @@ class Variable(Description):
     values: tuple[Value, ...] | None = None
 
     @model_validator(mode="after")
-    def _range_or_values(self) -> Variable:
+    def _check_range_or_values(self) -> Variable:
         given = [self.least is not None, self.most is not None, self.values is not None]
         if given not in ([True, True, False], [False, False, True]):
             raise ValueError("give least and most, or values")
         if self.values is not None:
             if not self.values:
-                raise ValueError("values is empty")
+                raise ValueError("values is empty; give at least one")
             if len({isinstance(value, str) for value in self.values}) > 1:
-                raise ValueError(f"values mix words and numbers, {self.values}: make them choices, or two studies")
+                raise ValueError(f"values contain texts and numbers, {self.values}: use choices, or two studies")
             return self
         least, most = self.ends()
         if not least < most:
@@ -58,13 +58,13 @@ class Variable(Description):
         return self
 
     def ends(self) -> tuple[float, float]:
-        """Least and most value of a range; DescriptionError where the variable is a list of values."""
+        """Return the least and most value of a range; DescriptionError for a list of values."""
         if self.least is None or self.most is None:
-            raise DescriptionError(f"a variable with the values {self.values} has no least and most")
+            raise DescriptionError(f"a variable with the values {self.values} is not a range with least and most")
         return self.least, self.most
 
     def at(self, share: float) -> Value:
-        """The value at a share from 0 to 1 of the range, not rounded, or of the list."""
+        """Return the value at a fraction from 0 to 1 of the range, not rounded, or of the list."""
         if self.values is not None:
             return self.values[min(int(share * len(self.values)), len(self.values) - 1)]
         least, most = self.ends()
@@ -73,11 +73,11 @@ class Variable(Description):
         return least + share * (most - least)
 
     def taken(self, value: Value) -> Value:
-        """The value as a design takes it: rounded if it has to be whole."""
+        """Return the value for a design: rounded if it must be an integer."""
         return round(float(value)) if self.whole and self.values is None else value
 
     def drawn(self, shares: np.ndarray) -> list[Value]:
-        """Values at shares (N,) as designs take them: as of `at` and `taken`."""
+        """Return the values for designs at fractions (N,), as by `at` and `taken`."""
         if self.values is not None or self.scale == "log":
             return [self.taken(self.at(share)) for share in shares.tolist()]
         least, most = self.ends()
@@ -85,14 +85,14 @@ class Variable(Description):
         return np.rint(values).astype(int).tolist() if self.whole else values.tolist()
 
     def grid(self) -> list[Value]:
-        """All values of a grid."""
+        """Return all values of a grid."""
         if self.values is not None:
             return list(self.values)
         return list(dict.fromkeys(self.taken(self.at(k / (self.steps - 1))) for k in range(self.steps)))
 
 
 class Objective(Description):
-    """A figure to make as small or as large as possible."""
+    """Figure to minimise or maximise."""
 
     figure: str
     goal: Literal["minimise", "maximise"] = "minimise"
@@ -105,7 +105,7 @@ class Constraint(Description):
     most: float | None = None
 
     @model_validator(mode="after")
-    def _bounded(self) -> Constraint:
+    def _check_bounds(self) -> Constraint:
         if self.least is None and self.most is None:
             raise ValueError("give least, most, or both")
         if self.least is not None and self.most is not None and self.least > self.most:
@@ -114,9 +114,9 @@ class Constraint(Description):
 
 
 class Sampling(Description):
-    """Choice of designs: all of a grid, at random, by a Sobol sequence, or by an optimiser (NSGA-II).
+    """Sampling of designs: a grid, random, a Sobol sequence, or an optimiser (NSGA-II).
 
-    ``designs`` is their number where it is not the grid's; ``batch`` designs are judged at a time.
+    ``designs`` is their number, except for a grid; ``batch`` is the number of designs that are evaluated together.
     """
 
     kind: Literal["grid", "random", "sobol", "optimise"] = "grid"
@@ -126,15 +126,13 @@ class Sampling(Description):
 
 
 class Study(Description):
-    """A study as read from TOML.
+    """Study as read from TOML.
 
-    ``sensor`` is the base sensor, given by name, path or table; it is kept whole, as workers elsewhere may not have
-    its file.
-    ``variables`` are free numbers or words of the sensor's description, by their path (``camera.focal_length_mm``);
-    ``choices`` are named alternatives that set several paths at once, such as cameras that can be bought. ``follow``
-    is what is set anew for every design as one would on the bench, see `twin.design.parameters.followed`.
-    ``refine`` lets the best design be improved along the gradient; ``verify`` is how many of the best are rendered, in
-    addition to the base sensor.
+    ``sensor`` is the base sensor, given by name, path or table. It is stored completely, because remote workers may not
+    have its file. ``variables`` are free values of the sensor's description by path (``camera.focal_length_mm``).
+    ``choices`` are named alternatives that set several paths at once, such as commercial cameras. ``follow`` lists the
+    adjustments to each design's stand-off, see `twin.design.parameters.following`. ``refine`` enables the refinement of
+    the best design along the gradient. ``verify`` is the number of designs to render, in addition to the base sensor.
     """
 
     title: str
@@ -154,19 +152,19 @@ class Study(Description):
 
     @field_validator("sensor", mode="before")
     @classmethod
-    def _found(cls, value: object) -> object:
+    def _load_sensor(cls, value: object) -> object:
         return load_sensor(value) if isinstance(value, str) else value
 
     @model_validator(mode="after")
-    def _consistent(self) -> Study:
+    def _check_consistency(self) -> Study:
         if unknown := [name for name in self.wanted() if name not in FIGURES]:
             raise ValueError(f"unknown figure {', '.join(unknown)}; known are {', '.join(FIGURES)}")
         if not self.variables and not self.choices:
             raise ValueError("nothing is free: give variables or choices")
         if twice := set(self.variables) & set(self.choices):
-            raise ValueError(f"{', '.join(sorted(twice))}: a choice needs a name of its own")
+            raise ValueError(f"{', '.join(sorted(twice))}: a variable has this name; give the choice another")
         if empty := [name for name, options in self.choices.items() if not options]:
-            raise ValueError(f"choices.{empty[0]} has no options")
+            raise ValueError(f"choices.{empty[0]} is empty; give at least one option")
         if taken := [name for name in self.choices if name in (*FIGURES, *OTHER_COLUMNS)]:
             raise ValueError(f"choices.{taken[0]}: a figure has this name; give the choice another")
         chosen = self.chosen()
@@ -176,32 +174,34 @@ class Study(Description):
             if what in self.follow and path in (*self.variables, *chosen):
                 raise ValueError(f"{path} is free, but follow sets it: leave '{what}' out of follow, or the path")
         if unfit := [path for path in (*self.variables, *chosen) if path.startswith("laser.window.tilt")]:
-            raise ValueError(f"{unfit[0]}: the formulas do not know it; compare two rendered sensors instead")
+            raise ValueError(f"{unfit[0]}: the formulas do not contain it; compare two rendered sensors instead")
         free = self.free().values()
         count = math.prod(one.steps if one.values is None else len(one.values) for one in free)
         if self.sampling.kind == "grid" and count > MOST_DESIGNS:
-            raise ValueError(f"a grid of {count:.3g} designs; at most {MOST_DESIGNS:g}: take fewer steps, or sobol")
+            raise ValueError(
+                f"the grid has {count:.3g} designs, more than {MOST_DESIGNS:g}: use fewer steps, or sampling 'sobol'"
+            )
         return self
 
     def chosen(self) -> dict[str, None]:
-        """Paths that options of choices set, in order."""
+        """Return the paths that options of choices set, in order, as keys."""
         options = (option for options in self.choices.values() for option in options.values())
         return dict.fromkeys(path for option in options for path in option)
 
     def free(self) -> dict[str, Variable]:
-        """All that is free, in order: variables, then choices by the names of their options."""
+        """Return all free variables in order: variables, then choices with the names of their options as values."""
         return self.variables | {name: Variable(values=tuple(options)) for name, options in self.choices.items()}
 
     def continuous(self) -> list[str]:
-        """Paths of the variables that take any number of a range."""
+        """Return the paths of continuous variables."""
         return [path for path, one in self.variables.items() if one.values is None and not one.whole]
 
     def wanted(self) -> list[str]:
-        """Figures of the objectives and of the constraints, in this order."""
+        """Return the figures of the objectives and of the constraints, in this order."""
         return list(dict.fromkeys([*(objective.figure for objective in self.objectives), *self.constraints]))
 
     def bounds(self) -> list[tuple[str, int, float]]:
-        """All bounds: the figure, 1 for one from above and -1 for one from below, and the bound."""
+        """Return all bounds as figure, sign (1 for an upper, -1 for a lower bound) and value."""
         return [
             (name, sign, bound)
             for name, constraint in self.constraints.items()
@@ -210,15 +210,15 @@ class Study(Description):
         ]
 
     def medium_of(self, sensor: Sensor) -> Medium:
-        """The study's medium of a sensor."""
+        """Return the study's medium from a sensor's media."""
         return sensor.medium(self.medium)
 
 
 def load_study(study: str | Path | Study, *, designs: int | None = None, verify: int | None = None) -> Study:
-    """Study by name (``baseline-angle``) or path; a sensor beside it is found by its file name.
+    """Load a study by name (``baseline-angle``) or path, or check a given study.
 
-    ``designs`` and ``verify`` replace the study's own; a study that is given as such is checked in the same way.
-    DescriptionError where the study is not valid, or a path does not exist in the sensor's description.
+    ``designs`` and ``verify`` replace the study's own values. The base sensor can be the name of a file in the study's
+    folder. Raises DescriptionError if the study is not valid, or a path does not exist in the sensor's description.
     """
     if isinstance(study, Study):
         path, table = Path("the study"), study.model_dump()

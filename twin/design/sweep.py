@@ -1,8 +1,7 @@
-"""Sweep of a study: designs are judged by formulas, the best is improved, a few are rendered, and results written.
+"""Sweep of a study: evaluate designs by formulas, refine the best, render a few, and write the results.
 
-Everything lies in one folder, to which several machines may append: ``plan.json`` holds the study, ``screen`` parts
-with all designs that are judged, ``verified`` one file for every design that was rendered. A sweep that is stopped
-continues where it was.
+All files are in one folder, which several machines can share. ``plan.json`` contains the study, ``screen`` the results
+of all evaluated designs in parts, and ``verified`` one file for each rendered design. A stopped sweep can be continued.
 """
 
 from __future__ import annotations
@@ -44,14 +43,18 @@ class SweepResult(Brief):
 
     Attributes
     ----------
+    study : Study
+        The study.
     folder : Path
         Folder of report.html, designs.csv, summary.json and winner.toml.
     columns : dict of str to (N,) array
         All N designs: "design", the free values, the figures of merit (units in their names), "violation", "failure".
     marked : tuple of Marked
-        Base sensor, best design and refined design, as far as they work and are better; the last is the winner.
-    agreements, notes
-        Comparison of formulas and rendering for each rendered design; sentences on the choice.
+        Base sensor if it works, best design, and refined design if it is better; the last one is the winner.
+    agreements : tuple of Agreement
+        Comparison of formulas and rendering for each rendered design.
+    notes : tuple of str
+        Sentences on the choice.
     """
 
     study: Study
@@ -63,16 +66,16 @@ class SweepResult(Brief):
 
     @property
     def winner(self) -> Marked:
-        """The design to build."""
+        """Design to build."""
         return self.marked[-1]
 
     def counts(self) -> tuple[int, int, int]:
-        """Number of designs, of those that work, and of those that meet all constraints."""
+        """Return the numbers of all designs, of working designs, and of designs that meet all constraints."""
         violation = self.columns["violation"]
         return len(violation), int(np.isfinite(violation).sum()), int((violation == 0).sum())
 
     def lines(self) -> list[str]:
-        """The result in lines of text for a terminal."""
+        """Return the result as lines of text."""
         lines = ["{} designs, {} work, {} meet all constraints".format(*self.counts()), *self.notes]
         names = [*self.study.free(), *self.study.wanted()]
         for one in self.marked:
@@ -104,27 +107,28 @@ def sweep(
     variant: Variant = CPU,
     progress: ProgressListener = unheard,
 ) -> SweepResult:
-    """Find the sensor to build: judge many designs by formulas, improve the best, and render some to make sure.
+    """Find the sensor to build: evaluate many designs by formulas, refine the best, and verify some by rendering.
 
-    Run again, it goes on where it was stopped; several machines may run it on one folder at the same time. OUT holds
-    report.html, designs.csv, summary.json and the winning design as winner.toml, which twin simulate takes as --sensor.
+    A stopped sweep continues when it is run again. Several machines can run it on the same folder at the same time. OUT
+    receives report.html, designs.csv, summary.json and the best design as winner.toml, a sensor for twin simulate
+    --sensor.
 
     Parameters
     ----------
     study : str, Path or Study
         Name (see: twin scenes) or path of the study's description, or a study.
     out : str or Path, optional
-        Folder for all results; runs/STUDY unless given.
+        Folder for all results; default: runs/STUDY.
     designs : int, optional
-        How many designs a random, Sobol or optimised study judges, in place of what the study says.
+        Number of designs of a random, Sobol or optimised study; default: the study's.
     verify : int, optional
-        How many designs are rendered beside the base sensor, 0 for none at all, in place of what the study says.
+        Number of designs to render in addition to the base sensor, 0 for no rendering; default: the study's.
     workers : int, optional
-        Processes of this machine; as many as there are processors unless given.
+        Number of processes on this machine; default: one per processor.
     scheduler : str, optional
-        Address of a Dask scheduler, such as tcp://host:8786, whose workers are used in place of this machine's.
+        Address of a Dask scheduler, such as tcp://host:8786, to use its workers instead of this machine.
     overwrite : bool
-        Remove what an earlier sweep has left in the folder.
+        Remove the files of an earlier sweep from the folder.
     variant : str
         As for `simulate`.
     progress : callable
@@ -138,13 +142,13 @@ def sweep(
     Raises
     ------
     DescriptionError
-        The study is not valid, ``workers`` is below 1, or the folder holds something else.
+        The study is not valid, ``workers`` is below 1, or the folder contains other files.
     DesignError
         No design can work.
     OutputError
         A file cannot be written.
     SetupError
-        No scheduler answers, or the workers' cluster is gone.
+        The scheduler or the workers' cluster does not respond.
 
     Examples
     --------
@@ -154,7 +158,7 @@ def sweep(
     if workers is not None and workers < 1:
         raise DescriptionError(f"workers is {workers}; it must be at least 1")
     if out is None and isinstance(study, Study):
-        raise DescriptionError("give the folder out for a study that is not read from a file")
+        raise DescriptionError("`out` is missing: give the folder for a study that is not read from a file")
     folder = Path("runs") / Path(str(study)).stem if out is None else Path(out)
     described = load_study(study, designs=designs, verify=verify)
     if overwrite:
@@ -181,13 +185,13 @@ def sweep(
     content["marked"] = [{"label": one.label} | one.design.table() for one in result.marked]
     content |= {"verified": result.agreements, "notes": result.notes}
     with written_aside(folder / SUMMARY, overwrite=True) as aside:
-        # Numbers that JSON cannot hold become null.
+        # NaN and infinity become null in JSON.
         aside.write_bytes(TypeAdapter(dict[str, Any]).dump_json(content, indent=2) + b"\n")
     return result
 
 
 def clear(folder: Path) -> None:
-    """Remove what an earlier sweep has left in a folder, and nothing else; a folder of other files stays as it is."""
+    """Remove only the files of an earlier sweep from a folder; a folder without a plan is not changed."""
     if not (folder / PLAN).is_file():
         return
     for pattern in (f"{PARTS}/part-*.parquet", f"{PARTS}/lost-*.parquet", f"{RENDERED}/*.parquet"):
@@ -195,7 +199,7 @@ def clear(folder: Path) -> None:
             path.unlink()
     for place in (folder / PARTS, folder / RENDERED, folder):
         for path in place.glob(".*"):
-            # What was being written when an earlier sweep was killed.
+            # Temporary files of a sweep that was killed.
             if path.is_file() and re.fullmatch(r"\.[0-9a-f]{16}\.(parquet|json|csv|toml|html)", path.name):
                 path.unlink()
         if place != folder and place.is_dir() and not any(place.iterdir()):

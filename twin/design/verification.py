@@ -1,7 +1,7 @@
-"""Verification of designs by rendering: the twin records, the sensor's software calibrates and measures.
+"""Verification of designs by rendering: the twin records, and the sensor software calibrates and measures.
 
-The software runs as a separate program, as for a real sensor. Its points are compared with the true plane, and their
-scatter with what the formulas predict.
+The sensor software runs as a separate program, as with a real sensor. Its points are compared with the true plane, and
+their scatter with the prediction of the formulas.
 """
 
 from __future__ import annotations
@@ -43,21 +43,34 @@ from uwlts.storage.truth import truth_path
 _USER_ERROR = 2
 _FEWEST_POINTS = 20
 _LARGEST_RESIDUAL = 5.0
-"""In robust standard deviations: points farther from the profile's trend count as outliers."""
+"""Limit of residuals from the profile's trend in robust standard deviations; larger ones are outliers."""
 _MAD_TO_STD = 1.4826
 
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """Measurements by a rendered sensor of a plane square to the laser's axis, at K depths; arrays (K,).
+    """Measurements of a plane normal to the laser's axis at K depths by a rendered sensor.
 
-    ``z_mm`` is the plane's true Z in the OCS, ascending; ``points`` counts the points found, outliers included.
-    ``scatter_mm`` is their standard deviation along Z about the profile's own quadratic trend (the random part),
-    ``error_mm`` their mean deviation along Z from the true plane (the systematic part, with the error of the calibrated
-    OCS's origin, which moves all depths alike), ``line_mm`` the length along Y over which they were found. Outliers,
-    farther from the trend than five robust standard deviations, are left out of these. Where fewer than 20 points were
-    found, scatter and error are NaN and the length is 0. ``exposure_ms`` is that of the plane's images, ``seconds`` are
-    the times to render, calibrate and measure.
+    Outliers, more than five robust standard deviations from the trend, are excluded except in ``points``. At depths
+    with fewer than 20 points, scatter and error are NaN and the line length is 0.
+
+    Attributes
+    ----------
+    z_mm : (K,)
+        True Z of the plane in the OCS, ascending.
+    points : (K,)
+        Number of points, including outliers.
+    scatter_mm : (K,)
+        Standard deviation along Z about the profile's quadratic trend (random error).
+    error_mm : (K,)
+        Mean deviation along Z from the true plane (systematic error). It includes the error of the calibrated OCS's
+        origin, which is equal at all depths.
+    line_mm : (K,)
+        Length of the profile along Y.
+    exposure_ms : float
+        Exposure of the plane's images.
+    seconds : dict
+        Times to render, calibrate and measure.
     """
 
     z_mm: np.ndarray
@@ -79,15 +92,39 @@ def verify(
     variant: str = CPU,
     workers: int = 2,
 ) -> Rendered:
-    """Calibrate a sensor and measure a plane of a reflectance with it, all by rendered images, in one of its media.
+    """Calibrate a sensor and measure a plane with it in one of its media, with rendered images.
 
-    What an earlier run left in ``folder`` is overwritten. The calibration stays there. Equal arguments give equal
-    results. With one worker the images are rendered in this process, else in processes of their own.
+    Equal arguments give equal results.
 
-    DescriptionError or DesignError where the sensor cannot work in the medium, or not be calibrated; CalibrationError
-    or CaptureError where its software cannot calibrate it or finds no stripe, with the software's message;
-    EvaluationError where the cloud has too few points at every depth; OutputError where a file cannot be written;
-    SetupError where a process was ended from outside, or the machine cannot render.
+    Parameters
+    ----------
+    sensor : Sensor
+        Sensor to verify.
+    medium : str
+        Name of one of the sensor's media.
+    folder : Path
+        Folder of the files. Files of an earlier run are replaced; the calibration is kept.
+    reflectance : float
+        Reflectance of the plane.
+    seed : int
+        Seed of the noise.
+    variant : str
+        Mitsuba variant.
+    workers : int
+        Number of processes; with 1, images are rendered in this process.
+
+    Raises
+    ------
+    DescriptionError, DesignError
+        The sensor cannot work in the medium, or cannot be calibrated.
+    CalibrationError, CaptureError
+        The sensor software cannot calibrate, or does not find the stripe; with its message.
+    EvaluationError
+        The cloud has too few points at every depth.
+    OutputError
+        A file cannot be written.
+    SetupError
+        A process was ended from outside, or the machine cannot render.
     """
     if workers < 1:
         raise errors.DescriptionError(f"workers is {workers}; it must be at least 1")
@@ -95,10 +132,10 @@ def verify(
     calibration, cloud = folder / "calibration.json", folder / "standard.ply"
     made_folder(folder)
     try:
-        calibration.unlink(missing_ok=True)  # one of an earlier run must not pass for this one's
+        calibration.unlink(missing_ok=True)  # a calibration of an earlier run must not be used
     except OSError as error:
         raise errors.OutputError(f"cannot replace {calibration}: {error.strerror}") from error
-    # Noise must differ between recordings: each has a seed of its own.
+    # Each recording has its own seed, so that the noise is independent.
     jobs = [
         (recording, Options(seed=int(np.random.SeedSequence([seed, k]).generate_state(1)[0])))
         for k, recording in enumerate(planned.all())
@@ -117,7 +154,7 @@ def verify(
         with Capture(capture) as opened:
             exposure, stage = float(opened.exposure_ms[0]), np.array(opened.stage_mm)
         found = read_cloud(cloud)
-        profiles = _judged(np.column_stack([found.frame, found.points_mm[:, 1:]]), stage)
+        profiles = _evaluate_points(np.column_stack([found.frame, found.points_mm[:, 1:]]), stage)
         times.append(time.perf_counter())
     finally:
         captures = [_capture(folder, recording) for recording in planned.all()]
@@ -134,7 +171,7 @@ def _capture(folder: Path, recording: PlannedRecording) -> Path:
 def _record(
     folder: Path, variant: str, job: tuple[PlannedRecording, Options], report: Callable[[object], None]
 ) -> None:
-    """Render a recording into its file, one of several rendered at the same time."""
+    """Render a recording to its file with one thread; several recordings are rendered at the same time."""
     use_variant(variant)
     import drjit as dr
 
@@ -151,26 +188,28 @@ def _record(
 
 
 def _run(command: str, *arguments: str, fails_as: type[Error]) -> None:
-    """Run a command of the sensor's software; its complaint as an error of a class where it fails."""
+    """Run a command of the sensor software; raise its message as ``fails_as`` if it fails."""
     line = [sys.executable, "-m", "uwlts", command, *arguments, "--overwrite"]
     done = subprocess.run(line, check=False, capture_output=True, text=True)
     if done.returncode == 0:
         return
-    said = done.stderr.strip().splitlines() or ["it says nothing"]
+    said = done.stderr.strip().splitlines() or ["no message"]
     if done.returncode == _USER_ERROR:
         raise fails_as(said[-1].removeprefix("error: "))
     raise errors.SetupError(f"uwlts {command} has ended unexpectedly (exit code {done.returncode}): {said[-1]}")
 
 
-def _judged(points: np.ndarray, stage_mm: np.ndarray) -> Rendered:
-    """Profiles, nearest first, from points (N, 3) with frame, Y and Z about the plane Z = 0, the stage at ``stage_mm``
-    (K,) along Z."""
+def _evaluate_points(points: np.ndarray, stage_mm: np.ndarray) -> Rendered:
+    """Evaluate points (N, 3), with frame, Y and Z, against the plane Z = 0.
+
+    ``stage_mm`` (K,) are the stage positions along Z. The result is sorted by increasing depth.
+    """
     order = np.argsort(-stage_mm)
     found = [points[points[:, 0] == frame, 1:] for frame in order]
     enough = [len(profile) >= _FEWEST_POINTS for profile in found]
     if not any(enough):
         raise errors.EvaluationError(
-            f"the plane standard shows {len(points)} points at {len(order)} depths, at least {_FEWEST_POINTS} are "
+            f"the plane standard has {len(points)} points at {len(order)} depths, but at least {_FEWEST_POINTS} are "
             "needed at one depth: check that the stripe is bright enough and in focus"
         )
     nothing = (math.nan, math.nan, 0.0)
@@ -180,9 +219,9 @@ def _judged(points: np.ndarray, stage_mm: np.ndarray) -> Rendered:
 
 
 def _profile(points_yz: np.ndarray) -> tuple[float, float, float]:
-    """Scatter, mean deviation and length in mm of a profile (N, 2) of the plane Z = 0, as `Rendered` defines them."""
+    """Return scatter, mean deviation and length in mm of a profile (N, 2) of the plane Z = 0, as in `Rendered`."""
     used = points_yz
-    # The first trend is pulled by the outliers that the second one is free of.
+    # The first fit includes outliers; the second one excludes them.
     for _ in range(2):
         y, z = used.T
         trend = np.polynomial.Polynomial.fit(y, z, 2)
@@ -202,9 +241,9 @@ def _profile(points_yz: np.ndarray) -> tuple[float, float, float]:
 class Agreement:
     """Rendered and predicted scatter of a candidate at depths Z, and whether they agree.
 
-    ``ratio`` is the root mean square over all points of the rendered scatter over that of the predicted one, or its
-    inverse if that is larger; they agree up to the study's tolerance. What the software or the renderer refuses stands
-    in ``failure``; the depths are empty then.
+    ``rendered_over_predicted`` is the ratio of the root mean squares of rendered and predicted scatter over all points.
+    ``ratio`` is this ratio or its inverse, whichever is larger. The two agree if it does not exceed the study's
+    tolerance. ``failure`` is the message if rendering or measuring failed; then there are no depths.
     """
 
     label: str
@@ -224,12 +263,12 @@ class Agreement:
 
     @property
     def largest_error_mm(self) -> float:
-        """The largest systematic error, NaN where none is known."""
+        """Largest systematic error, NaN if it is unknown."""
         return max((abs(error) for error in self.error_mm if math.isfinite(error)), default=math.nan)
 
 
 def verified(study: Study, candidate: Marked, *, workers: int, variant: str) -> Agreement:
-    """Render a candidate of a study in so many processes and compare its scatter with the predicted one."""
+    """Render a candidate of a study in ``workers`` processes and compare its scatter with the prediction."""
     options = {"reflectance": study.reflectance, "variant": variant, "workers": workers}
     try:
         with tempfile.TemporaryDirectory(prefix="verify-") as folder:
@@ -240,7 +279,7 @@ def verified(study: Study, candidate: Marked, *, workers: int, variant: str) -> 
 
 
 def compared(study: Study, candidate: Marked, rendered: Rendered) -> Agreement:
-    """Rendered and predicted figures of a candidate side by side."""
+    """Compare the rendered with the predicted scatter of a candidate."""
     p = parameters_of([candidate.sensor], [study.medium_of(candidate.sensor)])
     predicted = scatter_at(p, rendered.z_mm, 0.5 * rendered.line_mm, reflectance=study.reflectance)
     figures, _ = figures_of(p, reflectance=study.reflectance, water_depth_m=study.water_depth_m)
@@ -277,10 +316,31 @@ def render(
     variant: str,
     progress: ProgressListener = unheard,
 ) -> list[Agreement]:
-    """Verify candidates, in their order; each result is kept in a file of ``folder``.
+    """Verify candidates by rendering; return the results in the same order and keep each in a file of ``folder``.
 
-    What was rendered before is taken from there, but what failed is tried again.
-    OutputError where a file cannot be written, SetupError where the workers' cluster is gone.
+    Results of an earlier run are read from their files; failed ones are rendered again.
+
+    Parameters
+    ----------
+    study : Study
+        The study.
+    folder : Path
+        Folder of the results.
+    candidates : sequence of Marked
+        Designs to render.
+    workers : Workers
+        Processes.
+    variant : str
+        Mitsuba variant.
+    progress : callable
+        Called with the number of verified candidates and the total.
+
+    Raises
+    ------
+    OutputError
+        A file cannot be written.
+    SetupError
+        The workers' cluster does not respond.
     """
     made_folder(folder)
     paths = []
@@ -303,7 +363,7 @@ def render(
             pq.write_table(pa.Table.from_pylist([asdict(result)]), aside)
         known[place] = result
         progress(len(known), len(candidates))
-    # Name and tolerance may be others than when a result was kept.
+    # Label, number and tolerance can differ from those of the earlier run.
     return [
         replace(
             known[place], label=one.label, design=one.design.number, agrees=known[place].ratio <= study.verify_tolerance

@@ -1,7 +1,7 @@
-"""Scenes for verifying a sensor: a target and a step standard to calibrate it, a plane standard to measure.
+"""Scenes for the verification of a sensor: target and step standard for calibration, plane standard for measurement.
 
-Everything is laid out for the sensor at hand, in its object coordinate system (OCS, mm); the stage moves the sensor
-along Z, so that every image shows the same object at another depth.
+All sizes and positions follow from the sensor, in its object coordinate system (OCS, mm). The stage moves the sensor
+along Z, so that each image shows the object at another depth.
 """
 
 import math
@@ -19,8 +19,11 @@ from uwlts.model.sensor import Camera, Exposure, Medium, Sensor, Volume
 
 @dataclass(frozen=True, eq=False)
 class LineOfSight:
-    """A sensor's camera and fan in a medium. ``pose`` is ``T_camera_object`` (4, 4), ``laser_mm`` (3,) the fan's origin
-    in the OCS, ``fan_slope`` the tangent of half the fan's angle in the medium."""
+    """Camera and laser fan of a sensor in a medium.
+
+    ``pose`` is ``T_camera_object`` (4, 4). ``laser_mm`` (3,) is the fan's origin in the OCS. ``fan_slope`` is the
+    tangent of half the fan's angle in the medium.
+    """
 
     camera: Camera
     index: float
@@ -31,7 +34,7 @@ class LineOfSight:
 
     @classmethod
     def of(cls, sensor: Sensor, medium: Medium) -> "LineOfSight":
-        """That of a sensor as described; DesignError where it has no stand-off."""
+        """Make it for a described sensor; DesignError if the sheet does not cross the camera's axis."""
         wavelength = sensor.laser.wavelength_nm
         index, pose = medium.refractive_index(wavelength), camera_from_object(sensor)
         sine = math.sin(math.radians(sensor.laser.fan_angle_deg / 2)) / index
@@ -42,24 +45,24 @@ class LineOfSight:
         return cls(sensor.camera, index, window, pose, laser_mm, sine / math.sqrt(1 - sine**2))
 
     def depth_mm(self, z: Array) -> Array:
-        """Depth along the camera's axis, from its pupil, of points on the laser's axis through the stand-off."""
+        """Return the depth along the camera's axis, from the pupil, of points (0, 0, z) in the OCS."""
         return self.pose[2, 3] + self.pose[2, 2] * z
 
     def z_at(self, depth_mm: Array) -> Array:
-        """Z of the points at such a depth."""
+        """Return Z in the OCS of points at depths along the camera's axis: the inverse of `depth_mm`."""
         return (depth_mm - self.pose[2, 3]) / self.pose[2, 2]
 
     def blur_px(self, depth_mm: Array) -> Array:
-        """Diameter in px of the blur of a point in air: that of the pupil over the distance from the focused plane."""
+        """Return the diameter in px of the defocus blur of points in air."""
         camera = self.camera
         pupil = camera.focal_length_mm / camera.f_number
         return pupil * np.abs(1 / camera.focus_distance_mm - 1 / depth_mm) * camera.focal_length_px()
 
     def in_image(self, points: np.ndarray, *, margin_px: float = 0.0) -> np.ndarray:
-        """Which points (N, 3) appear in the image, at least so far within its border: (N,) bool."""
+        """Return a mask (N,) of the points (N, 3) inside the image, at least ``margin_px`` from its border."""
         camera, window = self.camera, self.window
         x, y, z = self.pose[:3, :3] @ points.T + self.pose[:3, 3:]
-        # The formulas hold beyond the window's outer face only.
+        # The formulas are valid only beyond the window's outer face.
         outside = (dot((x, y, z), window.normal) > window.outer_mm) & (z > 0)
         ahead = np.where(outside, x, 0), np.where(outside, y, 0), np.where(outside, z, 1e3)
         image, within = seen(np, Lens.of(camera), window, ahead), margin_px - 0.5
@@ -67,7 +70,7 @@ class LineOfSight:
         return outside & in_width & (image.y >= within) & (image.y <= camera.height_px - 1 - within)
 
     def line_mm(self, z: float) -> np.ndarray:
-        """Y, closely spaced, where the fan lights what the camera sees at depth ``z``; possibly none."""
+        """Return Y values, closely spaced, of the visible line at ``z``; can be empty."""
         reach = self.depth_mm(z) * self._diagonal_slope()
         middle = -self.pose[:3, 1] @ (self.pose[:3, 3] + self.pose[:3, 2] * z)
         y = np.linspace(middle - reach, middle + reach, 1001)
@@ -76,8 +79,11 @@ class LineOfSight:
         return y[longest_run(visible & lit)]
 
     def half_target_mm(self, z: float, y: float) -> np.ndarray:
-        """Half sides (2,), X and Y, of a target about (0, y, z) that fills the view, without window and distortion. At
-        a grazing angle it would have to be endless: it goes beyond the view's diagonal by a quarter."""
+        """Return half the sides (2,), X and Y, of a target about (0, y, z) that fills the view.
+
+        Window and distortion are neglected. The size is limited to 1.25 times the view's diagonal, because it would be
+        infinite at a grazing angle.
+        """
         camera, rotation = self.camera, self.pose[:3, :3]
         side = np.linspace(-0.5, 0.5, 41)
         edge = np.concatenate([[(t, -0.5), (t, 0.5), (-0.5, t), (0.5, t)] for t in side])
@@ -95,7 +101,7 @@ class LineOfSight:
 
 
 def longest_run(flags: np.ndarray | list[bool]) -> slice:
-    """Slice of the longest row of true flags; empty if there is none."""
+    """Return the slice of the longest run of true flags; empty if there is none."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
     start, end = max(edges.reshape(-1, 2).tolist(), key=lambda run: run[1] - run[0], default=(0, 0))
     return slice(start, end)
@@ -107,32 +113,32 @@ TARGET_POSES = 9
 
 _DEPTHS_TRIED = 250
 _MARGIN = 0.03
-"""Share of the depth range left out at either end: there the stripe runs into the image's edge."""
+"""Margin at either end of the depth range, relative to the range: there the stripe reaches the image's edge."""
 _OVERSIZE = 1.2
 _STEP_HEIGHT = 0.2
-"""Share of the depth range. A high step constrains the window's distance better than the scatter on its faces."""
+"""Height of the step relative to the depth range. A high step determines the window's distance more accurately."""
 _EDGE = 0.02
-"""Share of the line's length beside the step's riser that is left out."""
+"""Excluded width beside the step's edge, relative to the line's length."""
 _NEARER = 0.75
-"""Without water and window the image rows of the volume lie at most so much nearer to the camera."""
+"""Factor of the near depth for the target's range: without water and window, the same image rows are nearer."""
 _FARTHER = 1.5
-"""The same for the farthest ones."""
+"""Factor of the far depth for the target's range."""
 _CIRCLE_PX = 24.0
 """Diameter of the circles in the middle of the range."""
 _SMALLEST_CIRCLE_PX = 12.0
-"""The least one at its far end."""
+"""Least diameter of the circles, at the far end of the range."""
 _CIRCLE_BLURS = 2.5
-"""The least one in diameters of the blur."""
+"""Least diameter of the circles, relative to the diameter of the blur."""
 _DOT = 0.4
-"""Diameter of a marking dot in diameters of its circle."""
+"""Diameter of a marking dot relative to its circle."""
 _LARGEST_BLUR_PX = 12.0
-"""Diameter of the blur up to which software finds circles: it looks for their edges some 6 px on either side."""
+"""Largest diameter of the blur for circle detection, which searches edges within about 6 px on either side."""
 _BORDER_PX = 4.0
 
 
 @dataclass(frozen=True)
 class PlannedRecording:
-    """A scene and the sensor that records it into a file of this name."""
+    """Scene, the sensor that records it, and the name of the capture's file."""
 
     name: str
     sensor: Sensor
@@ -141,30 +147,34 @@ class PlannedRecording:
 
 @dataclass(frozen=True)
 class Recordings:
-    """Captures recorded for a verification; a sensor without refraction to calibrate needs no step standard."""
+    """Recordings of a verification; a sensor without refraction does not need the step standard."""
 
     target: PlannedRecording
     step: PlannedRecording | None
     standard: PlannedRecording
 
     def all(self) -> list[PlannedRecording]:
-        """The one with most images first."""
+        """Return all recordings, sorted by decreasing number of images."""
         return [recording for recording in (self.target, self.standard, self.step) if recording is not None]
 
 
 def recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recordings:
-    """Scenes that calibrate a sensor for one of its media, and the plane of a reflectance that it then measures.
+    """Plan the scenes for the calibration of a sensor in one of its media, and a plane with a reflectance to measure.
 
-    Behind a window in a medium denser than air, the target stands in air before the sensor without its window, and the
-    step standard in the medium. Where light is not refracted, the target alone calibrates the sensor as it is used.
+    With refraction at a window, the target is recorded in air without the camera's window, and the step standard in the
+    medium. Without refraction, only the target is recorded, under the conditions of use.
 
-    DescriptionError where the sensor has no such medium or the reflectance is not from 0 to 1, DesignError where the
-    sensor cannot work in it, with the reason and numbers.
+    Raises
+    ------
+    DescriptionError
+        The medium is unknown, or the reflectance is not from 0 to 1.
+    DesignError
+        The sensor cannot work in the medium.
     """
     of_use = sensor.medium(medium)
     near, far = measured_range(sensor, of_use)
     sight = LineOfSight.of(sensor, of_use)
-    # The middle in Y of the line at the near end, and a length that covers it at the far end.
+    # Middle in Y of the line at the near end, and a length that covers the line at the far end.
     at_near, at_far = sight.line_mm(near), sight.line_mm(far)
     y = float(at_near[0] + at_near[-1]) / 2
     length = 2 * _OVERSIZE * float(max(at_far[-1] - y, y - at_far[0]))
@@ -193,32 +203,35 @@ def recordings(sensor: Sensor, medium: str, *, reflectance: float) -> Recordings
 
 
 def measured_range(sensor: Sensor, medium: Medium) -> tuple[float, float]:
-    """Nearest and farthest Z in mm, OCS, in the measuring volume at which the camera sees the line, less a margin.
+    """Return the smallest and largest Z in mm, OCS, of the line in view within the measuring volume, with a margin.
 
-    DesignError as of `uwlts.model.placement.check_design`, and where the laser shines back towards the camera or the
-    camera sees nothing of what the laser lights in the volume.
+    Raises
+    ------
+    DesignError
+        As for `uwlts.model.placement.check_design`; or the laser points back towards the camera; or no part of the
+        line in the volume is in view.
     """
     standoff = check_design(sensor, medium).standoff_mm
     sight, volume = LineOfSight.of(sensor, medium), sensor.volume
     forward = sight.pose[2, 2]
     if forward <= 0:
         raise DesignError(
-            f"the laser's axis leans {math.degrees(math.acos(forward)):.0f} deg away from the camera's: the depth must "
-            "grow along both; turn the laser"
+            f"the angle between the laser's and the camera's axes is {math.degrees(math.acos(forward)):.0f} deg; it "
+            "must be below 90 deg: turn the laser"
         )
     depths = (np.linspace(volume.near_mm, volume.far_mm, _DEPTHS_TRIED) - standoff) / forward
     lit = depths[longest_run([len(sight.line_mm(z)) > 1 for z in depths])]
     if len(lit) < 2:
         raise DesignError(
-            f"nowhere in the volume from {volume.near_mm:g} to {volume.far_mm:g} mm does the camera see what the laser "
-            "lights: move the volume, widen fan_angle_deg, or turn the laser's fan towards the camera's view"
+            f"the camera does not see the laser line in the volume from {volume.near_mm:g} to {volume.far_mm:g} mm: "
+            "move the volume, increase fan_angle_deg, or turn the laser's fan towards the camera's view"
         )
     margin = _MARGIN * (lit[-1] - lit[0])
     return float(lit[0] + margin), float(lit[-1] - margin)
 
 
 def _step(medium: str, *, near: float, far: float, y: float, length: float) -> Scene:
-    """Two blocks side by side along the line, their faces half a step before and behind the scene's origin."""
+    """Plan two blocks side by side along the line, with faces half a step in front of and behind the origin."""
     height = round(_STEP_HEIGHT * (far - near), 3)
     back = 1.5 * height
     blocks = [
@@ -240,7 +253,7 @@ def _step(medium: str, *, near: float, far: float, y: float, length: float) -> S
 
 
 def _travel(near: float, far: float, count: int) -> dict[str, object]:
-    """Motion that brings the scene's origin to depths Z from far to near: the sensor approaches."""
+    """Return the motion through depths Z of the scene's origin, from far to near."""
     step = (far - near) / (count - 1)
     return {"start_mm": -far, "step_mm": step, "count": count, "direction": (0.0, 0.0, 1.0)}
 
@@ -250,15 +263,15 @@ def _scene(title: str, medium: str, **rest: object) -> Scene:
 
 
 def _target(sensor: Sensor, medium: str, sight: LineOfSight, *, near: float, far: float, y: float) -> PlannedRecording:
-    """A plate of circles square to Z, moved through the depths about a range at which its three marks are well seen.
+    """Plan a plate of circles normal to Z, moved through all depths with its three marks sharp and in view.
 
-    The marks stand about X = 0 and Y = ``y``; the stripe runs midway between two columns, over a plain ground.
-    DesignError where the marks are well seen at no two depths.
+    The marks are near X = 0 and Y = ``y``. The stripe runs midway between two columns, on the plain background. Raises
+    DesignError if the marks are sharp and in view at fewer than two depths.
     """
     depths = np.linspace(_NEARER * sight.depth_mm(near), _FARTHER * sight.depth_mm(far), _DEPTHS_TRIED)
     sharp = depths[longest_run(sight.blur_px(depths) <= _LARGEST_BLUR_PX)]
-    # The circles' size follows from the range, the range at which the marks are wholly in view from their size. Circles
-    # are large enough in the image at all depths, seen from aslant and out of focus.
+    # The size of the circles depends on the range, and the range with complete marks on their size. The circles must
+    # be large enough in the image at all depths, under oblique view and out of focus.
     roughly = _marks_in_view(sight, sharp, 0.0, y)
     ends, aslant = roughly[[0, -1]], sight.pose[2, 2]
     least = np.maximum(_SMALLEST_CIRCLE_PX / aslant, _CIRCLE_BLURS * sight.blur_px(ends)) * ends
@@ -295,7 +308,7 @@ def _target(sensor: Sensor, medium: str, sight: LineOfSight, *, near: float, far
         target={"kind": "circles"} | lattice,
         window_mounted=sight.camera.window.mounted,
     )
-    # Air shows the image rows of the sensor's volume at other depths: the volume must hold those.
+    # In air, the same image rows correspond to other depths, which the volume must contain.
     window = sensor.camera.window
     near, far = sight.depth_mm(z[[0, -1]]) - window.distance_mm - window.thickness_mm
     volume = Volume(near_mm=max(0.9 * near, 1e-3 * far), far_mm=1.1 * far)
@@ -303,7 +316,7 @@ def _target(sensor: Sensor, medium: str, sight: LineOfSight, *, near: float, far
 
 
 def _marks_in_view(sight: LineOfSight, depths: np.ndarray, diameter: float, y: float) -> np.ndarray:
-    """The camera's depths at which the three marks are wholly in view; DesignError where there are not two of them."""
+    """Return the depths with all three marks completely in view; DesignError if there are fewer than two."""
     spacing = 2 * diameter
     centres = np.array([(-spacing / 2, y), (spacing / 2, y), (-spacing / 2, y + spacing)])
     rims = (centres[:, None] + diameter / 2 * np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])).reshape(-1, 2)
@@ -316,7 +329,7 @@ def _marks_in_view(sight: LineOfSight, depths: np.ndarray, diameter: float, y: f
     if len(seen) < 2:
         raise DesignError(
             f"a calibration target in air is nowhere in view and blurred by less than {_LARGEST_BLUR_PX:g} px: stop "
-            f"down the lens (f_number {sight.camera.f_number:g}), focus it where the laser line is (focus_distance_mm "
+            f"down the lens (f_number {sight.camera.f_number:g}), focus it on the laser line (focus_distance_mm "
             f"{sight.camera.focus_distance_mm:g}), or change baseline, angle or focal length"
         )
     return seen

@@ -1,1 +1,1 @@
-"""The twin as hardware: a camera and a motion controller that speak the protocols of real ones."""
+"""The twin as hardware: camera and motion controller with the protocols of real devices."""

@@ -1,4 +1,4 @@
-"""A GigE Vision camera on the loopback interface, whose images are sent at the speed of a real cable."""
+"""GigE Vision camera on the loopback interface that sends images at the speed of a real cable."""
 
 import ctypes
 import socket
@@ -21,11 +21,11 @@ import numpy as np
 from uwlts.errors import HardwareError, ImageError
 from uwlts.runtime.shared_library import load_aravis
 
-# What 1 Gbit/s carries.
+# Data rate of 1 Gbit/s.
 _BYTES_PER_S = 125e6
-# Packets that go out together, as sleeps are not exact.
+# Packets per burst, because sleeps are not exact.
 _TOGETHER = 8
-# Headers of IP, UDP and GVSP are counted in the size of a packet.
+# Headers of IP, UDP and GVSP, which the packet size includes.
 _OVERHEAD_BYTES = 36
 # Kinds of packets and payload, and pixel formats (GigE Vision 2.0; GenICam Pixel Format Naming Convention).
 _LEADER = 1
@@ -35,14 +35,14 @@ _IMAGE = 1
 _WITH_CHUNKS = 0x4000
 _MONO8 = 0x01080001
 _COORD3D_C16 = 0x011000B8
-# Chunks by numbers of the camera's own.
+# Chunk identifiers, defined by the camera.
 _IMAGE_CHUNK = 0x45430000
 ENCODER_CHUNK = 0x45430001
 TIME_CHUNK = 0x45430002
 _CHUNK_BYTES = 3 * 8
-"""Room of what names the chunks behind an image."""
+"""Size of the chunks' identifiers and lengths after an image."""
 _ROW_BYTES = 2 * 8
-"""Room of what they hold of each row."""
+"""Size of the chunks' data for each row."""
 
 
 def image_packets(
@@ -54,11 +54,22 @@ def image_packets(
     packet_bytes: int,
     chunks: Mapping[int, Sequence[int]] = MappingProxyType({}),
 ) -> list[bytes]:
-    """Leader, parts of the region, and trailer of an image (H, W) of uint8, or of profiles (H, W) of uint16.
+    """Return the packets of an image: leader, payload of a region, and trailer.
 
-    ``time_ns`` is its time stamp, ``number`` its number of 16 bits, ``region`` left, top, width and height in px, of
-    which what lies beyond the image is dark, and ``packet_bytes`` the size of a packet with all its headers. Numbers of
-    rows follow the image as ``chunks`` by their identifiers (GigE Vision 2.0, extended chunk mode).
+    Parameters
+    ----------
+    image : (H, W) uint8 or uint16
+        Image, or profiles as uint16.
+    time_ns : int
+        Time stamp.
+    number : int
+        Number of the frame, 16 bits.
+    region : tuple of int
+        Left, top, width and height in px; pixels outside the image are dark.
+    packet_bytes : int
+        Size of a packet including all headers.
+    chunks : mapping, optional
+        One number per row for each chunk identifier, sent after the image (GigE Vision 2.0, extended chunk mode).
     """
     x, y, width, height = region
     seen = np.zeros((height, width), image.dtype)
@@ -78,7 +89,7 @@ def image_packets(
 
 
 def send_paced(stream: socket.socket, packets: list[bytes], to: tuple[str, int]) -> None:
-    """Send packets one after the other, no faster than the cable would; hosts lose what comes much faster."""
+    """Send packets no faster than a real cable, because hosts lose packets at much higher rates."""
     began, sent_bytes = time.perf_counter(), 0
     for index, packet in enumerate(packets):
         stream.sendto(packet, to)
@@ -92,26 +103,26 @@ _GENAPI = "http://www.genicam.org/GenApi/Version_1_0"
 LOOPBACK = "127.0.0.1"
 # GigE Vision's control port.
 PORT = 3956
-# Jumbo packets, as on a bench. With Aravis's 2000 bytes there are 670 packets in an image.
+# Jumbo packets, as on a bench. With Aravis's 2000 bytes, an image has 670 packets.
 _PACKET_BYTES = 9000
-# Commands are answered between looks for a trigger. At 1000 per s and more the thread would never rest.
+# Rate of checks for a trigger; commands are answered in between. At 1000 per s the thread would never sleep.
 _LOOKS_FOR_TRIGGER_HZ = 200.0
-# Hosts repeat a command that is not answered within 500 ms.
+# Hosts repeat a command without an answer after 500 ms.
 _LONGEST_WAIT_S = 0.1
 _NAME_BYTES = 32
 _SERIAL_BYTES = 16
-# Frames are counted in 16 bits, without 0.
+# Frame numbers have 16 bits and skip 0.
 _LAST_NUMBER = 2**16 - 1
-# Of a frame that is cut every tenth packet is lost, at least one, but never the first, by which hosts know of it.
+# In a "cut" frame, every tenth packet is lost, at least one, but not the first, which announces the frame.
 _CUT_EVERY = 10
-# GLib's number of the type double.
+# GLib's type number of double.
 _DOUBLE_TYPE = 15 << 2
 
 _FILL = ctypes.CFUNCTYPE(None, c_void_p, c_void_p, c_uint32, c_uint32, c_uint32)
 
 
 class _Register:
-    """Addresses of the fake camera's registers, of GigE Vision and its own."""
+    """Addresses of the fake camera's registers."""
 
     MAKER, MODEL, STREAM_PORT, PACKET_SIZE, STREAM_IP = 0x48, 0x68, 0xD00, 0xD04, 0xD18
     WIDTH, HEIGHT, SENSOR_HEIGHT, SENSOR_WIDTH = 0x100, 0x104, 0x118, 0x11C
@@ -144,23 +155,23 @@ _FUNCTIONS = {
 
 @dataclass(frozen=True)
 class _Shot:
-    """An image, or profiles (N, L); the times in ns at which the exposure of each began, and the encoder's counts."""
+    """Image, or profiles (N, L), with the start time of each exposure in ns and the encoder counts."""
 
     seen: np.ndarray
     times_ns: tuple[int, ...]
     counts: tuple[int, ...]
 
     def __add__(self, later: "_Shot") -> "_Shot":
-        """Profiles together with later ones."""
+        """Return these profiles followed by later ones."""
         seen = np.concatenate([self.seen, later.seen])
         return _Shot(seen, self.times_ns + later.times_ns, self.counts + later.counts)
 
 
 @dataclass(frozen=True)
 class ExposedFrame:
-    """An exposure: its middle in s of the monotonic clock, the encoder's count then, and what makes its image.
+    """Exposure: its middle in s of the monotonic clock, the encoder count at that time, and its image.
 
-    ``image(exposure_ms)`` returns the whole image (H, W) of uint8.
+    ``image(exposure_ms)`` returns the whole image (H, W), uint8.
     """
 
     middle_s: float
@@ -169,33 +180,49 @@ class ExposedFrame:
 
 
 class Scan3d(Protocol):
-    """A peak finder inside the camera."""
+    """Peak finder inside the camera."""
 
     def scale_px(self) -> float:
-        """Pixels of one step of its numbers."""
+        """Return the size of one step of its numbers in px."""
         ...
 
     def numbers(self, image: np.ndarray) -> np.ndarray:
-        """A number (L,), uint16, for each profile line of an image (H, W)."""
+        """Return a number (L,), uint16, for each profile line of an image (H, W)."""
         ...
 
 
 class GigeCamera:
-    """Serves a camera of 8 bit; a context manager.
+    """Server of an 8-bit camera, as a context manager.
 
-    ``frame(exposure_ms)`` returns the whole image (height_px, width_px) of uint8. It is called in one thread, always
-    the same. An exception of it leaves the frame out and is kept in ``failure``. A trigger that comes while an image is
-    being made replaces the one before, which stays without an answer. HardwareError where another camera is served on
-    this machine, SetupError where Aravis is not installed.
+    A trigger that arrives during the making of an image replaces the previous trigger, which is not answered.
 
-    With ``scan3d`` it is a 3D camera: its pixel format is Coord3D_C16 until a program asks for Mono8, and each frame
-    holds the profile that is found in the image, with 0 for no stripe; a free-running one sends as many profiles
-    together as its Height says. ``encoder()`` is the count of an encoder that is wired to the camera. It is sent as
-    chunk data where a program asks for it, of every profile, and so is the time.
+    Parameters
+    ----------
+    frame
+        ``frame(exposure_ms)`` returns the whole image (height_px, width_px), uint8. All calls are in the same thread.
+        If it raises an exception, the frame is lost and the exception is kept in ``failure``.
+    width_px, height_px : int
+        Size of the image.
+    serial : str
+        Serial number.
+    first_number : int
+        Number of the first frame.
+    scan3d : Scan3d, optional
+        Makes it a 3D camera: its pixel format is Coord3D_C16 until a program selects Mono8. Each frame contains the
+        profile of an image, with 0 for no stripe. A free-running camera sends ``Height`` profiles together.
+    encoder : callable, optional
+        Returns the count of an encoder that is wired to the camera. Count and time of each profile are sent as chunk
+        data on request.
+    expose : callable, optional
+        Called in the middle of each exposure of a free-running camera, at its frame rate and with true time stamps.
+        Images are made later and wait in the camera's memory. They are lost at the end of the acquisition.
 
-    With ``expose`` a free-running camera exposes at its frame rate with true time stamps, however long its images take:
-    it is called in the middle of each exposure, and frames wait in the camera's memory, as in one that is faster than
-    its cable. They are lost at the end of the acquisition.
+    Raises
+    ------
+    HardwareError
+        Another camera is served on this machine.
+    SetupError
+        Aravis is not installed.
     """
 
     def __init__(
@@ -217,7 +244,7 @@ class GigeCamera:
         self._size = (height_px, width_px)
         self._serial = serial.encode()
         self._library = _functions()
-        # The library keeps no reference to it.
+        # The library does not keep a reference to the callback.
         self._callback = _FILL(self._fill)
         self._server: int | None = None
         self._stream: socket.socket
@@ -235,39 +262,39 @@ class GigeCamera:
 
     @property
     def address(self) -> str:
-        """Address by which `uwlts` opens this camera."""
+        """Address of this camera for `uwlts`."""
         return f"gige:{LOOPBACK}"
 
     def inject(
         self, fault: Literal["drop", "repeat", "cut", "delay"], frames: int = 1, *, delay_s: float = 0.0
     ) -> None:
-        """Let a fault come with each of the next frames.
+        """Inject a fault into each of the next frames.
 
-        "drop" loses them altogether, "repeat" sends the frame before with its time stamp in place of each, "cut" loses
-        a tenth of their packets, and "delay" begins their exposures ``delay_s`` later.
+        "drop" loses the frame. "repeat" sends the previous frame again, with its time stamp. "cut" loses a tenth of the
+        packets. "delay" starts the exposure ``delay_s`` later.
         """
         with self._lock:
             self._faults[fault] = frames
             self._delay_s = delay_s if fault == "delay" else self._delay_s
 
     def _meets(self, fault: str) -> bool:
-        """Whether a fault comes with the frame at hand, which is then counted; only under the lock."""
+        """Return whether a fault applies to the present frame, and count it; call only with the lock held."""
         met = self._faults[fault] > 0
         self._faults[fault] -= met
         return met
 
     def disconnect(self) -> None:
-        """Be gone, as if the cable were pulled: nothing is sent and no command answered any more."""
+        """Disconnect as if the cable were pulled: send nothing and answer no command."""
         with self._lock:
             server, self._server = self._server, None
             self._making = self._answer = None
         if server is not None:
-            # Waits for the library's thread, which calls back; an object on its way out must not be touched.
+            # This waits for the library's thread. The object must not be used afterwards.
             self._library.g_object_unref(server)
             self._stream.close()
 
     def connect(self) -> None:
-        """Be there, as if the cable were plugged in and the camera switched on."""
+        """Connect as if the cable were plugged in and the camera switched on."""
         if self._server is not None:
             return
         library = self._library
@@ -277,11 +304,11 @@ class GigeCamera:
             except OSError as error:  # Aravis does not report it
                 raise HardwareError(
                     f"UDP port {PORT} of {LOOPBACK} cannot be used ({error.strerror}): another camera is served there; "
-                    "end that program first"
+                    "stop that program first"
                 ) from error
         self._stream = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._stream.bind((LOOPBACK, 0))
-        # Aravis would also listen at the broadcast address of all networks, which is held while the camera starts.
+        # Occupy the broadcast address during the start, so that Aravis does not listen on all networks.
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as guard:
             guard.bind(("255.255.255.255", PORT))
             with tempfile.NamedTemporaryFile(suffix=".xml") as features:
@@ -291,8 +318,10 @@ class GigeCamera:
                 self._server = library.arv_gv_fake_camera_new_full(interface, self._serial, name)
         if not library.arv_gv_fake_camera_is_running(self._server):
             self.disconnect()
-            raise HardwareError(f"Aravis's camera does not start on {LOOPBACK}: is the loopback interface up?")
-        # The library is to lose all packets of its own.
+            raise HardwareError(
+                f"Aravis's camera does not start on {LOOPBACK}: check that the loopback interface is up"
+            )
+        # The library's own packets are all dropped.
         every = (c_uint64 * 3)()
         library.g_value_init(every, _DOUBLE_TYPE)
         library.g_value_set_double(every, 1.0)
@@ -320,7 +349,7 @@ class GigeCamera:
         library.arv_fake_camera_set_fill_pattern(self._camera, self._callback, None)
 
     def _features(self) -> bytes:
-        """The description of the camera's features: those of Aravis's fake camera, and of a 3D camera or encoder."""
+        """Return the XML of the camera's features: Aravis's fake camera, with those of a 3D camera or encoder."""
         library, size = self._library, c_size_t()
         usual = library.arv_fake_camera_new(self._serial)
         described = ctypes.string_at(library.arv_fake_camera_get_genicam_xml(usual, ctypes.byref(size)), size.value)
@@ -338,7 +367,7 @@ class GigeCamera:
         for name, number in scan3d.items():
             entry = ElementTree.Element(f"{{{_GENAPI}}}EnumEntry", Name=name)
             ElementTree.SubElement(entry, f"{{{_GENAPI}}}Value").text = str(number)
-            # Before the first of the others, as the standard's schema wants it.
+            # The standard's schema requires entries of one kind to be adjacent.
             formats.insert([each.tag for each in formats].index(entry.tag), entry)
         if self._encoder is not None:
             payload.text += f" + {_CHUNK_BYTES} + HEIGHT * {_ROW_BYTES}"
@@ -346,7 +375,7 @@ class GigeCamera:
         return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
     def _fill(self, _buffer: int, _data: None, exposure_us: int, _gain: int, _pixel_format: int) -> None:
-        """Called by the library when a frame is due; what it sends itself is lost."""
+        """Send a frame; the library calls this when a frame is due, and its own packets are dropped."""
         if self._expose is not None and not self._library.arv_fake_camera_is_in_software_trigger_mode(self._camera):
             self._stopping.wait(0.5e-6 * exposure_us)
             self._maker_thread.submit(self._develop, self._expose(), 1e-3 * exposure_us)
@@ -356,7 +385,7 @@ class GigeCamera:
             self._send(shot)
 
     def _develop(self, exposed: ExposedFrame, exposure_ms: float) -> None:
-        """Make the image of an exposure in memory and send it; called in the second thread, in turn."""
+        """Make the image of an exposure and send it; called in order in the second thread."""
         with self._lock:
             if self._server is None or not self._read(_Register.ACQUISITION):
                 return
@@ -368,7 +397,7 @@ class GigeCamera:
         counts = () if exposed.encoder is None else (exposed.encoder,)
         shot = _Shot(seen, (round(1e9 * exposed.middle_s - 0.5e6 * exposure_ms),), counts)
         if self._of_profiles():
-            # Profiles are sent together, as many as a frame has rows; another port shows another acquisition.
+            # Profiles are collected until a frame is full; another port indicates another acquisition.
             port, (gathered_for, gathered) = self._read(_Register.STREAM_PORT), self._gathered
             shot = shot if gathered is None or gathered_for != port else gathered + shot
             short = len(shot.seen) < self._read(_Register.HEIGHT)
@@ -407,7 +436,7 @@ class GigeCamera:
             send_paced(self._stream, packets, (socket.inet_ntoa(struct.pack(">I", host)), port & 0xFFFF))
 
     def _due(self, exposure_ms: float) -> _Shot | None:
-        """The image to send now, if it is ready; else it is being made."""
+        """Return the image to send now; None while it is being made."""
         triggered = bool(self._library.arv_fake_camera_is_in_software_trigger_mode(self._camera))
         with self._lock:
             answer, self._answer = self._answer, None
@@ -426,7 +455,7 @@ class GigeCamera:
             return self._take(making)
 
     def _send_when_ready(self, made: Future[_Shot]) -> None:
-        """Called in the second thread; a trigger from inside has the library ask again."""
+        """Keep a finished image and trigger the library to ask for it; called in the second thread."""
         with self._lock:
             if self._server is None or not self._read(_Register.ACQUISITION):
                 return
@@ -435,7 +464,7 @@ class GigeCamera:
                 self._library.arv_fake_camera_write_register(self._camera, _Register.TRIGGER_SOFTWARE, 1)
 
     def _take(self, made: Future[_Shot]) -> _Shot | None:
-        """The image made for the latest trigger; none if it failed, or was made for an earlier one."""
+        """Return the image of the latest trigger; None if it failed or belongs to an earlier trigger."""
         if made is not self._making:
             return None
         self._making = None
@@ -449,12 +478,12 @@ class GigeCamera:
         began_ns = time.monotonic_ns()
         image = self._frame(exposure_ms)
         if image.shape != self._size or image.dtype != np.uint8:
-            raise ImageError(f"the camera shows {self._size} uint8, the image is {image.shape} {image.dtype}")
+            raise ImageError(f"the image is {image.shape} {image.dtype}; expected {self._size} uint8")
         counts = () if self._encoder is None else (self._encoder(),)
         return _Shot(self._seen(image), (began_ns,), counts)
 
     def _seen(self, image: np.ndarray) -> np.ndarray:
-        """The image, or the profile (1, L) that a 3D camera finds in it."""
+        """Return the image, or a 3D camera's profile (1, L) of it."""
         return self._scan3d.numbers(image)[None] if self._scan3d is not None and self._of_profiles() else image
 
     def _of_profiles(self) -> bool:
@@ -476,7 +505,7 @@ class GigeCamera:
 
 
 def _functions() -> SimpleNamespace:
-    """The library's functions with their types, for this module alone."""
+    """Return the library's functions with their types, for this module only."""
     library, functions = load_aravis(), SimpleNamespace()
     for name, (result, arguments) in _FUNCTIONS.items():
         function = library[name]

@@ -1,13 +1,13 @@
-"""A Grbl 1.1h controller with one axis and a laser, on a pseudo terminal: the twin's stage.
+"""Grbl 1.1h controller with one axis and a laser, on a pseudo terminal: the twin's stage.
 
-It answers byte for byte as the firmware does on an Arduino Uno: greeting, ``$`` commands, settings, status reports,
-real-time characters, G-code with modal state, planner and receive buffers, soft limits, homing, alarms. Programs open
-`GrblController.port` as they would open /dev/ttyACM0. As on the Uno, opening the port restarts the controller and
-closing it does not; ``gated`` adds the hardware interlock by which the laser has power only while the port is open.
+Its answers are identical to those of the firmware on an Arduino Uno: greeting, ``$`` commands, settings, status
+reports, real-time characters, G-code with modal state, planner and receive buffers, soft limits, homing, alarms.
+Programs open `GrblController.port` like /dev/ttyACM0. As on the Uno, opening the port restarts the controller, and
+closing it does not. ``gated`` adds a hardware interlock: the laser has power only while the port is open.
 
-Left out: the Y and Z axes (error:20), arcs, probing, jogging, overrides, hard limits, parking, check mode.
+Not implemented: Y and Z axes (error:20), arcs, probing, jogging, overrides, hard limits, parking, check mode.
 
-The stage's position is counted in mm from the lower end of travel, where the limit switch is if $23 is 1.
+The stage's position is in mm from the lower end of travel, the position of the limit switch if $23 is 1.
 """
 
 import errno
@@ -29,17 +29,14 @@ BENCH_SETTINGS: dict[int, float] = {
     100: 80, 101: 250, 102: 250, 110: 900, 111: 500, 112: 500, 120: 50, 121: 10, 122: 10, 130: 750, 131: 200, 132: 200,
 }
 # fmt: on
-# Times between two looks at the line.
+# Intervals of polling the line.
 _BUSY_MS = 2
 _IDLE_MS = 20
 
 
 @dataclass(frozen=True)
 class StageState:
-    """True state of the stage and the laser at a moment; ``power`` is 0 when no light comes out.
-
-    ``time_s`` is that of the monotonic clock.
-    """
+    """True state of stage and laser at ``time_s`` of the monotonic clock; ``power`` is 0 without light."""
 
     time_s: float
     position_mm: float
@@ -50,30 +47,40 @@ class StageState:
 
     @property
     def moving(self) -> bool:
-        """Whether the stage is not at rest."""
+        """True if the stage moves."""
         return self.speed_mm_per_s != 0
 
 
 @dataclass(frozen=True)
 class LitTime:
-    """A period in which the laser was lit, in s of the monotonic clock; ``off_s`` is None while it still is."""
+    """Period of laser light in s of the monotonic clock; ``off_s`` is None while the laser is on."""
 
     on_s: float
     off_s: float | None = None
 
     @property
     def duration_s(self) -> float:
-        """How long it was lit, or has been until now."""
+        """Duration until the end or until now."""
         return (time.monotonic() if self.off_s is None else self.off_s) - self.on_s
 
 
 class GrblController:
-    """The controller; runs in a thread of its own within a ``with``. All methods may be called from any thread.
+    """Controller as a context manager, with its own thread; all methods are thread-safe.
 
-    ``settings`` by number replace `BENCH_SETTINGS`. The stage stands at ``position_mm`` when the power comes on, and
-    time runs ``speed_up`` times as fast, but for dwells. ``build`` is what `GrblFirmware` takes of its version, options
-    and time to boot. ``resets_when_opened``: as the Uno does through DTR. ``gated``: the laser's supply is cut while
-    the port is closed.
+    Parameters
+    ----------
+    settings : mapping, optional
+        Grbl settings by number, in place of those in `BENCH_SETTINGS`.
+    position_mm : float
+        Position of the stage when the power is switched on.
+    speed_up : float
+        Factor of the controller's time, except for dwells.
+    resets_when_opened : bool
+        Restart the controller when the port is opened, as the Uno does through DTR.
+    gated : bool
+        Switch the laser's supply off while the port is closed.
+    **build
+        Version, options and boot time, as for `GrblFirmware`.
     """
 
     def __init__(
@@ -98,8 +105,8 @@ class GrblController:
 
     def __enter__(self) -> "GrblController":
         self._master, slave = os.openpty()
-        # Raw from the start, or the terminal would echo the greeting back as a command.
-        import tty  # only POSIX systems have pseudo terminals
+        # Raw mode from the start; otherwise the terminal would echo the greeting as a command.
+        import tty  # pseudo terminals exist only on POSIX systems
 
         tty.setraw(slave)
         self.port = os.ttyname(slave)
@@ -115,7 +122,7 @@ class GrblController:
         self.disconnect()
 
     def state(self) -> StageState:
-        """The true state, from which the sensor's images are rendered."""
+        """Return the true state, for rendering."""
         with self._lock:
             lit = self._powered and not self._laser_broken and (self._port_open or not self._gated)
             power = self._firmware.laser_power() if lit else 0.0
@@ -125,7 +132,7 @@ class GrblController:
 
     @property
     def lights(self) -> tuple[LitTime, ...]:
-        """Periods of light so far, as the controller saw them, to some ms."""
+        """Periods of light so far, accurate to a few ms."""
         with self._lock:
             return tuple(self._lights)
 
@@ -137,11 +144,11 @@ class GrblController:
             self._lights[-1] = LitTime(self._lights[-1].on_s, state.time_s)
 
     def steps(self, state: StageState | None = None) -> int:
-        """Count of an encoder on the axis, a step each, in a state; now unless given."""
+        """Return the count of an encoder on the axis, one per step, in a state (default: now)."""
         return round((state or self.state()).position_mm / self._firmware.step_mm)
 
     def disconnect(self) -> None:
-        """Pull the cable out: the line is gone and, with it, the controller's power."""
+        """Pull the cable, which also cuts the controller's power."""
         with self._lock:
             if self._powered:
                 self._firmware.axis.stop(self._now())
@@ -150,24 +157,24 @@ class GrblController:
                 self._log_light()
 
     def inject(self, fault: str, value: float = 1, *, noise: bytes = b"\xff\xfe<Id|MPos:1#\x80,0\r\n") -> None:
-        """Let a fault of ``twin serve --fault`` happen, of as many steps or with the number ``value``.
+        """Inject a fault of ``twin serve --fault``; ``value`` is its number or number of steps.
 
-        A value of 0 repairs "mute", "cut-line" and "break-laser"; ``noise`` is what "garbage" puts on the line.
+        The value 0 repairs "mute", "cut-line" and "break-laser". ``noise`` is sent by "garbage".
         """
         firmware = self._firmware
         with self._lock:
             match fault:
                 case "stage-disconnect":
                     self.disconnect()
-                case "mute":  # the wire on which the controller answers breaks; it still receives
+                case "mute":  # the controller's transmit line breaks; it still receives
                     self._muted = bool(value)
-                case "cut-line":  # both wires break; the controller keeps its power
+                case "cut-line":  # both data lines break; the controller keeps its power
                     self._muted = self._cut = bool(value)
-                case "stall":  # until a reset, while the controller reports that it runs
+                case "stall":  # blocked until a reset, while the controller reports "Run"
                     firmware.axis.stick(self._now())
                 case "stop-short":  # commands or pulses lost in the controller
                     firmware.short_steps = int(value)
-                case "lose-steps":  # the motor slips; the controller, which measures nothing, cannot know
+                case "lose-steps":  # the motor slips, which the controller cannot detect
                     firmware.shift_mm += int(value) * firmware.step_mm
                 case "alarm":
                     firmware.raise_alarm(int(value))
@@ -175,19 +182,19 @@ class GrblController:
                     self._say(noise)
                 case "restart":  # as after a dip of the supply
                     firmware.restart()
-                case "hold":  # the button, or noise on its line
+                case "hold":  # feed-hold button, or noise on its line
                     firmware.hear(b"!")
-                case "break-laser":  # no light comes out, whatever the pin says
+                case "break-laser":  # no light, whatever the state of the pin
                     self._laser_broken = bool(value)
                 case _:
-                    raise ValueError(f"a stage has no fault '{fault}'")
+                    raise ValueError(f"unknown fault '{fault}' of the stage")
 
     # The line
 
     def _run(self) -> None:
         poll = select.poll()
         poll.register(self._master, select.POLLIN)
-        # Until a program has opened it once, a pseudo terminal does not say that it is closed.
+        # A pseudo terminal reports that it is closed only after it has been opened once.
         os.close(os.open(self.port, os.O_RDWR | os.O_NOCTTY))
         while not self._ending.is_set():
             patience_ms = _BUSY_MS if self._firmware.busy else _IDLE_MS
@@ -209,17 +216,17 @@ class GrblController:
                 self._firmware.work()
                 self._log_light()
             if events & select.POLLHUP:
-                # Polling a closed port does not wait.
+                # Polling a closed port returns immediately.
                 time.sleep(_BUSY_MS / 1000)
 
     def _say(self, data: bytes) -> None:
-        # A closed port's bytes are lost; the pseudo terminal would keep them for the next program.
+        # Bytes to a closed port are lost; the pseudo terminal would keep them for the next program.
         if self._muted or not (self._powered and self._port_open):
             return
         try:
             os.write(self._master, data)
         except OSError as error:
-            # Nobody reads, or nobody is there: a serial line does not mind.
+            # No program reads, or the port is closed: a serial line ignores both.
             if error.errno not in (errno.EAGAIN, errno.EIO):
                 raise
 

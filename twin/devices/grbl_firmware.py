@@ -1,4 +1,4 @@
-"""Grbl 1.1 for one axis: its answers, states and alarms, and its reading of G-code blocks."""
+"""Grbl 1.1 for one axis: answers, states, alarms, and parser of G-code blocks."""
 
 import math
 import re
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from twin.devices.grbl_motion import Axis
 
 _WORD = re.compile(r"([A-Z])([+-]?(?:\d+\.?\d*|\.\d+))")
-# Commands by modal group; the axis commands of group 0 exclude each other as well.
+# Commands by modal group; the axis commands of group 0 also exclude each other.
 _COMMANDS = {
     "once": ("G4", "G53", "G92", "G92.1"),
     "motion": ("G0", "G1", "G80"),
@@ -29,7 +29,7 @@ _VALUES = "XFSPNT"
 
 
 class GrblError(Exception):
-    """A line that Grbl answers with ``error:code``."""
+    """Error in a line, which Grbl answers with ``error:code``."""
 
     def __init__(self, code: int):
         super().__init__(f"error:{code}")
@@ -38,7 +38,7 @@ class GrblError(Exception):
 
 @dataclass(frozen=True)
 class CommandBlock:
-    """The commands of a line by modal group, its values by letter, and whether G53 is among them."""
+    """Commands of a line by modal group, its values by letter, and whether it contains G53."""
 
     commands: dict[str, str]
     values: dict[str, float]
@@ -46,7 +46,7 @@ class CommandBlock:
 
 
 def parse_block(line: str) -> CommandBlock:
-    """Words of a line without spaces and comments, in capitals; GrblError with Grbl's number."""
+    """Parse a line in capitals, without spaces and comments; GrblError with Grbl's error number."""
     commands: dict[str, str] = {}
     values: dict[str, float] = {}
     machine_coordinates, position = False, 0
@@ -98,16 +98,31 @@ _LONGEST_LINE = 79
 _WCO_IDLE = 10
 _WCO_BUSY = 30
 _DWELL_STEP_S = 0.05
-"""DWELL_TIME_STEP: a dwell takes whole steps, at least what was asked for."""
+"""DWELL_TIME_STEP: dwells are rounded up to whole steps."""
 
 
 class GrblFirmware:
-    """One controller. Not safe between threads.
+    """Firmware of one controller; not thread-safe.
 
-    All ``settings`` are given by number. The stage stands at ``position_mm`` when the power comes on. ``options`` are
-    the code letters of the build in ``$I``, ``boot_s`` is the time from a restart to the greeting, that of the Uno's
-    boot loader. ``clock`` returns the controller's time in s, ``say`` takes the bytes for the computer. By a clock that
-    runs ``speed_up`` times as fast dwells take that many times as long, as exposures, which they outlast, do.
+    Parameters
+    ----------
+    settings : mapping
+        All settings by number.
+    position_mm : float
+        Position of the stage when the power is switched on.
+    clock : callable
+        Returns the controller's time in s.
+    say : callable
+        Receives the bytes for the computer.
+    version : str
+        Version in the greeting.
+    options : str
+        Code letters of the build in ``$I``.
+    boot_s : float
+        Time from a restart to the greeting; default: that of the Uno's boot loader.
+    speed_up : float
+        Factor between the controller's time and real time. Dwells are longer by this factor in the controller's time,
+        because exposures during a dwell take real time.
     """
 
     def __init__(
@@ -130,30 +145,30 @@ class GrblFirmware:
 
     @property
     def stage_mm(self) -> float:
-        """Position of the stage."""
+        """True position of the stage."""
         return self.stage_at(self._now())[0]
 
     def stage_at(self, time_s: float) -> tuple[float, float]:
-        """True position in mm and signed speed in mm/s at a time of the controller, now or a little before."""
+        """Return the true position in mm and signed speed in mm/s at a time of the controller, now or just before."""
         position, speed = self.axis.at(time_s)
         return position + self.shift_mm, speed
 
     @property
     def step_mm(self) -> float:
-        """Way of one step."""
+        """Length of one step."""
         return 1 / self._settings[100]
 
     @property
     def busy(self) -> bool:
-        """Whether something goes on without more characters coming."""
+        """True if the controller is active without further input."""
         return self._booted_s is not None or self._job is not None or self.axis.pending > 0
 
     def laser_power(self) -> float:
-        """Share of the time in which the laser's pin is on."""
+        """Return the duty cycle of the laser's pin."""
         return self._spindle(self._now()) / self._settings[30]
 
     def hear(self, data: bytes) -> None:
-        """Characters from the computer; while it starts they are lost."""
+        """Receive characters from the computer; they are lost during the start."""
         for byte in data if self._booted_s is None else b"":
             if byte == 0x18:
                 self._soft_reset()
@@ -172,7 +187,7 @@ class GrblFirmware:
         self._say(f"{text}\r\n".encode("ascii"))
 
     def restart(self) -> None:
-        """Restart: the laser is off, position and queue are forgotten."""
+        """Restart: switch the laser off, and discard position and queue."""
         now = self._now()
         self.shift_mm += self.axis.at(now)[0]
         self.axis.place(0.0)
@@ -206,7 +221,7 @@ class GrblFirmware:
             self._send("[MSG:'$H'|'$X' to unlock]")
 
     def raise_alarm(self, code: int) -> None:
-        """Stop everything and say why."""
+        """Stop all motion and report an alarm."""
         self.axis.stop(self._now())
         self._mode, self._job, self._modal["spindle"] = "Alarm", None, "M5"
         self._send(f"ALARM:{code}")
@@ -218,7 +233,7 @@ class GrblFirmware:
             self._greet()
 
     def work(self) -> None:
-        """Whatever the main loop does between two interrupts."""
+        """Run the main loop once."""
         now = self._now()
         self.axis.advance(now)
         if self._booted_s is not None:
@@ -234,7 +249,7 @@ class GrblFirmware:
                 next(job)
                 return
             except StopIteration:
-                # An alarm or a reset within the job has thrown it away already.
+                # An alarm or a reset within the job has already discarded it.
                 self._job = None if self._job is job else self._job
 
     def _ready(self) -> bool:
@@ -260,7 +275,7 @@ class GrblFirmware:
         except GrblError as error:
             self._send(f"error:{error.code}")
         else:
-            # What an alarm has thrown away is not acknowledged.
+            # A line that an alarm has discarded is not acknowledged.
             if not self._critical and self._starts == starts:
                 self._send("ok")
 
@@ -278,7 +293,7 @@ class GrblFirmware:
         if int(self._settings[10]) & 2:
             fields.append(f"Bf:{_PLANNER_BLOCKS - self.axis.pending},{_RECEIVE_BYTES - len(self._input)}")
         fields.append(f"FS:{abs(speed) * 60:.0f},{self._spindle(now):.0f}")
-        # Half a step, so that rounding does not press the switch.
+        # Tolerance of half a step, so that rounding does not trigger the limit switch.
         stage_mm, slack = position + self.shift_mm, 0.5 / self._settings[100]
         if stage_mm < -slack if int(self._settings[23]) & 1 else stage_mm > self._settings[130] + slack:
             fields.append("Pn:X")
@@ -289,7 +304,7 @@ class GrblFirmware:
         return f"<{'|'.join(fields)}>"
 
     def _spindle(self, now: float) -> float:
-        """The S in force at the pin; laser mode darkens G0 and holds, and scales M4 by the share of the feed."""
+        """Return the effective S; laser mode switches off during G0 and holds, and scales M4 with the speed."""
         if self._modal["spindle"] == "M5" or self._mode == "Alarm":
             return 0.0
         s = min(self._s, self._settings[30])
@@ -313,7 +328,7 @@ class GrblFirmware:
             yield
 
     def _dwell(self, seconds: float) -> Generator[None, None, None]:
-        """A dwell in the controller's own steps, which a hold interrupts."""
+        """Dwell in the controller's time steps; a hold pauses the dwell."""
         left, last = math.ceil(round(seconds / _DWELL_STEP_S, 6)) * _DWELL_STEP_S * self._speed_up, self._now()
         while left > 0:
             yield
@@ -362,7 +377,7 @@ class GrblFirmware:
         self.axis.acceleration = self._settings[120]
 
     def _home(self) -> Generator[None, None, None]:
-        """Seek the switch, pull off, locate it slowly, pull off; then the position is known."""
+        """Home the axis: seek the switch, pull off, approach it slowly, pull off, and set the position."""
         if not self._settings[22]:
             raise GrblError(5)
         self._mode, low, travel = "Home", bool(int(self._settings[23]) & 1), self._settings[130]

@@ -1,8 +1,8 @@
-"""Motion of one axis in closed form: movements under an acceleration limit that end at rest, and braking.
+"""Motion of one axis in closed form: movements with limited acceleration that end at rest, and braking.
 
-Times are in s of the simulated controller, positions in mm, speeds in mm/s. As in Grbl's planner, a movement of
-the same direction and speed as the one before continues it without a stop. Between others the axis comes to rest, which
-Grbl does only between opposite directions.
+Times are in s of the simulated controller, positions in mm, speeds in mm/s. As in Grbl's planner, a movement with the
+same direction and speed as the previous one continues it without a stop. Between all other movements the axis stops,
+whereas Grbl stops only between opposite directions.
 """
 
 import math
@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 
 @dataclass(frozen=True)
 class Ramp:
-    """From ``start_speed`` at ``start_mm`` to rest at ``end_mm``, beginning at ``start_s``.
+    """Movement from ``start_speed`` at ``start_mm`` to rest at ``end_mm``, starting at ``start_s``.
 
-    ``blocks`` are the ends of the planner's blocks of which it consists, the last one ``end_mm``.
+    ``blocks`` are the end positions of the planner's blocks in this movement; the last one is ``end_mm``.
     """
 
     start_mm: float
@@ -26,26 +26,26 @@ class Ramp:
 
     @property
     def end_mm(self) -> float:
-        """Where it comes to rest."""
+        """Final position."""
         return self.blocks[-1]
 
     @property
     def peak(self) -> float:
-        """Highest speed: a short way never reaches the full one."""
+        """Highest speed; a short movement does not reach ``speed``."""
         way = abs(self.end_mm - self.start_mm)
         return min(self.speed, math.sqrt(self.start_speed**2 / 2 + self.acceleration * way))
 
     @property
     def end_s(self) -> float:
-        """When it comes to rest."""
+        """Time of the end."""
         if self.peak == 0:
             return self.start_s
-        # At the peak all the way, but for what each of the two ramps takes longer.
+        # Time at peak speed over the whole distance, plus the additional time of both ramps.
         late_s = ((self.peak - self.start_speed) ** 2 + self.peak**2) / (2 * self.acceleration * self.peak)
         return self.start_s + abs(self.end_mm - self.start_mm) / self.peak + late_s
 
     def at(self, time_s: float) -> tuple[float, float]:
-        """Position and signed speed."""
+        """Return position and signed speed."""
         way, sign = abs(self.end_mm - self.start_mm), math.copysign(1.0, self.end_mm - self.start_mm)
         if time_s <= self.start_s:
             return self.start_mm, sign * self.start_speed
@@ -65,7 +65,7 @@ class Ramp:
 
 @dataclass(frozen=True)
 class Brake:
-    """From a signed ``speed`` at ``start_mm`` to rest."""
+    """Braking from a signed ``speed`` at ``start_mm`` to rest."""
 
     start_mm: float
     speed: float
@@ -74,12 +74,12 @@ class Brake:
 
     @property
     def end_s(self) -> float:
-        """When it comes to rest."""
+        """Time of the end."""
         return self.start_s + abs(self.speed) / self.acceleration
 
     def at(self, time_s: float) -> tuple[float, float]:
-        """Position and signed speed."""
-        # Counted from the end, so that the rest is exact.
+        """Return position and signed speed."""
+        # Calculated from the end, so that the final position is exact.
         left = self.end_s - min(max(time_s, self.start_s), self.end_s)
         slowing = math.copysign(self.acceleration, self.speed)
         way = self.speed * abs(self.speed) / (2 * self.acceleration)
@@ -88,7 +88,7 @@ class Brake:
 
 @dataclass
 class Axis:
-    """Movements one after the other, held and resumed; asked for any time that does not lie before the last one."""
+    """Queue of movements that can be held and resumed; times of successive calls must not decrease."""
 
     acceleration: float
     rest_mm: float = 0.0
@@ -98,7 +98,7 @@ class Axis:
 
     @property
     def pending(self) -> int:
-        """Blocks not yet done."""
+        """Number of unfinished blocks."""
         return sum(len(move.blocks) for move in self._moves)
 
     @property
@@ -108,15 +108,15 @@ class Axis:
 
     @property
     def held(self) -> bool:
-        """Whether a hold was asked for and not ended."""
+        """True if the axis is held."""
         return self._brake is not None
 
     def braking(self, time_s: float) -> bool:
-        """Whether a hold is still slowing down."""
+        """Return whether the axis is decelerating for a hold."""
         return self._brake is not None and self._clock(time_s) < self._brake.end_s
 
     def add(self, end_mm: float, *, speed: float, time_s: float) -> None:
-        """Queue a block; it starts when those before it are done, or at once, and continues one of its kind."""
+        """Queue a block; it starts after the queued ones, and continues a movement of equal direction and speed."""
         self.advance(time_s)
         start_mm, start_s = self.planned_mm, self._moves[-1].end_s if self._moves else time_s
         if end_mm == start_mm:
@@ -131,7 +131,7 @@ class Axis:
             self._moves.append(Ramp(start_mm, (end_mm,), speed, self.acceleration, start_s))
 
     def advance(self, time_s: float) -> None:
-        """Retire the blocks that are done."""
+        """Remove finished blocks."""
         if self._brake:
             return
         while self._moves and self._clock(time_s) >= self._moves[0].end_s:
@@ -143,12 +143,12 @@ class Axis:
             self._moves[0] = replace(move, blocks=left or move.blocks[-1:])
 
     def commanded(self, time_s: float) -> float:
-        """Speed that the movement at hand was commanded with; 0 where there is none."""
+        """Return the commanded speed of the present movement; 0 without one."""
         self.advance(time_s)
         return self._moves[0].speed if self._moves else 0.0
 
     def at(self, time_s: float) -> tuple[float, float]:
-        """Position and signed speed."""
+        """Return position and signed speed."""
         clock = self._clock(time_s)
         if self._brake:
             return self._brake.at(clock)
@@ -158,14 +158,14 @@ class Axis:
         return self.planned_mm, 0.0
 
     def hold(self, time_s: float) -> None:
-        """Brake and keep what is left of the movements."""
+        """Brake and keep the remaining movements."""
         self.advance(time_s)
         if not self._brake:
             position, speed = self.at(time_s)
             self._brake = Brake(position, speed, self.acceleration, self._clock(time_s))
 
     def resume(self, time_s: float) -> None:
-        """Go on with what is left, from rest."""
+        """Continue the remaining movements from rest."""
         if not self._brake or self.braking(time_s):
             return
         ends = [(end_mm, move.speed) for move in self._moves for end_mm in move.blocks]
@@ -176,17 +176,17 @@ class Axis:
             self.add(end_mm, speed=speed, time_s=time_s)
 
     def stick(self, time_s: float) -> None:
-        """Let time stand still for the movement, or the next one."""
+        """Block the present movement, or the next one."""
         self._stuck_s = time_s
 
     def stop(self, time_s: float) -> None:
-        """Stop dead where it is and forget the movements, and what they are stuck at."""
+        """Stop immediately and discard the movements; a blocked movement is released."""
         stuck_s = None if self._moves else self._stuck_s
         self.place(self.at(time_s)[0])
         self._stuck_s = stuck_s
 
     def place(self, position_mm: float) -> None:
-        """Rest at a position."""
+        """Set the position at rest and discard the movements."""
         self.rest_mm, self._brake, self._stuck_s = position_mm, None, None
         self._moves.clear()
 

@@ -1,6 +1,6 @@
-"""Serves a scene as hardware: a Grbl controller on a pseudo terminal and a GigE Vision camera, joined by a bench.
+"""Service of a scene as hardware: a Grbl controller on a pseudo terminal and a GigE Vision camera.
 
-The bench renders what the camera sees of scene, stage and laser; faults NAME[:ARGUMENT][@FRAME] disturb it.
+The bench renders the camera's images for the state of stage and laser. Faults NAME[:ARGUMENT][@FRAME] can be injected.
 """
 
 import math
@@ -40,7 +40,7 @@ _FORM = re.compile(r"(?P<name>[a-z-]+)(:(?P<argument>[^@]+))?(@(?P<frame>[1-9]\d
 
 @dataclass(frozen=True)
 class _Kind:
-    """A fault's argument unless given, None where it takes none, and which arguments it takes."""
+    """Default argument of a fault (None if it takes no argument), and the rules for the argument."""
 
     argument: float | None = None
     whole: bool = True
@@ -61,7 +61,7 @@ NAMES = tuple(_KINDS)
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault that comes with a frame, counted from 1 as the camera is asked for them."""
+    """Fault at a frame; frames are numbered from 1 in the order of requests to the camera."""
 
     name: str
     argument: float | None
@@ -69,11 +69,11 @@ class Fault:
 
     @property
     def ahead(self) -> bool:
-        """Whether it has to be injected before its frame is begun, which is when the one before is done."""
+        """True if it must be injected before its frame starts, after the previous frame."""
         return self.name == "delay"
 
     def inject(self, stage: GrblController, camera: GigeCamera) -> None:
-        """Let it happen."""
+        """Inject the fault."""
         value = 1 if self.argument is None else self.argument
         match self.name:
             case "drop" | "repeat" | "cut":
@@ -90,16 +90,16 @@ class Fault:
 
 
 def parse_fault(text: str) -> Fault:
-    """A fault from NAME[:ARGUMENT][@FRAME], by default of the kind's own argument with the first frame.
+    """Parse a fault NAME[:ARGUMENT][@FRAME]; defaults are the kind's argument and the first frame.
 
-    DescriptionError where there is no such fault, or its argument is none.
+    Raises DescriptionError if the fault is unknown, or the argument is not valid.
     """
     found = _FORM.fullmatch(text)
     if not found or found["name"] not in _KINDS:
-        raise DescriptionError(f"'{text}' is no fault: write NAME[:ARGUMENT][@FRAME] with one of {', '.join(NAMES)}")
+        raise DescriptionError(f"'{text}' is not a fault: write NAME[:ARGUMENT][@FRAME] with one of {', '.join(NAMES)}")
     kind, argument = _KINDS[found["name"]], found["argument"]
     if argument is not None and kind.argument is None:
-        raise DescriptionError(f"the fault {found['name']} takes no argument, '{argument}' was given")
+        raise DescriptionError(f"the fault {found['name']} takes no argument; found '{argument}'")
     value = kind.argument
     if argument is not None:
         try:
@@ -112,33 +112,33 @@ def parse_fault(text: str) -> Fault:
     return Fault(found["name"], value, int(found["frame"] or 1))
 
 
-# Keeps the random numbers of the walks, which follow the place, apart from those of the noise, which follow the frame.
+# Streams of random numbers: walks depend on the position, noise on the frame.
 _WALKS = 0
 _NOISE = 1
 
 
 @dataclass(frozen=True)
 class Track:
-    """Place of the scene's motion on the stage: it starts at ``start_mm`` of the stage's own positions."""
+    """Position of the scene's motion on the stage: it starts at the stage position ``start_mm``."""
 
     motion: Motion
     start_mm: float
 
     @classmethod
     def on(cls, stage: Stage, motion: Motion, *, start_mm: float | None = None) -> "Track":
-        """The motion in the middle of the travel, on a whole step, unless ``start_mm`` says where it starts.
+        """Place a motion at ``start_mm``, by default in the middle of the travel, rounded to a step.
 
-        DescriptionError where the motion does not lie within the travel.
+        Raises DescriptionError if the motion is not within the travel.
         """
         way_mm = (motion.count - 1) * motion.step_mm
         if start_mm is None:
             start_mm = round((stage.travel_mm - way_mm) / 2 / stage.resolution_mm) * stage.resolution_mm
         low, high = sorted((start_mm, start_mm + way_mm))
-        # A motion as long as the travel may lie beyond its end by half the step to which its start was rounded.
+        # Rounding to a step can move a motion as long as the travel beyond its end by half a step.
         if not -stage.resolution_mm <= low <= high <= stage.travel_mm + stage.resolution_mm:
             raise DescriptionError(
                 f"the scene's motion would run from {low:g} to {high:g} mm of the stage, whose travel is 0 to "
-                f"{stage.travel_mm:g} mm: start it elsewhere, or shorten it"
+                f"{stage.travel_mm:g} mm: change `stage_start`, or shorten the motion"
             )
         return cls(motion, start_mm)
 
@@ -148,7 +148,7 @@ class Track:
         return self.start_mm - self.motion.start_mm
 
     def shot(self, position_mm: float, light: Light) -> Shot:
-        """The shot at a position of the stage; errors of the stage between the scan's positions are interpolated."""
+        """Return the shot at a stage position; the stage's errors are interpolated between the motion's positions."""
         scene_mm, motion = position_mm - self.offset_mm, self.motion
         error_mm = 0.0
         if motion.position_errors_mm:
@@ -160,7 +160,7 @@ class Track:
 
 @dataclass(frozen=True)
 class FrameRates:
-    """Numbers of frames made and rendered, and the times in s that rendered and repeated ones took."""
+    """Numbers of all frames and of rendered frames, and times in s of rendered and repeated frames."""
 
     frames: int = 0
     rendered: int = 0
@@ -173,37 +173,37 @@ class FrameRates:
         if self.rendered:
             parts.append(f"{self.rendered} rendered at {self.rendered / self.rendering_s:.1f} frames/s")
         if repeated:
-            parts.append(f"{repeated} of the same place at {repeated / self.repeating_s:.1f} frames/s")
+            parts.append(f"{repeated} at the same position at {repeated / self.repeating_s:.1f} frames/s")
         return ", ".join(parts)
 
 
 class Bench:
-    """Frames of a studio for a stage whose ``state()`` is true at the moment of the call; used by one thread.
+    """Renderer of frames for a stage; used by one thread.
 
-    ``track`` is where the scene lies on the stage; the lamp is on while the laser is off if ``lamp``. DesignError where
-    the detector does not have 8 bit.
+    ``state()`` returns the present true state of the stage, and ``track`` is the position of the scene's motion on it.
+    With ``lamp``, the lamp is on while the laser is off. Raises DesignError if the detector does not have 8 bits.
     """
 
     def __init__(self, studio: "Studio", *, state: Callable[[], StageState], track: Track, lamp: bool):
         bits = studio.sensor.detector.bits
         if bits != 8:
-            raise DesignError(f"the served camera gives 8 bit, the sensor's detector {bits}: set bits = 8")
+            raise DesignError(f"the served camera has 8 bits, the sensor's detector {bits}: set bits = 8")
         self.rates = FrameRates()
         self._studio, self._state, self._track, self._lamp = studio, state, track, lamp
         self._travelled_mm = math.nan
         self._seen: dict[str, np.ndarray] = {}
 
     def prepare(self, exposure_ms: float) -> None:
-        """Compile what renders a laser image, which takes longer than a laser is lit for one, and forget the image."""
+        """Compile the kernels for laser images with a trial image, because the compilation exceeds an exposure."""
         state = replace(self._state(), laser_on=True, power=1.0)
         light = self._electrons_per_ms(state, None)
         self._studio.detected(exposure_ms * light, exposure_ms=exposure_ms, noise_seed=[self._studio.options.seed])
         self._travelled_mm = math.nan
 
     def frame(self, exposure_ms: float, state: StageState | None = None) -> np.ndarray:
-        """Image (height_px, width_px) of uint8 of a moment, now unless given; noise differs from call to call.
+        """Render the image (height_px, width_px), uint8, of a state, by default the present one.
 
-        The stage's movement shows in the image if the moment is given.
+        A given state includes motion blur. The noise is different in each call.
         """
         began, known = time.perf_counter(), len(self._seen)
         travel = None if state is None else self._studio.travel_at(state.speed_mm_per_s, exposure_ms=exposure_ms)
@@ -224,7 +224,7 @@ class Bench:
         return image
 
     def _electrons_per_ms(self, state: StageState, travel: "Travel | None") -> np.ndarray:
-        """Mean photo-electrons per ms (H, W), without noise; the latest place's are kept."""
+        """Return mean photo-electrons per ms (H, W), without noise; those of the latest position are kept."""
         travelled_mm = self._track.shot(state.position_mm, "laser").travelled_mm
         if travelled_mm != self._travelled_mm:
             self._travelled_mm, self._seen = travelled_mm, {}
@@ -233,14 +233,14 @@ class Bench:
         laser = self._light("laser", state, travel)
         if state.power >= 1:
             return laser
-        # A laser frame holds the daylight, which a weaker laser leaves as it is.
+        # A laser frame includes the daylight, which does not depend on the laser's power.
         day = self._light("day", state, travel)
         return day + np.float32(state.power) * np.maximum(laser - day, 0)
 
     def _light(self, light: Light, state: StageState, travel: "Travel | None") -> np.ndarray:
         if light not in self._seen:
             shot, options = self._track.shot(state.position_mm, light), self._studio.options
-            # Whole um, which are all different places; seeds must not be negative.
+            # Position in whole um as a non-negative seed.
             place = round(1e3 * shot.travelled_mm) % 2**32
             seed = int(np.random.SeedSequence([options.seed, _WALKS, place]).generate_state(1)[0])
             self._seen[light] = self._studio.electrons_per_ms(shot, spp=options.spp, seed=seed, travel=travel)
@@ -249,7 +249,7 @@ class Bench:
 
 @dataclass(frozen=True)
 class ServedTwin:
-    """A served stage and camera, the place of the scene, and exposures in ms that suit it."""
+    """Served stage and camera, position of the scene on the stage, and suitable exposures in ms."""
 
     controller: GrblController
     camera: GigeCamera
@@ -258,7 +258,7 @@ class ServedTwin:
     rates: Callable[[], FrameRates]
 
     def lines(self) -> list[str]:
-        """Ports, motion and exposures, as lines for the operator."""
+        """Return ports, motion and exposures as lines of text."""
         motion, start_mm = self.track.motion, self.track.start_mm
         end_mm = start_mm + (motion.count - 1) * motion.step_mm
         suited = ", ".join(f"{light} {exposure:.3f} ms" for light, exposure in self.exposure_ms.items())
@@ -272,9 +272,9 @@ class ServedTwin:
         ]
 
     def wait_for_end(self) -> None:
-        """Return at Ctrl-C, or when the process is asked to terminate; raise what kept the camera from making a frame.
+        """Wait for Ctrl-C or a termination signal; raise an exception that occurred while making a frame.
 
-        A shell makes programs in its background ignore Ctrl-C; a service must not.
+        Handlers are installed explicitly, because shells make background programs ignore Ctrl-C.
         """
         ended = threading.Event()
         before = {number: signal.signal(number, lambda *_: ended.set()) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -310,49 +310,48 @@ def serve(
 ) -> Iterator[ServedTwin]:
     """Serve a scene as hardware: a GigE Vision camera and a Grbl controller with stage and laser.
 
-    A frame shows what the camera sees where the stage stands, with the laser as it is. A free-running camera exposes at
-    its frame rate whatever rendering takes; its frames come later, with true time stamps. Camera and controller can be
-    reached from this machine only.
+    A frame shows the scene at the stage's present position, with the laser on or off. A free-running camera exposes at
+    its frame rate, independent of the rendering time; its frames arrive later, with true time stamps. Camera and
+    controller can only be reached from this machine.
 
     Parameters
     ----------
     sensor
-        Name or path of the sensor description that the sensor's software will be given.
+        Name or path of the sensor description for the sensor software.
     placement
-        Named place of the objects, such as near, standoff or far.
+        Named position of the objects, such as near, standoff or far.
     effects
-        Effects of real images to add, as for `simulate`, but for lamp-and-laser: the controller switches the laser.
-        With camera-3d the camera's pixel format is Coord3D_C16 until a program sets Mono8.
+        Effects of real images to add, as for `simulate`, except lamp-and-laser, because the controller switches the
+        laser. With camera-3d, the camera's pixel format is Coord3D_C16 until a program sets Mono8.
     without
-        Effects to leave out, as for `simulate`. A moving stage blurs the images of a free-running camera, not those of
-        a triggered one.
+        Effects to omit, as for `simulate`. Motion blur affects a free-running camera, not a triggered one.
     ideal
-        Leave out all of these: a pinhole's sharp image without noise.
+        Omit all effects: a pinhole's sharp image without noise.
     stage_start
-        Stage position in mm at which the scene's motion starts; the middle of the travel is used unless given. There
-        the stage stands at first.
+        Stage position in mm at the start of the scene's motion, and initial position of the stage; default: the motion
+        is in the middle of the travel.
     lamp
-        Whether the lamp is on while the laser is off; if the scene's motion has lamp images unless given.
+        Switch the lamp on while the laser is off; default: if the scene's motion has lamp images.
     speed_up
-        How much faster than real the stage moves.
+        Factor of the stage's speed.
     fault
-        Faults as NAME[:ARGUMENT][@FRAME], each with the frame of that number, else with the first: drop, repeat or cut
-        (so many frames), delay (s), camera-disconnect, stage-disconnect, mute, cut-line, stall, stop-short or
-        lose-steps (steps), alarm (number), hold, restart, garbage, break-laser.
+        Faults as NAME[:ARGUMENT][@FRAME], by default at the first frame: drop, repeat or cut (number of frames), delay
+        (s), camera-disconnect, stage-disconnect, mute, cut-line, stall, stop-short or lose-steps (steps), alarm
+        (number), hold, restart, garbage, break-laser.
     report
-        Called with a line of text for every fault, by the camera's thread.
+        Called with a line of text for each fault, in the camera's thread.
     scene, as_built, medium, water, spp, seed, variant
         As for `simulate`.
 
     Returns
     -------
     context manager of ServedTwin
-        Its addresses and exposures; the scene is served within the ``with``.
+        Addresses and exposures; the scene is served within the ``with`` block.
 
     Raises
     ------
     DescriptionError, DesignError
-        A description, name or option is wrong, the sensor cannot work, or the motion does not fit the stage.
+        A description, name or option is invalid, the sensor cannot work, or the motion does not fit the stage.
     HardwareError
         Another camera is served on this machine.
     SetupError
@@ -361,12 +360,14 @@ def serve(
     described = choose_scene(scene, placement=placement, medium=medium, water=water)
     options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
     if options.flaws.lamp_and_laser:
-        raise DescriptionError("lamp-and-laser cannot be served, as the controller switches the laser: leave it out")
+        raise DescriptionError("lamp-and-laser cannot be served, because the controller switches the laser: remove it")
     if not speed_up > 0:
         raise DescriptionError(f"speed_up is {speed_up:g}; it must be positive")
     motion = described.motion
     if not isinstance(motion, Motion):
-        raise DescriptionError(f"{described.title} moves on a {motion.kind}; a stage is served: give steps of a stage")
+        raise DescriptionError(
+            f"{described.title} moves on a {motion.kind}; expected a scene with a motion of the stage"
+        )
     _, built = choose_sensors(sensor, as_built)
     faults = [parse_fault(text) for text in fault]
     use_variant(variant)
@@ -374,7 +375,7 @@ def serve(
 
     track = Track.on(built.stage, motion, start_mm=stage_start)
     lamp = "lamp" in motion.lights if lamp is None else lamp
-    # The controller moves the stage, and a frame may ask for any light.
+    # The controller moves the stage, and a frame can need any light.
     at_rest = {"lights": ("lamp", "laser") if lamp else ("laser",), "speed_mm_per_s": 0.0}
     studio = Studio(built, altered(described, motion=at_rest), options)
     settings = {
@@ -401,7 +402,7 @@ def serve(
         return image
 
     if studio.peak_finder is not None and built.camera.stripe_along != "width":
-        raise DesignError("a 3D camera's profile lines are its columns: take a sensor with stripe_along = 'width'")
+        raise DesignError("the profile lines of a 3D camera are its columns: use a sensor with stripe_along = 'width'")
 
     def expose() -> ExposedFrame:
         state = controller.state()

@@ -1,1 +1,1 @@
-"""Descriptions of sensors, media, targets' surroundings and artefacts, and the types of calibrations; no algorithms."""
+"""Types of descriptions (sensor, media, artefacts) and of results (calibration, mount, stripes); no algorithms."""

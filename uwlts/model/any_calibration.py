@@ -1,4 +1,4 @@
-"""Calibrations of any kind, and the digest by which a cloud names its own."""
+"""Union of the kinds of calibration, and their digest, which identifies the calibration of a cloud."""
 
 import hashlib
 import weakref
@@ -10,7 +10,7 @@ AnyCalibration = Calibration | PolynomialCalibration
 
 
 def calibration_digest(calibration: AnyCalibration) -> str:
-    """Short digest that identifies a calibration, as the clouds made with it name it."""
+    """Return the short digest that identifies a calibration in clouds."""
     if (digest := _digests.get(id(calibration))) is None:
         digest = hashlib.sha256(calibration.model_dump_json().encode()).hexdigest()[:16]
         _digests[id(calibration)] = digest
@@ -19,4 +19,4 @@ def calibration_digest(calibration: AnyCalibration) -> str:
 
 
 _digests: dict[int, str] = {}
-"""Digests of calibrations in use, by their identity."""
+"""Digests of calibrations in use, by `id`."""

@@ -1,4 +1,4 @@
-"""Descriptions of artefacts with their calibrated sizes, distinguished by `kind`."""
+"""Descriptions of artefacts with calibrated sizes, distinguished by `kind`."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -14,11 +14,11 @@ _MOST_SPHERES = 6
 
 
 class SphereStandard(Description):
-    """Spheres in fixed positions; two make the dumbbell of VDI/VDE 2634, one gives the probing error alone.
+    """Spheres in fixed positions: two are the dumbbell of VDI/VDE 2634, one gives only the probing error.
 
-    Spheres whose calibrated sizes and spacings leave their order open (within 0.5 % of the smallest diameter) are
-    taken in the order of rising Y or X, whichever their centres spread along more. `cap_angle_deg` leaves out points
-    farther than that from the point of the sphere that faces the sensor (-Z).
+    Sizes and spacings define the order of the spheres, unless they agree within 0.5 % of the smallest diameter. Then
+    the spheres are ordered by increasing Y or X, the coordinate with the larger spread of centres. `cap_angle_deg`
+    limits the evaluated points to a cap about the point that faces the sensor (-Z).
     """
 
     kind: Literal["spheres"] = "spheres"
@@ -29,10 +29,10 @@ class SphereStandard(Description):
     cap_angle_deg: Annotated[float, Field(gt=0, le=180)] | None = None
 
     @model_validator(mode="after")
-    def _one_spacing_between_neighbours(self) -> "SphereStandard":
+    def _check_spacings(self) -> "SphereStandard":
         count, given = len(self.diameters_mm), len(self.spacings_mm)
         if given != count - 1:
-            raise ValueError(f"{count} spheres have {count - 1} spacings between consecutive ones; {given} are given")
+            raise ValueError(f"{count} spheres need {count - 1} spacings between neighbours; {given} are given")
         for spacing, (first, second) in zip(self.spacings_mm, pairwise(self.diameters_mm), strict=True):
             if spacing < (first + second) / 2:
                 raise ValueError(f"spheres of {first} and {second} mm cannot stand {spacing} mm apart: they overlap")
@@ -40,14 +40,14 @@ class SphereStandard(Description):
 
 
 class PlaneStandard(Description):
-    """A flat surface."""
+    """Flat surface."""
 
     kind: Literal["plane"] = "plane"
     flatness_mm: NotNegative | None = None
 
 
 class StepStandard(Description):
-    """Parallel faces at two levels, one step or several of the same height (base - block - base)."""
+    """Parallel faces at two levels: one step, or several of the same height (base - block - base)."""
 
     kind: Literal["step"] = "step"
     height_mm: Positive
@@ -57,7 +57,7 @@ class StepStandard(Description):
 
 
 class PipeStandard(Description):
-    """A cylinder seen from outside or inside."""
+    """Cylinder, measured from outside or inside."""
 
     kind: Literal["pipe"] = "pipe"
     diameter_mm: Positive
@@ -68,7 +68,7 @@ Artefact = Annotated[SphereStandard | PlaneStandard | StepStandard | PipeStandar
 
 
 def parse_artefact(table: object) -> Artefact:
-    """An artefact's description; EvaluationError naming what is wrong with it."""
+    """Validate an artefact's description; EvaluationError with the invalid keys."""
     try:
         return TypeAdapter(Artefact).validate_python(table)
     except ValidationError as error:
@@ -76,9 +76,10 @@ def parse_artefact(table: object) -> Artefact:
 
 
 def read_artefact(path: str | Path) -> Artefact:
-    """An artefact's description from a TOML file.
+    """Read an artefact's description from a TOML file.
 
-    CaptureError, DescriptionError or EvaluationError where it cannot be read, is no TOML, or describes no artefact.
+    Raises CaptureError if the file cannot be read, DescriptionError if it is not TOML, and EvaluationError if it does
+    not describe an artefact.
     """
     text = read_text(path, most_bytes=MOST_TOML_BYTES, called="artefact", foreign="is not valid TOML")
     try:

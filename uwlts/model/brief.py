@@ -1,4 +1,4 @@
-"""Short texts of results: sizes of arrays and lists in place of what they hold."""
+"""Short text representations of results, with sizes in place of the contents of arrays and lists."""
 
 import dataclasses
 import html
@@ -6,32 +6,32 @@ from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
 _LONGEST = 60
-"""Most characters of a value that is shown as it is; of a longer one the size is shown."""
+"""Largest number of characters of a value that is shown completely."""
 _MOST = 8
-"""Most items of a value that is shown as it is."""
+"""Largest number of items of a value that is shown completely."""
 
 
 class Brief:
-    """Result whose `repr` fits on a screen, and which notebooks show as a table; units are in the names."""
+    """Base of results with a `repr` that fits on a screen and a table for notebooks; names contain the units."""
 
     def shown(self) -> dict[str, str]:
-        """Names of the fields and short texts of their values."""
+        """Return short texts of the fields' values by name."""
         known = getattr(type(self), "model_fields", None)
         names = known or [each.name for each in dataclasses.fields(self)]  # pyright: ignore[reportArgumentType]
         return {name: brief(getattr(self, name)) for name in names}
 
     def __repr__(self) -> str:
-        """Type, and one line for each field."""
+        """Return the type and one line for each field."""
         return "\n".join([f"{type(self).__name__}:", *(f"  {name}: {text}" for name, text in self.shown().items())])
 
     def _repr_html_(self) -> str:
-        """The same as a table."""
+        """Return the fields as an HTML table."""
         rows = "".join(f"<tr><th>{name}</th><td>{html.escape(text)}</td></tr>" for name, text in self.shown().items())
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
 
 
 def brief(value: object) -> str:
-    """Short text of a value."""
+    """Return a short text of a value."""
     if (shape := getattr(value, "shape", ())) and (dtype := getattr(value, "dtype", None)):
         return f"{' x '.join(map(str, shape))} {dtype}"
     if value is None or isinstance(value, bool | int | float | str | Path):

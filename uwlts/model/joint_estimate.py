@@ -1,4 +1,4 @@
-"""The joint estimate that a calibration holds: parameters, values, covariance, and a summary of its evidence."""
+"""Joint estimate of a calibration: parameters, values, covariance, and a summary of the evidence."""
 
 from typing import Annotated
 
@@ -10,25 +10,26 @@ from uwlts.model.sensor import Table, Uncertainty, Vector
 
 _Count = Annotated[int, Field(ge=0)]
 _Std = Annotated[FiniteFloat, Field(ge=0)]
-_ROUNDED = 1e-6  # of a correlation; files hold all digits
+_ROUNDED = 1e-6  # tolerance of correlations; files contain all digits
 _Pair = tuple[FiniteFloat, FiniteFloat]
 
 
 class _Stored(BaseModel):
-    """Base of what files hold of a joint estimate; keys that other versions add are kept."""
+    """Base of stored parts of a joint estimate; unknown keys of other versions are kept."""
 
     model_config = ConfigDict(frozen=True, extra="allow", populate_by_name=True, allow_inf_nan=False)
 
     def in_file(self) -> dict[str, JsonValue]:
-        """Plain JSON with the keys of files."""
+        """Return plain JSON with the keys of files."""
         return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
 
 class CoveredRegion(_Stored):
-    """A region of the sheet that stripes cover, seen through the window or not in one medium.
+    """Region of the sheet that stripes cover, in one medium, with or without the camera's window.
 
-    ``medium`` is its number among the calibration's media, None for air; ``outline_mm`` is convex, Y and Z of the OCS;
-    ``camera_depth_mm`` are the nearest and farthest depths along the camera's axis from its entrance pupil.
+    ``medium`` is the index of the medium in the calibration's media, None for air. ``outline_mm`` is a convex polygon
+    in Y and Z of the OCS. ``camera_depth_mm`` are the smallest and largest depths along the camera's axis from its
+    entrance pupil.
     """
 
     medium: _Count | None
@@ -40,7 +41,7 @@ class CoveredRegion(_Stored):
 
 
 class ImageFit(_Stored):
-    """Fit of one image: the kind of its residuals, their rms without outliers, and their numbers."""
+    """Fit of one image: kind of its residuals, rms without outliers, and numbers of residuals and outliers."""
 
     source: str
     kind: str
@@ -50,10 +51,10 @@ class ImageFit(_Stored):
 
 
 class NominalSheet(_Stored):
-    """The sheet as described, for which sheet parameters of zero stand: camera frame, mm.
+    """Described sheet, the reference of the sheet parameters: camera frame, mm.
 
-    ``normal`` is the sheet's in air, ``axis`` the laser's axis, square to it; the sheet turns about ``middle_mm``,
-    the fan begins at ``apex_mm`` and leaves the laser's window at ``pivot_mm``.
+    ``normal`` is the sheet's normal in air, and ``axis`` the laser's axis, perpendicular to it. The sheet turns about
+    ``middle_mm``. The fan starts at ``apex_mm`` and leaves the laser's window at ``pivot_mm``.
     """
 
     normal: Vector
@@ -64,12 +65,12 @@ class NominalSheet(_Stored):
 
 
 class JointEstimate(_Stored):
-    """All P parameters that were estimated together, by iterated least squares, and the evidence.
+    """Joint estimate of P parameters by iterated least squares, and the evidence.
 
-    ``values``, ``std`` and ``std_before`` are (P,) in the parameters' units, ``covariance`` (P, P); ``std_before`` is
-    None where nothing was known before. ``scatter_px`` is the standard deviation of every kind of residual,
-    ``shared_variance`` the variance of a mean of many residuals of a kind over that of as many independent ones.
-    ``rounds`` and ``stopped`` give the number of iterations and why they ended.
+    ``values``, ``std`` and ``std_before`` are (P,) in the parameters' units, and ``covariance`` is (P, P).
+    ``std_before`` is the prior standard uncertainty, None without a prior. ``scatter_px`` is the standard deviation of
+    each kind of residual. ``shared_variance`` is the variance of the mean of many residuals of a kind, divided by its
+    value for independent residuals. ``rounds`` is the number of iterations, and ``stopped`` the reason of their end.
     """
 
     parameters: tuple[ParameterInFile, ...]
@@ -88,10 +89,10 @@ class JointEstimate(_Stored):
     covered: tuple[CoveredRegion, ...] = ()
 
     @model_validator(mode="after")
-    def _sized(self) -> "JointEstimate":
+    def _check_sizes(self) -> "JointEstimate":
         count = len(self.parameters)
         if {count} != {*map(len, (self.values, self.std, self.std_before, self.covariance, *self.covariance))}:
-            raise ValueError(f"not all of it is of its {count} parameters")
+            raise ValueError(f"values, std, std_before and covariance must have the size of the {count} parameters")
         if any(row[place] < 0 for place, row in enumerate(self.covariance)):
             raise ValueError("a variance is negative")
         covariance, std = self.covariance_matrix(), np.array(self.std)
@@ -106,11 +107,11 @@ class JointEstimate(_Stored):
         return self
 
     def std_of(self, key: ParameterKey) -> float | None:
-        """Standard uncertainty of a parameter; None where it was not estimated."""
+        """Return the standard uncertainty of a parameter; None if it was not estimated."""
         return self.std[self.parameters.index(key)] if key in self.parameters else None
 
     def covariance_matrix(self) -> np.ndarray:
-        """The covariance as an array (P, P)."""
+        """Return the covariance as an array (P, P)."""
         return np.array(self.covariance, dtype=np.float64).reshape(len(self.parameters), -1)
 
 
@@ -131,7 +132,7 @@ class CaptureSource(_Stored):
 
 
 class Origin(BaseModel):
-    """Captures and target that a calibration was made from, how well the sensor was known before, and warnings."""
+    """Sources of a calibration: captures, target, prior uncertainties of the sensor, and warnings."""
 
     known_before: Uncertainty = Uncertainty()
     air_captures: tuple[CaptureSource, ...] = ()
@@ -141,5 +142,5 @@ class Origin(BaseModel):
     warnings: tuple[str, ...] = ()
 
     def captures(self) -> tuple[CaptureSource, ...]:
-        """All captures: of targets, of steps and of scans."""
+        """Return all captures: of targets, of steps and of scans."""
         return self.air_captures + self.step_captures + self.scan_captures

@@ -1,7 +1,7 @@
-"""Finds descriptions by name or path, reads their TOML, and turns validation failures into clear errors.
+"""Library of descriptions: find them by name or path, read their TOML, and report invalid keys.
 
-Names are looked up in the library that ships with the package: ``scenes/sensors`` for sensors, ``scenes`` for scenes.
-A description may name a ``base`` of its own kind and give only what differs from it.
+Names belong to the library that ships with the package: ``scenes/sensors`` for sensors, ``scenes`` for scenes. A
+description can name a ``base`` of its own kind and contain only the differences.
 """
 
 import re
@@ -21,23 +21,23 @@ AnyDescription = TypeVar("AnyDescription", bound=Description)
 _MOST_PROBLEMS = 30
 _NO_TOML = "is not valid TOML"
 _MOST_BASES = 16
-"""Descriptions of which each is the base of the next; the shipped ones have two."""
+"""Largest length of a chain of bases; the shipped descriptions have two."""
 
 
 def library_folder() -> Path:
-    """Folder of the descriptions that ship with the package: inside the wheel, or beside it in a source checkout."""
+    """Return the folder of the shipped descriptions: inside the wheel, or beside the package in a source checkout."""
     package = Path(__file__).resolve().parents[1]
     inside = package / "scenes"
     return inside if inside.is_dir() else package.parent / "scenes"
 
 
 def names(folder: str = "") -> list[str]:
-    """Names of the shipped descriptions in a folder of the library."""
+    """Return the names of the shipped descriptions in a folder of the library."""
     return sorted(path.stem for path in (library_folder() / folder).glob("*.toml"))
 
 
 def find(name_or_path: str | Path, folder: str = "") -> Path:
-    """Path of a description given by file or by name; raises DescriptionError with the known names."""
+    """Return the path of a description given by file or name; DescriptionError with the known names."""
     path = Path(name_or_path)
     if path.suffix == ".toml":
         if not is_regular_file(path):
@@ -51,12 +51,12 @@ def find(name_or_path: str | Path, folder: str = "") -> Path:
 
 
 def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> Table:
-    """Table of a TOML file with its ``base`` filled in; nested tables are merged, everything else is replaced."""
+    """Read a TOML file and merge it with its ``base``: tables are merged, all other values replaced."""
     text = read_text(path, most_bytes=MOST_TOML_BYTES, error=DescriptionError, called="description", foreign=_NO_TOML)
     if path.resolve() in seen:
         raise DescriptionError(f"{path} is its own base: {' -> '.join(p.name for p in (*seen, path))}")
     if len(seen) == _MOST_BASES:
-        raise DescriptionError(f"{path} is the base of {_MOST_BASES} descriptions one after another: give fewer")
+        raise DescriptionError(f"{path}: more than {_MOST_BASES} bases in a chain; use fewer")
     try:
         table = parsed_toml(text)
     except ValueError as error:
@@ -67,19 +67,20 @@ def read_table(path: Path, folder: str = "", *, seen: tuple[Path, ...] = ()) -> 
     if not isinstance(base, str):
         raise DescriptionError(f"{path}: base is {base!r}; expected the name or path of another description")
     beside = path.parent / f"{base.removesuffix('.toml')}.toml"
-    # A description may be called like the shipped one on which it is based.
+    # A description can have the same name as its shipped base.
     base_path = beside if is_regular_file(beside) and beside.resolve() != path.resolve() else find(base, folder)
     return merged(read_table(base_path, folder, seen=(*seen, path.resolve())), table)
 
 
 _EITHER_OR = (({"baseline_mm", "triangulation_angle_deg"}, {"origin_mm", "axis"}), ({"water"}, {"turbidity"}))
-"""Keys that say the same in two ways: of the laser's place, and of a medium."""
+"""Alternative keys for the same information: placement of the laser, and properties of a medium."""
 
 
 def merged(base: Table, changes: Table) -> Table:
-    """A new table: ``base`` with ``changes`` laid over it, tables merged key by key.
+    """Merge ``changes`` into a copy of ``base``, nested tables key by key.
 
-    What the changes say in another way, as where the laser stands, the base says no longer.
+    Keys of the base are dropped if the changes give the same information with alternative keys, such as the laser's
+    placement.
     """
     replaced = {
         key
@@ -96,23 +97,23 @@ def merged(base: Table, changes: Table) -> Table:
 
 
 def validated(model: type[AnyDescription], table: object, source: str | Path) -> AnyDescription:
-    """The table as a description; DescriptionError names each wrong key, what was found and what is expected."""
+    """Validate a table as a description; DescriptionError with each invalid key, its value and the expected one."""
     try:
         return model.model_validate(table)
     except ValidationError as error:
         words = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", model.__name__).lower()
-        known = [*map(_explained, first_problems(error, _MOST_PROBLEMS))]
+        known = [*map(_explain, first_problems(error, _MOST_PROBLEMS))]
         left = error.error_count() - len(known)
         more = [f"  {left:,} {'more ' if known else ''}values are wrong"] if left else []
         raise DescriptionError("\n".join([f"{source} is not a valid {words}:", *known, *more])) from error
     except Error as error:
         raise type(error)(f"{source}: {error}") from error
     except ArithmeticError as error:
-        raise DescriptionError(f"{source} holds numbers that nothing can be calculated with: {error}") from error
+        raise DescriptionError(f"{source} contains numbers outside the range of calculations: {error}") from error
 
 
-def _explained(problem: ErrorDetails) -> str:
-    # The kind that is meant where none is named has an empty tag.
+def _explain(problem: ErrorDetails) -> str:
+    # The default kind of a tagged union has an empty tag.
     key = ".".join(str(part) for part in problem["loc"] if part != "") or "(whole description)"
     if problem["type"] == "extra_forbidden":
         return f"  {key}: unknown key (check its spelling and its unit suffix, such as _mm or _deg)"
@@ -123,10 +124,14 @@ def _explained(problem: ErrorDetails) -> str:
 
 
 def load_sensor(name_or_path: str | Path) -> Sensor:
-    """Read a sensor description: a shipped one by name, such as "thesis", or a TOML file, which may name a ``base``.
+    """Read a sensor description: a shipped one by name, such as "thesis", or a TOML file, which can have a ``base``.
 
-    Returns the nominal data of camera, laser, windows, detector, stage, measuring volume and media. DescriptionError
-    where no sensor has this name, or the file is missing, not TOML, or has an unknown or wrong key.
+    The description contains the nominal data of camera, laser, windows, detector, stage, measuring volume and media.
+
+    Raises
+    ------
+    DescriptionError
+        The name is unknown, or the file is missing, not TOML, or has an unknown key or an invalid value.
 
     Examples
     --------

@@ -1,7 +1,7 @@
-"""Refractive index, absorption and scattering of the media and windows; all indices are relative to air.
+"""Refractive index, absorption and scattering of media and windows; all indices are relative to air.
 
-Formulas refuse values outside the range in which their authors fitted them. The window materials were measured in
-air, so their formulas give indices relative to air as they stand.
+Formulas reject values outside the range of their fit. The window materials were measured in air, so that their formulas
+give indices relative to air.
 """
 
 import math
@@ -18,13 +18,13 @@ from uwlts.errors import DescriptionError, RangeError
 def check_range(name: str, value: float, lowest: float, highest: float, source: str) -> None:
     """Raise RangeError unless ``lowest <= value <= highest``."""
     if not (math.isfinite(value) and lowest <= value <= highest):
-        raise RangeError(f"{name} is {value:g}, but {source} holds from {lowest:g} to {highest:g}")
+        raise RangeError(f"{name} is {value:g}, but {source} is valid from {lowest:g} to {highest:g}")
 
 
 def water_index(*, wavelength_nm: float, temperature_c: float, salinity_g_kg: float = 0.0) -> float:
-    """Refractive index of fresh or sea water relative to air.
+    """Return the refractive index of fresh or sea water relative to air.
 
-    Quan and Fry 1995, Applied Optics 34:3477, Eq. 3, valid for 0-30 degC, 0-35 g/kg and 400-700 nm; RangeError outside.
+    Quan and Fry 1995, Applied Optics 34:3477, Eq. 3. Raises RangeError outside 0-30 degC, 0-35 g/kg and 400-700 nm.
     """
     source = "the formula of Quan and Fry (1995)"
     check_range("wavelength_nm", wavelength_nm, 400.0, 700.0, source)
@@ -43,7 +43,7 @@ def water_index(*, wavelength_nm: float, temperature_c: float, salinity_g_kg: fl
 
 @dataclass(frozen=True)
 class Glass:
-    """A window material: index relative to air against wavelength in um, its range, absorption at 635 nm, source."""
+    """Window material: index relative to air as a function of wavelength in um, valid range, absorption at 635 nm."""
 
     index: Callable[[float], float]
     lowest_um: float
@@ -53,12 +53,12 @@ class Glass:
 
 
 def _sellmeier(strengths: tuple[float, ...], poles_um2: tuple[float, ...]) -> Callable[[float], float]:
-    """Sellmeier's formula n^2 = 1 + sum B L^2 / (L^2 - C), with L in um and C in um^2."""
+    """Return Sellmeier's formula n^2 = 1 + sum B L^2 / (L^2 - C), with L in um and C in um^2."""
     return lambda um: math.sqrt(1 + sum(b * um**2 / (um**2 - c) for b, c in zip(strengths, poles_um2, strict=True)))
 
 
 def _soda_lime(um: float) -> float:
-    """Rubin 1985, Solar Energy Materials 12:275: n = 1.5130 - 0.003169 L^2 + 0.003962 / L^2."""
+    """Return n = 1.5130 - 0.003169 L^2 + 0.003962 / L^2, L in um (Rubin 1985, Solar Energy Materials 12:275)."""
     return 1.5130 - 0.003169 * um**2 + 0.003962 / um**2
 
 
@@ -75,14 +75,14 @@ GLASSES = {
 
 
 def find_glass(name: str) -> Glass:
-    """The named window material; raises DescriptionError with the known names."""
+    """Return the named window material; DescriptionError with the known names."""
     if name not in GLASSES:
         raise DescriptionError(f"unknown glass '{name}'; known are {', '.join(GLASSES)}, or give its index as a number")
     return GLASSES[name]
 
 
 def glass_index(name: str, *, wavelength_nm: float) -> float:
-    """Refractive index of a named glass relative to air; raises RangeError outside the formula's range."""
+    """Return the refractive index of a named glass relative to air; RangeError outside the formula's range."""
     glass = find_glass(name)
     lowest, highest, source = 1e3 * glass.lowest_um, 1e3 * glass.highest_um, f"{name} ({glass.source})"
     check_range("wavelength_nm", wavelength_nm, lowest, highest, source)
@@ -91,21 +91,24 @@ def glass_index(name: str, *, wavelength_nm: float) -> float:
 
 @cache
 def read_table(name: str) -> np.ndarray:
-    """Columns (columns, rows) of a table in ``uwlts/tables``; its source stands in the file's first lines."""
+    """Read a table in ``uwlts/model/tables`` as (columns, rows); the first lines of the file name the source."""
     text = files("uwlts.model").joinpath("tables", name).read_text(encoding="utf-8")
     rows = [line for line in text.splitlines() if not line.startswith("#")]
     return np.loadtxt(rows, delimiter=",", skiprows=1).T
 
 
 def water_absorption_per_m(*, wavelength_nm: float) -> float:
-    """Absorption of pure water in 1/m (Pope and Fry 1997), linear between the table's 2.5 nm steps."""
+    """Return the absorption of pure water in 1/m (Pope and Fry 1997), interpolated linearly in steps of 2.5 nm."""
     wavelength, absorption = read_table("water_absorption.csv")
     check_range("wavelength_nm", wavelength_nm, wavelength[0], wavelength[-1], "the table of Pope and Fry (1997)")
     return float(np.interp(wavelength_nm, wavelength, absorption))
 
 
 def water_scattering_per_m(*, wavelength_nm: float, salinity_g_kg: float = 0.0) -> float:
-    """Molecular scattering of water in 1/m (Zhang, Hu and He 2009 at 20 degC), linear in wavelength and salinity."""
+    """Return the molecular scattering of water in 1/m at 20 degC (Zhang, Hu and He 2009).
+
+    The table is interpolated linearly in wavelength and salinity.
+    """
     wavelength, fresh, sea = read_table("water_scattering.csv")
     source = "the table after Zhang, Hu and He (2009)"
     check_range("wavelength_nm", wavelength_nm, wavelength[0], wavelength[-1], source)

@@ -1,4 +1,4 @@
-"""The mount of a laser profiler on a moving platform, as `uwlts.calibrate_mount` finds it and `mount.json` holds it."""
+"""Mount of a laser profiler on a moving platform: the result of `uwlts.calibrate_mount`, stored in `mount.json`."""
 
 from pathlib import Path
 from typing import Annotated, Literal, assert_never
@@ -9,19 +9,17 @@ from pydantic import Field, model_validator
 from uwlts.files.json_files import write_model
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import is_rigid
-from uwlts.model.sensor import Description, NotNegative, Positive, Vector
+from uwlts.model.sensor import Description, NotNegative, Positive, Rows, Vector
 
 FORMAT, VERSION = "uwlts-mount", 1
 
-Rows = tuple[tuple[float, ...], ...]
-
 
 class MountPose(Description):
-    """One pose of the platform and what its profile or image says.
+    """Pose of the platform and residuals of its profile or image.
 
-    ``rms_mm`` is the root mean square distance of its points from the artefact (of a target's middle from its common
-    place), ``held_out_mm`` the same where the mount was calculated without this pose. A pose that was not used has a
-    ``reason``.
+    ``rms_mm`` is the root mean square distance of its points from the artefact; for a target, the distance of its
+    centre from the common position. ``held_out_mm`` is the same for a mount that was calculated without this pose. A
+    rejected pose has a ``reason``.
     """
 
     name: str
@@ -33,9 +31,9 @@ class MountPose(Description):
 
 
 class NextPose(Description):
-    """The candidate pose that would lower the uncertainty most, in words and as ``T_base_platform``.
+    """Candidate pose that would reduce the uncertainty most, as a text and as ``T_base_platform``.
 
-    ``before_mm`` and ``after_mm`` are the standard uncertainty of a point in the middle of the field of view.
+    ``before_mm`` and ``after_mm`` are the standard uncertainties of a point in the middle of the field of view.
     """
 
     words: str
@@ -45,7 +43,7 @@ class NextPose(Description):
 
 
 class SphereFound(Description):
-    """The sphere: centre in the base frame, and its radius, given or found."""
+    """Estimated sphere: centre in the base frame, and radius, given or estimated."""
 
     kind: Literal["sphere"] = "sphere"
     centre_mm: Vector
@@ -54,7 +52,7 @@ class SphereFound(Description):
 
 
 class PlaneFound(Description):
-    """The plane: the points p of the base frame with normal . p = distance_mm."""
+    """Estimated plane: points p in the base frame with normal . p = distance_mm."""
 
     kind: Literal["plane"] = "plane"
     normal: Vector
@@ -62,7 +60,7 @@ class PlaneFound(Description):
 
 
 class StepFound(Description):
-    """The step: its face at smaller z of the profiles as `PlaneFound`, and how far along the normal the other lies."""
+    """Estimated step: the face at smaller z as in `PlaneFound`, and the offset of the other face along the normal."""
 
     kind: Literal["step"] = "step"
     normal: Vector
@@ -72,7 +70,7 @@ class StepFound(Description):
 
 
 class RingFound(Description):
-    """The ring: axis of its cylinder, centre and radius of the circle in which that meets the plane of the face."""
+    """Estimated ring: axis of its cylinder, and centre and radius of the cylinder's circle in the plane of the face."""
 
     kind: Literal["ring"] = "ring"
     axis: Vector
@@ -82,18 +80,19 @@ class RingFound(Description):
 
 
 class BoardFound(Description):
-    """The target: ``T_base_target`` (4, 4), mm."""
+    """Estimated target: ``T_base_target`` (4, 4), mm."""
 
     kind: Literal["board"] = "board"
     T_base_target: Rows
 
 
 class SensorShare(Description):
-    """What a mount has in common with the points of the sensor with whose calibration it was found.
+    """Correlation of a mount with the points of the sensor, through the calibration of the sensor.
 
-    ``calibration`` is that calibration's digest. ``by_parameters`` (6, P) are the derivatives of the mount, ordered as
-    `Mount.covariance`, by the parameters of its joint estimate, for the sensor's frame as the calibration's file places
-    it beside the camera. ``covariance_apart`` (6, 6) is the mount's covariance by all else.
+    ``calibration`` is the digest of the calibration. ``by_parameters`` (6, P) are the derivatives of the mount, ordered
+    as in `Mount.covariance`, with respect to the parameters of the calibration's joint estimate. They apply to the
+    sensor's frame that the calibration's file defines relative to the camera. ``covariance_apart`` (6, 6) is the
+    mount's covariance from all other sources.
     """
 
     calibration: str
@@ -102,17 +101,18 @@ class SensorShare(Description):
 
 
 class Mount(Brief, Description):
-    """Transform from the sensor to the platform that carries it, with its uncertainty and the evidence.
+    """Transform from the sensor to its moving platform, with uncertainty and evidence.
 
-    ``T_platform_sensor`` (4, 4) maps points of the sensor's frame (x and z of the profiles, y = z x x across the sheet)
-    to the frame of the platform (a robot's flange), mm. ``covariance`` (6, 6) is of the translation (mm), then of a
-    further rotation (rad) about the platform's axes, R_true = exp(rotation) R. ``coverage_factor`` times a standard
-    uncertainty is half of the 95 % interval (Student's t). ``point_std_mm`` is the noise of a point of a profile,
-    ``pose_std_mm`` that of the platform's position for each coordinate; both are estimated from the profiles.
-    On a rotary table (``table``) the platform's z axis is the table's; shift along it and turn about it are chosen, and
-    have no variance. ``sensor`` says which part of the covariance the calibration of the sensor makes, where that is
-    known by a joint estimate; else the profiles count as exact but for their noise. ``inputs`` holds the SHA-256 of
-    every file that was read.
+    ``T_platform_sensor`` (4, 4) maps points from the sensor's frame (x and z of the profiles, y = z x x across the
+    sheet) to the frame of the platform (a robot's flange), mm. ``covariance`` (6, 6) belongs to the translation (mm)
+    and a small rotation (rad) about the platform's axes, R_true = exp(rotation) R. ``coverage_factor`` times a standard
+    uncertainty is half of the 95 % interval (Student's t). ``point_std_mm`` is the noise of a profile's point, and
+    ``pose_std_mm`` that of each coordinate of the platform's position; both are estimated from the profiles.
+
+    On a rotary table (``table``), the platform's z axis is the table's axis. Translation along it and rotation about it
+    are conventions and have zero variance. ``sensor`` contains the contribution of the sensor's calibration to the
+    covariance, if the calibration has a joint estimate. Otherwise the profiles are assumed exact apart from noise.
+    ``inputs`` holds the SHA-256 of every input file.
     """
 
     T_platform_sensor: Rows
@@ -135,13 +135,11 @@ class Mount(Brief, Description):
     inputs: dict[str, str] = {}
 
     @model_validator(mode="after")
-    def _consistent(self) -> "Mount":
+    def _check_consistency(self) -> "Mount":
         if [*map(len, self.T_platform_sensor)] != [4] * 4 or not is_rigid(self.transform(), within=1e-6):
             raise ValueError("T_platform_sensor must be a rigid 4x4 matrix")
-        if [*map(len, self.covariance)] != [6] * 6:
-            raise ValueError("covariance must be a symmetric 6x6 matrix")
-        covariance = np.array(self.covariance)
-        if np.abs(covariance - covariance.T).max() > 1e-9 * np.abs(covariance).max():
+        covariance = np.array(self.covariance) if [*map(len, self.covariance)] == [6] * 6 else np.full((6, 6), np.nan)
+        if not np.abs(covariance - covariance.T).max() <= 1e-9 * np.abs(covariance).max():
             raise ValueError("covariance must be a symmetric 6x6 matrix")
         if self.sensor is not None:
             by, apart = self.sensor.by_parameters, self.sensor.covariance_apart
@@ -152,19 +150,19 @@ class Mount(Brief, Description):
         return self
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write the mount as JSON, whole or not at all; OutputError if that fails."""
+        """Write the mount as JSON, completely or not at all; OutputError if that fails."""
         write_model(path, self, format=FORMAT, version=VERSION, overwrite=overwrite)
 
     def transform(self) -> np.ndarray:
-        """``T_platform_sensor`` as an array (4, 4), mm."""
+        """Return ``T_platform_sensor`` as an array (4, 4), mm."""
         return np.array(self.T_platform_sensor)
 
     def std(self) -> np.ndarray:
-        """Standard uncertainties (6,): translation, mm, and rotation about the platform's axes, rad."""
+        """Return the standard uncertainties (6,) of the translation, mm, and of the rotation, rad."""
         return np.sqrt(np.diag(np.array(self.covariance)))
 
     def size_mm(self) -> float:
-        """Radius or height of the artefact; 0 of one without a size."""
+        """Return the radius or height of the artefact; 0 for a plane or target."""
         match self.artefact:
             case SphereFound() | RingFound():
                 return self.artefact.radius_mm
@@ -176,10 +174,10 @@ class Mount(Brief, Description):
                 assert_never(self.artefact)
 
     def apart_from(self, calibration: str) -> tuple[np.ndarray, np.ndarray | None]:
-        """Covariance (6, 6) that is independent of points by a calibration of the sensor, given by its digest.
+        """Return the part (6, 6) of the covariance that is independent of a sensor calibration, given by its digest.
 
-        Where the mount was found with that calibration, there are also the mount's derivatives (6, P) by the parameters
-        of its joint estimate.
+        If the mount was estimated with that calibration, also return the derivatives (6, P) of the mount with respect
+        to the parameters of the joint estimate.
         """
         if self.sensor is None or self.sensor.calibration != calibration:
             return np.array(self.covariance), None

@@ -1,4 +1,4 @@
-"""Keys of the parameters of a joint estimate: what each is, its unit, how it is shown, and its text in files."""
+"""Keys of the parameters of a joint estimate, with description, unit and text in files."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -12,9 +12,9 @@ _DEG = float(np.degrees(1.0))
 
 @dataclass(frozen=True)
 class ParameterLabel:
-    """A parameter in words, its unit as shown, and the factor from the estimate's unit to that one.
+    """Description of a parameter, its displayed unit, and the factor from the estimate's unit to the displayed one.
 
-    Slopes are shown as angles: at 1 deg that is right to a part in 10 000.
+    Slopes are displayed as angles; at 1 deg, the error is 1 in 10 000.
     """
 
     words: str
@@ -22,17 +22,17 @@ class ParameterLabel:
     factor: float = 1.0
 
     def format_value(self, value: float, std: float) -> str:
-        """A value of the estimate in the unit shown, to the digits that its standard uncertainty leaves."""
+        """Format a value of the estimate in the displayed unit, with the significant digits of its uncertainty."""
         digits = max(0, int(np.ceil(1 - np.log10(self.factor * std))))
         return f"{self.factor * value:.{digits}f}"
 
     def format_with_std(self, value: float, std: float) -> str:
-        """The same with the standard uncertainty and the unit."""
+        """Format a value with its standard uncertainty and unit."""
         return f"{self.format_value(value, std)} +- {self.factor * std:.2g}{self.unit and ' '}{self.unit}"
 
 
 class _SingleParameter(Enum):
-    """Base of the kinds of which an estimate has at most one of each."""
+    """Base of the kinds with a fixed list of parameters, each at most once in an estimate."""
 
     text: str
     quantity: ParameterLabel
@@ -43,7 +43,7 @@ class _SingleParameter(Enum):
 
 
 class LensParameter(_SingleParameter):
-    """Parameters of the camera's lens; ``F`` stands for ``FX`` and ``FY`` where pixels are square."""
+    """Parameters of the camera's lens; ``F`` replaces ``FX`` and ``FY`` for square pixels."""
 
     F = "f", "focal length", "px"
     FX = "fx", "focal length along the rows", "px"
@@ -61,7 +61,7 @@ class LensParameter(_SingleParameter):
 
 
 class WindowParameter(_SingleParameter):
-    """Parameters of the camera's window; its normal runs along (``SLOPE_X``, ``SLOPE_Y``, 1)."""
+    """Parameters of the camera's window; its normal is parallel to (``SLOPE_X``, ``SLOPE_Y``, 1)."""
 
     DISTANCE = "window_distance", "window distance", "mm"
     SLOPE_X = "window_slope_x", "window tilt to the right", "°", _DEG
@@ -71,7 +71,7 @@ class WindowParameter(_SingleParameter):
 
 
 class SheetParameter(_SingleParameter):
-    """Parameters of the laser sheet: turns of its normal in rad, shift in mm, numbers of `FanModel`."""
+    """Parameters of the laser sheet: rotations of its normal in rad, offset in mm, and angles of `FanModel`."""
 
     TURN_FAN = "sheet_turn_fan", "turn of the sheet about its fan's direction", "°", _DEG
     TURN_AXIS = "sheet_turn_axis", "turn of the sheet about the laser's axis", "°", _DEG
@@ -81,7 +81,7 @@ class SheetParameter(_SingleParameter):
 
 
 class StageParameter(_SingleParameter):
-    """Relative error of the stage's scale; slopes of a scan's direction towards two directions across it."""
+    """Parameters of the stage: relative scale error, and slopes of a scan's direction towards two other axes."""
 
     SCALE = "stage_scale", "scale of the stage", "µm/m", 1e6
     SLOPE_1 = "scan_slope_1", "lean of the scan's direction (X towards Y)", "°", _DEG
@@ -89,8 +89,11 @@ class StageParameter(_SingleParameter):
 
 
 class TargetParameter(_SingleParameter):
-    """Errors of the target: bends in mm, as a dish at its corners, and as a saddle twice that of the middles of the
-    sides that its x axis crosses; relative stretch along x and y; shift of the stripe on it in px, as by gloss.
+    """Errors of the target.
+
+    ``BOW`` is the deviation of the corners in mm for a bowl shape. ``SADDLE`` is twice the deviation in mm of the
+    midpoints of the sides that the x axis crosses, for a saddle shape. ``STRETCH_X`` and ``STRETCH_Y`` are relative.
+    ``STRIPE`` is the shift of the stripe in px, caused for example by gloss.
     """
 
     BOW = "target_bow", "bend of the target", "µm", 1e3
@@ -105,24 +108,24 @@ _INDEX_OF, _HEIGHT_OF, _STEP = "index of ", "height of the ", " mm step"
 
 @dataclass(frozen=True)
 class MediumIndex:
-    """Refractive index of a medium, by the medium's name, relative to air."""
+    """Refractive index of a named medium, relative to air."""
 
     medium: str
 
     @property
     def text(self) -> str:
-        """The parameter in files."""
+        """Text of the parameter in files."""
         return f"{_INDEX_OF}{self.medium}"
 
     @property
     def quantity(self) -> ParameterLabel:
-        """The parameter as it is shown."""
+        """Label of the parameter."""
         return ParameterLabel(self.text)
 
 
 @dataclass(frozen=True)
 class StepHeight:
-    """Height in mm of a step standard, by its nominal height to six digits, as files have it."""
+    """Height in mm of a step standard, identified by its nominal height to six digits, as in files."""
 
     nominal_mm: float
 
@@ -131,12 +134,12 @@ class StepHeight:
 
     @property
     def text(self) -> str:
-        """The parameter in files."""
+        """Text of the parameter in files."""
         return f"{_HEIGHT_OF}{self.nominal_mm:g}{_STEP}"
 
     @property
     def quantity(self) -> ParameterLabel:
-        """Name that the parameter is shown by."""
+        """Label of the parameter."""
         return ParameterLabel(self.text, "mm")
 
 
@@ -147,21 +150,21 @@ _SINGLE: dict[str, SingleParameter] = {key.text: key for kind in get_args(Single
 
 
 def parameter_of(text: str) -> ParameterKey:
-    """The parameter that a file means by a text; ValueError where there is none."""
+    """Return the parameter with a text in files; ValueError if there is none."""
     if text in _SINGLE:
         return _SINGLE[text]
     if text.startswith(_INDEX_OF):
         return MediumIndex(text.removeprefix(_INDEX_OF))
     if text.startswith(_HEIGHT_OF) and text.endswith(_STEP):
         return StepHeight(float(text.removeprefix(_HEIGHT_OF).removesuffix(_STEP)))
-    raise ValueError(f"there is no parameter {text!r}")
+    raise ValueError(f"unknown parameter {text!r}")
 
 
-def _decoded(value: object) -> ParameterKey:
+def _decode(value: object) -> ParameterKey:
     if not isinstance(value, ParameterKey | str):
-        raise ValueError(f"a parameter is given by its text, not by {value!r}")
+        raise ValueError(f"a parameter is {value!r}; expected its text")
     return parameter_of(value) if isinstance(value, str) else value
 
 
-ParameterInFile = Annotated[ParameterKey, PlainValidator(_decoded), PlainSerializer(lambda key: key.text)]
-"""A parameter as a field of a pydantic model: a text in the file, a key in the program."""
+ParameterInFile = Annotated[ParameterKey, PlainValidator(_decode), PlainSerializer(lambda key: key.text)]
+"""Parameter as a field of a pydantic model: a text in files, a key in the program."""

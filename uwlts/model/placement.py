@@ -1,4 +1,4 @@
-"""Nominal placement of camera, laser and sheet, and checks that such a sensor can work."""
+"""Nominal placement of camera, laser and sheet, and checks of a design."""
 
 import math
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from uwlts.model.sensor import Medium, Sensor, Window
 
 @dataclass(frozen=True)
 class LaserPose:
-    """Fan of the laser in the camera frame: origin (3,) in mm, unit axis, fan direction and sheet normal (3,)."""
+    """Laser fan in the camera frame: origin (3,) in mm; axis, fan direction and sheet normal as unit vectors (3,)."""
 
     origin_mm: np.ndarray
     axis: np.ndarray
@@ -20,10 +20,10 @@ class LaserPose:
 
 
 def laser_pose(sensor: Sensor) -> LaserPose:
-    """Nominal pose of the laser's fan in the camera frame, with fan = axis x normal.
+    """Return the nominal pose of the laser's fan in the camera frame, with fan = axis x normal.
 
-    The sheet's normal is the baseline's direction (+x for a stripe along the height, -y along the width) made square
-    to the laser's axis, then turned by the roll about the axis.
+    The sheet's normal is the baseline's direction (+x for a stripe along the height, -y along the width), projected
+    onto the plane normal to the laser's axis and rotated by the roll about the axis.
     """
     laser = sensor.laser
     towards = np.array((1.0, 0.0, 0.0) if sensor.camera.stripe_along == "height" else (0.0, -1.0, 0.0))
@@ -38,7 +38,7 @@ def laser_pose(sensor: Sensor) -> LaserPose:
         raise DesignError("the laser is not placed: give baseline and triangulation angle, or origin and axis")
     normal = towards - (towards @ axis) * axis
     if np.linalg.norm(normal) < 1e-6:
-        raise DesignError("the laser's axis runs along the baseline: the sheet has no direction across it")
+        raise DesignError("the laser's axis runs along the baseline, so that the sheet is undefined: change the axis")
     normal /= np.linalg.norm(normal)
     fan = np.cross(axis, normal)
     roll = math.radians(laser.roll_deg)
@@ -47,11 +47,11 @@ def laser_pose(sensor: Sensor) -> LaserPose:
 
 
 def camera_from_object(sensor: Sensor) -> np.ndarray:
-    """``T_camera_object`` (4, 4): maps the object coordinate system (OCS) to the camera frame.
+    """Return ``T_camera_object`` (4, 4), which maps the object coordinate system (OCS) to the camera frame.
 
-    The OCS follows the thesis: X normal to the sheet, Z along the laser's axis away from the sensor, Y = Z x X along
-    the stripe; its origin is where the camera's axis meets the sheet (the stand-off). DesignError where that is not in
-    front of the window.
+    The OCS is that of the thesis: X normal to the sheet, Z along the laser's axis away from the sensor, Y = Z x X along
+    the stripe. Its origin is the intersection of the camera's axis with the sheet (the stand-off). Raises DesignError
+    if the origin is not in front of the window.
     """
     pose = laser_pose(sensor)
     crossing = pose.normal[2]
@@ -70,7 +70,7 @@ def camera_from_object(sensor: Sensor) -> np.ndarray:
 
 @dataclass(frozen=True)
 class SheetView:
-    """View of the sheet by the camera: line length at the stand-off and the depth range outside the window, mm."""
+    """Camera's view of the sheet: line length at the stand-off, and depth range outside the window, mm."""
 
     standoff_mm: float
     line_length_mm: float
@@ -81,16 +81,16 @@ class SheetView:
 def _half_width_mm(
     window: Window, medium_index: float, wavelength_nm: float, half_slope: float, depth_mm: np.ndarray
 ) -> np.ndarray:
-    """Half the width of a view of that half slope in air, at depths outside an untilted window, by Snell's law."""
+    """Return half the width of the view at depths outside an untilted window, from its half slope in air (Snell)."""
     sine = math.sin(math.atan(half_slope))
     slopes = [s / math.sqrt(1 - s * s) for s in (sine, sine / window.index(wavelength_nm), sine / medium_index)]
     return slopes[0] * window.distance_mm + slopes[1] * window.thickness_mm + slopes[2] * depth_mm
 
 
 def view_of_sheet(sensor: Sensor, medium: Medium) -> SheetView:
-    """Line length and depth range of the nominal sensor in a medium, with lens distortion and tilts left out.
+    """Return line length and depth range of the nominal sensor in a medium, without lens distortion and tilts.
 
-    DesignError where the sheet does not cross the view within ten stand-offs.
+    Raises DesignError if the sheet does not cross the view within ten stand-offs.
     """
     camera, wavelength, pose = sensor.camera, sensor.laser.wavelength_nm, laser_pose(sensor)
     index = medium.refractive_index(wavelength)
@@ -110,9 +110,13 @@ def view_of_sheet(sensor: Sensor, medium: Medium) -> SheetView:
 
 
 def check_design(sensor: Sensor, medium: Medium) -> SheetView:
-    """View of a sensor in the medium; DesignError with the reason and numbers where it cannot work there.
+    """Check a sensor's design in a medium and return its view of the sheet.
 
-    That is with a window smaller than the cone or fan that passes it, or a sheet that misses the measuring volume.
+    Raises
+    ------
+    DesignError
+        A window is smaller than the camera's cone of view or the laser's fan, or the camera does not see the sheet in
+        the measuring volume.
     """
     camera, laser = sensor.camera, sensor.laser
     window = camera.window
@@ -121,15 +125,15 @@ def check_design(sensor: Sensor, medium: Medium) -> SheetView:
         needed = 2 * half + camera.focal_length_mm / camera.f_number
         if needed > window.aperture_diameter_mm:
             raise DesignError(
-                f"the camera's window opens {window.aperture_diameter_mm:.1f} mm, but the cone of view is "
-                f"{needed:.1f} mm wide at its outer face: enlarge the window or bring it closer to the lens"
+                f"the camera's window has an aperture of {window.aperture_diameter_mm:.1f} mm, but the cone of view is "
+                f"{needed:.1f} mm wide at its outer face: enlarge the window or move it closer to the lens"
             )
     if laser.window.mounted:
         spread = 2 * math.tan(math.radians(laser.fan_angle_deg / 2)) * laser.window.distance_mm
         if spread > laser.window.aperture_diameter_mm:
             raise DesignError(
-                f"the laser's window opens {laser.window.aperture_diameter_mm:.1f} mm, but the fan is {spread:.1f} mm "
-                f"wide at its inner face: enlarge the window or bring it closer to the laser"
+                f"the laser's window has an aperture of {laser.window.aperture_diameter_mm:.1f} mm, but the fan is "
+                f"{spread:.1f} mm wide at its inner face: enlarge the window or move it closer to the laser"
             )
     view = view_of_sheet(sensor, medium)
     if view.nearest_mm > sensor.volume.far_mm or view.farthest_mm < sensor.volume.near_mm:

@@ -1,4 +1,4 @@
-"""The polynomial reference method's calibration: two polynomials for each profile line, stored as JSON."""
+"""Calibration by the polynomial reference method: two polynomials for each profile line, stored as JSON."""
 
 import json
 from pathlib import Path
@@ -10,23 +10,22 @@ from pydantic import Field, model_validator
 from uwlts.files.writing import written_aside
 from uwlts.model.brief import Brief
 from uwlts.model.calibration import Residuals
-from uwlts.model.sensor import Description, Medium, Positive, Table
+from uwlts.model.sensor import Description, Medium, Positive, Rows, Table
 
 FORMAT, VERSION = "uwlts-polynomials", 1
 Pair = tuple[float, float]
-Rows = tuple[tuple[float, ...], ...]
 
 
 class PolynomialCalibration(Brief, Description):
-    """A sensor calibrated by polynomials (thesis, section 4.7): stripe position to Z, and Z to Y, for each line.
+    """Sensor calibrated by polynomials for each line: stripe position to Z, and Z to Y (thesis section 4.7).
 
-    It holds in the medium and with the window it was made with, and only where its evidence reached. Both polynomials
-    of a line are of ``degree``; the first row is the line ``first_line``. On ``position_range_px`` and
-    ``depth_range_mm``, of the stripe position and of Z in the OCS, the arguments of the Legendre polynomials run from
-    -1 to 1 in all lines.
-    ``domains_px`` has for each line the range of stripe positions that was calibrated, None for a line without any;
-    ``depth_coefficients`` and ``along_coefficients`` have a row of Legendre coefficients in mm for each line, of
-    Z(position) and of Y(Z).
+    The calibration is valid only in its own medium, with the same window, and within the range of its evidence.
+
+    Both Legendre polynomials of a line have the degree ``degree``. ``depth_coefficients`` (Z of position) and
+    ``along_coefficients`` (Y of Z) have one row of coefficients in mm for each line; the first row belongs to
+    ``first_line``. In all lines, the arguments -1 to 1 correspond to ``position_range_px`` (stripe position) and
+    ``depth_range_mm`` (Z in the OCS). ``domains_px`` is the calibrated range of stripe positions of each line, None for
+    a line without calibration.
     """
 
     sensor_name: str
@@ -49,13 +48,13 @@ class PolynomialCalibration(Brief, Description):
 
     @property
     def joint(self) -> None:
-        """Polynomials hold no joint estimate."""
+        """Always None: polynomials come without a joint estimate."""
 
     @model_validator(mode="after")
-    def _consistent(self) -> "PolynomialCalibration":
+    def _check_consistency(self) -> "PolynomialCalibration":
         count, lines = len(self.domains_px), self.width_px if self.stripe_along == "width" else self.height_px
         if not 0 < count <= lines - self.first_line:
-            raise ValueError(f"{count} lines from line {self.first_line} on do not lie in an image of {lines} lines")
+            raise ValueError(f"{count} lines from line {self.first_line} on do not fit an image of {lines} lines")
         for name in ("depth_coefficients", "along_coefficients"):
             if [*map(len, getattr(self, name))] != [self.degree + 1] * count:
                 expected = f"{count} rows of {self.degree + 1} numbers"
@@ -63,29 +62,29 @@ class PolynomialCalibration(Brief, Description):
         for name in ("position_range_px", "depth_range_mm"):
             low, high = getattr(self, name)
             if not low < high:
-                raise ValueError(f"{name} must grow, not go from {low:g} to {high:g}")
+                raise ValueError(f"{name} must increase; found {low:g} to {high:g}")
         low, high = self.position_range_px
         known = [domain for domain in self.domains_px if domain is not None]
         if not known or not all(low <= a <= b <= high for a, b in known):
-            raise ValueError("domains_px must name ranges that grow and lie within position_range_px")
+            raise ValueError("domains_px must have increasing ranges within position_range_px")
         return self
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write the calibration as JSON, whole or not at all; OutputError if that fails."""
-        # One key a line: indented, the thousands of coefficients would take a line each.
+        """Write the calibration as JSON, completely or not at all; OutputError if that fails."""
+        # One line for each key; with indentation, each of thousands of coefficients would take a line.
         content = {"format": FORMAT, "version": VERSION} | self.model_dump(mode="json")
         lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value)}" for key, value in content.items())
         with written_aside(path, overwrite=overwrite) as aside:
             aside.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
 
     def figures(self, step: str) -> Table:
-        """Figures of a step among the residuals; none where there are none of it."""
+        """Return the figures of a calibration step; an empty table if there are none."""
         return self.residuals.get(step, {})
 
     def index_of(self, medium: Medium) -> float:
-        """Refractive index of a medium at the laser's wavelength, relative to air; RangeError where it has none."""
+        """Return the index of a medium at the laser's wavelength, relative to air; RangeError outside the formula."""
         return medium.refractive_index(self.wavelength_nm)
 
     def domains(self) -> np.ndarray:
-        """``domains_px`` as an array (L, 2), NaN for None."""
+        """Return ``domains_px`` as an array (L, 2) with NaN for None."""
         return np.array([(np.nan, np.nan) if domain is None else domain for domain in self.domains_px])

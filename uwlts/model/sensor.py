@@ -1,7 +1,7 @@
-"""Description of a sensor: what drawings and data sheets say, read from TOML, validated when made.
+"""Description of a sensor from drawings and data sheets, read from TOML and validated when made.
 
-Everything here is nominal. Lengths are mm, the camera frame is x right, y down, z along the optical axis with its
-origin at the entrance pupil; all refractive indices are relative to air.
+All values are nominal. Lengths are in mm. The camera frame has x to the right, y down, z along the optical axis, and
+its origin at the entrance pupil. All refractive indices are relative to air.
 """
 
 import math
@@ -33,10 +33,10 @@ _Length = Annotated[float, Field(ge=1e-6, le=1e6)]
 """A length of a sensor in mm: from 1 nm to 1 km, so that no product of lengths leaves the range of numbers."""
 
 _Coordinate = Annotated[float, Field(ge=-1e6, le=1e6)]
-"""A coordinate in an image in px; those far outside the image are of lenses that are shifted."""
+"""A coordinate in an image in px; shifted lenses have principal points far outside the image."""
 
 
-def _unit(vector: Vector) -> Vector:
+def _check_unit(vector: Vector) -> Vector:
     if not np.isclose(np.linalg.norm(vector), 1, atol=1e-6):
         raise ValueError(f"{vector} is not a unit vector")
     return vector
@@ -45,36 +45,38 @@ def _unit(vector: Vector) -> Vector:
 Rows = tuple[tuple[float, ...], ...]
 
 
-def _mounted(rows: Rows) -> Rows:
+def _check_mounting(rows: Rows) -> Rows:
     matrix = np.array(rows) if [*map(len, rows)] == [4] * 4 else np.zeros((4, 4))
-    turn = matrix[:3, :3]
-    if not (np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) and np.linalg.det(turn) > 0 and matrix[3, 3] == 1):
-        raise ValueError("must be a 4x4 matrix of a rotation, a shift, and 0 0 0 1")
+    rotation = matrix[:3, :3]
+    square = rotation @ rotation.T
+    if not (np.allclose(square, np.eye(3), atol=1e-6) and np.linalg.det(rotation) > 0 and matrix[3, 3] == 1):
+        raise ValueError("must be a 4x4 rigid transform: rotation, translation, and last row 0 0 0 1")
     return rows
 
 
-UnitVector = Annotated[Vector, AfterValidator(_unit)]
+UnitVector = Annotated[Vector, AfterValidator(_check_unit)]
 
 _INDEX_FORMULA = 1.5e-5
-"""Error that Quan and Fry (1995) give for their formula of the index of water."""
+"""Uncertainty of the formula for the index of water, as stated by Quan and Fry (1995)."""
 
 
 Table = Annotated[dict[str, JsonValue], BeforeValidator(to_jsonable_python), AfterValidator(require_plain)]
-"""A table of a TOML or JSON file that is checked where it is used."""
+"""A table of a TOML or JSON file; code that uses it checks its content."""
 
 
 class Description(BaseModel):
-    """Base of all descriptions: frozen, unknown keys and non-finite numbers refused."""
+    """Base class of all descriptions: frozen; rejects unknown keys and numbers that are not finite."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Window(Description):
-    """A flat window before a module. ``distance_mm`` runs along the module's axis from its origin to the inner face.
+    """Flat window in front of a module (camera or laser).
 
-    The normal is the module's axis turned by ``tilt_x_deg`` about the module's x axis, then ``tilt_y_deg`` about its y
-    axis. ``glass`` is a name known to `uwlts.model.media` or a refractive index relative to air. An unmounted window is
-    left out of the light's way: the module looks straight into the medium, which is then air.
+    ``distance_mm`` is measured along the module's axis from its origin to the inner face. The normal is the module's
+    axis, rotated by ``tilt_x_deg`` about the module's x axis, then by ``tilt_y_deg`` about its y axis. ``glass`` is a
+    name in `uwlts.model.media.GLASSES` or a refractive index relative to air. Without a mounted window the module looks
+    directly into the medium, which must be air.
     """
 
     distance_mm: _Length
@@ -88,37 +90,37 @@ class Window(Description):
 
     @field_validator("glass")
     @classmethod
-    def _known_glass(cls, value: str | float) -> str | float:
+    def _check_glass(cls, value: str | float) -> str | float:
         if isinstance(value, str):
             media.find_glass(value)
         return value
 
     def index(self, wavelength_nm: float) -> float:
-        """Refractive index of the glass relative to air."""
+        """Return the refractive index of the glass relative to air."""
         name = self.glass
         return media.glass_index(name, wavelength_nm=wavelength_nm) if isinstance(name, str) else name
 
     def absorption_per_mm(self) -> float:
-        """Absorption of the glass in 1/mm: the given value, else the named glass's at 635 nm, else none."""
+        """Return the absorption of the glass in 1/mm: the given value, else the named glass's at 635 nm, else 0."""
         if self.absorption_per_m is not None:
             return 1e-3 * self.absorption_per_m
         return 1e-3 * media.find_glass(self.glass).absorption_per_m if isinstance(self.glass, str) else 0.0
 
     def normal(self) -> np.ndarray:
-        """Unit normal (3,) in the module's frame, pointing along the light of a camera ray (away from the module)."""
+        """Return the unit normal (3,) in the module's frame, directed away from the module."""
         x, y = math.radians(self.tilt_x_deg), math.radians(self.tilt_y_deg)
         return np.array([math.cos(x) * math.sin(y), -math.sin(x), math.cos(x) * math.cos(y)])
 
 
 _Coefficient = Annotated[float, Field(ge=-1e9, le=1e9)]
-"""Those of telephoto lenses reach thousands, as r is small; with r6 products stay in the range of numbers."""
+"""Telephoto lenses have coefficients of several thousand, because r is small. The limit prevents overflow with r^6."""
 
 
 class Distortion(Description):
-    """Coefficients in OpenCV's order and sense: Brown-Conrady's, and with k4, k5 and k6 the rational model's.
+    """Distortion coefficients in OpenCV's order: the Brown-Conrady model, or with k4, k5 and k6 the rational model.
 
-    With r2 = x2 + y2 a point (x, y) is seen at x g + 2 p1 x y + p2 (r2 + 2 x2), y g + 2 p2 x y + p1 (r2 + 2 y2), where
-    g = (1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5 r4 + k6 r6).
+    The radial factor is g = (1 + k1 r2 + k2 r4 + k3 r6) / (1 + k4 r2 + k5 r4 + k6 r6) with r2 = x2 + y2. The distorted
+    image of (x, y) is x g + 2 p1 x y + p2 (r2 + 2 x2), y g + 2 p2 x y + p1 (r2 + 2 y2).
     """
 
     k1: _Coefficient = 0.0
@@ -131,20 +133,21 @@ class Distortion(Description):
     k6: _Coefficient = 0.0
 
     def is_rational(self) -> bool:
-        """Whether the radial factor has a denominator."""
+        """Return whether the radial factor is a rational function."""
         return self.k4 != 0 or self.k5 != 0 or self.k6 != 0
 
     def used(self) -> dict[str, float]:
-        """The coefficients of the model in use: Brown-Conrady's five, or all eight of the rational one."""
+        """Return the coefficients of the model in use: five for Brown-Conrady, all eight for the rational model."""
         return self.model_dump(exclude=None if self.is_rational() else {"k4", "k5", "k6"})
 
 
 class Camera(Description):
-    """Image sensor and lens. ``focal_length_mm`` is the pinhole's image distance (camera constant).
+    """Image sensor and lens.
 
-    ``stripe_along`` is the side of the image along which the laser stripe runs: "width" (1280 in the thesis's camera,
-    one peak per column) or "height" (1024, one peak per row). It also places the laser: above the camera (-y) for
-    "width", to its right (+x) for "height". A pixel is ``pixel_size_um`` wide, ``pixel_aspect`` times its height.
+    ``focal_length_mm`` is the image distance of the pinhole model (camera constant). ``stripe_along`` is the direction
+    of the laser stripe in the image: "width" (one peak per column, 1280 in the thesis's camera) or "height" (one peak
+    per row, 1024). It also defines the side of the laser: above the camera (-y) for "width", to the right (+x) for
+    "height". ``pixel_size_um`` is the width of a pixel, and ``pixel_aspect`` its width divided by its height.
     """
 
     width_px: Annotated[int, Field(ge=16, le=20000)]
@@ -160,39 +163,40 @@ class Camera(Description):
     window: Window
 
     def principal_point(self) -> tuple[float, float]:
-        """Principal point in px; the image centre unless given. Pixel (0, 0) is the centre of the first pixel."""
+        """Return the principal point in px, by default the image centre. Pixel (0, 0) is the first pixel's centre."""
         return self.principal_point_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
 
     def focal_length_px(self) -> float:
-        """Focal length in pixels, along x where they are not square."""
+        """Return the focal length in pixels along x."""
         return 1e3 * self.focal_length_mm / self.pixel_size_um
 
     def focal_lengths_px(self) -> tuple[float, float]:
-        """Focal lengths in pixels along x and y."""
+        """Return the focal lengths in pixels along x and y."""
         return self.focal_length_px(), self.pixel_aspect * self.focal_length_px()
 
     def corner_slope(self) -> float:
-        """Slope in air of the rays to the corners of the image, its middle being the principal point."""
+        """Return the slope in air of the rays to the image's corners, for a principal point in the image's centre."""
         fx, fy = self.focal_lengths_px()
         return math.hypot(self.width_px / fx, self.height_px / fy) / 2
 
     def lines(self) -> int:
-        """Number of profile lines in an image: its columns if the stripe runs along the width, else its rows."""
+        """Return the number of profile lines: image columns if the stripe runs along the width, else image rows."""
         return self.width_px if self.stripe_along == "width" else self.height_px
 
 
 class Laser(Description):
-    """Sheet source. Place it by ``baseline_mm`` and ``triangulation_angle_deg``, or by ``origin_mm`` and ``axis``.
+    """Laser that emits a sheet of light.
 
-    The baseline runs in the camera's x-y plane from the entrance pupil to the fan's origin, the angle lies between the
-    camera's and the laser's axis. ``waist_radius_mm`` is the 1/e2 radius across the sheet at ``waist_distance_mm`` from
-    the origin, in the medium of use. ``roll_deg`` turns the fan about the laser's axis.
+    It is placed either by ``baseline_mm`` and ``triangulation_angle_deg``, or by ``origin_mm`` and ``axis``. The
+    baseline runs in the camera's x-y plane from the entrance pupil to the fan's origin. The angle is that between the
+    camera's and the laser's axes. ``roll_deg`` rotates the fan about the laser's axis.
 
-    ``power_mw`` leaves the line optics, spread over the fan as ``fan_profile`` says: "flat", the same power in every
-    angle; "gaussian", exp(-2 (angle / half the fan)^2) up to the fan's edges; or pairs of an angle in deg and a
-    relative power per angle, linear between them and zero outside. A beam that enters the line optics tilted by
-    ``bow_deg`` gives a line that curves towards the sheet's normal (positive) or away from it.
-    ``linewidth_nm`` is the full width at half maximum of the spectrum.
+    ``waist_radius_mm`` is the 1/e^2 radius across the sheet at ``waist_distance_mm`` from the origin, in the medium of
+    use. ``power_mw`` is the power behind the line optics. ``fan_profile`` is its distribution over the fan: "flat", a
+    constant power per angle; "gaussian", exp(-2 (angle / half the fan)^2) up to the fan's edges; or pairs of an angle
+    in deg and a relative power per angle, interpolated linearly and zero outside. ``bow_deg`` is the tilt of the beam
+    at the line optics, which curves the line towards the sheet's normal (positive) or away from it. ``linewidth_nm`` is
+    the full width at half maximum of the spectrum.
     """
 
     wavelength_nm: Annotated[float, Field(ge=400, le=700)]
@@ -212,17 +216,17 @@ class Laser(Description):
     window: Window
 
     @model_validator(mode="after")
-    def _placed_once(self) -> "Laser":
+    def _check_placement(self) -> "Laser":
         by_angle = (self.baseline_mm is not None, self.triangulation_angle_deg is not None)
         by_axis = (self.origin_mm is not None, self.axis is not None)
         if (all(by_angle), any(by_axis)) != (True, False) and (any(by_angle), all(by_axis)) != (False, True):
             raise ValueError("place the laser by baseline_mm and triangulation_angle_deg, or by origin_mm and axis")
         if self.axis is not None and np.linalg.norm(self.axis) < 1e-9:
-            raise ValueError(f"axis {self.axis} has no direction")
+            raise ValueError(f"axis is {self.axis}; expected a vector other than zero")
         return self
 
     @model_validator(mode="after")
-    def _profile_within_the_fan(self) -> "Laser":
+    def _check_fan_profile(self) -> "Laser":
         if isinstance(self.fan_profile, str):
             return self
         if (count := len(self.fan_profile)) < 2:
@@ -245,18 +249,18 @@ AnyPhase = str | phase_functions.DescribedPhase | None
 
 
 class Medium(Description):
-    """Air, fresh or sea water by temperature and salinity, or any medium with its index given.
+    """Medium of a measurement: air, fresh or sea water with temperature and salinity, or custom with a given index.
 
-    Water is pure unless ``water`` names one known to `uwlts.model.waters`, or ``turbidity`` sweeps it from pure (0)
-    over clear (1) and coastal (2) to harbour (3). ``absorption_per_m`` and ``scattering_per_m`` replace what follows
-    from these.
+    Water is pure by default. ``water`` selects a natural water of `uwlts.model.waters`; ``turbidity`` interpolates from
+    pure (0) over clear (1) and coastal (2) to harbour (3). ``absorption_per_m`` and ``scattering_per_m`` replace the
+    resulting coefficients.
 
-    ``phase`` is the phase function of the particles, while the molecules of water scatter as molecules do; of
-    everything if ``scattering_per_m`` is given. It is a name of `uwlts.model.phase_functions.KINDS`, of which
-    "henyey-greenstein" takes ``asymmetry``, and "fournier-forand" ``particle_index`` (relative to water) and
-    ``particle_slope`` (of the size distribution), which ``backscatter_share`` replaces if given; or a table of a
-    ``kind`` with parameters of its own. Unless given it is that of the named ``water``, "petzold" where ``turbidity``
-    is given, else "molecular".
+    ``phase`` is the phase function of the particles; scattering by water molecules is added. If ``scattering_per_m`` is
+    given, ``phase`` applies to all scattering. It is a name in `uwlts.model.phase_functions.KINDS`, or a table with a
+    ``kind`` and its parameters. The name "henyey-greenstein" uses ``asymmetry``. The name "fournier-forand" uses
+    ``particle_index`` (relative to water) and ``particle_slope`` (of the size distribution), or ``backscatter_share``
+    instead if it is given. The default is the phase function of the named ``water``, "petzold" with ``turbidity``, else
+    "molecular".
     """
 
     kind: Literal["air", "fresh", "sea", "custom"]
@@ -275,14 +279,14 @@ class Medium(Description):
 
     @field_validator("water")
     @classmethod
-    def _known_water(cls, value: str | None) -> str | None:
+    def _check_water(cls, value: str | None) -> str | None:
         if value is not None and value not in waters.WATERS:
             raise ValueError(f"unknown water; known are {', '.join(waters.WATERS)}")
         return value
 
     @field_validator("phase")
     @classmethod
-    def _known_phase(cls, value: AnyPhase) -> AnyPhase:
+    def _check_phase(cls, value: AnyPhase) -> AnyPhase:
         if isinstance(value, str):
             phase_functions.phase_function_kind(value)
         elif value is not None:
@@ -290,7 +294,7 @@ class Medium(Description):
         return value
 
     @model_validator(mode="after")
-    def _consistent(self) -> "Medium":
+    def _check_consistency(self) -> "Medium":
         if self.kind == "custom" and self.index is None:
             raise ValueError("a custom medium needs its index")
         if self.kind == "fresh" and self.salinity_g_kg > 0:
@@ -298,38 +302,38 @@ class Medium(Description):
         if self.water is not None and self.turbidity is not None:
             raise ValueError(f"give water ('{self.water}') or turbidity ({self.turbidity:g}), not both")
         if self.kind == "air" and (self.water is not None or self.turbidity is not None):
-            raise ValueError("air has neither water nor turbidity: use kind = 'fresh', 'sea' or 'custom'")
+            raise ValueError("air must have neither water nor turbidity: use kind = 'fresh', 'sea' or 'custom'")
         if self.kind in ("fresh", "sea") and self.index is None:
             self.refractive_index(635.0)
         return self
 
     def refractive_index(self, wavelength_nm: float) -> float:
-        """Refractive index relative to air; RangeError outside the formula's range."""
+        """Return the refractive index relative to air; RangeError outside the formula's range."""
         if self.index is not None or self.kind == "air":
             return self.index or 1.0
         state = {"temperature_c": self.temperature_c, "salinity_g_kg": self.salinity_g_kg}
         return media.water_index(wavelength_nm=wavelength_nm, **state)
 
     def index_per_kelvin(self, wavelength_nm: float) -> float:
-        """Change of the index with temperature; 0 where it is given."""
+        """Return the derivative of the index with respect to temperature, 1/K; 0 for a given index."""
         if self.index is not None or self.kind == "air":
             return 0.0
-        # The formula ends at 30 degC.
+        # The formula is valid up to 30 degC.
         here = self.model_copy(update={"temperature_c": min(self.temperature_c, 29.0)})
         return here.warmer_by(1.0).refractive_index(wavelength_nm) - here.refractive_index(wavelength_nm)
 
     def index_uncertainty(self, wavelength_nm: float, uncertainty: "Uncertainty") -> float:
-        """Standard uncertainty of the index, from the temperature's where it follows from that."""
+        """Return the standard uncertainty of the index, propagated from the temperature unless the index is given."""
         if self.index is not None or self.kind == "air":
             return uncertainty.index
         return math.hypot(self.index_per_kelvin(wavelength_nm) * uncertainty.temperature_k, _INDEX_FORMULA)
 
     def warmer_by(self, kelvin: float) -> "Medium":
-        """The same medium at another temperature."""
+        """Return the medium at a higher temperature."""
         return self.model_copy(update={"temperature_c": self.temperature_c + kelvin})
 
     def absorption_per_mm(self, wavelength_nm: float) -> float:
-        """Absorption coefficient a in 1/mm; RangeError outside the tables."""
+        """Return the absorption coefficient a in 1/mm; RangeError outside the tables."""
         if self.absorption_per_m is not None:
             return 1e-3 * self.absorption_per_m
         if not self._is_water():
@@ -338,11 +342,11 @@ class Medium(Description):
         return 1e-3 * (pure + self._particles(wavelength_nm).absorption_per_m)
 
     def scattering_per_mm(self, wavelength_nm: float) -> float:
-        """Scattering coefficient b in 1/mm; RangeError outside the tables."""
+        """Return the scattering coefficient b in 1/mm; RangeError outside the tables."""
         return sum((part.coefficient_per_mm for part in self.scatterers(wavelength_nm)), 0.0)
 
     def scatterers(self, wavelength_nm: float) -> tuple[phase_functions.Scatterer, ...]:
-        """The kinds of scatterers, each with its part of b and its phase function; RangeError outside the tables."""
+        """Return the kinds of scatterers with their coefficients and phase functions; RangeError outside the tables."""
         if self.scattering_per_m is not None:
             parts = [(self.scattering_per_m, self._phase_function())]
         elif self._is_water():
@@ -354,7 +358,7 @@ class Medium(Description):
         return tuple(phase_functions.Scatterer(1e-3 * b, phase) for b, phase in parts if b > 0)
 
     def _is_water(self) -> bool:
-        """Whether absorption and scattering are those of water, pure or not, unless given."""
+        """Return whether absorption and scattering follow from the properties of water."""
         return self.kind in ("fresh", "sea") or self.water is not None or self.turbidity is not None
 
     def _particles(self, wavelength_nm: float) -> waters.Particles:
@@ -365,7 +369,7 @@ class Medium(Description):
     def _phase_function(self) -> phase_functions.PhaseFunction:
         if isinstance(self.phase, phase_functions.DescribedPhase):
             return self.phase.phase_function()
-        # The scale of turbidity runs over Petzold's stations.
+        # The turbidity scale interpolates between Petzold's stations.
         name = self.phase or ("molecular" if self.turbidity is None else "petzold")
         if self.phase is None and self.water is not None:
             name = waters.named_water(self.water).phase
@@ -374,24 +378,24 @@ class Medium(Description):
         return phase_functions.phase_function_kind(name).of_keys(keys)
 
     def extinction_per_mm(self, wavelength_nm: float) -> float:
-        """Extinction coefficient c = a + b in 1/mm, by which a beam grows weaker."""
+        """Return the beam attenuation coefficient c = a + b in 1/mm."""
         return self.absorption_per_mm(wavelength_nm) + self.scattering_per_mm(wavelength_nm)
 
 
 class Detector(Description):
-    """Image sensor after EMVA 1288: photons to electrons to grey values. The gain maps the full well to full scale.
+    """Image sensor model after EMVA 1288: photons to electrons to grey values. The full well maps to full scale.
 
-    ``dark_current_e_per_s`` holds at ``reference_temperature_c`` and doubles with every ``dark_current_doubling_k``
-    up to ``temperature_c``, the image sensor's own.
+    ``dark_current_e_per_s`` is the value at ``reference_temperature_c``. It doubles for each increase of
+    ``temperature_c``, the image sensor's temperature, by ``dark_current_doubling_k``.
 
-    How pixels differ belongs to the camera, for whose serial number ``pattern_seed`` stands. ``prnu`` is the rms of
-    their gain as a share of the light's signal. ``dsnu_e`` is the rms in electrons of the dark image of short exposure,
-    an offset of the readout that neither exposure nor temperature changes; ``dsnu_row_e`` and ``dsnu_column_e`` are
-    offsets in addition that whole rows and columns share. ``hot_pixels_per_million`` have a dark current on top of the
-    others', exponentially distributed about a mean of ``hot_pixel_dark_current_e_per_s`` at the reference temperature.
+    Differences between pixels are constant for a camera; ``pattern_seed`` identifies the camera, as a serial number
+    does. ``prnu`` is the rms of the relative gain. ``dsnu_e`` is the rms in electrons of the readout offset, which is
+    independent of exposure and temperature. ``dsnu_row_e`` and ``dsnu_column_e`` are additional offsets of rows and
+    columns. Hot pixels, ``hot_pixels_per_million``, have an additional dark current. It is exponentially distributed
+    with the mean ``hot_pixel_dark_current_e_per_s`` at the reference temperature.
 
-    ``blooming`` is the share of the charge above the full well that spills along the columns; the rest is drained.
-    A "rolling" shutter starts to expose each row ``line_time_us`` after the row above it.
+    ``blooming`` is the fraction of the charge above the full well that spills along the columns; the rest is drained.
+    A "rolling" shutter starts the exposure of each row ``line_time_us`` after that of the row above.
     """
 
     bits: Literal[8, 10, 12]
@@ -416,7 +420,7 @@ class Detector(Description):
     line_time_us: NotNegative = 0.0
 
     @model_validator(mode="after")
-    def _complete(self) -> "Detector":
+    def _check_completeness(self) -> "Detector":
         if self.shutter == "rolling" and self.line_time_us == 0:
             raise ValueError("a rolling shutter needs line_time_us, the delay from row to row; found 0")
         if (self.hot_pixels_per_million > 0) != (self.hot_pixel_dark_current_e_per_s > 0):
@@ -427,40 +431,42 @@ class Detector(Description):
         return self
 
     def full_scale_dn(self) -> int:
-        """Largest grey value."""
+        """Return the largest grey value."""
         return 2**self.bits - 1
 
     def gain_dn_per_e(self) -> float:
-        """Overall system gain K in grey values per electron."""
+        """Return the overall system gain K in grey values per electron."""
         return self.full_scale_dn() / self.full_well_e
 
     def dark_current_growth(self) -> float:
-        """Dark current at the image sensor's temperature over that at the reference (EMVA 1288 release 4)."""
+        """Return the ratio of the dark currents at image sensor and reference temperature (EMVA 1288 release 4)."""
         return 2.0 ** ((self.temperature_c - self.reference_temperature_c) / self.dark_current_doubling_k)
 
 
 LEAST_BRACKET_STEP = 1.5
-"""Ratio of exposures at one place from which they are a bracket; closer ones are repeats."""
+"""Least ratio of successive exposures in a bracket; exposures that are closer are repeats."""
 
 MOST_IN_BRACKET = 8
-"""Exposures at one place at most."""
+"""Largest number of exposures in a bracket."""
 
 
-def _growing(factors: tuple[float, ...]) -> tuple[float, ...]:
+def _check_bracket(factors: tuple[float, ...]) -> tuple[float, ...]:
     if factors[0] != 1 or any(b < LEAST_BRACKET_STEP * a for a, b in pairwise(factors)):
         raise ValueError(
-            f"bracket is {factors}; expected multiples of the exposure that begin with 1, each at least "
-            f"{LEAST_BRACKET_STEP:g} times the one before, such as [1, 4, 16]"
+            f"bracket is {factors}; expected increasing factors of the exposure, the first 1 and each at least "
+            f"{LEAST_BRACKET_STEP:g} times the previous one, such as [1, 4, 16]"
         )
     return factors
 
 
-Bracket = Annotated[tuple[Positive, ...], Field(min_length=1, max_length=MOST_IN_BRACKET), AfterValidator(_growing)]
-"""Multiples of the laser's exposure, growing from 1, at which images of one place are taken to be fused."""
+Bracket = Annotated[
+    tuple[Positive, ...], Field(min_length=1, max_length=MOST_IN_BRACKET), AfterValidator(_check_bracket)
+]
+"""Factors of the laser images' exposure, increasing from 1. Images with these exposures are fused."""
 
 
 class Exposure(Description):
-    """Exposure of laser and of lamp images in ms; "auto" brings the brightest light to ``auto_level`` of full scale."""
+    """Exposure of laser and lamp images in ms. With "auto", the brightest pixel is at ``auto_level`` of full scale."""
 
     laser_ms: Positive | Literal["auto"] = "auto"
     lamp_ms: Positive | Literal["auto"] = "auto"
@@ -469,9 +475,9 @@ class Exposure(Description):
 
 
 class Lamp(Description):
-    """Other light than the laser's, at the laser's wavelength: what it puts on every surface.
+    """Light other than the laser's, as irradiance on every surface at the laser's wavelength.
 
-    The lamp is on when the laser is off; ``ambient_w_per_m2`` is daylight behind the camera's filter, always there.
+    The lamp is on when the laser is off. ``ambient_w_per_m2`` is constant daylight, behind the camera's filter.
     """
 
     irradiance_w_per_m2: Positive = 5.0
@@ -479,7 +485,7 @@ class Lamp(Description):
 
 
 class Stage(Description):
-    """Linear stage that moves the sensor; speed and acceleration are the largest that it does."""
+    """Linear stage that moves the sensor; speed and acceleration are its limits."""
 
     travel_mm: Positive
     resolution_mm: Positive
@@ -489,30 +495,37 @@ class Stage(Description):
 
 
 class Volume(Description):
-    """Measuring volume along the camera's axis, counted from the outer face of its window."""
+    """Measuring volume: depths along the camera's axis from the outer face of its window."""
 
     near_mm: _Length
     far_mm: _Length
 
     @model_validator(mode="after")
-    def _ordered(self) -> "Volume":
+    def _check_order(self) -> "Volume":
         if self.near_mm >= self.far_mm:
             raise ValueError(f"near_mm {self.near_mm:g} must be smaller than far_mm {self.far_mm:g}")
         return self
 
 
 class Uncertainty(Description):
-    """Standard uncertainties of what drawings, data sheets and certificates say, for the joint calibration.
+    """Standard uncertainties of values from drawings, data sheets and certificates, for the joint calibration.
 
-    Of the windows: distance and tilt of the camera's, thickness and index of its glass, tilt of the laser's against the
-    sheet. ``bow_deg`` is the tilt of the beam into the line optics. ``temperature_k`` is that of a medium whose index
-    follows from its temperature, ``drift_k`` how much it may change between calibration and scan; ``index`` that of a
-    medium whose index is given. Of the stage: each position, the scale of
-    all of them, and its direction against the target's normal. Of the standards: how far the target's corners lie off
-    its plane when it bends like a dish or like a saddle, the relative error of its lengths along rows and columns, by
-    how much its surface shifts the stripe, and the height of the steps. ``tangential`` is that of the lens's p1 and p2;
-    ``sheet_thickness`` is relative: that of the thickness of the laser's sheet. An uncertainty of zero means that the
-    quantity is not estimated but taken as described.
+    A quantity with zero uncertainty is not estimated; its described value is used.
+
+    - ``window_distance_mm``, ``window_tilt_deg``, ``glass_thickness_mm``, ``glass_index``: the camera's window.
+    - ``laser_window_tilt_deg``: tilt of the laser's window relative to the sheet.
+    - ``bow_deg``: tilt of the beam at the line optics.
+    - ``temperature_k``: temperature of a medium whose index follows from its temperature; ``drift_k``: change of this
+      temperature between calibration and scan.
+    - ``index``: index of a medium with a given index.
+    - ``stage_position_mm``: each stage position; ``stage_scale``: scale of all stage positions;
+      ``stage_alignment_deg``: stage direction relative to the target's normal.
+    - ``target_bow_mm``: deviation of the target's corners from its plane by a bow or saddle shape; ``target_stretch``:
+      relative error of the target's lengths along rows and columns; ``target_stripe_px``: shift of the stripe by the
+      target's surface.
+    - ``step_height_mm``: height of a step standard.
+    - ``tangential``: the lens's coefficients p1 and p2.
+    - ``sheet_thickness``: thickness of the laser sheet, relative.
     """
 
     window_distance_mm: NotNegative = 5.0
@@ -535,15 +548,15 @@ class Uncertainty(Description):
     sheet_thickness: NotNegative = 0.1
 
     def stage_lean(self) -> float:
-        """Standard uncertainty of the direction of the stage as a slope."""
+        """Return the standard uncertainty of the stage's direction as a slope."""
         return float(np.tan(np.radians(self.stage_alignment_deg)))
 
 
 class Sensor(Description):
-    """A complete sensor with the media it is used in.
+    """Complete sensor and the media of its use, by name.
 
-    ``more_lasers`` shine further sheets at the same time. ``stripe`` holds settings of how the stripe is found in the
-    sensor's images, where they are to differ from the usual ones (`uwlts.stripe.StripeOptions`).
+    ``more_lasers`` emit further sheets at the same time. ``stripe`` contains options of stripe detection
+    (`uwlts.stripe.StripeOptions`) that differ from the defaults.
     """
 
     name: str
@@ -561,30 +574,30 @@ class Sensor(Description):
     stripe: Table = {}
 
     def medium(self, name: str) -> Medium:
-        """One of the sensor's media; DescriptionError where it has none of this name."""
+        """Return one of the sensor's media; DescriptionError if the name is unknown."""
         if name not in self.media:
             raise DescriptionError(f"the sensor '{self.name}' knows the media {', '.join(self.media)}, not '{name}'")
         return self.media[name]
 
     @model_validator(mode="after")
-    def _one_wavelength(self) -> "Sensor":
+    def _check_wavelengths(self) -> "Sensor":
         for laser in self.more_lasers:
             if laser.wavelength_nm != self.laser.wavelength_nm:
                 raise ValueError(
                     f"the lasers have {self.laser.wavelength_nm:g} and {laser.wavelength_nm:g} nm; "
-                    "a sensor is rendered at one wavelength: give all lasers the same"
+                    "all lasers of a sensor must have the same wavelength"
                 )
         return self
 
 
 class CaptureHeader(Description):
-    """Description that holds for all frames of a capture.
+    """Description that is common to all frames of a capture.
 
-    ``medium_name`` is the medium's in the sensor's description, ``stage_direction`` the nominal unit direction in which
-    the stage moves the sensor, in the OCS, ``saturation_dn`` the grey value at which pixels clip. ``target`` and
-    ``artefact`` describe what was before the sensor (`parse_target`, `parse_artefact`); they are checked when they are
-    used. ``T_platform_sensor`` (4, 4), mm, is where the sensor is mounted on the platform that carries it, by the
-    drawing: the frames' poses are then the platform's. ``provenance`` says what recorded the capture, and how.
+    ``medium_name`` is the name of the medium in the sensor's description. ``stage_direction`` is the nominal direction
+    of the sensor's motion by the stage, a unit vector in the OCS. ``saturation_dn`` is the grey value of clipped
+    pixels. ``target`` and ``artefact`` describe the measured object; `parse_target` and `parse_artefact` validate them
+    later. ``T_platform_sensor`` (4, 4), mm, is the nominal pose of the sensor on a moving platform; with it, the
+    frames' poses are those of the platform. ``provenance`` documents how the capture was recorded.
     """
 
     name: str
@@ -595,5 +608,5 @@ class CaptureHeader(Description):
     saturation_dn: Annotated[int, Field(gt=0)]
     target: Table | None = None
     artefact: Table | None = None
-    T_platform_sensor: Annotated[Rows, AfterValidator(_mounted)] | None = None
+    T_platform_sensor: Annotated[Rows, AfterValidator(_check_mounting)] | None = None
     provenance: Table = {}

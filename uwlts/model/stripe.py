@@ -1,9 +1,9 @@
-"""Stripe centres of an image and of a capture, and how they follow from the numbers of a 3D camera.
+"""Stripe centres of an image and of a capture, and their conversion from the numbers of a 3D camera.
 
-A 3D camera finds the stripe itself and gives one number per profile line, in the pixel format Coord3D_C16 or as 16-bit
-images, tables or arrays. A place on a line is ``scale`` times the number plus ``offset`` (GenICam Standard Features
-Naming Convention 2.7, ``Scan3dCoordinateScale``, ``Scan3dCoordinateOffset``), and one number can stand for no stripe
-(``Scan3dInvalidDataValue``, where ``Scan3dInvalidDataFlag`` is set).
+A 3D camera detects the stripe itself and outputs one number per profile line, in the pixel format Coord3D_C16 or as
+16-bit images, tables or arrays. The stripe centre is ``scale`` times the number plus ``offset`` (GenICam Standard
+Features Naming Convention 2.7, ``Scan3dCoordinateScale``, ``Scan3dCoordinateOffset``). One number can mean "no stripe"
+(``Scan3dInvalidDataValue``, if ``Scan3dInvalidDataFlag`` is set).
 """
 
 from __future__ import annotations
@@ -17,39 +17,39 @@ from uwlts.errors import ImageError, RangeError
 
 
 class StripeStatus(IntEnum):
-    """Reason why a line has a centre or has none."""
+    """Result of stripe detection on a profile line; only OK has a centre."""
 
     OK = 0
     NO_STRIPE = 1
-    """Nothing on the line rises above the threshold, or only things too narrow or too wide for a stripe."""
+    """No peak on the line is above the threshold and has the width of a stripe."""
     AMBIGUOUS = 2
     """A second stripe of comparable strength; see `uwlts.stripe.StripeOptions.ambiguous_ratio`."""
     BORDER = 3
-    """The pixels needed around the centre run over the image border."""
+    """The window around the centre extends beyond the image border."""
     SATURATED = 4
-    """The clipped plateau is too wide for the window; moderate clipping is handled and stays OK."""
+    """The saturated plateau is too wide for the window; moderate saturation is OK."""
     END = 5
-    """Next to a place where the stripe ends or jumps; see `uwlts.stripe.StripeOptions.end_lines`."""
+    """Close to an end or jump of the stripe; see `uwlts.stripe.StripeOptions.end_lines`."""
 
 
-_OK = np.uint8(StripeStatus.OK)  # NumPy compares with its own integers several times as fast as with an enumeration
+_OK = np.uint8(StripeStatus.OK)  # NumPy compares with its own integers several times faster than with an enumeration
 
 
 @dataclass(frozen=True)
 class Stripe:
-    """Stripe centres of one image, or of what a 3D camera gives in its place; L profile lines.
+    """Stripe centres of one image with L profile lines, or of one profile of a 3D camera.
 
     Attributes
     ----------
     centre_px : (L,) float64
-        Position along the line, px; pixel 0's centre is 0. NaN where the status is not OK.
+        Position along the line, px; 0 is the centre of pixel 0. NaN if the status is not OK.
     amplitude : (L,) float32
-        Height above the local background, grey levels, of the Gaussian of the measured width that fits best; less
-        than the true height where the image is saturated. NaN where the status is not OK.
+        Height in grey values above the local background of the best-fitting Gaussian with the measured width. Too low
+        if the image is saturated. NaN if the status is not OK.
     width_px : (L,) float32
-        Full width at half maximum, px, with the smoothing across the stripe taken out. NaN where not OK.
+        Full width at half maximum, px, corrected for the smoothing across the stripe. NaN if the status is not OK.
     status : (L,) uint8
-        A `StripeStatus` per line.
+        `StripeStatus` of each line.
     stripe_along : str
         ``"height"``: lines are image rows. ``"width"``: lines are image columns.
     """
@@ -62,7 +62,7 @@ class Stripe:
 
     @property
     def lines(self) -> np.ndarray:
-        """(M,) int: indices of the lines with a centre."""
+        """Indices (M,) of the lines with a centre."""
         return np.flatnonzero(self.status == _OK)
 
     @classmethod
@@ -76,40 +76,51 @@ class Stripe:
         status: np.ndarray,
         stripe_along: str,
     ) -> Stripe:
-        """Return the stripe with centres on some lines (M,) alone; ``status`` (L,) is that of all lines."""
+        """Make a stripe from centres on M of L lines.
+
+        Parameters
+        ----------
+        lines : (M,) int
+            Lines with a centre.
+        centre_px, amplitude, width_px : (M,)
+            Values of these lines.
+        status : (L,) uint8
+            Status of all lines.
+        stripe_along : str
+            As in `Stripe`.
+        """
         centre = np.full(len(status), np.nan)
         height, width = np.full((2, len(status)), np.nan, np.float32)
         centre[lines], height[lines], width[lines] = centre_px, amplitude, width_px
         return cls(centre, height, width, status, stripe_along)
 
     def without(self, lines: np.ndarray, reason: StripeStatus) -> Stripe:
-        """Return the stripe with no centre on some lines (M,), for the reason that a status names."""
+        """Return the stripe without the centres on lines (M,), whose status becomes ``reason``."""
         centre, amplitude, width, status = (getattr(self, row).copy() for row in ROWS)
         centre[lines], amplitude[lines], width[lines], status[lines] = np.nan, np.nan, np.nan, reason
         return Stripe(centre, amplitude, width, status, self.stripe_along)
 
     def pixels(self) -> np.ndarray:
-        """(M, 2) float64: image coordinates (u = column, v = row) of the centres of `lines`, px."""
+        """Return the image coordinates (M, 2), u = column and v = row in px, of the centres of `lines`."""
         return pixels_of(self.lines, self.centre_px[self.lines], stripe_along=self.stripe_along)
 
 
 @dataclass(frozen=True)
 class StripeCandidates:
-    """All stripes of one image, M of them, in the order of lines and places: of several sheets, of reflections.
+    """All M stripe candidates of one image, sorted by line and centre: several sheets, or reflections.
 
     Attributes
     ----------
     line : (M,) int
-        Profile line of each; a line may have none, one, or several.
+        Profile line of each candidate; a line can have any number of candidates.
     centre_px, amplitude, width_px : (M,) float64, float32, float32
-        As of `Stripe`.
+        As in `Stripe`.
     log_likelihood : (M,) float64
-        Logarithm of the likelihood that the pixels have with the stripe over that without it, for the background's
-        white noise.
+        Log likelihood ratio of the pixels with and without the stripe, for white noise of the background.
     count : int
         Number L of profile lines.
     stripe_along : str
-        As of `Stripe`.
+        As in `Stripe`.
     """
 
     line: np.ndarray
@@ -121,16 +132,16 @@ class StripeCandidates:
     stripe_along: str
 
     def __getitem__(self, some: np.ndarray) -> StripeCandidates:
-        """Those that an index array or a mask chooses."""
+        """Return the candidates selected by an index array or a mask."""
         columns = self.line, self.centre_px, self.amplitude, self.width_px, self.log_likelihood
         kept = (column[some] for column in columns)
         return StripeCandidates(*kept, count=self.count, stripe_along=self.stripe_along)
 
     def split(self, sheets: int = 2) -> list[Stripe]:
-        """Return one `Stripe` for each of so many sheets of light, in the order of growing places.
+        """Return one `Stripe` for each light sheet, sorted by increasing centre.
 
-        Lines with another number of stripes than sheets do not show which is which: they are AMBIGUOUS, those without
-        any NO_STRIPE. RangeError for a number of sheets below 1.
+        The status of a line is AMBIGUOUS if the number of its candidates differs from the number of sheets, and
+        NO_STRIPE if there is no candidate. Raises RangeError for a number of sheets below 1.
         """
         if sheets < 1:
             raise RangeError(f"sheets is {sheets}; expected 1 or more")
@@ -146,22 +157,22 @@ class StripeCandidates:
         return found
 
     def pixels(self) -> np.ndarray:
-        """(M, 2) float64: image coordinates (u = column, v = row), px."""
+        """Return the image coordinates (M, 2), u = column and v = row in px."""
         return pixels_of(self.line, self.centre_px, stripe_along=self.stripe_along)
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureStripes:
-    """Stripe centres of all laser images of a capture, joined: N of them.
+    """All N stripe centres of a capture's laser images.
 
     Attributes
     ----------
     frame, line : (N,) int
         Image and profile line of each centre.
     centre_px, amplitude, width_px : (N,) float64, float32, float32
-        As of `Stripe`; amplitude and width are NaN where a 3D camera does not give them.
+        As in `Stripe`; amplitude and width are NaN if a 3D camera does not supply them.
     lines_by_status : dict
-        Numbers of the profile lines of all images by the names of `StripeStatus`.
+        Number of profile lines in all images for each name of `StripeStatus`.
     """
 
     frame: np.ndarray
@@ -172,35 +183,39 @@ class CaptureStripes:
     lines_by_status: dict[str, int]
 
     def __getitem__(self, some: np.ndarray | slice) -> CaptureStripes:
-        """Those that a slice, an index array or a mask chooses."""
+        """Return the centres selected by a slice, an index array or a mask."""
         columns = self.frame, self.line, self.centre_px, self.amplitude, self.width_px
         return CaptureStripes(*(column[some] for column in columns), lines_by_status=self.lines_by_status)
 
 
 def pixels_of(lines: np.ndarray, places_px: np.ndarray, *, stripe_along: str) -> np.ndarray:
-    """(N, 2) float64: image coordinates (u = column, v = row) of places (N,) on profile lines (N,), px."""
+    """Return image coordinates (N, 2), u = column and v = row in px, of centres (N,) on profile lines (N,)."""
     order = (places_px, lines) if stripe_along == "height" else (lines, places_px)
     return np.column_stack(order).astype(np.float64)
 
 
 ROWS = ("centre_px", "amplitude", "width_px", "status")
-"""What can be given of every profile line, in this order; the first alone is needed."""
+"""Values of a profile line in this order; only the first is required."""
 
 
 @dataclass(frozen=True)
 class Coordinates:
-    """Meaning of a 3D camera's numbers: ``scale`` in px, ``offset`` in px, the number for no stripe if there is one."""
+    """Conversion of a 3D camera's numbers: ``scale`` and ``offset`` in px, and the number that means "no stripe"."""
 
     scale: float = 1.0
     offset: float = 0.0
     invalid: float | None = None
 
     def stripe(self, numbers: np.ndarray, *, stripe_along: str, length_px: int) -> Stripe:
-        """The stripe of a profile (L,), or of up to four rows (K, L) in the order of `ROWS`; NaN is no stripe either.
+        """Convert a profile (L,), or up to four rows (K, L) in the order of `ROWS`, to a stripe.
 
-        ``length_px`` is how many pixels a profile line has. Amplitude and width are NaN where they are not given. A
-        status of its own is one of `StripeStatus`. ImageError where places lie beyond the lines, or a status is
-        unknown.
+        NaN also means "no stripe". Amplitude and width are NaN if they are not given. ``length_px`` is the number of
+        pixels of a profile line.
+
+        Raises
+        ------
+        ImageError
+            A centre is outside its line, a status is unknown, or the array has another shape.
         """
         rows = np.atleast_2d(np.asarray(numbers, float))
         if rows.ndim != 2 or len(rows) > len(ROWS):
@@ -217,7 +232,7 @@ class Coordinates:
         centre = np.where(good, self.scale * rows[0] + self.offset, np.nan)
         if good.any() and not -0.5 <= np.nanmin(centre) <= np.nanmax(centre) <= length_px - 0.5:
             raise ImageError(
-                f"the centre lines run from {np.nanmin(centre):g} to {np.nanmax(centre):g} px, the profile lines from "
+                f"the centres range from {np.nanmin(centre):g} to {np.nanmax(centre):g} px, the profile lines from "
                 f"0 to {length_px - 1} px: check scale ({self.scale:g}), offset ({self.offset:g}) and the number for "
                 f"no stripe ({self.invalid})"
             )
@@ -230,5 +245,5 @@ class Coordinates:
 
 
 def rows_of(stripe: Stripe) -> np.ndarray:
-    """Everything known of a stripe's lines as an array (4, L) in the order of `ROWS`."""
+    """Return the values of a stripe's lines as an array (4, L) in the order of `ROWS`."""
     return np.stack([getattr(stripe, row) for row in ROWS]).astype(float)

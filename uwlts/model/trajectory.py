@@ -1,4 +1,4 @@
-"""The path of a platform: its poses at known times, and between them."""
+"""Trajectory of a platform: poses at known times, and interpolation between them."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,17 +15,17 @@ from uwlts.model.calibration import is_rigid
 
 _ROUNDED = 1e-6
 _LARGEST_DRIFT_PPM = 10_000.0
-"""A hundred times the worst quartz: more is a mistaken unit."""
+"""A hundred times the drift of the worst quartz; larger values indicate a wrong unit."""
 COVARIANCE_COLUMNS = {f"cov_{i}{j}": (i, j) for i in range(6) for j in range(i, 6)}
-"""Names of a file's columns with the upper triangle of each covariance, and their places in it."""
+"""Names of a file's columns with the upper triangle of each covariance, and their row and column in it."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectory(Brief):
-    """Poses of a platform at growing times.
+    """Poses of a platform at increasing times.
 
-    Between them positions follow a cubic spline and rotations one with continuous angular acceleration (SciPy's
-    `CubicSpline` and `RotationSpline`), so that velocity and rate of turn are continuous.
+    Positions are interpolated by a cubic spline and rotations by a spline with continuous angular acceleration (SciPy's
+    `CubicSpline` and `RotationSpline`). Velocity and angular velocity are therefore continuous.
 
     Attributes
     ----------
@@ -33,12 +33,12 @@ class Trajectory(Brief):
     poses : (N, 4, 4) float64
         ``T_base_platform``, mm.
     covariance : (N, 6, 6) float64, optional
-        Of each pose: the shift in mm, then a further rotation in rad about the base's axes, R_true = exp(rotation) R.
+        Of each pose: translation in mm, and small rotation in rad about the base's axes, R_true = exp(rotation) R.
 
     Raises
     ------
     DescriptionError
-        Fewer than two poses, times that are not finite or do not grow, or matrices that are not rigid.
+        Fewer than two poses, times that are not finite or do not increase, or matrices that are not rigid.
     """
 
     times_s: np.ndarray
@@ -49,25 +49,24 @@ class Trajectory(Brief):
         times, poses = np.array(self.times_s, dtype=np.float64), np.array(self.poses, dtype=np.float64)
         if times.ndim != 1 or poses.shape != (len(times), 4, 4) or len(times) < 2:
             raise DescriptionError(
-                f"a trajectory has times (N,) and poses (N, 4, 4) for two or more times; found {times.shape} and "
-                f"{poses.shape}"
+                f"a trajectory needs times (N,) and poses (N, 4, 4) with N >= 2; found {times.shape} and {poses.shape}"
             )
         if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
             wrong = int(np.argmin(np.append(np.inf, np.diff(times)) > 0))
             raise DescriptionError(
-                f"the times of a trajectory must be finite and grow: pose {wrong + 1} is at {times[wrong]:g} s"
+                f"the times of a trajectory must be finite and increase: pose {wrong + 1} is at {times[wrong]:g} s"
             )
         if not is_rigid(poses, within=_ROUNDED):
-            raise DescriptionError("the poses of a trajectory must be rotations with a shift (0 0 0 1 as last row)")
+            raise DescriptionError("the poses of a trajectory must be rigid transforms with 0 0 0 1 as last row")
         known = {"times_s": times, "poses": poses}
         if self.covariance is not None:
-            known["covariance"] = _checked_covariances(self.covariance, len(times))
+            known["covariance"] = _check_covariances(self.covariance, len(times))
         for name, values in known.items():
             values.flags.writeable = False
             object.__setattr__(self, name, values)
 
     def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write the path as CSV of the format quaternion-xyzw, mm, with covariances; OutputError if that fails."""
+        """Write the trajectory as CSV, format quaternion-xyzw, mm, with covariances; OutputError if that fails."""
         turns = Rotation.from_matrix(self.poses[:, :3, :3]).as_quat()
         table = np.column_stack([self.times_s, self.poses[:, :3, 3], turns])
         names = ["time_s", "x_mm", "y_mm", "z_mm", "qx", "qy", "qz", "qw"]
@@ -86,14 +85,14 @@ class Trajectory(Brief):
         return RotationSpline(self.times_s, Rotation.from_matrix(self.poses[:, :3, :3]))
 
     def rates_at(self, times_s: np.ndarray) -> np.ndarray:
-        """Velocities in mm/s and turns in rad/s (M, 6) in the base frame at times (M,) within the path."""
+        """Return velocities in mm/s and angular velocities in rad/s (M, 6) in the base frame at times (M,)."""
         wanted = np.asarray(times_s, dtype=np.float64)
-        # SciPy's rates are in the moving frame.
+        # SciPy's angular velocities are in the moving frame.
         turns = self._rotations(wanted).apply(self._rotations(wanted, 1))
         return np.hstack([self._positions(wanted, 1), turns])
 
     def covariance_at(self, times_s: np.ndarray) -> np.ndarray | None:
-        """Covariances (M, 6, 6) at times (M,), linear between those of the poses; None where they are not known."""
+        """Interpolate the covariances (M, 6, 6) linearly at times (M,); None if they are unknown."""
         if self.covariance is None:
             return None
         flat = self.covariance.reshape(len(self.times_s), 36)
@@ -101,13 +100,13 @@ class Trajectory(Brief):
         return at.reshape(-1, 6, 6)
 
     def poses_at(self, times_s: np.ndarray) -> np.ndarray:
-        """``T_base_platform`` (M, 4, 4) at times (M,), mm; DescriptionError for times before or after the path."""
+        """Interpolate ``T_base_platform`` (M, 4, 4), mm, at times (M,); DescriptionError outside the trajectory."""
         wanted = np.asarray(times_s, dtype=np.float64)
         first, last = self.times_s[[0, -1]]
         if outside := int(np.count_nonzero(~((wanted >= first) & (wanted <= last)))):
             raise DescriptionError(
-                f"{outside} of {wanted.size} times, {wanted.min():.3f} to {wanted.max():.3f} s, lie outside the "
-                f"trajectory, which lasts from {first:.3f} to {last:.3f} s: is the offset of the clocks right?"
+                f"{outside} of {wanted.size} times, {wanted.min():.3f} to {wanted.max():.3f} s, are outside the "
+                f"trajectory from {first:.3f} to {last:.3f} s: check the offset of the clocks"
             )
         poses = np.tile(np.eye(4), (len(wanted), 1, 1))
         poses[:, :3, :3] = self._rotations(wanted).as_matrix()
@@ -116,10 +115,10 @@ class Trajectory(Brief):
 
 
 def on_clock(times_s: np.ndarray, *, offset_s: float, drift_ppm: float) -> np.ndarray:
-    """Times (N,) of a camera by the clock of its platform, s, which is ahead by ``offset_s`` at the first of them, and
-    runs faster by ``drift_ppm`` parts in a million.
+    """Convert times (N,) in s from the camera's clock to the platform's clock.
 
-    DescriptionError where these are not finite, or the drift is larger than any clock's.
+    The platform's clock is ahead by ``offset_s`` at the first time, and runs faster by ``drift_ppm``. Raises
+    DescriptionError if a number is not finite, or the drift is larger than any clock's.
     """
     if not (np.isfinite(offset_s) and abs(drift_ppm) <= _LARGEST_DRIFT_PPM):
         raise DescriptionError(
@@ -129,12 +128,12 @@ def on_clock(times_s: np.ndarray, *, offset_s: float, drift_ppm: float) -> np.nd
     return times_s + offset_s + 1e-6 * drift_ppm * (times_s - np.min(times_s, initial=np.inf))
 
 
-def _checked_covariances(values: np.ndarray, count: int) -> np.ndarray:
-    """Covariances (N, 6, 6) of N poses; DescriptionError where they are none."""
+def _check_covariances(values: np.ndarray, count: int) -> np.ndarray:
+    """Return covariances (N, 6, 6) of N poses as an array; DescriptionError if they are invalid."""
     covariances = np.array(values, dtype=np.float64)
     if covariances.shape != (count, 6, 6) or not np.isfinite(covariances).all():
         raise DescriptionError(
-            f"the covariances of {count} poses are finite numbers ({count}, 6, 6); found {covariances.shape}"
+            f"the covariances of {count} poses must be finite numbers ({count}, 6, 6); found {covariances.shape}"
         )
     sizes = np.sqrt(np.maximum(np.einsum("nii->ni", covariances), 1e-30))
     scaled = covariances / (sizes[:, :, None] * sizes[:, None])

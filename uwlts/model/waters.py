@@ -1,17 +1,18 @@
-"""Natural waters by name: what particles and dissolved matter add to pure water.
+"""Natural waters by name: absorption and scattering by particles and dissolved matter, in addition to pure water.
 
 A new water is an entry of `WATERS`: a sentence, its absorption and scattering, and the phase function of its particles.
 
-Petzold's stations (1972, SIO Ref. 72-78, Figs. 22 to 37, at 530 nm; texts after Mobley give 514 nm, the report itself
-530): their absorption and scattering beyond pure water are carried to other wavelengths by exp(-S (l - 530 nm)),
-S = 0.014 / nm (coloured dissolved matter, Bricaud and others 1981; 0.011 to 0.018 are found), and by 530 nm / l
-(exponents from 0.3 for large to 1.7 for small particles, Haltrin 1999); both forms and S are recalled, not checked
-against the papers. Around 635 nm they matter little. Towards 400 nm the absorption of "clear" is too high, as that
-station's is threefold pure water's already at 530 nm.
+"clear", "coastal" and "harbour" are Petzold's stations (1972, SIO Ref. 72-78, Figs. 22 to 37). The report gives the
+wavelength 530 nm; texts after Mobley give 514 nm. The excess absorption over pure water is scaled to a wavelength l by
+exp(-S (l - 530 nm)) with S = 0.014 / nm, for coloured dissolved matter (Bricaud and others 1981; the literature has
+0.011 to 0.018). The excess scattering is scaled by 530 nm / l (Haltrin 1999: exponents from 0.3 for large to 1.7 for
+small particles). Both forms and S are quoted from memory and were not checked against the papers. They have little
+effect near 635 nm. Towards 400 nm the absorption of "clear" is too high, because the station's absorption at 530 nm is
+already three times that of pure water.
 
-Jerlov's types are the tables of Solonenko and Mobley (2015), 400-700 nm. Other authors' scattering differs up to 2.8
-times for the same type: sweep ``scattering_per_m`` where a result depends on it. The tables' pure water absorbs a few
-per cent less than Pope and Fry's beyond 650 nm, so that the clearest types then absorb less than "pure".
+Jerlov's types are the tables of Solonenko and Mobley (2015), 400-700 nm. The scattering by other authors differs by a
+factor of up to 2.8 for the same type; vary ``scattering_per_m`` if a result depends on it. Beyond 650 nm, the tables'
+pure water absorbs a few per cent less than Pope and Fry's. The clearest types then absorb less than "pure".
 """
 
 import math
@@ -32,9 +33,9 @@ _SOURCE = "the absorption and scattering of natural waters"
 
 @dataclass(frozen=True)
 class Particles:
-    """Absorption and scattering by particles and dissolved matter, beyond those of pure water, in 1/m.
+    """Absorption and scattering by particles and dissolved matter, in addition to pure water, in 1/m.
 
-    The absorption may be slightly negative where a water's table takes pure water to absorb less than ours.
+    The absorption can be slightly negative if a water's table assumes a lower absorption of pure water.
     """
 
     absorption_per_m: float
@@ -43,9 +44,10 @@ class Particles:
 
 @dataclass(frozen=True)
 class NaturalWater:
-    """A named water: what it adds to pure water at a wavelength in nm (RangeError outside 400-700 nm unless pure).
+    """Named water.
 
-    ``phase`` names the phase function of its particles, one of `uwlts.model.phase_functions.KINDS`.
+    ``particles`` returns its particles at a wavelength in nm (RangeError outside 400-700 nm unless pure). ``phase`` is
+    the name of their phase function in `uwlts.model.phase_functions.KINDS`.
     """
 
     sentence: str
@@ -54,7 +56,7 @@ class NaturalWater:
 
 
 def _station(absorption_per_m: float, scattering_per_m: float, wavelength_nm: float) -> Particles:
-    """Beyond the sea water of a station, carried from 530 nm to another wavelength."""
+    """Return the particles of a station at a wavelength, scaled from 530 nm; pure sea water is subtracted."""
     check_range("wavelength_nm", wavelength_nm, 400.0, 700.0, _SOURCE)
     absorption = absorption_per_m - water_absorption_per_m(wavelength_nm=_STATION_NM)
     scattering = scattering_per_m - water_scattering_per_m(wavelength_nm=_STATION_NM, salinity_g_kg=35.0)
@@ -65,10 +67,11 @@ def _station(absorption_per_m: float, scattering_per_m: float, wavelength_nm: fl
 
 
 def _jerlov(column: int, wavelength_nm: float) -> Particles:
-    """Beyond pure water, by a column of the tables, linear between their 25 nm.
+    """Return the particles of a Jerlov type, a column of the tables, interpolated linearly in steps of 25 nm.
 
-    What is linear is the difference from pure water, as its absorption climbs steeply between 575 and 600 nm. The
-    molecules' part taken off the scattering is the authors' own (their Eq. 8, after Haltrin 1999).
+    The difference from pure water is interpolated, because the absorption of pure water increases steeply between 575
+    and 600 nm. The molecular scattering to be subtracted is that of the tables' authors (their Eq. 8, after Haltrin
+    1999).
     """
     check_range("wavelength_nm", wavelength_nm, 400.0, 700.0, _SOURCE)
     wavelength, absorption = read_table("jerlov_absorption.csv")[[0, column]]
@@ -96,21 +99,21 @@ WATERS = {
     "jerlov-7C": NaturalWater("coast, turbid", partial(_jerlov, 8)),
     "jerlov-9C": NaturalWater("the most turbid coast", partial(_jerlov, 9)),
 }
-"""All named waters: Petzold's by absorption and scattering in 1/m with sea water, Jerlov's by the tables' columns."""
+"""All named waters. Petzold's: absorption and scattering in 1/m including sea water; Jerlov's: column of the tables."""
 
 
 def named_water(name: str) -> NaturalWater:
-    """The water of a name; DescriptionError with the known names."""
+    """Return a water by name; DescriptionError with the known names."""
     if name not in WATERS:
         raise DescriptionError(f"unknown water '{name}'; known are {', '.join(WATERS)}")
     return WATERS[name]
 
 
 def particles_at(turbidity: float, *, wavelength_nm: float) -> Particles:
-    """Particles of water of a turbidity: 0 is "pure", 1 "clear", 2 "coastal", 3 "harbour".
+    """Return the particles of water with a turbidity: 0 is "pure", 1 "clear", 2 "coastal", 3 "harbour".
 
-    Between 0 and 1 they grow in proportion, from 1 on geometrically: equal steps multiply by equal factors. RangeError
-    where the turbidity is outside 0..3, or the wavelength outside 400-700 nm.
+    The interpolation is linear between 0 and 1, and geometric above 1. Raises RangeError if the turbidity is outside
+    0 to 3, or the wavelength outside 400-700 nm.
     """
     check_range("turbidity", turbidity, 0.0, 3.0, "the scale from pure water to a harbour's")
     clear, coastal, harbour = (WATERS[name].particles(wavelength_nm) for name in ("clear", "coastal", "harbour"))

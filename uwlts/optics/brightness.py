@@ -1,12 +1,11 @@
-"""Shift of a stripe's centre where the brightness varies over the surface, and by blur.
+"""Shift of a stripe's centre caused by brightness gradients on the surface and by image blur.
 
-The sheet has a thickness. Where the surface under it shines brighter on one side, most of the light that is seen comes
-from there and not from the sheet's middle: for a sheet of Gaussian profile with the standard deviation s, from s^2
-times the slope of the brightness's logarithm beside it. The slope shows when the stage moves the sheet over the
-surface.
+The laser sheet has a thickness. If the surface reflects more light on one side of the sheet, the centroid of the light
+moves to that side. For a Gaussian sheet profile with standard deviation s, the shift is s^2 times the gradient of the
+logarithm of brightness across the sheet. The gradient is measured while the stage moves the sheet over the surface.
 
-The image is blurred, too. Where a stripe leans or bends in the image and fades along itself, as at the rim of a sphere,
-blur moves light from one line to the next and with it the centre that is seen there.
+Image blur also shifts the centre. It moves light between neighbouring profile lines. The shift is large if the stripe
+is tilted or curved in the image and its brightness changes along the stripe, as at the rim of a sphere.
 """
 
 from __future__ import annotations
@@ -28,49 +27,61 @@ from uwlts.runtime.compiled import compiled, compiled_with_arrays
 from uwlts.stripe.peak_window import FWHM_PER_SIGMA
 
 BLUR_STD = 1.0 / math.sqrt(3.0)
-"""Standard uncertainty of what blur moves centres by, over the largest possible: that is left as it is, and anything
-between none and all of it is as likely (JCGM 100:2008, 4.3.7)."""
+"""Standard uncertainty of the blur shift, divided by the largest possible shift. The shift is not corrected; any value
+between zero and the largest is equally likely (JCGM 100:2008, 4.3.7)."""
 
 _MOST_BLUR_PX = 0.1
-"""Centres that blur may move by more, which is as much as speckle does, are left out."""
+"""Limit of the blur shift, about the shift by speckle. Centres above it are rejected."""
 
 _REACH_MM = 2.0
-"""The brightness at a point is taken from images within this way of the stage."""
+"""Largest stage distance of images whose brightness is compared."""
 
 _LEAST_APART_MM = 0.05
-"""Least standard deviation of the positions of images for their brightness to be compared: a third of a sheet."""
+"""Least standard deviation of the stage positions of compared images: a third of the sheet's thickness."""
 
 _LINES = 12  # neighbouring lines on either side for slopes of brightness
-_BEND_LINES = 6  # the same for slopes of the stripe, which bends
-_LEAST_SHARE = 0.2  # share of the neighbours that must show it
+_BEND_LINES = 6  # fewer for slopes of the stripe's position, because the stripe is curved
+_LEAST_SHARE = 0.2  # fraction of the neighbours that must have a stripe centre
 
 _LEAST_ACROSS = 0.3
-"""Least cosine between the stage's motion and the sheet's normal for which a scan shows what lies beside the sheet."""
+"""Least cosine between stage direction and sheet normal for a measurement of the gradient across the sheet."""
 
 _TABLE_TOLERANCE = np.array([1e-7] * 3 + [1e-6] * 5)
-"""Error of the tabulated points, mm, of the shift per slope, mm^2, of the thickness, mm, and of pixels for it."""
+"""Tolerances of a table: points (mm), shift per slope (mm^2), sheet thickness (mm) and its image (px)."""
 
 _MOST_FOR_FOOTPRINT = 1000
 _FOOTPRINT_PER_SHEET = math.sqrt(3.0)
-"""Standard deviations of what a point is the mean of, over that of the sheet: see `footprint_mm`."""
+"""Standard deviation of a point's footprint across the sheet, divided by that of the sheet: see `footprint_mm`."""
 _METHOD_STD = 0.15
-"""Relative standard uncertainty of its square by how a stripe's centre is taken: 2.3 to 3.8 instead of 3 where the
-profile fit's weights run from those of faint stripes with weak speckle to those of bright ones with strong speckle."""
+"""Relative standard uncertainty of the squared factor because of the stripe method. The square ranges from 2.3 to 3.8
+instead of 3: the weights of the profile fit depend on the stripe's brightness and on speckle."""
 _PIXEL_VARIANCE = 1.0 / 12.0
-"""Of a pixel's own width, px2: an image is blurred at least by that."""
+"""Variance of a pixel's width in px^2: a lower limit of blur."""
 
 _MOVED_PX = 0.5
-"""Step for the derivatives of the points by the pixel."""
+"""Step in px for derivatives of the points with respect to the stripe centre."""
 
 
 @dataclass(frozen=True, eq=False)
 class LitSheet:
-    """What stripe centres (N,) see of a sheet that has a thickness.
+    """Points on a laser sheet of finite thickness, for N stripe centres.
 
-    ``found`` are the points on the sheet's middle, OCS at the stage's position 0. ``of_slope`` (N, 3), mm2, is how far
-    their light comes from beside them, along the camera's rays, for each 1/mm by which the brightness's logarithm grows
-    across the sheet; ``sigma_mm`` (N,) is the sheet's thickness, and ``per_sigma_px`` (N,) how far the stripe moves on
-    a surface square to the laser's axis where the sheet does so by its thickness.
+    Attributes
+    ----------
+    found : MeasuredPoints
+        Points on the middle of the sheet, OCS at stage position 0.
+    of_slope : (N, 3)
+        Shift of a point along its camera ray, mm, per gradient of log brightness across the sheet, 1/mm: unit mm^2.
+    sigma_mm : (N,)
+        Standard deviation of the sheet's profile.
+    per_sigma_px : (N,)
+        Shift of the stripe in the image if the sheet moves by ``sigma_mm``, on a surface normal to the laser's axis.
+    calibration : Calibration
+    line, centre_px : (N,)
+        Profile lines and stripe centres.
+    evaluate
+        Function that returns points, ``of_slope``, ``sigma_mm`` and ``per_sigma_px`` as one array (M, 8) for lines (M,)
+        and centres (M,).
     """
 
     found: MeasuredPoints
@@ -80,7 +91,7 @@ class LitSheet:
     calibration: Calibration
     line: np.ndarray
     centre_px: np.ndarray
-    at: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    evaluate: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
     @classmethod
     def of(
@@ -93,14 +104,27 @@ class LitSheet:
         medium_index: float,
         digest: str | None = None,
     ) -> LitSheet:
-        """The sheet as described of a sensor by a calibration, without a window where the sensor has none.
+        """Locate stripe centres on the sheet.
 
-        With the calibration's ``digest`` tables are kept for the next scan.
+        Parameters
+        ----------
+        calibration : Calibration
+            Camera, window and sheet. The window is ignored if the sensor's window is not mounted.
+        sensor : Sensor
+            Description of the laser: thickness and origin of the sheet.
+        line : (N,) int
+            Profile lines.
+        centre_px : (N,)
+            Stripe centres.
+        medium_index : float
+            Refractive index of the medium, relative to air.
+        digest : str, optional
+            Digest of the calibration. If given, interpolation tables are kept for the next scan.
         """
         if not sensor.camera.window.mounted:
             calibration = calibration.model_copy(update={"window": None})
         origin_mm = laser_pose(sensor).origin_mm
-        known = _on_sheet(calibration, sensor.laser, origin_mm, medium_index=medium_index)
+        known = _make_sheet_function(calibration, sensor.laser, origin_mm, medium_index=medium_index)
         laser = sensor.laser.model_dump_json(), origin_mm.tobytes()
         key = None if digest is None else ("sheet", digest, sensor.camera.window.mounted, *laser, medium_index)
         status = np.full(len(line), RayStatus.OK, dtype=np.uint8)
@@ -117,11 +141,18 @@ class LitSheet:
         return cls(found, values[:, 3:6], values[:, 6], values[:, 7], calibration, line, centre_px, exact)
 
     def beside(self, width_px: np.ndarray, slopes: np.ndarray, *, stage_direction: Vector) -> np.ndarray:
-        """From the points on the sheet's middle to where their light comes from, along the camera's rays: (N, 3), mm.
+        """Return the shifts (N, 3) in mm along the camera rays, from the middle of the sheet to the light's centroid.
 
-        The sheet is as thick as described, but no thicker than the stripes would make it on a surface square to the
-        laser. ``width_px`` (N,) is the stripe's full width at half maximum, ``slopes`` (N,) those of
-        `slopes_of_brightness`, ``stage_direction`` as the capture describes it.
+        The sheet's thickness is the described one, limited by the median stripe width.
+
+        Parameters
+        ----------
+        width_px : (N,)
+            Full width of each stripe at half maximum; NaN where unknown.
+        slopes : (N,)
+            Slopes by `slopes_of_brightness`, per mm of the stage.
+        stage_direction : Vector
+            Stage direction as the capture describes it.
         """
         direction = np.array(self.calibration.stage_direction_of(stage_direction))
         across = float(
@@ -134,19 +165,27 @@ class LitSheet:
         return self.of_slope * (slopes / across * np.minimum(1.0, (widest / self.per_sigma_px) ** 2))[:, None]
 
     def footprint_mm(self, width_px: np.ndarray) -> tuple[float, float]:
-        """Standard deviations of the part of a surface square to the laser that a point is the mean of, mm.
+        """Return the standard deviations in mm, across the sheet (X) and along the stripe (Y), of a point's footprint.
 
-        Along the stripe (Y) it is the image's blur, which is what the sheet leaves of the stripe's width (N,); medians
-        over the stripe centres. Across the sheet (X) it is the square root of 3 times the sheet's thickness: a pixel
-        shows the radiance S(u) of the place u that it sees, so that a surface's height h(u) changes the image by -S' h,
-        and its centroid by the integral of -u S' h = (u / s)^2 S h for a sheet of standard deviation s. As weights of h
-        these have the variance 3 s^2, not the s^2 of the light.
+        The footprint is the part of the surface over which a point averages, on a surface normal to the laser. Both
+        values are medians over the stripe centres.
+
+        Along the stripe it is the image blur: the stripe's width without the contribution of the sheet's thickness.
+
+        Across the sheet it is sqrt(3) s for a sheet of standard deviation s. A pixel shows the radiance S(u) at
+        position u. A surface height h(u) changes the image by -S' h, and the centroid by the integral of
+        -u S' h = (u / s)^2 S h. These weights of h have the variance 3 s^2, whereas the light has s^2.
+
+        Parameters
+        ----------
+        width_px : (N,)
+            Full width of each stripe at half maximum; NaN where unknown.
         """
         chosen = np.flatnonzero(np.isfinite(width_px) & (self.found.status == RayStatus.OK))
         chosen = chosen[:: max(1, len(chosen) // _MOST_FOR_FOOTPRINT)]
         line, place = self.line[chosen], self.centre_px[chosen]
-        # To the neighbouring line, within the table.
-        beside = self.at(line + np.where(line < line.max(), 1, -1), place)
+        # Neighbouring lines must stay within the table.
+        beside = self.evaluate(line + np.where(line < line.max(), 1, -1), place)
         width, sigma = width_px[chosen] / FWHM_PER_SIGMA, self.sigma_mm[chosen]
         of_sheet = np.minimum(self.per_sigma_px[chosen], width)
         blur = np.sqrt(np.maximum(width**2 - of_sheet**2, _PIXEL_VARIANCE))
@@ -155,10 +194,10 @@ class LitSheet:
         return _FOOTPRINT_PER_SHEET * float(np.median(thickness)), float(np.median(blur * spacing))
 
 
-def _on_sheet(
+def _make_sheet_function(
     calibration: Calibration, laser: Laser, origin_mm: np.ndarray, *, medium_index: float
 ) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Values (N, 8) for lines and places (N,), points, and ``of_slope`` to ``per_sigma_px``; and status (N,)."""
+    """Return a function from lines and centres (N,) to the values (N, 8) of `LitSheet.evaluate` and the status (N,)."""
     frame = calibration.object_transform()
 
     def exact(line: np.ndarray, place_px: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -168,7 +207,7 @@ def _on_sheet(
         found, ray, slope = rays_on_sheet(calibration, pixels, medium_index=medium_index)
         in_camera = found.points_mm[:count]
         sigma = sheet_sigma_mm(laser, np.linalg.norm(in_camera - origin_mm, axis=1), medium_index=medium_index)
-        # A sheet that moves by 1 mm moves the point along its ray by so much over the slope.
+        # Shift of the point along its ray if the sheet moves by 1 mm along its normal.
         per_mm = ray[:count] @ frame[:3, :3] / slope[:count, None]
         per_px = (found.points_mm[count:, :] - in_camera) @ frame[:3, 2] / _MOVED_PX
         result = np.empty((count, 8))
@@ -176,7 +215,7 @@ def _on_sheet(
         result[:, :3] = to_object(calibration, in_camera, **at_start)
         result[:, 3:6] = per_mm * (sigma**2)[:, None]
         result[:, 6] = sigma
-        # Where the surface is square to the laser's axis, Z stays: the pixel follows the sheet as both move Z alike.
+        # On a surface normal to the laser's axis, Z is constant: the shifts of sheet and pixel cancel in Z.
         result[:, 7] = np.abs(per_mm[:, 2] * sigma / per_px)
         return result, found.status[:count]
 
@@ -186,13 +225,21 @@ def _on_sheet(
 def slopes_of_brightness(
     frame: np.ndarray, line: np.ndarray, amplitude: np.ndarray, stage_mm: np.ndarray, exposure_ms: np.ndarray
 ) -> np.ndarray:
-    """Slope (N,) per mm of the stage of the logarithm of a scan's stripe amplitudes; 0 where it is unknown.
+    """Return the slopes (N,) of the log stripe amplitude per mm of stage travel, 0 where they are unknown.
 
-    It is unknown everywhere if a 3D camera does not give all amplitudes.
+    Each slope belongs to a plane fitted to the log amplitudes of neighbouring lines and images. The fit averages noise
+    and speckle. All slopes are 0 if an amplitude is not finite, because the 3D camera does not supply it.
 
-    A plane is fitted to the logarithms of all neighbours, so that noise and speckle of the single ones hardly count.
-    ``amplitude`` (N,) is positive, ``stage_mm`` and ``exposure_ms`` (F,) are those of every image, in any order; where
-    an exposure is not known, all are taken as equal.
+    Parameters
+    ----------
+    frame, line : (N,) int
+        Image and profile line of each stripe centre.
+    amplitude : (N,)
+        Stripe amplitudes, positive.
+    stage_mm : (F,)
+        Stage position of each image, in any order.
+    exposure_ms : (F,)
+        Exposure time of each image. If one of them is unknown (0), all are assumed equal.
     """
     if not np.isfinite(amplitude).all():
         return np.zeros(len(frame))
@@ -212,20 +259,23 @@ def slopes_of_brightness(
 
 
 def footprint_std(uncertainty: Uncertainty) -> float:
-    """Relative standard uncertainty of the squares of `footprint_mm`: by the sheet's thickness and the method."""
+    """Return the relative standard uncertainty of the squares of `LitSheet.footprint_mm`.
+
+    It combines the uncertainties of the sheet's thickness and of the stripe method.
+    """
     return math.hypot(beside_std(uncertainty), _METHOD_STD)
 
 
 def beside_std(uncertainty: Uncertainty) -> float:
-    """Relative standard uncertainty of `LitSheet.beside`, which goes with the square of the sheet's thickness."""
+    """Return the relative standard uncertainty of `LitSheet.beside`, which is proportional to the squared thickness."""
     return 2.0 * uncertainty.sheet_thickness
 
 
 def sheet_sigma_mm(laser: Laser, distance_mm: np.ndarray, *, medium_index: float) -> np.ndarray:
-    """Standard deviation of the sheet's profile, mm, so far from the laser in a medium, as described.
+    """Return the standard deviation of the described sheet's profile, mm, at distances from the laser in a medium.
 
-    Half the 1/e2 radius w, with w^2 = w0^2 (1 + ((z - z0) / zR)^2), zR = pi w0^2 n / (M2 lambda) (Siegman, Lasers, Eqs.
-    17.5 and 17.6, with the beam quality M2).
+    It is half the 1/e^2 radius w: w^2 = w0^2 (1 + ((z - z0) / zR)^2) with zR = pi w0^2 n / (M2 lambda)
+    (Siegman, Lasers, Eqs. 17.5 and 17.6, with the beam quality M2).
     """
     waist = laser.waist_radius_mm
     rayleigh = math.pi * waist**2 * medium_index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
@@ -235,11 +285,19 @@ def sheet_sigma_mm(laser: Laser, distance_mm: np.ndarray, *, medium_index: float
 def moved_by_blur_px(
     frame: np.ndarray, line: np.ndarray, centre_px: np.ndarray, amplitude: np.ndarray, width_px: np.ndarray
 ) -> np.ndarray:
-    """Shift (N,) of stripe centres that blur may cause, px, by their neighbours in the same image.
+    """Estimate the largest shifts (N,) in px that blur can cause, from neighbouring centres in the same image.
 
-    A stripe y(x), blurred by the standard deviation b in all directions, is seen at E[y(x - e) A(x - e)] / E[A(x - e)]
-    with e of that deviation: beside y(x) by b^2 (y' (ln A)' + y'' / 2) to second order. The stripe's width squared,
-    less what it owes to leaning, stands for b^2, of which it is the largest possible value.
+    Let a stripe y(x) have the amplitude A(x). Isotropic blur of standard deviation b moves its centre to
+    E[y(x - e) A(x - e)] / E[A(x - e)], where e has the standard deviation b. To second order, the shift is
+    b^2 (y' (ln A)' + y'' / 2). The squared stripe width, corrected for the stripe's tilt in the image, is an upper
+    limit of b^2.
+
+    Parameters
+    ----------
+    frame, line : (N,) int
+        Image and profile line of each stripe centre, in any order.
+    centre_px, amplitude, width_px : (N,)
+        Centre, positive amplitude, and full width at half maximum of each stripe.
     """
     if np.any((frame[1:] < frame[:-1]) | ((frame[1:] == frame[:-1]) & (line[1:] < line[:-1]))):
         order, moved = np.lexsort((line, frame)), np.empty(len(line))
@@ -254,9 +312,9 @@ def moved_by_blur_px(
 
 
 def sharp_lines(stripes: CaptureStripes) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers (M,) of the stripe centres that blur hardly moves, and by how much it may, px.
+    """Return the indices (M,) of stripe centres that blur shifts by less than 0.1 px, and their largest shifts, px.
 
-    All of them, and 0, if a 3D camera does not give all amplitudes and widths, by which it is known.
+    If an amplitude or width is not finite, because the 3D camera does not supply it, return all centres with shift 0.
     """
     if len(stripes.line) == 0:
         return np.empty(0, np.intp), np.empty(0)
@@ -268,7 +326,10 @@ def sharp_lines(stripes: CaptureStripes) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _slopes_along(frame: np.ndarray, line: np.ndarray, values: np.ndarray, reach: int) -> np.ndarray:
-    """Slopes (N,) by line of straight lines through the values so many lines around, of images in order."""
+    """Return the slopes (N,) per line of straight lines fitted to values within ``reach`` lines of the same image.
+
+    The values are sorted by image and line.
+    """
     slopes = np.zeros(len(line))
     _fit_lines(frame, line, np.ascontiguousarray(values, dtype=float), reach, slopes)
     return slopes
@@ -276,7 +337,7 @@ def _slopes_along(frame: np.ndarray, line: np.ndarray, values: np.ndarray, reach
 
 @compiled
 def _fit_lines(frame: np.ndarray, line: np.ndarray, values: np.ndarray, reach: int, slopes: np.ndarray) -> None:
-    """Fill the slopes (N,) that are known; sums over the window are running ones."""
+    """Write the slopes (N,) that can be fitted into ``slopes``, with running sums over the lines."""
     first, last, n, x1, x2, z1, xz = 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0
     origin, base = 0, 0.0
     for k in range(line.size):
@@ -297,14 +358,14 @@ def _fit_lines(frame: np.ndarray, line: np.ndarray, values: np.ndarray, reach: i
 def _slopes_by_position(
     row: np.ndarray, column: np.ndarray, values: np.ndarray, position: np.ndarray, *, rows: int
 ) -> np.ndarray:
-    """Slopes (N,) by position of planes fitted to the values within so many rows."""
+    """Return the slopes (N,) per position of planes fitted to the values within ``rows`` images."""
     first = column.min()
     shape = len(position), int(column.max() - first) + 1
     there, z, slopes = np.zeros(shape, np.bool_), np.zeros(shape), np.zeros(shape)
     place = row * shape[1] + (column - first)
     there.ravel()[place] = True
     z.ravel()[place] = values - values.mean()
-    # Images taken nearly at one place do not show the slope across it.
+    # Images at nearly the same stage position do not determine the slope.
     least = max(0.15 * (np.median(position[rows:] - position[:-rows]) / rows) ** 2, _LEAST_APART_MM**2)
     _fit_planes(there, z, position - position.mean(), rows, _LINES, least, slopes)
     return slopes.ravel()[place]
@@ -314,9 +375,9 @@ def _slopes_by_position(
 def _fit_planes(
     there: np.ndarray, z: np.ndarray, s: np.ndarray, rows: int, columns: int, least: float, slopes: np.ndarray
 ) -> None:
-    """Slopes (F, L) of planes through the values z (F, L) that are there, at positions s (F,), 0 where unknown.
+    """Write slopes (F, L) of planes fitted to the values z (F, L) marked by ``there``, at positions s (F,).
 
-    The sums over the window are running ones, first along a row and then from row to row.
+    Running sums over the window, first along each row, then from row to row. Unknown slopes stay as they are.
     """
     count, width = there.shape
     along = np.zeros((count, 5, width))

@@ -1,6 +1,6 @@
-"""The camera: pixels to rays and points to pixels, with lens distortion, straight or through the window.
+"""Camera model: pixels to rays and points to pixels, with lens distortion, with or without a window.
 
-Pinhole with Brown-Conrady or rational distortion in OpenCV's sense; pixel (0, 0) is the centre of the first pixel.
+Pinhole camera with OpenCV's Brown-Conrady or rational distortion. Pixel (0, 0) is the centre of the first pixel.
 """
 
 import math
@@ -14,32 +14,35 @@ from uwlts.model.calibration import CameraModel, WindowModel
 from uwlts.model.sensor import Distortion
 from uwlts.optics.window import check_index, tangent_ratio, window_normal
 
-# Newton's method doubles its digits with each step; only at the edge of the invertible domain, where the distortion's
-# derivative vanishes, it gains a mere bit a step, and the 53 bits of a float end it.
+# Newton's method doubles the number of correct digits with each step. At the edge of the invertible domain the
+# derivative of the distortion vanishes, and a step gains only one of the 53 bits of a float.
 _USUAL_STEPS = 8
 _MOST_STEPS = 60
 _MOST_HALVINGS = 12
 
-# Agreement of a distorted point with what it should be, in units of the focal length: some twenty roundings of numbers
-# of the order of one. With a focal length of 10,000 px it is 4e-11 px.
+# Tolerance of a distorted point in units of the focal length: about twenty rounding errors of numbers near 1. With a
+# focal length of 10,000 px it is 4e-11 px.
 _ROUNDING = 4e-15
 
-# Tangent of the angle to the axis (89.9 deg) beyond which no lens looks through a flat image.
+# Tangent of the largest angle to the axis (89.9 deg): no lens images wider angles onto a plane.
 _WIDEST = 1000.0
 
 
 def directions(camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
-    """Unit vectors (N, 3) in the camera frame along which the camera sees the pixels (N, 2), given as (u, v) in px.
+    """Return the unit vectors (N, 3) in the camera frame of the rays through pixels (N, 2), (u, v) in px.
 
-    A row is NaN where the distortion has no inverse: outside the image of the domain in which it is one-to-one and
-    which holds the principal point. The inverse is exact to rounding (Newton's method in the plane).
+    The distortion is inverted to rounding by Newton's method in two dimensions. The inverse exists in the image of the
+    domain, the largest disc about the principal point where the distortion is one-to-one. Rows outside are NaN.
 
-    Raises RangeError: a pixel is not finite.
+    Raises
+    ------
+    RangeError
+        A pixel is not finite.
     """
-    pixels = _finite("pixels", pixels)
+    pixels = _require_finite("pixels", pixels)
     x, y = (pixels[:, 0] - camera.cx_px) / camera.fx_px, (pixels[:, 1] - camera.cy_px) / camera.fy_px
     if camera.coefficients().any():
-        x, y = _undistorted(camera.distortion, x, y)
+        x, y = _undistort(camera.distortion, x, y)
     result = np.empty((3, len(pixels))).T  # coordinates contiguous: three times faster to refract
     length = np.sqrt(x * x + y * y + 1.0)
     np.divide(x, length, out=result[:, 0])
@@ -49,35 +52,41 @@ def directions(camera: CameraModel, pixels: np.ndarray) -> np.ndarray:
 
 
 def project(camera: CameraModel, points: np.ndarray) -> np.ndarray:
-    """Pixels (N, 2) of points (N, 3) in the camera frame (or of directions), seen without a window.
+    """Project points (N, 3) in the camera frame, or directions, to pixels (N, 2) without a window.
 
-    A row is NaN where the camera has no image of the point: at or behind the plane z = 0, and outside the domain in
-    which the distortion is one-to-one, where the polynomial would fold the point back into the image.
+    A row is NaN if the camera cannot see the point: at or behind the plane z = 0, or outside the domain of
+    `directions`, where the polynomial would fold the point back into the image.
 
-    Raises RangeError: a coordinate is not finite.
+    Raises
+    ------
+    RangeError
+        A coordinate is not finite.
     """
-    return _projected(camera, _finite("points", points))
+    return _project(camera, _require_finite("points", points))
 
 
 def project_through_window(
     camera: CameraModel, window: WindowModel | None, points: np.ndarray, *, medium_index: float
 ) -> np.ndarray:
-    """Pixels (N, 2) of points (N, 3) in the medium, camera frame, mm, seen through the window.
+    """Project points (N, 3) in the medium, camera frame, mm, through the window to pixels (N, 2).
 
-    The faces are parallel, so a ray stays in the plane of their normal and the point. There the offset of the point
-    from the normal through the pupil is the sum of ``height * tan(angle)`` over the layers, with ``index * sin(angle)``
-    the same in all. In the tangent in the rarest layer that sum rises and is concave, so Newton's method from zero
-    approaches its only solution from below, without bracketing.
+    The window's faces are parallel, so a ray stays in the plane that contains their normal and the point. In this
+    plane, the distance of the point from the normal through the pupil is the sum of ``height * tan(angle)`` over the
+    layers. The product ``index * sin(angle)`` is the same in all layers. The sum is an increasing, concave function of
+    the tangent in the layer with the lowest index. Newton's method from zero therefore converges to the only solution
+    from below, without bracketing.
 
-    A row is NaN where the camera has no image of the point: as for `project`, and for points that do not lie beyond
-    the window's outer face.
+    A row is NaN if the camera cannot see the point: as for `project`, or in front of the window's outer face.
 
-    Raises RangeError: a coordinate is not finite, or as for `uwlts.optics.window.trace_window`.
+    Raises
+    ------
+    RangeError
+        A coordinate is not finite, or as for `uwlts.optics.window.trace_window`.
     """
-    points = _finite("points", points)
+    points = _require_finite("points", points)
     check_index("medium_index", medium_index)
     if window is None:
-        return _projected(camera, points)
+        return _project(camera, points)
     normal = window_normal(window)
     thickness = window.thickness_mm if window.refractions == 2 else 0.0
     inner = window.distance_mm * normal[2]
@@ -90,24 +99,24 @@ def project_through_window(
     slope = np.divide(tangent, distance, out=np.zeros_like(distance), where=distance > 0)
     toward = normal + slope[:, None] * offset
     toward[np.isnan(depth)] = np.nan
-    return _projected(camera, toward)
+    return _project(camera, toward)
 
 
-def _finite(name: str, values: np.ndarray) -> np.ndarray:
+def _require_finite(name: str, values: np.ndarray) -> np.ndarray:
     values = np.asarray(values, dtype=float)
     finite = np.isfinite(values)
     if not finite.all():
         example = values[~finite.all(axis=1)][0]
-        raise RangeError(f"{name} must be finite, but there is {example}; pass only those that were found")
+        raise RangeError(f"{name} must be finite, but one is {example}; remove such rows")
     return values
 
 
 def _tangent_in_air(
     heights: tuple[float, float, np.ndarray], indices: tuple[float, float, float], distance: np.ndarray
 ) -> np.ndarray:
-    """Tangent (N,) of the angle in the first layer, of index 1, of rays that run ``distance`` sideways in all layers.
+    """Return the tangent (N,) of the angle in the first layer, of index 1, of rays with a given lateral ``distance``.
 
-    The unknown is the tangent in the rarest layer, from which `tangent_ratio` gives those in the others.
+    Solve for the tangent in the layer with the lowest index; `tangent_ratio` gives the tangents in the others.
     """
     layers = [(height, index) for height, index in zip(heights, indices, strict=True) if np.any(height != 0)]
     rarest = min(index for _, index in layers)
@@ -122,17 +131,17 @@ def _tangent_in_air(
         step = missing / rise
         tangent = tangent - step
         if not np.any(np.abs(step) > 1e-10 * (1.0 + tangent)):
-            break  # the error left is the square of this step
+            break  # the remaining error is of the order of the squared step
     return tangent * tangent_ratio(rarest**-2, tangent**2)
 
 
-def _projected(camera: CameraModel, points: np.ndarray) -> np.ndarray:
-    """As `project`, with rows of NaN staying NaN."""
+def _project(camera: CameraModel, points: np.ndarray) -> np.ndarray:
+    """Project points as `project`, but allow rows of NaN."""
     z = np.where(points[:, 2] > 0, points[:, 2], np.nan)
     x, y = points[:, 0] / z, points[:, 1] / z
     if camera.coefficients().any():
         outside = x * x + y * y >= _largest_square(camera.distortion)
-        x, y = _distorted(camera.distortion, x, y)
+        x, y = _distort(camera.distortion, x, y)
         x[outside] = np.nan
         y[outside] = np.nan
     return np.stack([camera.fx_px * x + camera.cx_px, camera.fy_px * y + camera.cy_px], axis=1)
@@ -144,13 +153,15 @@ def _largest_square(d: Distortion) -> float:
 
 @lru_cache(maxsize=16)
 def _edge_square(k1: float, k2: float, p1: float, p2: float, k3: float, k4: float, k5: float, k6: float) -> float:
-    """Square of the radius up to which the distortion is one-to-one; infinite where there is no end to it.
+    """Return the squared radius of the domain where the distortion is one-to-one, or infinity if it is everywhere.
 
-    The distortion's Jacobian is symmetric, and where it is positive definite all over a disc no two points of the disc
-    have the same image. The radial factor g(r) = N / D gives it the eigenvalues g and (r g)'; the tangential terms
-    lower them by 6 r |(p1, p2)| at most. So the disc ends where the smaller of the two first reaches 6 r |(p1, p2)|,
-    which is the exact edge for a barrel, or at a pole of g. Solved for 1 / r, as then the polynomials lead with 1; an
-    edge farther than `_WIDEST` is none.
+    The Jacobian of the distortion is symmetric. If it is positive definite on a disc, no two points of the disc have
+    the same image. With the radial factor g(r) = N / D, its eigenvalues are g and (r g)'. The tangential terms lower
+    them by at most 6 r |(p1, p2)|. The disc therefore ends where the smaller eigenvalue first reaches 6 r |(p1, p2)|,
+    or at a pole of g. For barrel distortion this edge is exact.
+
+    The unknown of the polynomials is 1 / r, so that their leading coefficient is 1. Radii above `_WIDEST` count as
+    infinite.
     """
     r = Polynomial([0.0, 1.0])
     tangential = 6.0 * math.hypot(p1, p2) * r
@@ -163,18 +174,18 @@ def _edge_square(k1: float, k2: float, p1: float, p2: float, k3: float, k4: floa
 
 
 def _radial(d: Distortion, s: np.ndarray) -> np.ndarray:
-    """The radial factor g at squares s of the radius."""
+    """Return the radial factor g at squared radii s."""
     above = 1.0 + s * (d.k1 + s * (d.k2 + s * d.k3))
     return above / _below(d, s) if d.is_rational() else above
 
 
 def _below(d: Distortion, s: np.ndarray) -> np.ndarray:
-    """The radial factor's denominator."""
+    """Return the denominator of the radial factor at squared radii s."""
     return 1.0 + s * (d.k4 + s * (d.k5 + s * d.k6))
 
 
 def _radial_slope(d: Distortion, s: np.ndarray) -> np.ndarray:
-    """The radial factor's derivative by s."""
+    """Return the derivative of the radial factor with respect to s."""
     slope = d.k1 + s * (2.0 * d.k2 + s * (3.0 * d.k3))
     if not d.is_rational():
         return slope
@@ -182,13 +193,13 @@ def _radial_slope(d: Distortion, s: np.ndarray) -> np.ndarray:
 
 
 def _growth(d: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Square of the radius, and the factor of the coordinates in the distortion of `_distorted`."""
+    """Return the squared radius, and the factor of the coordinates in `_distort`."""
     s = x * x + y * y
     return s, _radial(d, s) + 2.0 * (d.p1 * y + d.p2 * x)
 
 
-def _distorted(d: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distortion of ideal image coordinates in units of the focal length (OpenCV, module calib3d)."""
+def _distort(d: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distort ideal image coordinates, in units of the focal length (OpenCV, module calib3d)."""
     s, growth = _growth(d, x, y)
     return x * growth + d.p2 * s, y * growth + d.p1 * s
 
@@ -196,17 +207,18 @@ def _distorted(d: Distortion, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray,
 def _jacobian(
     d: Distortion, x: np.ndarray, y: np.ndarray, s: np.ndarray, growth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives xx, xy = yx, yy of `_distorted`, with what `_growth` gives."""
+    """Return the derivatives xx, xy = yx, yy of `_distort`; ``s`` and ``growth`` are the results of `_growth`."""
     slope = _radial_slope(d, s)
     x_slope, y_slope = 2.0 * (slope * x + d.p2), 2.0 * (slope * y + d.p1)
     return growth + x * (x_slope + 2.0 * d.p2), x * y_slope + (2.0 * d.p2) * y, growth + y * (y_slope + 2.0 * d.p1)
 
 
 def image_derivatives(camera: CameraModel, pixels: np.ndarray, ideal: np.ndarray) -> np.ndarray:
-    """Derivatives (14, 2, N) of the ideal image coordinates (2, N) of pixels (N, 2): by u, v, fx, fy, cx, cy, k1 to k6.
+    """Return the derivatives (14, 2, N) of the ideal image coordinates (2, N) of pixels (N, 2).
 
-    The order of the distortion is OpenCV's, k1 k2 p1 p2 k3 k4 k5 k6. The distorted image D(x, y; k) stays at
-    ((u - cx) / fx, (v - cy) / fy), so that dD/d(x, y) d(x, y) is the change of the latter minus dD/dk dk.
+    The derivatives are with respect to u, v, fx, fy, cx, cy, and the distortion in OpenCV's order, k1 k2 p1 p2 k3 k4 k5
+    k6. Implicit differentiation of D(x, y; k) = ((u - cx) / fx, (v - cy) / fy) = w gives
+    dD/d(x, y) d(x, y) = dw - dD/dk dk.
     """
     (x, y), d = ideal, camera.distortion
     focal, centre = np.array([camera.fx_px, camera.fy_px]), np.array([camera.cx_px, camera.cy_px])
@@ -227,7 +239,7 @@ def image_derivatives(camera: CameraModel, pixels: np.ndarray, ideal: np.ndarray
 def _newton_step(
     d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray, x: np.ndarray, y: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Newton's step (x, y) towards the inverse of `_distorted`, and how far the present image is from the one seen."""
+    """Return Newton's step (x, y) towards the inverse of `_distort`, and the present residual."""
     s, growth = _growth(d, x, y)
     x_missing, y_missing = x_seen - x * growth - d.p2 * s, y_seen - y * growth - d.p1 * s
     xx, xy, yy = _jacobian(d, x, y, s, growth)
@@ -236,8 +248,8 @@ def _newton_step(
     return x_step, y_step, np.abs(x_missing) + np.abs(y_missing)
 
 
-def _undistorted(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse of `_distorted` in its domain around the centre; NaN where there is none."""
+def _undistort(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Invert `_distort` in its domain about the centre; NaN outside the image of the domain."""
     allowed = _allowed(x_seen, y_seen)
     with np.errstate(all="ignore"):
         s = x_seen * x_seen + y_seen * y_seen
@@ -253,14 +265,15 @@ def _undistorted(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple
         found &= x * x + y * y < _largest_square(d)
     if not found.all():
         hard = np.flatnonzero(~found)
-        x[hard], y[hard] = _undistorted_with_care(d, x_seen[hard], y_seen[hard])
+        x[hard], y[hard] = _undistort_damped(d, x_seen[hard], y_seen[hard])
     return x, y
 
 
-def _undistorted_with_care(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `_undistorted`, by steps from the centre that stay in the domain and are halved until they help.
+def _undistort_damped(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Invert `_distort` by damped Newton steps from the centre.
 
-    As the Jacobian is positive definite in the domain, Newton's direction always helps if the step is short enough.
+    A step is halved until it stays in the domain and reduces the residual. Because the Jacobian is positive definite in
+    the domain, a short enough step always reduces it.
     """
     largest, allowed = _largest_square(d), _allowed(x_seen, y_seen)
     x, y = np.zeros_like(x_seen), np.zeros_like(y_seen)
@@ -270,7 +283,7 @@ def _undistorted_with_care(d: Distortion, x_seen: np.ndarray, y_seen: np.ndarray
         length, helps = np.ones_like(x), np.zeros(len(x), dtype=bool)
         for _ in range(_MOST_HALVINGS):
             x_next, y_next = x + length * x_step, y + length * y_step
-            x_now, y_now = _distorted(d, x_next, y_next)
+            x_now, y_now = _distort(d, x_next, y_next)
             left = np.abs(x_seen - x_now) + np.abs(y_seen - y_now)
             helps = (left < missing) & (x_next * x_next + y_next * y_next < largest)
             if helps.all():

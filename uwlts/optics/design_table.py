@@ -1,4 +1,4 @@
-"""Table of a sensor's design: resolution, line length, depth range and speckle limit by the design formulas."""
+"""Table of the design formulas' results for a sensor: resolution, line length, depth range, speckle limit."""
 
 import math
 from dataclasses import replace
@@ -33,9 +33,9 @@ class DesignRow(NamedTuple):
 
 
 def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
-    """Calculate what a sensor can do by the design formulas: resolution, line length, depth range, speckle limit.
+    """Calculate resolution, line length, depth range and speckle limit of a sensor with the design formulas.
 
-    Depths and ranges run along the camera's axis unless named otherwise.
+    Depths and ranges are measured along the camera's axis unless a row says otherwise.
 
     Parameters
     ----------
@@ -103,6 +103,6 @@ def design(sensor: str | Path | Sensor, *, medium: str) -> list[DesignRow]:
 
 
 def table_lines(rows: list[DesignRow]) -> list[str]:
-    """The table as text."""
+    """Format the table as lines of text."""
     width = max(len(row.name) for row in rows)
     return [f"{row.name:<{width}}  {row.value:>8.4g} {row.unit:<5}  {row.source}" for row in rows]

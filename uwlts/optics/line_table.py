@@ -1,8 +1,7 @@
-"""Smooth functions of the stripe's place, tabulated for every profile line, so that many places cost little.
+"""Chebyshev tables of smooth functions of profile line and stripe centre, for fast evaluation.
 
-Where a pixel's ray meets the sheet, and how that depends on the calibration, takes hundreds of operations to follow
-through lens, window and medium, and yet is so smooth over the image that a polynomial of some ten to thirty terms
-holds it to rounding. One is kept for every profile line.
+Ray tracing through lens, window and medium to the sheet takes hundreds of operations per pixel. The result is so smooth
+over the image that a polynomial of 10 to 30 terms approximates it to rounding. A table holds one for each profile line.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from numpy.polynomial import chebyshev
 from uwlts.runtime.compiled import compiled, compiled_part
 
 _NODES = (12, 8), (24, 24)
-"""Numbers of nodes along lines and places that are tried, one after another."""
+"""Numbers of nodes along lines and centres, tried in turn."""
 
 _KEPT = 16
 """Number of cached tables, of the most recently used functions."""
@@ -27,15 +26,22 @@ _WIDER = 64
 the same calibration."""
 
 _WORTH = 5000
-"""Places from which a table is worth making: it costs as much as some thousand of them."""
+"""Least number of centres that is worth a table: making one costs about as much as a thousand evaluations."""
 
 
 @dataclass(frozen=True, eq=False)
 class LineTable:
-    """A function of line and place on it with K values, as Chebyshev series of both.
+    """Chebyshev series in line and centre of a function with K values.
 
-    ``terms`` (T, n, K) are those of line and place, ``of_lines`` (L, T) the polynomials of each line from
-    ``first_line`` on, for places from ``low_px`` to ``high_px``.
+    Attributes
+    ----------
+    terms : (T, n, K)
+        Coefficients by term of the line, term of the centre, and value.
+    of_lines : (L, T)
+        Chebyshev polynomials at each line, from ``first_line`` on.
+    first_line : int
+    low_px, high_px : float
+        Limits of the centres.
     """
 
     terms: np.ndarray
@@ -54,11 +60,18 @@ class LineTable:
         tolerance: float | np.ndarray,
         share: float = 0.0,
     ) -> LineTable | None:
-        """Table of a function for the lines and places between two, ends included.
+        """Tabulate a function, or return None if it is not finite everywhere or not smooth enough.
 
-        ``exact`` gives the values (N, K) for lines (N,) and places (N,), both float. None where one is not finite, or
-        where the last terms of the series are not below the tolerance, of all values or of each (K,), or that ``share``
-        of the largest value where it is more, as of a function that is not smooth.
+        Parameters
+        ----------
+        exact
+            Function that returns the values (N, K) for lines (N,) and centres (N,), both float.
+        lines, places_px : tuple
+            Lowest and highest line and centre, both included.
+        tolerance : float or (K,)
+            Limit of the last two coefficients of the series.
+        share : float
+            Relative tolerance: fraction of each largest absolute value. The larger of the two tolerances applies.
         """
         (line, half_lines), (place, half_places) = (
             (0.5 * (low + high), max(0.5 * (high - low), 0.5)) for low, high in (lines, places_px)
@@ -77,7 +90,7 @@ class LineTable:
                 at_lines = (np.arange(lines[0], lines[1] + 1) - line) / half_lines
                 of_lines = chebyshev.chebvander(at_lines, count[0] - 1)
                 whole = cls(series, of_lines, lines[0], place - half_places, place + half_places)
-                # What is left out besides stays far below the tolerance.
+                # The truncation error must stay far below the tolerance.
                 return whole.shortened(1e-3 * error)
         return None
 
@@ -92,10 +105,21 @@ class LineTable:
         share: float = 0.0,
         key: Hashable = None,
     ) -> LineTable | None:
-        """Table for all of the places (N,) on lines (N,) int; None also where they are too few to be worth one.
+        """Tabulate a function over the range of given lines and centres, as `of`.
 
-        Of what says all about the function, as a ``key``, tables are kept. They are for some places more, so that a
-        table depends on nothing but these and the key.
+        Return None also if there are fewer than 5000 centres, or if a centre is not finite.
+
+        Parameters
+        ----------
+        exact, tolerance, share
+            As for `of`.
+        line : (N,) int
+            Profile lines.
+        place_px : (N,)
+            Stripe centres on the lines.
+        key : Hashable, optional
+            Key that determines the function completely. If given, tables are cached under it. Their limits are rounded
+            outwards, so that a table depends only on its limits and the key.
         """
         if len(line) < _WORTH or line.dtype.kind not in "iu" or not np.isfinite(place_px).all():
             return None
@@ -115,18 +139,18 @@ class LineTable:
         return cls.of(exact, lines, places_px, tolerance=tolerance, share=share)
 
     def combined(self, weights: np.ndarray) -> LineTable:
-        """Table of the sums of its values with weights (K, M)."""
+        """Return the table of linear combinations of the values, with weights (K, M)."""
         return replace(self, terms=self.terms @ weights)
 
     def shortened(self, tolerance: float | np.ndarray) -> LineTable:
-        """Table without the last terms, of lines and of places, that add up to no more than the tolerance in each."""
+        """Return the table without trailing terms whose absolute sum is within the tolerance, in lines and centres."""
         size = np.abs(self.terms)
         of_lines, of_places = (_needed(size.sum(axis=axis), tolerance) for axis in (1, 0))
         terms = np.ascontiguousarray(self.terms[:of_lines, :of_places])
         return replace(self, terms=terms, of_lines=np.ascontiguousarray(self.of_lines[:, :of_lines]))
 
     def series(self, line: np.ndarray, place_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Series (L, n, K) of lines and, for lines (N,) int and places (N,), their rows (N,) and arguments (N,)."""
+        """Return the series (L, n, K) of lines, and the row (N,) and argument (N,) in them of each line and centre."""
         row, of_lines = np.ascontiguousarray(line, dtype=np.intp) - self.first_line, self.of_lines
         if len(row) < len(of_lines):
             row, of_lines = np.arange(len(row)), of_lines[row]
@@ -135,7 +159,7 @@ class LineTable:
         return np.tensordot(of_lines, self.terms, 1), row, at
 
     def values(self, line: np.ndarray, place_px: np.ndarray) -> np.ndarray:
-        """Values (N, K) for lines (N,) int and places (N,) within the table."""
+        """Return values (N, K) for lines (N,) int and centres (N,) within the limits of the table."""
         result = np.empty((len(line), self.terms.shape[2]))
         sum_series(*self.series(line, place_px), result)
         return result
@@ -145,28 +169,28 @@ _tables: dict[Hashable, LineTable | None] = {}
 
 
 def _into_series(count: int) -> np.ndarray:
-    """Matrix that makes a Chebyshev series' terms of the values at so many nodes."""
+    """Return the matrix from values at ``count`` Chebyshev nodes to coefficients of the series."""
     into_series = 2.0 / count * chebyshev.chebvander(chebyshev.chebpts1(count), count - 1).T
     into_series[0] *= 0.5
     return into_series
 
 
 def _needed(size: np.ndarray, tolerance: float | np.ndarray) -> int:
-    """Number of the first terms, at least one, after which sizes (T, K) add up to no more than the tolerance."""
+    """Return the number of leading terms, at least 1, after which sizes (T, K) sum to no more than the tolerance."""
     left = np.cumsum(size[::-1], axis=0)[::-1]
     return max(1, int(np.count_nonzero((left > tolerance).any(axis=1))))
 
 
 @compiled
 def sum_series(series: np.ndarray, row: np.ndarray, at: np.ndarray, result: np.ndarray) -> None:
-    """Sums of Chebyshev polynomials at places (N,)."""
+    """Write values (N, K) of Chebyshev series at arguments (N,) from -1 to 1; ``row`` (N,) selects the series."""
     for n in range(row.size):
         sum_terms(series[row[n]], at[n], result[n])
 
 
 @compiled_part
 def sum_terms(terms: np.ndarray, x: float, sums: np.ndarray) -> None:
-    """Sums (K,) of a line's terms (n, K) times Chebyshev polynomials, each by recurrence from the two before."""
+    """Write values (K,) of a Chebyshev series with coefficients (n, K) at x, by the three-term recurrence."""
     before, polynomial, first = 1.0, x, terms[0]
     for k in range(sums.size):
         sums[k] = first[k]

@@ -1,4 +1,4 @@
-"""The calibration that follows from a sensor's description alone, for designs and for checks with true parameters."""
+"""Calibration from a sensor's description alone, for designs and for checks with true parameters."""
 
 import math
 from pathlib import Path
@@ -25,7 +25,7 @@ def nominal(sensor: str | Path | Sensor, *, medium: str) -> Calibration:
     sensor : str, Path or Sensor
         Name or path of a sensor description, or the description itself.
     medium : str
-        One of the sensor's media; the laser's window may turn the sheet in it.
+        One of the sensor's media. A tilted window of the laser refracts the sheet in it.
 
     Raises
     ------
@@ -35,22 +35,23 @@ def nominal(sensor: str | Path | Sensor, *, medium: str) -> Calibration:
         The sensor cannot work.
     """
     described = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
-    return nominal_calibration(described, described.medium(medium))
+    return nominal_calibration(described, described.medium(medium)).model_copy(update={"medium_name": medium})
 
 
 def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibration:
-    """The calibration a sensor would have if it were built exactly as its description says.
+    """Return the calibration that a sensor would have if it were built exactly as described.
 
-    Without a medium the sheet is the plane of the fan as it leaves the laser. In a medium it is the
-    plane that fits the fan's rays best where the camera sees them, after they have passed the laser's window: a window
-    turned about the sheet's normal leaves the sheet as it is, one turned about the fan's direction turns and bends it.
+    Without a medium, the sheet is the plane of the fan where it leaves the laser. With a medium, the sheet is the best
+    plane through the fan's rays behind the laser's window, over the depths in the camera's view. A window that is
+    turned about the sheet's normal does not change the sheet. A window that is turned about the fan's direction turns
+    and bends it.
     """
     camera = sensor.camera
     return Calibration(
         sensor_name=sensor.name,
         stripe_along=camera.stripe_along,
         wavelength_nm=sensor.laser.wavelength_nm,
-        # Without a window the described focal length holds no refraction: it is one in air.
+        # Without a window, the described focal length includes no refraction: it is that in air.
         medium_kind=medium.kind if medium is not None and camera.window.mounted else "air",
         camera=CameraModel.described(camera),
         window=WindowModel.described(camera.window, sensor.laser.wavelength_nm) if camera.window.mounted else None,
@@ -61,7 +62,7 @@ def nominal_calibration(sensor: Sensor, medium: Medium | None = None) -> Calibra
 
 
 def _sheet(sensor: Sensor, medium: Medium | None) -> SheetModel:
-    """Plane of the fan, or through its rays in a medium, over the depths that the camera sees."""
+    """Return the plane of the fan, or the plane fitted to its rays in a medium over the depths in the camera's view."""
     laser, pose = sensor.laser, laser_pose(sensor)
     if medium is None:
         return SheetModel(normal=tuple(pose.normal), offset_mm=float(pose.normal @ pose.origin_mm))
@@ -70,7 +71,7 @@ def _sheet(sensor: Sensor, medium: Medium | None) -> SheetModel:
     fan = np.stack([np.zeros(_RAYS), np.sin(angle), np.cos(angle)], axis=1)
     window = WindowModel.described(laser.window, laser.wavelength_nm) if laser.window.mounted else None
     rays = trace_window(fan, window, medium_index=medium.refractive_index(laser.wavelength_nm))
-    # Module frame of the laser: x along the sheet's normal, y along the fan, z along the axis.
+    # Laser frame: x along the sheet's normal, y along the fan, z along the axis.
     module = np.stack([pose.normal, pose.fan, pose.axis])
     origins, directions = rays.origins @ module + pose.origin_mm, rays.directions @ module
     view = view_of_sheet(sensor, medium)

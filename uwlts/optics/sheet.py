@@ -1,11 +1,13 @@
-"""The laser sheet in a medium: a plane, or slightly a cone, turned by the laser's window.
+"""Laser sheet in a medium: a plane or a slightly conical surface, refracted by the laser's window.
 
-A ray at the angle a to the axis leaves a sheet whose beam enters the line optics tilted by the angle b with the part
-b (1 - cos a) across it; the laser's window, at the angle t to the sheet, keeps what runs along its face, divided by the
-medium's index n (Snell's law). At the distance r from where the rays seem to come from, z of it along the axis, the
-sheet in the medium therefore lies off a plane by (b (r - q) + t w (z - q)) / n, where q = r cos a follows from
-q^2 = n^2 z^2 - (n^2 - 1) r^2, and w is the share of z that lies behind the window; and that plane is turned by
-t (1 - 1 / n) about the window. This holds to first order in b and t; what the glass shifts is left out.
+A sheet is conical if the beam enters the line optics with a tilt b. A ray at the angle a to the axis then has the
+component b (1 - cos a) across the sheet. Let t be the angle between the sheet and the normal of the laser's window.
+Refraction divides the component of a ray along the window's face by the medium's index n (Snell's law).
+
+Let r be the distance of a point from the rays' apparent origin, and z its component along the axis. The fraction w of z
+is in the medium. With q = r cos a and q^2 = n^2 z^2 - (n^2 - 1) r^2, the sheet in the medium deviates from a plane by
+(b (r - q) + t w (z - q)) / n. The window turns that plane by t (1 - 1 / n). This is exact to first order in b and t;
+the offset by the glass is neglected.
 """
 
 from dataclasses import dataclass
@@ -14,17 +16,29 @@ import numpy as np
 
 from uwlts.model.calibration import FanModel, SheetModel
 
-# A bulge is a few hundredths of a millimetre and almost constant along a ray: each round gains three digits or more.
+# Iterations of `SheetSurface.crossings`. The deviation from the plane is a few hundredths of a millimetre and almost
+# constant along a ray, so that each iteration gains at least three digits.
 _ROUNDS = 4
-# No ray that has passed the window runs there; the square of q / r of points that a search may try.
+# Lower limit of (q / r)^2, for points that a solver may try. Rays behind the window do not reach such points.
 _GRAZING = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class FanDistances:
-    """Distances (N,) of points from the apparent origin of a fan in a medium: all, along the axis, and q.
+    """Distances of points from the apparent origin of a fan in a medium.
 
-    ``away`` (3, N) are the points from there, and ``wet`` is the share of the distance along that is in the medium.
+    Attributes
+    ----------
+    away : (3, N)
+        Vectors from the origin to the points.
+    all : (N,)
+        Their lengths r.
+    along : (N,)
+        Their components z along the fan's axis.
+    in_air : (N,)
+        The lengths q in air (see the module's description).
+    wet : (N,)
+        Fraction w of ``along`` that is in the medium.
     """
 
     away: np.ndarray
@@ -34,15 +48,15 @@ class FanDistances:
     wet: np.ndarray
 
     def bulges(self) -> tuple[np.ndarray, np.ndarray]:
-        """Factors (N,), (N,) of the beam's tilt and the window's turn, over the index."""
+        """Return n times the sheet's deviation (N,), (N,) per beam tilt b and per window angle t."""
         return self.all - self.in_air, self.wet * (self.along - self.in_air)
 
 
 @dataclass(frozen=True, eq=False)
 class SheetSurface:
-    """Points that the sheet lights, camera frame, mm: the plane ``normal . x = offset_mm`` and the bulge of the fan.
+    """Surface of the sheet in the camera frame, mm: the plane ``normal . x = offset_mm`` plus the fan's deviation.
 
-    ``index`` is that of the medium; without a ``fan`` the surface is a plane.
+    ``index`` is the medium's refractive index. Without a ``fan`` the surface is a plane.
     """
 
     normal: np.ndarray
@@ -51,11 +65,11 @@ class SheetSurface:
     fan: FanModel | None = None
 
     def is_plane(self) -> bool:
-        """Whether nothing bends the sheet."""
+        """Return whether the surface is a plane."""
         return self.fan is None or (self.fan.bow_rad == 0.0 and self.fan.window_turn_rad == 0.0)
 
     def crossings(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distances (N,) in mm along rays (3, N) to the surface, and its gradient along the rays there (N,)."""
+        """Return distances (N,) in mm along rays (3, N) to the surface, and the gradient (N,) along each ray there."""
         along = self.normal @ directions
         reach = (self.offset_mm - self.normal @ origins) / along
         if self.is_plane():
@@ -68,7 +82,7 @@ class SheetSurface:
         return reach, slope
 
     def miss_mm(self, points: np.ndarray) -> np.ndarray:
-        """Distances (N,) of points (3, N) beyond the surface."""
+        """Return the signed distances (N,) of points (3, N) from the surface, positive on the side of the normal."""
         miss = self.normal @ points - self.offset_mm
         if (fan := self.fan) is None or self.is_plane():
             return miss
@@ -76,19 +90,19 @@ class SheetSurface:
         return miss - (fan.bow_rad * of_bow + fan.window_turn_rad * of_turn) / self.index
 
     def gradient(self, points: np.ndarray) -> np.ndarray:
-        """Gradient (3, N) of `miss_mm`."""
+        """Return the gradient (3, N) of `miss_mm` at points (3, N)."""
         if (fan := self.fan) is None or self.is_plane():
             return np.repeat(self.normal[:, None], points.shape[1], axis=1)
-        at, n = fan_distances(points, fan, medium_index=self.index), self.index
+        found, n = fan_distances(points, fan, medium_index=self.index), self.index
         axis = np.array(fan.axis)[:, None]
-        of_air = (n**2 * at.along * axis - (n**2 - 1.0) * at.away) / at.in_air
-        of_bow = at.away / at.all - of_air
-        of_turn = at.wet * (axis - of_air) + (1.0 - at.wet) * (1.0 - at.in_air / at.along) * axis
+        of_air = (n**2 * found.along * axis - (n**2 - 1.0) * found.away) / found.in_air
+        of_bow = found.away / found.all - of_air
+        of_turn = found.wet * (axis - of_air) + (1.0 - found.wet) * (1.0 - found.in_air / found.along) * axis
         return self.normal[:, None] - (fan.bow_rad * of_bow + fan.window_turn_rad * of_turn) / n
 
 
 def fan_distances(points: np.ndarray, fan: FanModel, *, medium_index: float) -> FanDistances:
-    """Distances of points (3, N); in a medium a fan seems to begin farther away than it does."""
+    """Return the distances of points (3, N) from a fan's apparent origin, which in a medium is behind the true one."""
     axis = np.array(fan.axis)
     behind = medium_index * behind_window_mm(fan)
     away = points - (np.array(fan.pivot_mm) - behind * axis)[:, None]
@@ -98,12 +112,12 @@ def fan_distances(points: np.ndarray, fan: FanModel, *, medium_index: float) -> 
 
 
 def behind_window_mm(fan: FanModel) -> float:
-    """Distance from the fan's origin to the window's outer face, along its axis."""
+    """Return the distance along the axis from the fan's origin to the window's outer face."""
     return float(np.array(fan.axis) @ (np.array(fan.pivot_mm) - np.array(fan.apex_mm)))
 
 
 def sheet_surface(sheet: SheetModel, *, medium_index: float) -> SheetSurface:
-    """The sheet in a medium of an index relative to air."""
+    """Return the surface of a sheet in a medium; the index is relative to air."""
     normal, fan = np.array(sheet.normal), sheet.fan
     if fan is None:
         return SheetSurface(normal, sheet.offset_mm)

@@ -1,7 +1,7 @@
-"""From stripe centres in the image to points on the surface.
+"""Triangulation: from stripe centres in the image to points on the surface.
 
-By lens, window and sheet, then the stage (thesis Fig. 43); or by polynomials, position to Z and Z to Y (thesis, section
-4.7).
+Either with models of lens, window, sheet and stage (thesis Fig. 43), or with polynomials from image position to Z and
+from Z to Y (thesis section 4.7).
 """
 
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ from uwlts.optics.line_table import LineTable
 from uwlts.optics.sheet import SheetSurface, sheet_surface
 from uwlts.optics.window import RaysInMedium, RayStatus, trace_window
 
-# Sine of the angle to the sheet below which a ray counts as parallel to it: some thousand roundings. A ray at this
+# Sine of the angle to the sheet below which a ray counts as parallel: some thousand rounding errors. A ray at this
 # angle would meet a sheet 1 mm away after a million kilometres.
 _PARALLEL = 1e-12
 
-# To which points of profiles are tabulated.
+# Tolerance of the table of a profile's points.
 _TABLE_TOLERANCE_MM = 1e-7
 
-# Pixels computed together, so that all intermediate results stay in the processor's cache.
+# Pixels per block, so that all intermediate results stay in the processor's cache.
 _BLOCK = 4096
 
 
 @dataclass(frozen=True)
 class MeasuredPoints:
-    """Measured points: in the camera frame, or in the object coordinate system (OCS) at the stage position 0.
+    """Measured points in the camera frame, or in the object coordinate system (OCS) at stage position 0.
 
     Attributes
     ----------
@@ -52,10 +52,27 @@ def reconstruct_profile(
     stage_mm: np.ndarray | float,
     stage_direction: np.ndarray,
 ) -> MeasuredPoints:
-    """Measured points of the stripe centres of one profile, or of many joined together.
+    """Reconstruct points in the OCS from the stripe centres of one profile, or of several joined profiles.
 
-    ``lines`` (N,) are image columns if the stripe runs along the width, else image rows; ``centres_px`` (N,) is the
-    stripe's place on each. The rest is as for `reconstruct_pixels`.
+    Parameters
+    ----------
+    calibration : Calibration
+        Camera, window, sheet and transform to the OCS.
+    lines : (N,) int
+        Image columns if the stripe runs along the width, else image rows.
+    centres_px : (N,)
+        Stripe centre on each line.
+    medium_index : float
+        Refractive index of the medium, relative to air; ignored without a window.
+    stage_mm : float or (N,)
+        Stage position of all points or of each.
+    stage_direction : (3,)
+        Unit vector in the OCS: direction of the sensor's motion.
+
+    Raises
+    ------
+    RangeError
+        As for `points_on_sheet` and `stage_travel`.
     """
     found = _profile_points(calibration, lines, centres_px, medium_index=medium_index)
     points = to_object(calibration, found.points_mm, stage_mm=stage_mm, stage_direction=stage_direction)
@@ -65,7 +82,7 @@ def reconstruct_profile(
 def _profile_points(
     calibration: Calibration, lines: np.ndarray, centres_px: np.ndarray, *, medium_index: float
 ) -> MeasuredPoints:
-    """As `points_on_sheet`, by a table where there are many points and all of their part of the image has some."""
+    """Return the points of `points_on_sheet`, from a `LineTable` if one is worth making."""
 
     def exact(line: np.ndarray, place: np.ndarray) -> MeasuredPoints:
         pixels = pixels_of(line, place, stripe_along=calibration.stripe_along)
@@ -88,17 +105,21 @@ def reconstruct_pixels(
     stage_mm: np.ndarray | float,
     stage_direction: np.ndarray,
 ) -> MeasuredPoints:
-    """Measured points in the OCS of pixels (N, 2), given as (u, v) in px; see `points_on_sheet` and `to_object`."""
+    """Reconstruct points in the OCS from pixels (N, 2), (u, v) in px; the rest is as for `reconstruct_profile`."""
     found = points_on_sheet(calibration, pixels, medium_index=medium_index)
     points = to_object(calibration, found.points_mm, stage_mm=stage_mm, stage_direction=stage_direction)
     return MeasuredPoints(points, found.status)
 
 
 def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_index: float) -> MeasuredPoints:
-    """Crossings of the camera rays of pixels (N, 2), (u, v), with the sheet, camera frame (thesis Eqs. 3.3 to 3.9).
+    """Intersect the camera rays of pixels (N, 2), (u, v) in px, with the sheet, camera frame (thesis Eqs. 3.3 to 3.9).
 
-    The pixels may be those of many frames. The index of the medium, relative to air, matters only behind a window.
-    RangeError where a pixel is not finite, or the index is not finite and positive.
+    The pixels may belong to several frames. The medium's index, relative to air, is ignored without a window.
+
+    Raises
+    ------
+    RangeError
+        A pixel is not finite, or the index is not finite and positive.
     """
     return rays_on_sheet(calibration, pixels, medium_index=medium_index)[0]
 
@@ -106,7 +127,7 @@ def points_on_sheet(calibration: Calibration, pixels: np.ndarray, *, medium_inde
 def rays_on_sheet(
     calibration: Calibration, pixels: np.ndarray, *, medium_index: float
 ) -> tuple[MeasuredPoints, np.ndarray, np.ndarray]:
-    """As `points_on_sheet`, with the rays' directions (N, 3) in the medium and the sheet's gradient (N,) along them."""
+    """Return `points_on_sheet`, ray directions (N, 3) in the medium, and the sheet's gradient (N,) along the rays."""
     pixels = np.asarray(pixels, dtype=float)
     sheet = sheet_surface(calibration.sheet, medium_index=medium_index)
     found = []
@@ -120,10 +141,15 @@ def rays_on_sheet(
 def to_object(
     calibration: Calibration, points_camera: np.ndarray, *, stage_mm: np.ndarray | float, stage_direction: np.ndarray
 ) -> np.ndarray:
-    """Points (N, 3) in the OCS at stage position 0, mm, from points (N, 3) in the camera frame at ``stage_mm``.
+    """Transform points (N, 3) from the camera frame at ``stage_mm`` to the OCS at stage position 0, mm.
 
-    ``p_object = T_object_camera p_camera + stage_mm * stage_direction`` with a position for all points or for each, and
-    the unit direction in the OCS in which the stage moves the sensor; rows of NaN stay NaN. Raises as `stage_travel`.
+    The result is ``T_object_camera p_camera + stage_mm * stage_direction``. Rows of NaN stay NaN. ``stage_mm`` is one
+    position for all points or one for each; ``stage_direction`` is a unit vector in the OCS.
+
+    Raises
+    ------
+    RangeError
+        As for `stage_travel`.
     """
     travel = stage_travel(stage_mm, stage_direction)
     object_from_camera = np.linalg.inv(calibration.object_transform())
@@ -133,9 +159,12 @@ def to_object(
 
 
 def stage_travel(stage_mm: np.ndarray | float, stage_direction: np.ndarray) -> np.ndarray:
-    """Shift of points in the OCS by the stage's motion: (3, N), or (3, 1) where all share a position.
+    """Return the shift of points in the OCS by the stage: (3, N), or (3, 1) for a single position.
 
-    RangeError where a stage position is not finite, or the direction is not a unit vector.
+    Raises
+    ------
+    RangeError
+        A stage position is not finite, or the direction is not a unit vector.
     """
     stage_mm, stage_direction = np.asarray(stage_mm, dtype=float), np.asarray(stage_direction, dtype=float)
     if not np.isfinite(stage_mm).all():
@@ -146,10 +175,10 @@ def stage_travel(stage_mm: np.ndarray | float, stage_direction: np.ndarray) -> n
 
 
 def _crossings(rays: RaysInMedium, sheet: SheetSurface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Crossings (N, 3) of rays in the medium with the sheet (thesis Eq. 3.9 for a plane), status and slope (N,).
+    """Intersect rays in the medium with the sheet: points (N, 3), status (N,), and gradient (N,) along the rays.
 
-    A crossing that is not ahead of the ray is BEHIND if the light passed the sheet between the pupil and the medium,
-    that is, if the two lie on different sides of it; otherwise the ray runs away from the sheet.
+    For a plane this is thesis Eq. 3.9. The status of a ray that does not meet the sheet in the medium is BEHIND or
+    NO_CROSSING: BEHIND if the pupil and the ray's origin in the medium are on different sides of the sheet.
     """
     normal = sheet.normal
     gap = sheet.offset_mm - rays.origins @ normal
@@ -178,12 +207,15 @@ def reconstruct_by_polynomials(
     stage_mm: np.ndarray | float,
     stage_direction: np.ndarray,
 ) -> MeasuredPoints:
-    """Measured points in the OCS at stage position 0 of stripe centres; X is 0 but for the stage's travel.
+    """Reconstruct points in the OCS at stage position 0 from stripe centres, with polynomials.
 
-    A centre outside the range that its line was calibrated for, or on a line that was not calibrated, has no point:
-    its status is OUTSIDE_CALIBRATION.
+    X is 0 plus the stage's travel. The status is OUTSIDE_CALIBRATION if a line is not calibrated, or if a centre is
+    outside the calibrated range of its line. Parameters are as for `reconstruct_profile`.
 
-    Arguments are as for `reconstruct_profile`; RangeError where a centre is not finite, or as from `stage_travel`.
+    Raises
+    ------
+    RangeError
+        A centre is not finite, or as for `stage_travel`.
     """
     lines, centres_px = np.asarray(lines), np.asarray(centres_px, dtype=float)
     if not np.isfinite(centres_px).all():
@@ -192,7 +224,7 @@ def reconstruct_by_polynomials(
     rows = lines - calibration.first_line
     known = (rows >= 0) & (rows < len(domains))
     rows = np.where(known, rows, 0)
-    # Comparisons with the NaN of a line without a range are false.
+    # Lines without a range have NaN limits; comparisons with NaN are false.
     known &= (centres_px >= domains[rows, 0]) & (centres_px <= domains[rows, 1])
     rows = rows[known]
     depth = _polynomial_values(calibration.depth_coefficients, rows, centres_px[known], calibration.position_range_px)
@@ -207,6 +239,6 @@ def reconstruct_by_polynomials(
 def _polynomial_values(
     coefficients: tuple[tuple[float, ...], ...], rows: np.ndarray, x: np.ndarray, limits: tuple[float, float]
 ) -> np.ndarray:
-    """Values (N,) of the polynomials in ``rows`` (N,) at x (N,)."""
+    """Evaluate the polynomials in ``rows`` (N,) at x (N,)."""
     low, high = limits
     return legendre.legval((2 * x - low - high) / (high - low), np.array(coefficients)[rows].T, tensor=False)

@@ -1,6 +1,6 @@
-"""Camera rays through a flat window of any tilt: from the entrance pupil to the medium behind the glass.
+"""Camera rays through a tilted flat window, from the entrance pupil to the medium behind the glass.
 
-Snell's law in vector form (thesis Eq. 2.18, after Glassner 1989). Everything is in the camera frame, in mm.
+Snell's law in vector form (thesis Eq. 2.18, after Glassner 1989). All quantities are in the camera frame, in mm.
 """
 
 import math
@@ -14,12 +14,12 @@ from uwlts.model.calibration import WindowModel
 
 
 class RayStatus(IntEnum):
-    """Result for a camera ray; anything but OK has no point.
+    """Status of a camera ray. Only rays with status OK have a point.
 
-    NO_DIRECTION: the lens model has no inverse at the pixel. BEHIND_WINDOW: the ray never reaches the window going
-    forward. TOTAL_REFLECTION: a face of the window lets nothing through. NO_CROSSING: the ray runs parallel to the
-    sheet or away from it. BEHIND: the ray passes the sheet inside the housing or the glass, not in the medium.
-    OUTSIDE_CALIBRATION: a polynomial calibration says nothing about this place of the image.
+    NO_DIRECTION: the lens model cannot be inverted at the pixel. BEHIND_WINDOW: the ray runs away from the window.
+    TOTAL_REFLECTION: a face of the window reflects all light. NO_CROSSING: the ray runs parallel to the sheet or away
+    from it. BEHIND: the ray meets the sheet inside the housing or the glass, not in the medium. OUTSIDE_CALIBRATION:
+    the polynomial calibration does not cover this part of the image.
     """
 
     OK = 0
@@ -33,11 +33,16 @@ class RayStatus(IntEnum):
 
 @dataclass(frozen=True)
 class RaysInMedium:
-    """Rays as they run in the medium, in the camera frame.
+    """Rays in the medium, camera frame.
 
-    ``origins`` (N, 3), mm, lie on the window's outer face (in the entrance pupil where there is no window);
-    ``directions`` (N, 3) are unit vectors away from the sensor; both are NaN where ``status`` (N,), uint8 of
-    `RayStatus`, is not OK.
+    Attributes
+    ----------
+    origins : (N, 3)
+        Points on the window's outer face, mm; the entrance pupil without a window. NaN if the status is not OK.
+    directions : (N, 3)
+        Unit vectors away from the sensor. NaN if the status is not OK.
+    status : (N,) uint8
+        `RayStatus`.
     """
 
     origins: np.ndarray
@@ -47,10 +52,10 @@ class RaysInMedium:
 
 @dataclass(frozen=True, eq=False)
 class RayDerivatives:
-    """Rays in the medium, camera frame, mm, and their derivatives.
+    """Rays in the medium, camera frame, mm, and their derivatives with respect to C parameters.
 
-    ``origins`` (3, N), ``directions`` (3, N) of length one, and both by C quantities: ``origins_by`` and
-    ``directions_by`` (C, 3, N).
+    ``origins`` and ``directions`` (unit vectors) have the shape (3, N); their derivatives ``origins_by`` and
+    ``directions_by`` have the shape (C, 3, N).
     """
 
     origins: np.ndarray
@@ -60,23 +65,23 @@ class RayDerivatives:
 
 
 def require_index(index: float) -> None:
-    """Refuse a refractive index relative to air that no medium to measure in has; RangeError."""
+    """Raise RangeError unless the refractive index of a medium, relative to air, is from 1 to 2."""
     if not 1 <= index < 2:
-        raise RangeError(f"the refractive index is {index:g}; expected that of a medium relative to air, from 1 to 2")
+        raise RangeError(f"the refractive index is {index:g}; expected a value relative to air, from 1 to 2")
 
 
 def check_index(name: str, value: float) -> None:
     """Raise RangeError unless a refractive index or a ratio of two is finite and positive."""
     if not (math.isfinite(value) and value > 0):
-        raise RangeError(f"{name} is {value:g}; a refractive index is finite and positive")
+        raise RangeError(f"{name} is {value:g}; expected a finite, positive number")
 
 
 def refract(directions: np.ndarray, normal: np.ndarray, *, ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    """Directions behind an interface, by Snell's law in vector form (thesis Eq. 2.18).
+    """Refract rays at an interface by Snell's law in vector form (thesis Eq. 2.18).
 
-    Eq. 2.18 holds for a normal that opposes the incident ray; with N = (0, 0, 1) along the camera's axis, as the
-    thesis prints it beside Eq. 3.6, it sends the ray backwards. Here the normal may point to either side: the sign of
-    the square root follows the side from which the ray comes.
+    Eq. 2.18 holds for a normal that opposes the incident ray. With N = (0, 0, 1) along the camera's axis, as printed
+    with Eq. 3.6 of the thesis, the equation sends the ray backwards. Here the normal may point to either side: the sign
+    of the square root is that of the cosine between ray and normal.
 
     Parameters
     ----------
@@ -85,13 +90,18 @@ def refract(directions: np.ndarray, normal: np.ndarray, *, ratio: float) -> tupl
     normal : (3,) or (N, 3)
         Unit normal of the interface, for all rays or for each.
     ratio : float
-        Index before the interface over index behind it; RangeError where it is not finite and positive.
+        Index before the interface divided by the index behind it.
 
     Returns
     -------
     refracted : (N, 3)
         Unit vectors, NaN where the ray is totally reflected.
     total_reflection : (N,) bool
+
+    Raises
+    ------
+    RangeError
+        The ratio is not finite and positive.
     """
     check_index("the ratio of refractive indices", ratio)
     rays, normal = np.asarray(directions, dtype=float).T, np.asarray(normal, dtype=float)
@@ -106,15 +116,19 @@ def refract(directions: np.ndarray, normal: np.ndarray, *, ratio: float) -> tupl
 
 
 def tangent_ratio(index_squared: float, tangent_squared: np.ndarray) -> np.ndarray:
-    """Tangent of a ray's angle to the normal behind an interface over that before it, by Snell's law.
+    """Return the ratio of the tangents of a ray's angle to the normal, behind and before an interface (Snell's law).
 
-    With m the index behind the interface over that before it and t the tangent before: 1 / sqrt(m^2 + (m^2 - 1) t^2).
+    The ratio is 1 / sqrt(m^2 + (m^2 - 1) t^2). Here m is the ratio of the indices behind and before the interface, and
+    t is the tangent before it.
     """
     return 1.0 / np.sqrt(index_squared + (index_squared - 1.0) * tangent_squared)
 
 
 def leaning(direction: np.ndarray, across: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vector (3,) that leans from a direction by slopes (k,) towards others (k, 3), and its derivatives (k, 3)."""
+    """Return a direction tilted by slopes (k,) towards vectors (k, 3), and its derivatives (k, 3) by the slopes.
+
+    The tilted direction is a unit vector (3,).
+    """
     raw = direction + slopes @ across
     length = np.linalg.norm(raw)
     unit = raw / length
@@ -122,22 +136,29 @@ def leaning(direction: np.ndarray, across: np.ndarray, slopes: np.ndarray) -> tu
 
 
 def window_normal(window: WindowModel) -> np.ndarray:
-    """Unit normal (3,) of a window, along a camera ray; RangeError where the camera looks along the glass."""
+    """Return the unit normal (3,) of a window, directed away from the camera.
+
+    Raises RangeError if the camera's axis runs along the glass.
+    """
     normal = np.array(window.normal)
     length = np.linalg.norm(normal)
     if not abs(normal[2]) > 1e-6 * length:
-        raise RangeError(f"the window's normal {window.normal} must have a part along the camera's axis (z)")
+        raise RangeError(f"the window's normal {window.normal} must have a component along the camera's axis (z)")
     return normal / math.copysign(length, normal[2])
 
 
 def trace_window(directions: np.ndarray, window: WindowModel | None, *, medium_index: float) -> RaysInMedium:
-    """Follow rays from the entrance pupil, the camera frame's origin, through the window into the medium.
+    """Trace rays from the entrance pupil (the origin of the camera frame) through the window into the medium.
 
-    Thesis Eqs. 3.4 to 3.7 for one refraction, once more at the outer face for two. Without a window the rays stay as
-    they are. In air (``medium_index`` 1) a window shifts the rays and a single interface does nothing.
+    One refraction follows thesis Eqs. 3.4 to 3.7; two refractions repeat them at the outer face. Without a window the
+    rays do not change. In air (``medium_index`` 1), two refractions shift the rays, and one changes nothing.
 
-    ``directions`` (N, 3) are unit vectors in air, camera frame; rows that are not finite get the status NO_DIRECTION.
-    RangeError where the index is not finite and positive, or the window's plane runs along the camera's axis.
+    ``directions`` (N, 3) are unit vectors in air, camera frame. Rows that are not finite get the status NO_DIRECTION.
+
+    Raises
+    ------
+    RangeError
+        The index is not finite and positive, or the camera's axis runs along the glass.
     """
     check_index("medium_index", medium_index)
     directions = np.asarray(directions, dtype=float)
@@ -168,11 +189,12 @@ def trace_window(directions: np.ndarray, window: WindowModel | None, *, medium_i
 def trace_derivatives(
     rays: np.ndarray, rays_by: np.ndarray, window: WindowModel, *, medium_index: float
 ) -> RayDerivatives | None:
-    """Rays (3, N) behind the window, as of `trace_window`, with derivatives; None where a ray does not get there.
+    """Trace rays (3, N) as `trace_window`, with derivatives; return None if a ray does not reach the medium.
 
-    The columns are those of ``rays_by`` (c, 3, N), then the window's distance, the two slopes of its normal, the
-    thickness and the index of the glass, and the medium's index. At a face index times direction changes along the
-    normal only (Snell's law): n' r' = n r + (root - n cosine) normal, with root^2 = n'^2 - n^2 + (n cosine)^2.
+    The derivatives are with respect to the c parameters of ``rays_by`` (c, 3, N), then the window's distance, the two
+    slopes of its normal, the thickness and index of the glass, and the medium's index. At a face, index times direction
+    changes only along the normal (Snell's law): n' r' = n r + (root - n cosine) normal, with
+    root^2 = n'^2 - n^2 + (n cosine)^2.
     """
     count = len(rays_by)
     of_distance, _, _, of_thickness, of_glass, of_medium = np.eye(count + 6)[count:]

@@ -108,7 +108,7 @@ WRONG = {
     "no such effect": ({"vary": {"effects.glitter": {"kind": "constant", "value": 1}}}, "unknown effect 'glitter'"),
     "no strength": (
         {"vary": {"effects.colour-filter": {"kind": "constant", "value": 1}}},
-        "has no strength; name it in effects",
+        "does not have a strength; name it in effects",
     ),
     "a word for a number": ({"vary": {POWER: {"kind": "choice", "values": ["strong"]}}}, "in place of the number 7"),
     "another size": ({"vary": {"sensor.camera.width_px": {"kind": "constant", "value": 64}}}, "have the same size"),
@@ -116,7 +116,7 @@ WRONG = {
         {"vary": {POWER: {"kind": "uniform", "least": 2, "most": 1}}},
         "least 2 must be smaller than most 1",
     ),
-    "no logarithm": ({"vary": {POWER: {"kind": "log_uniform", "least": 0, "most": 1}}}, "above 0, found 0"),
+    "no logarithm": ({"vary": {POWER: {"kind": "log_uniform", "least": 0, "most": 1}}}, "it must be above 0"),
     "nothing between": (
         {"vary": {POWER: {"kind": "normal", "mean": 0, "std": 1, "least": 9, "most": 10}}},
         "less than a millionth",
@@ -125,10 +125,7 @@ WRONG = {
     "shares": ({"splits": {"train": 0.5}}, "add up to 0.7; expected 1"),
     "no such label": ({"labels": ["centres"]}, "labels.0"),
     "no target": ({"labels": ["target"]}, "for scenes with a calibration target"),
-    "a wrong value": (
-        {"vary": {POWER: {"kind": "constant", "value": -1.0}}},
-        "drawn were sensor.laser.power_mw = -1.0",
-    ),
+    "a wrong value": ({"vary": {POWER: {"kind": "constant", "value": -1.0}}}, "drawn: sensor.laser.power_mw = -1.0"),
     "a blurred exposure": (
         {"motion": {"speed_mm_per_s": 5.0}, "vary": {"frame.exposure": {"kind": "constant", "value": 2.0}}},
         "vary sensor.exposure.laser_ms instead",

@@ -164,7 +164,7 @@ def test_samples_are_read_in_any_way(folder):
     assert set(few) == {"key", "image", "centre_px"}
     with pytest.raises(DescriptionError, match="unknown split 'dev'"):
         twin.load_dataset(folder, split="dev")
-    with pytest.raises(DescriptionError, match="has no centres; it has bound_px"):
+    with pytest.raises(DescriptionError, match="unknown centres; the data set contains bound_px"):
         twin.load_dataset(folder, names=["centres"])
 
 
@@ -223,7 +223,7 @@ def test_damaged_files_are_named(folder, tmp_path):
         twin.load_dataset(copy)[0]
     card = copy / "dataset.json"
     card.write_text(card.read_text(encoding="utf-8").replace(f'"{shard.name}"', '"../other.tar"'), encoding="utf-8")
-    with pytest.raises(CaptureError, match="which is no file of a data set"):
+    with pytest.raises(CaptureError, match="which is not a file of a data set"):
         twin.load_dataset(copy)
     with pytest.raises(CaptureError, match="run twin dataset again"):
         twin.load_dataset(tmp_path)

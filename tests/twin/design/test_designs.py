@@ -77,14 +77,14 @@ def test_shipped_studies_can_be_judged(name):
         (('title = "test"', 'title = "test"\nmedium = "beer"'), "beer"),
         (('title = "test"', 'title = "test"\nreflectance = 1.5'), "reflectance"),
         (("least = 200.0\n", "values = [1.0]\nleast = 200.0\n"), "give least and most, or values"),
-        (('"N-BK7", "fused-silica"', '"N-BK7", 1.52'), "mix words and numbers"),
+        (('"N-BK7", "fused-silica"', '"N-BK7", 1.52'), "contain texts and numbers"),
         (("choices.camera.", "choices.line_mm."), "give the choice another"),
         (('"camera.width_px" = 640', '"laser.baseline_mm" = 640'), "by a variable and by a choice"),
         (("laser.baseline_mm", "camera.focus_distance_mm"), "follow sets it"),
-        (("laser.baseline_mm", "laser.window.tilt_x_deg"), "do not know it"),
+        (("laser.baseline_mm", "laser.window.tilt_x_deg"), "do not contain it"),
         (
             ("steps = 3", 'steps = 99999\n[variables."camera.f_number"]\nleast = 2.0\nmost = 9.0\nsteps = 9999'),
-            "a grid of",
+            "the grid has",
         ),
     ],
 )

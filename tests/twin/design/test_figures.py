@@ -222,7 +222,7 @@ def test_the_window_for_the_pressure_is_that_of_equation_3_2(thesis):
     ("changes", "says"),
     [
         ({"laser": {"baseline_mm": 20.0}}, "behind the window"),
-        ({"camera": {"focus_distance_mm": 10.0}}, "within its focal length"),
+        ({"camera": {"focus_distance_mm": 10.0}}, "not larger than the focal length"),
         ({"camera": {"window": {"aperture_diameter_mm": 20.0}}}, "cone of view"),
         ({"laser": {"window": {"distance_mm": 200.0}}}, "fan is"),
         ({"volume": {"near_mm": 900.0, "far_mm": 950.0}}, "reach no point"),

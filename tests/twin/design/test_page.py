@@ -474,13 +474,15 @@ def test_the_page_says_what_an_engineer_needs(swept, tmp_path):
     text, chosen = page.text(), marked[-1].design.table()
     assert (columns["violation"] == 0).sum() > 5
     works = (columns["failure"] == "").sum()
-    assert f"30 judged, all of a grid; {works} work, {(columns['violation'] == 0).sum()} meet all constraints" in text
+    assert (
+        f"30 evaluated, all of a grid; {works} work, {(columns['violation'] == 0).sum()} meet all constraints" in text
+    )
     for name in ("laser.baseline_mm", "laser.triangulation_angle_deg", "sigma_z_rms_mm", "line_mm", "standoff_mm"):
         tile = f"{words_of(name)} {value_text(name, chosen[name])}"
         assert tile.replace("\N{NO-BREAK SPACE}", " ") in text
     assert "A note & more." in text and "laser baseline from 150" in text
-    assert "Formulas and rendering disagree by a factor 2.5, more than the 1.5 allowed: most at Z = 0 mm" in text
-    assert "20 µm were predicted and 50 µm rendered" in text
+    assert "Formulas and rendering disagree by a factor 2.5 (limit 1.5), most at Z = 0 mm" in text
+    assert "20 µm predicted, 50 µm rendered" in text
     assert "the measuring volume would begin … mm behind the window's outer face" in text
     # Nothing is asked of the network: links lead within the page, and the policy forbids the rest.
     assert page.loads and all(link.startswith(("#", "data:image/png")) for link in page.loads)
@@ -527,7 +529,7 @@ def failing(study: Study) -> dict[str, np.ndarray]:
 
 def test_a_page_without_designs_says_so():
     page = Page(page_text(small(), {}, marked=[], agreements=[]))
-    assert "No design has been judged." in page.text() and "0 judged" in page.text() and not page.figures
+    assert "No design has been evaluated." in page.text() and "0 evaluated" in page.text() and not page.figures
 
 
 def test_a_page_of_failures_says_why():
@@ -542,8 +544,8 @@ def test_a_page_where_nothing_meets_the_constraints():
     designs, columns = grid(study)
     page = Page(page_text(study, columns, marked=marked_of(study, designs, columns), agreements=[]))
     assert "No design meets all constraints." in page.text()
-    assert "None meets all constraints: the front is that of all that work." in page.text()
-    assert "misses its bound: at least 200 % is asked" in page.text()
+    assert "No design meets all constraints: the front is that of all working designs." in page.text()
+    assert "misses its bound: at least 200 % is required" in page.text()
     assert len(page.figures) == 1
 
 
@@ -555,7 +557,7 @@ def test_a_page_of_one_design(kind):
     one = {name: values[place : place + 1] for name, values in columns.items()}
     marked = [Marked("only", built(study, designs[place]), row_of(columns, place))]
     page = Page(page_text(study, one, marked=marked, agreements=[]))
-    assert "1 judged" in page.text() and not page.open
+    assert "1 evaluated" in page.text() and not page.open
 
 
 def test_designs_in_a_row_span_no_area():
@@ -569,7 +571,7 @@ def test_designs_in_a_row_span_no_area():
         ]
         page = Page(page_text(study, judged(study, row), marked=[], agreements=[]))
         assert not page.open
-    assert "span no area" in page.text()
+    assert "are on a line in these two variables" in page.text()
 
 
 def test_a_chosen_design_that_cannot_be_drawn_is_said():
@@ -584,7 +586,7 @@ def test_a_chosen_design_that_cannot_be_drawn_is_said():
 def test_results_of_another_study_are_refused(swept):
     _, _, columns = swept
     other = small(variables={"camera.f_number": {"least": 2, "most": 8}})
-    with pytest.raises(EvaluationError, match=r"no camera\.f_number"):
+    with pytest.raises(EvaluationError, match=r"lack the columns camera\.f_number"):
         page_text(other, columns, marked=[], agreements=[])
 
 
@@ -599,5 +601,5 @@ def test_verdicts():
 def test_missed_bounds_in_words():
     study = small(constraints={"line_mm": {"least": 100.0, "most": 200.0}})
     ((text, _),) = misses(study, {"line_mm": 250.0}).values()
-    assert text == "line length in the middle is 250\N{NO-BREAK SPACE}mm, at most 200\N{NO-BREAK SPACE}mm is asked"
+    assert text == "line length in the middle is 250\N{NO-BREAK SPACE}mm, at most 200\N{NO-BREAK SPACE}mm is required"
     assert not misses(study, {"line_mm": 150.0})

@@ -68,13 +68,13 @@ def test_a_camera_window_smaller_than_the_cone_of_view_is_refused(thesis, water)
         return altered(thesis, {"camera": {"window": {"aperture_diameter_mm": diameter}}})
 
     check_design(with_aperture(needed + 1e-3), water)
-    with pytest.raises(DesignError, match=rf"opens {needed - 0.2:.1f} mm, .* {needed:.1f} mm wide"):
+    with pytest.raises(DesignError, match=rf"aperture of {needed - 0.2:.1f} mm, .* {needed:.1f} mm wide"):
         check_design(with_aperture(needed - 0.2), water)
 
 
 def test_a_laser_window_smaller_than_the_fan_is_refused(thesis, water):
     narrow = altered(thesis, {"laser": {"window": {"aperture_diameter_mm": 20.0}}})
-    with pytest.raises(DesignError, match=r"laser's window opens 20\.0 mm, but the fan is 24\.9 mm"):
+    with pytest.raises(DesignError, match=r"laser's window has an aperture of 20\.0 mm, but the fan is 24\.9 mm"):
         check_design(narrow, water)
     # Wide enough at its inner face, 24.85 mm, but not at the outer one.
     between = altered(thesis, {"laser": {"window": {"aperture_diameter_mm": 25.0}}})

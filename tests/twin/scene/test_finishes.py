@@ -140,7 +140,7 @@ def test_the_medium_may_have_the_coats_index():
 
 @pytest.mark.parametrize("wavelength", [390.0, 710.0])
 def test_steel_outside_the_table_is_refused(wavelength):
-    with pytest.raises(RangeError, match=r"Johnson and Christy \(1974\) holds from 397 to 704"):
+    with pytest.raises(RangeError, match=r"Johnson and Christy \(1974\) is valid from 397 to 704"):
         iron_index(wavelength_nm=wavelength)
 
 

@@ -68,8 +68,8 @@ def impossible_correlation(joint):
     [
         (damage(parameters=None), "parameters: Field required"),
         (damage(scatter_px=None), "scatter_px: Field required"),
-        (damage(values=[1.0]), "not all of it is of its"),
-        (damage(covariance=[[1.0]]), "not all of it is of its"),
+        (damage(values=[1.0]), "must have the size of the"),
+        (damage(covariance=[[1.0]]), "must have the size of the"),
         (edited(0, 1, 1.5), "the covariance is not symmetric"),
         (edited(2, 2, 4.0), "the variances are not the squares of std"),
         (impossible_correlation, "the covariance has a negative eigenvalue"),

@@ -37,13 +37,13 @@ def test_known_poses_are_kept():
 
 def test_times_outside_are_refused():
     trajectory = uwlts.Trajectory(np.array([10.0, 11.0]), helix(np.array([0.0, 1.0])))
-    with pytest.raises(uwlts.Error, match=r"2 of 3 times, 9.5.*to 11.2.*lasts from 10.000 to 11.000 s.*clocks"):
+    with pytest.raises(uwlts.Error, match=r"2 of 3 times, 9.5.*to 11.2.*trajectory from 10.000 to 11.000 s.*clocks"):
         trajectory.poses_at(np.array([9.5, 10.2, 11.2]))
 
 
 @pytest.mark.parametrize(
     ("times", "message"),
-    [([0.0], "two or more"), ([0.0, 1.0, 1.0], "pose 3 is at 1 s"), ([0.0, np.nan, 1.0], "finite and grow")],
+    [([0.0], "N >= 2"), ([0.0, 1.0, 1.0], "pose 3 is at 1 s"), ([0.0, np.nan, 1.0], "finite and increase")],
 )
 def test_impossible_times_are_refused(times, message):
     with pytest.raises(uwlts.Error, match=message):
@@ -52,7 +52,7 @@ def test_impossible_times_are_refused(times, message):
 
 def test_reflections_are_refused():
     poses = np.tile(np.diag([1.0, 1.0, -1.0, 1.0]), (2, 1, 1))
-    with pytest.raises(uwlts.Error, match="rotations"):
+    with pytest.raises(uwlts.Error, match="rigid transforms"):
         uwlts.Trajectory(np.array([0.0, 1.0]), poses)
 
 
@@ -74,7 +74,7 @@ def test_tum_files_hold_seconds_metres_and_quaternions(tmp_path):
     [
         ("x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,1\n1,0,0,0,0,0,1\n", "quaternion-xyzw", "no column time_s"),
         ("0 1 2 3 0 0 1\n", "tum", "7 columns; expected time"),
-        ("time_s,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n0,1,0,0,0,0,0,1\n", "quaternion-xyzw", "grow"),
+        ("time_s,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n0,1,0,0,0,0,0,1\n", "quaternion-xyzw", "increase"),
     ],
 )
 def test_other_files_are_refused(tmp_path, text, pose_format, message):

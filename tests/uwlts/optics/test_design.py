@@ -152,7 +152,7 @@ def test_a_volume_without_an_end_and_one_that_begins_at_the_window():
     assert 1e5 < measuring_volume(AIR, side_px=2 * edge - 1).far_mm < math.inf
     close = replace(AIR, window=FlatWindow(distance_mm=350.0))
     assert measuring_volume(close, side_px=1024).near_mm == 350.0
-    with pytest.raises(RangeError, match=r"leaves the view at 548\.5 mm, behind the window"):
+    with pytest.raises(RangeError, match=r"leaves the camera's view at 548\.5 mm, before the window"):
         measuring_volume(replace(AIR, window=FlatWindow(distance_mm=549.0)), side_px=1024)
 
 
@@ -273,11 +273,11 @@ GLASS = {"pressure_mpa": 1, "unsupported_diameter_mm": 63, "strength_mpa": 60}
         (lambda: replace(AIR, pixel_size_mm=math.nan), "pixel_size_mm is nan"),
         (lambda: replace(AIR, triangulation_angle_rad=35), "angle is 35 rad"),
         (lambda: FlatWindow(distance_mm=-1.0), "must not be negative"),
-        (lambda: FlatWindow(distance_mm=1.0, medium_index=0.9), "not below 1"),
-        (lambda: FlatWindow(medium_index=1.33), "in the pupil itself"),
+        (lambda: FlatWindow(distance_mm=1.0, medium_index=0.9), "must be at least 1"),
+        (lambda: FlatWindow(medium_index=1.33), "in the pupil;"),
         (lambda: depth_mm(AIR, [0.0, math.nan]), "finite"),
-        (lambda: depth_mm(AIR, 1652.0), "does not see the sheet"),
-        (lambda: depth_mm(WATER, -1e6), "does not see the sheet"),
+        (lambda: depth_mm(AIR, 1652.0), "does not meet the sheet"),
+        (lambda: depth_mm(WATER, -1e6), "does not meet the sheet"),
         (lambda: pixel_of_depth(WATER, 68.72), r"outer face at 68\.73 mm"),
         (lambda: pixel_of_depth(WATER, math.inf), "finite"),
         (lambda: pixel_of_depth(WATER, 300.0, math.nan), "finite"),
@@ -287,7 +287,7 @@ GLASS = {"pressure_mpa": 1, "unsupported_diameter_mm": 63, "strength_mpa": 60}
         (lambda: scheimpflug_angle_rad(triangulation_angle_rad=math.nan, magnification=0.1), "angle is nan"),
         *((lambda n=n: speckle_limit_um(**SPECKLE | {n: -1}), f"{n} is -1") for n in SPECKLE),
         *((lambda n=n: window_thickness_mm(**GLASS | {n: math.inf}), f"{n} is inf") for n in GLASS),
-        (lambda: line_needed_mm(pipe_diameter_mm=300, passes=1), "1 passes"),
+        (lambda: line_needed_mm(pipe_diameter_mm=300, passes=1), "passes is 1"),
     ],
 )
 def test_numbers_without_a_meaning_are_refused(refused, message):

@@ -150,7 +150,7 @@ def single_viewpoint(medium):
     ("calibration", "medium", "refusal"),
     [
         (single_viewpoint(FRESH), FRESH, None),
-        (single_viewpoint(FRESH), AIR, "made in air, but the calibration is that of a single viewpoint in water"),
+        (single_viewpoint(FRESH), AIR, "made in air, but the calibration has a single viewpoint in water"),
         (single_viewpoint(FRESH), SEA, "the calibration is for fresh only"),
         (single_viewpoint(SEA), SEA, None),
         (single_viewpoint(AIR), AIR, None),
@@ -214,11 +214,9 @@ def test_another_sensor_s_calibration_is_noticed(path):
     other, camera = CALIBRATION.model_copy(update={"sensor_name": "other"}), CALIBRATION.camera
     assert reconstruct(path, CALIBRATION).warnings == []
     (warning,) = reconstruct(path, other).warnings
-    assert "the calibration of 'other': is it the right one?" in warning
+    assert "the calibration of 'other': check that it is the right one" in warning
     long = camera.model_copy(update={"fx_px": 2 * camera.fx_px, "fy_px": 2 * camera.fy_px})
-    with pytest.raises(
-        CalibrationError, match=r"by its description it has a focal length of \d+ px, by the calibration"
-    ):
+    with pytest.raises(CalibrationError, match=r"described focal length is \d+ px, the calibrated one is \d+ px"):
         reconstruct(path, other.model_copy(update={"camera": long}))
     with pytest.raises(CalibrationError, match="taken with a laser of 635 nm, the calibration is for 520 nm"):
         reconstruct(path, CALIBRATION.model_copy(update={"wavelength_nm": 520.0}))

@@ -9,6 +9,7 @@ import pytest
 import uwlts
 from uwlts.errors import CaptureError, DescriptionError, OutputError
 from uwlts.model.trajectory import Trajectory
+from uwlts.optics.nominal import nominal_calibration
 from uwlts.storage.cloud import PointCloud
 
 
@@ -56,6 +57,18 @@ def test_results_are_short_texts():
     assert "<td>100000 x 3 float64</td>" in cloud_of(100_000)._repr_html_()
 
 
-def test_a_nominal_calibration_is_of_its_medium():
-    assert uwlts.nominal("thesis", medium="water").medium_kind == uwlts.load_sensor("thesis").media["water"].kind
-    assert uwlts.nominal("thesis", medium="air").medium_kind == "air"
+def test_a_nominal_calibration_reports_its_medium(tmp_path):
+    """The name is the one that was asked for, as in captures; the kind is that of the medium's description."""
+    sensor = uwlts.load_sensor("thesis")
+    media = {"air": sensor.media["air"], "water": sensor.media["water"], "fresh": sensor.media["water"]}
+    media["sea"] = sensor.media["water"].model_copy(update={"kind": "sea", "salinity_g_kg": 35.0})
+    sensor = sensor.model_copy(update={"media": media})
+    kinds = {"air": "air", "water": "fresh", "fresh": "fresh", "sea": "sea"}
+    for name, kind in kinds.items():
+        calibration = uwlts.nominal(sensor, medium=name)
+        assert (calibration.medium_name, calibration.medium_kind) == (name, kind)
+        assert f"medium_name: {name}" in repr(calibration)
+        calibration.save(tmp_path / f"{name}.json")
+        assert uwlts.read(tmp_path / f"{name}.json") == calibration
+    # Without a name, files are as before, so that the digests in older clouds stay valid.
+    assert "medium_name" not in nominal_calibration(sensor).model_dump_json()

@@ -1,1 +1,1 @@
-"""The page of a design study: charts, the chosen design drawn to scale, tables."""
+"""Page of a design study: charts, tables, and a drawing of the chosen design to scale."""

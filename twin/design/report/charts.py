@@ -1,4 +1,4 @@
-"""Charts of a study: figures over what is free, the Pareto front, all designs at once, rendering against formulas."""
+"""Charts of a study: figures over free variables, Pareto front, parallel coordinates, rendering against formulas."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from uwlts.pages.toolkit import BLUE, COLOURS, FAINT, INK, RED, legend_below, ne
 
 Static = tuple[Figure, str]
 Interactive = tuple[go.Figure, str]
-"""A figure for a page, and its caption."""
+"""Figure for a page, and its caption."""
 
 _FRONT = COLOURS[2]
 """Colour of the Pareto front."""
 _PALE = "#c3cad2"
-"""Colour of bars of designs that miss a constraint."""
+"""Colour of bars of designs that violate a constraint."""
 _LIMITS = ("#d9480f", "#862e9c", "#0b7285", "#e67700", "#364fc7")
-"""Colours of the lines on which constraints are just met."""
+"""Colours of the contours of bounds."""
 _SYMBOLS = (("diamond", "D"), ("circle", "o"), ("star", "*"), ("square", "s"), ("cross", "P"))
-"""Symbols of marked designs, of plotly and of matplotlib."""
+"""Symbols of highlighted designs, in plotly and in matplotlib."""
 _TEXT_PLACES = ("top right", "bottom right", "top left", "bottom left")
-"""Places of labels beside marked designs, in turn."""
+"""Positions of labels of highlighted designs, in turn."""
 _SHOWN = (
     "sigma_z_rms_mm",
     "sigma_z_mm",
@@ -53,12 +53,12 @@ _SHOWN = (
     "sigma_y_mm",
     "speckle_limit_mm",
 )
-"""Figures shown besides objectives and constraints, the most informative first."""
+"""Figures shown in addition to objectives and constraints, the most informative first."""
 _MOST_PANELS = 9
 _PANEL_COLUMNS = 3
 _PANEL_INCHES = (4.0, 3.1)
 _BAR_INCHES = 0.17
-# More points and lines make a page slow; more dots, points of a curve, bars and axes would hide each other.
+# Limits: more points and lines make a page slow; more dots, curve points, bars and axes would overlap.
 MOST_POINTS = 20_000
 MOST_LINES = 5_000
 _MOST_DOTS = 2000
@@ -66,35 +66,35 @@ _MOST_OF_CURVE = 500
 _MOST_BARS = 40
 _MOST_DIMENSIONS = 12
 _FEW = 300
-"""More points are drawn smaller."""
+"""Above this number, points are drawn smaller."""
 _IN_SVG = 2500
-"""More points are drawn with WebGL, which does not slow the page down."""
+"""Above this number, points are drawn with WebGL, which is faster."""
 _LAYOUT = {"template": "none", "font": {"color": INK}, "paper_bgcolor": "white"}
 _WIDE_RANGE = 30.0
-"""A figure whose largest value is so many times the least gets a logarithmic axis."""
+"""Ratio of the largest to the smallest value above which a figure has a logarithmic axis."""
 _DASHED = "Dashed: bounds."
 _INTERVALS = 100
-"""Places along a curve of which each shows its best design, where more is free than is drawn."""
+"""Intervals of a curve with one best design each, if further variables are free."""
 _CELLS = 40
-"""The same for maps, along each side."""
+"""Cells along each side of a map with one best design each, if further variables are free."""
 _FLAT = 1e-6
-"""Designs whose places lie on a line but for this share of the ranges span no area."""
+"""Tolerance, relative to the ranges, for designs on a line, which do not span a map."""
 _LEVELS = 12
 _WIDE = 15.0
-"""A figure whose best values differ by this factor gets logarithmic colours."""
+"""Ratio of a figure's values above which a map has logarithmic colours."""
 _MARGIN = 0.02
-"""Share of the ranges beside them."""
+"""Margin of the axes relative to the ranges."""
 _BESIDE = 1e-4
-"""Part of a bound by which its line is drawn on the side that misses it: a figure in steps may equal the bound."""
+"""Relative offset of a bound's contour into the violated side, because a discrete figure can equal the bound."""
 
 _plain_text = matplotlib.rc_context({"text.parse_math": False})
-"""Names given by users hold no formulas, whatever dollar signs they have."""
+"""Dollar signs in users' names are not formulas."""
 _escaped = partial(escape, quote=False)
-"""Text in which plotly finds no tags."""
+"""Escape text for plotly."""
 
 
 def shown_figures(judged: Judged) -> list[str]:
-    """Figures to show: objectives, constraints, then the most informative others; those that are known."""
+    """Return the known figures to show: objectives, constraints, then the most informative others."""
     names = dict.fromkeys([*judged.study.wanted(), *_SHOWN])
     return [name for name in names if np.isfinite(judged.figure(name)[judged.works]).any()]
 
@@ -103,7 +103,7 @@ def shown_figures(judged: Judged) -> list[str]:
 
 
 def _panels(names: Sequence[str], *, height: float = _PANEL_INCHES[1]) -> tuple[Figure, list[tuple[Axes, str]]]:
-    """A figure with axes for each of the first figures of merit, with their names, which are the titles."""
+    """Make a Matplotlib figure with axes for the first figures of merit; their labels are the titles."""
     names = names[:_MOST_PANELS]
     columns = min(_PANEL_COLUMNS, len(names))
     rows = -(-len(names) // columns)
@@ -116,7 +116,7 @@ def _panels(names: Sequence[str], *, height: float = _PANEL_INCHES[1]) -> tuple[
 
 
 def _mark(axes: Axes, marked: Sequence[Marked], x: str, y: str) -> None:
-    """Draw marked designs as symbols, the chosen one in red."""
+    """Draw highlighted designs as symbols, the chosen one in red."""
     for number, one in enumerate(marked):
         at, (colour, size) = (
             (one.design.number_of(x), one.design.number_of(y)),
@@ -138,7 +138,7 @@ def _draw_bounds(draw: Callable[..., object], judged: Judged, name: str) -> None
 
 @_plain_text
 def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
-    """Figures over one variable: a curve for every combination of what else is free, or the best of all."""
+    """Draw figures over one variable: a curve for each combination of the other variables, or the best of all."""
     others = [name for name in judged.study.free() if name != x]
     groups: dict[str, list[int]] = {}
     for place in np.flatnonzero(judged.works):
@@ -147,12 +147,12 @@ def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
     if len(groups) > len(COLOURS):
         groups = {"best": judged.best_first.tolist()}
         varying = tables.listed([tables.words_of(name) for name in others]).capitalize()
-        caption = f"{varying} also vary: the best design of every place. "
+        caption = f"{varying} also vary: each point is the best design of its interval. "
     at, found = np.asarray(judged.columns[x], dtype=float), {}
     for name, members in groups.items():
         places = np.array(members)
         if caption:
-            # The best come first: one per interval.
+            # Designs are sorted by merit: the first of each interval is the best.
             share = share_of(judged.study.variables[x], at[places])
             places = places[np.unique((share * (_INTERVALS - 1)).round(), return_index=True)[1]]
         places = places[np.argsort(at[places], kind="stable")]
@@ -168,7 +168,7 @@ def curves(judged: Judged, marked: Sequence[Marked], x: str) -> Static:
         _mark(axes, marked, x, name)
         axes.set(xlabel=tables.label_of(x), xscale=judged.study.variables[x].scale)
     legend_below(figure)
-    missed = "Hollow: misses a constraint. " if (judged.works & ~judged.feasible).any() else ""
+    missed = "Hollow: a constraint is missed. " if (judged.works & ~judged.feasible).any() else ""
     return figure, f"{caption}{missed}{_DASHED if judged.study.bounds() else ''}".strip()
 
 
@@ -178,23 +178,23 @@ def _combination(judged: Judged, names: Sequence[str], place: int) -> str:
 
 @_plain_text
 def bars(judged: Judged) -> Static:
-    """Figures of every combination of choices, the best first."""
+    """Draw the figures of all combinations of choices as bars, the best first."""
     places = judged.best_first[:_MOST_BARS]
     labels = [_combination(judged, list(judged.study.free()), place) for place in places]
     figure, panels = _panels(shown_figures(judged), height=max(_PANEL_INCHES[1], _BAR_INCHES * len(places)))
     for number, (axes, name) in enumerate(panels):
         axes.barh(range(len(places)), judged.figure(name)[places], color=np.where(judged.feasible[places], BLUE, _PALE))
-        # Long names stand at the left only.
+        # Labels are long: only the left panels have them.
         axes.set_yticks(range(len(places)), labels if number % _PANEL_COLUMNS == 0 else [""] * len(places))
         axes.invert_yaxis()
         _draw_bounds(axes.axvline, judged, name)
     count = f"The best {len(places)} of {int(judged.works.sum()):,} designs." if len(places) == _MOST_BARS else ""
-    grey = " Grey: misses a constraint." if not judged.feasible[places].all() else ""
+    grey = " Grey: a constraint is missed." if not judged.feasible[places].all() else ""
     return figure, f"{count}{grey} {_DASHED if judged.study.bounds() else ''}".strip()
 
 
 def share_of(variable: Variable, values: np.ndarray) -> np.ndarray:
-    """Shares from 0 to 1 of a variable's range."""
+    """Normalise values to a variable's range (0 to 1), on its scale."""
     values, (least, most) = np.asarray(values, dtype=float), variable.ends()
     if variable.scale == "log":
         return np.log(values / least) / math.log(most / least)
@@ -205,7 +205,7 @@ def share_of(variable: Variable, values: np.ndarray) -> np.ndarray:
 
 
 def map_places(judged: Judged, x: str, y: str) -> np.ndarray:
-    """Designs (N,) to show over two variables: all of them, or the best one of every place where more is free."""
+    """Return the indices of designs to show over two variables: all, or the best of each cell if more are free."""
     if len(judged.study.free()) == 2:
         return np.arange(len(judged))
     cells = [np.rint(_CELLS * share_of(judged.study.variables[name], judged.columns[name])) for name in (x, y)]
@@ -214,7 +214,10 @@ def map_places(judged: Judged, x: str, y: str) -> np.ndarray:
 
 
 def mesh_between(judged: Judged, places: np.ndarray, x: str, y: str) -> Triangulation | None:
-    """Triangles between designs over two variables, none at a design that cannot work; None where they span no area."""
+    """Triangulate designs over two variables; triangles with a failed design are masked.
+
+    Return None if the designs are on a line.
+    """
     shares = np.column_stack([share_of(judged.study.variables[name], judged.columns[name][places]) for name in (x, y)])
     if np.linalg.matrix_rank(shares - shares.mean(axis=0), tol=_FLAT) < 2:
         return None
@@ -225,7 +228,7 @@ def mesh_between(judged: Judged, places: np.ndarray, x: str, y: str) -> Triangul
 
 @_plain_text
 def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static | None:
-    """The figures over two variables beside each other; None where the designs span no area."""
+    """Draw maps of the figures over two variables; None if the designs are on a line."""
     study, places = judged.study, map_places(judged, x, y)
     mesh = mesh_between(judged, places, x, y)
     if mesh is None or mesh.mask is None or mesh.mask.all():
@@ -235,7 +238,7 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
     def over(name: str) -> np.ndarray:
         return np.where(works, judged.figure(name)[places], np.nan)
 
-    # By how much each bound is missed, in parts of it; a figure in steps may equal the bound.
+    # Violation of each bound relative to it; a discrete figure can equal the bound.
     missed = [(sign * (over(name) - bound) / (abs(bound) or 1.0) - _BESIDE) for name, sign, bound in study.bounds()]
     limits = list(zip(missed, itertools.cycle(_LIMITS), (tables.bound_text(*each) for each in study.bounds())))
     fails = np.max(missed, axis=0, initial=-1.0)
@@ -260,7 +263,7 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
         axes.grid(visible=False)
         axes.set(xlabel=tables.label_of(x), ylabel="" if number % _PANEL_COLUMNS else tables.label_of(y))
         axes.set(xscale=variables[0].scale, yscale=variables[1].scale)
-        # Designs on the border of the range are seen wholly.
+        # Margin for symbols at the border of the range.
         xlim, ylim = ((float(v.at(-_MARGIN)), float(v.at(1 + _MARGIN))) for v in variables)
         axes.set(xlim=xlim, ylim=ylim)
     legend_below(figure)
@@ -268,25 +271,25 @@ def contours(judged: Judged, marked: Sequence[Marked], x: str, y: str) -> Static
     ends = {name: variable.ends() for name, variable in zip((x, y), variables, strict=True)}
     outside = [m.label for m in marked if not all(a <= m.design.number_of(n) <= b for n, (a, b) in ends.items())]
     parts = (
-        f"{tables.listed(others).capitalize()} also vary: each place shows the design there that misses the "
-        f"constraints least and then has the best {tables.words_of(study.objectives[0].figure)}."
+        f"{tables.listed(others).capitalize()} also vary: each point is the design of its cell with the smallest "
+        f"constraint violation, then with the best {tables.words_of(study.objectives[0].figure)}."
         if others
         else "",
-        "Linear between the designs (dots).",
+        "Interpolated linearly between designs (dots).",
         "Grey: a constraint is missed." if misses else "",
-        "Crosses: designs cannot work; the table of reasons says why." if not works.all() else "",
+        "Crosses: designs that cannot work; see the table of reasons." if not works.all() else "",
         f"Outside the ranges: {tables.listed(outside)}." if outside else "",
     )
     return figure, " ".join(filter(None, parts))
 
 
 def _fill(axes: Axes, mesh: Triangulation, values: np.ndarray, *, good: np.ndarray) -> None:
-    """Draw a figure as filled contours, wide ranges in their logarithm."""
+    """Draw a figure as filled contours, with a logarithmic scale for wide ranges."""
     known = np.isfinite(values)
     mesh = Triangulation(mesh.x, mesh.y, mesh.triangles, mask=~known[mesh.triangles].all(axis=1))
     if mesh.mask is None or mesh.mask.all():
         return
-    # Few extreme values must not take all the colours.
+    # The colour scale excludes a few extreme values.
     best = values[good & known]
     low, high = np.quantile(values[known], 0.02), np.quantile(best if len(best) > 10 else values[known], 0.98)
     high = max(high, low + 1e-12 + 1e-9 * abs(low))
@@ -306,7 +309,7 @@ def _fill(axes: Axes, mesh: Triangulation, values: np.ndarray, *, good: np.ndarr
 
 @_plain_text
 def verification_chart(found: Agreement) -> Static | None:
-    """Scatter as predicted and as rendered, and the systematic error, over Z."""
+    """Draw predicted and rendered scatter, and the systematic error, over Z."""
     if not found.z_mm:
         return None
     figure, (scatter, error) = new_figure(9.6, 3.2, columns=2)
@@ -326,10 +329,10 @@ def verification_chart(found: Agreement) -> Static | None:
 
 
 def trade_off(judged: Judged) -> tuple[tuple[str, int], tuple[str, int]]:
-    """The two figures to weigh against each other, each with 1 to minimise or -1 to maximise.
+    """Return the two figures of the Pareto chart, each with 1 to minimise or -1 to maximise.
 
-    The study's first two objectives; of a study with one, also the first other figure with a constraint or, without
-    any, the length of the line.
+    They are the study's first two objectives. With one objective, the second figure is the first constrained one, or
+    the line length without constraints.
     """
     wanted = [(o.figure, 1 if o.goal == "minimise" else -1) for o in judged.study.objectives]
     wanted += [(name, 1 if c.least is None else -1) for name, c in judged.study.constraints.items()]
@@ -343,7 +346,7 @@ def trade_off(judged: Judged) -> tuple[tuple[str, int], tuple[str, int]]:
 
 
 def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None:
-    """All designs that work over two figures, and the front of those that meet the constraints."""
+    """Draw all working designs over two figures, and the Pareto front of those that meet the constraints."""
     (x, x_sign), (y, y_sign) = trade_off(judged)
     values = np.column_stack([judged.figure(x) * x_sign, judged.figure(y) * y_sign])
     known = judged.works & np.isfinite(values).all(axis=1)
@@ -429,13 +432,15 @@ def pareto_chart(judged: Judged, marked: Sequence[Marked]) -> Interactive | None
         f"{'less' if sign > 0 else 'more'} {tables.words_of(name)}" for name, sign in ((x, x_sign), (y, y_sign))
     )
     thin = f" {int(shown.sum()):,} of {int(known.sum()):,} designs are drawn." if shown.sum() < known.sum() else ""
-    none = "" if judged.feasible.any() else " None meets all constraints: the front is that of all that work."
-    more = " Further objectives are left out here." if len(judged.study.objectives) > 2 else ""
-    return figure, f"Better is {better}: nothing beats the designs on the green line in both.{more}{none}{thin}"
+    none = (
+        "" if judged.feasible.any() else " No design meets all constraints: the front is that of all working designs."
+    )
+    more = " Further objectives are not shown." if len(judged.study.objectives) > 2 else ""
+    return figure, f"Better is {better}. No design is better in both than a design on the green line.{more}{none}{thin}"
 
 
 def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of the candidates (N,), drawn at random, all kept ones among them."""
+    """Select at most ``most`` of the candidates (N,): all ``kept`` ones, and others at random."""
     others = np.flatnonzero(candidates & ~kept)
     room = max(0, most - int(kept.sum()))
     if len(others) > room:
@@ -446,7 +451,7 @@ def sample(candidates: np.ndarray, kept: np.ndarray, most: int) -> np.ndarray:
 
 
 def parallel_chart(judged: Judged) -> Interactive | None:
-    """Every design that meets the constraints as a line over all that is free, wanted and bounded."""
+    """Draw each design that meets the constraints as a line over free variables, objectives and constraints."""
     if not judged.feasible.any():
         return None
     places = np.flatnonzero(sample(judged.feasible, judged.front(judged.of_interest), MOST_LINES))
@@ -479,16 +484,16 @@ def parallel_chart(judged: Judged) -> Interactive | None:
     figure.update_layout(_LAYOUT, height=470, margin={"l": 80, "r": 40, "t": 110, "b": 30}, font_size=12)
     total = int(judged.feasible.sum())
     count = f"{len(places):,} of {total:,} designs" if len(places) < total else f"All {total:,} designs"
-    return figure, (f"{count} that meet all constraints. Drag along an axis to keep only what passes there.")
+    return figure, f"{count} that meet all constraints. Drag along an axis to select designs by their values."
 
 
 def _dimension(judged: Judged, name: str, places: np.ndarray) -> dict[str, object]:
-    """A parallel axis: choices and laser classes by name, else numbers."""
+    """Return a parallel axis: choices and laser classes by name, else numbers."""
     values, variable = judged.columns[name][places], judged.study.free().get(name)
     label = _escaped(tables.label_of(name))
     if variable is not None and variable.values is not None:
         options = list(variable.values)
-        # Ticks hold plain text, in which nothing is a tag.
+        # Tick labels are plain text and need no escaping.
         texts = [
             textwrap.shorten(tables.value_text(name, option, unit=False), 24, placeholder="…") for option in options
         ]

@@ -1,7 +1,7 @@
-"""Drawing of a sensor to scale: rays, windows, sheet and measuring volume, from the side and onto the sheet.
+"""Scale drawing of a sensor: rays, windows, sheet and measuring volume in side view and front view.
 
-The side view looks along the sheet, square to the camera's axis, so that the sheet is a line; the front view looks onto
-the sheet. The measuring volume is that of the formulas.
+The side view looks along the sheet, perpendicular to the camera's axis, so that the sheet is a line. The front view
+looks onto the sheet. The measuring volume follows from the formulas.
 """
 
 from __future__ import annotations
@@ -24,26 +24,28 @@ from uwlts.model.sensor import Camera, Medium, Sensor, Window
 from uwlts.pages.toolkit import BLUE, INK, RED, SOFT, new_figure
 
 _BEYOND = 1.06
-"""Rays and sheet are drawn so much farther than the volume's far end."""
+"""Length of drawn rays and sheet relative to the distance of the volume's far end."""
 _DEPTHS = 201
-"""Depths at which the part of the volume is sought that camera and laser reach."""
+"""Depths for the outline of the region that both camera and laser reach."""
 _PLACES = 21
-"""The same along the stripe."""
+"""Points along the stripe at each depth."""
 _BORDER = 41
 """Pixels along each side of the image."""
-# The description does not contain the housing: these only hint at where it is.
+# The description does not contain the housing: these sizes only indicate it.
 _HOUSING_MM = 42.0
 _WALL_MM = 5.0
 _BARE_FRONT_MM = 12.0
-"""Distance of the front from the pupil where there is no window."""
+"""Distance of the housing's front from the pupil without a window."""
 _BARE_HALF_MM = 15.0
-"""Half the width of the front there."""
+"""Half the width of the front without a window."""
 
 
 @dataclass(frozen=True, eq=False)
 class Module:
-    """Camera or laser from one side, in mm: origin (2,), corners of window, (4, 2) or (0, 2), and housing (5, 2). Only
-    origin and window are to scale: the description does not know the housing."""
+    """Camera or laser in a view, in mm: origin (2,), corners of the window, (4, 2) or (0, 2), and housing (5, 2).
+
+    Origin and window are to scale. The housing is only indicated, because the description does not contain it.
+    """
 
     origin: np.ndarray
     window: np.ndarray
@@ -52,12 +54,28 @@ class Module:
 
 @dataclass(frozen=True, eq=False)
 class SideView:
-    """A sensor in the plane of the camera's axis and the baseline; points are (baseline, depth) from the pupil, in mm.
+    """Sensor in the plane of the camera's axis and the baseline; points are (baseline, depth) from the pupil, in mm.
 
-    ``edges`` are rays (K, 2) of the image's edges: pupil, both faces of the window if there is one, and an end in the
-    medium. ``sheet`` (K, 2) is the laser's axis, ``volume`` (2, 2) its points at the depths of the volume's ends,
-    ``in_view`` the ends of the part that camera and laser reach, ``crossing`` where the sheet crosses the camera's
-    axis, at ``angle_rad``. ``baseline_mm`` is the distance of the fan's origin from that axis, in any direction.
+    Attributes
+    ----------
+    camera, laser : Module
+    pupil_mm : float
+        Diameter of the pupil.
+    baseline_mm : float
+        Distance of the fan's origin from the camera's axis.
+    edges : tuple of (K, 2)
+        Rays at the image's edges: pupil, both faces of the window if there is one, and an end in the medium.
+    sheet : (K, 2)
+        The laser's axis.
+    volume : (2, 2)
+        Points of the sheet at the ends of the measuring volume.
+    in_view : (2, 2), optional
+        Ends of the part that both camera and laser reach.
+    crossing : (2,)
+        Intersection of the sheet with the camera's axis, at the angle ``angle_rad``.
+    outer_mm : float
+        Depth of the window's outer face.
+    angle_rad : float
     """
 
     camera: Module
@@ -73,17 +91,25 @@ class SideView:
     angle_rad: float
 
     def outlines(self) -> list[np.ndarray]:
-        """Lines (K, 2) that show the design behind another one; everything else lies within their extent."""
+        """Return lines (K, 2) for drawing the design behind another one; they enclose the whole view."""
         return [*self.edges, self.sheet, self.camera.housing, self.laser.housing, self.volume]
 
 
 @dataclass(frozen=True, eq=False)
 class FrontView:
-    """The sheet face on; points are (along the stripe, along the laser's axis) from the fan's origin, in mm.
+    """Sheet from the front; points are (along the stripe, along the laser's axis) from the fan's origin, in mm.
 
-    ``fan`` are the fan's edges (K, 2) and ``borders`` the image's four sides (N, 2) in the sheet, NaN where they miss
-    it. ``lines`` (3, 2, 2) are the ends of the line at near end, middle and far end of what the camera sees of the
-    volume, NaN if it sees nothing; ``region`` (N, 2) is the outline of what camera and laser reach, possibly empty.
+    Attributes
+    ----------
+    laser : Module
+    fan : tuple of (K, 2)
+        Edges of the fan.
+    borders : tuple of (N, 2)
+        The image's four sides, projected onto the sheet; NaN if a ray misses the sheet.
+    lines : (3, 2, 2)
+        Ends of the line at near end, middle and far end of the volume in view; NaN if nothing is in view.
+    region : (N, 2)
+        Outline of the region that both camera and laser reach; can be empty.
     """
 
     laser: Module
@@ -93,23 +119,30 @@ class FrontView:
     region: np.ndarray
 
     def outlines(self) -> list[np.ndarray]:
-        """Lines (K, 2) that show the design behind another one; everything else lies within their extent."""
+        """Return lines (K, 2) for drawing the design behind another one; they enclose the whole view."""
         return [*self.fan, *self.lines, self.laser.housing]
 
 
 def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
-    """Side and front view of a sensor in a medium. DesignError where the sheet does not cross the camera's axis in
-    front of the window, or the laser shines back; else errors as of `twin.design.parameters.numbers_of`."""
+    """Return the side view and front view of a sensor in a medium.
+
+    Raises
+    ------
+    DesignError
+        The sheet does not cross the camera's axis in front of the window, or the laser points back to the camera.
+    Error
+        As for `twin.design.parameters.numbers_of`.
+    """
     pose, p, camera = laser_pose(sensor), parameters_of([sensor], [medium]), sensor.camera
     outer = float(p.outer_mm(np).item())
     crossing = _crossing_mm(pose, outer)
     start = np.array([0.0, 0.0, crossing])
 
     def on_sheet(depths: np.ndarray) -> np.ndarray:
-        """Points (N, 3) at depths on the line through ``start`` along the laser's axis."""
+        """Return points (N, 3) at depths on the line through ``start`` along the laser's axis."""
         return start + ((depths - crossing) / pose.axis[2])[:, None] * pose.axis
 
-    # Camera and laser are modules of one kind: a frame with z along the axis, and perhaps a window.
+    # Camera and laser are both modules: a frame with z along the axis, and optionally a window.
     seeing = _Mounted.of(sensor, camera.window, medium, np.zeros(3), np.eye(3))
     frame = np.stack([pose.normal, np.cross(pose.axis, pose.normal), pose.axis], axis=1)
     lighting = _Mounted.of(sensor, sensor.laser.window, medium, pose.origin_mm, frame)
@@ -122,7 +155,7 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
     angles = np.array([0.0, p.lit_from_rad.item(), p.lit_to_rad.item()])[:, None]
     axis, *fan = lighting.rays(np.cos(angles) * pose.axis + np.sin(angles) * pose.fan, end, pose.axis)
 
-    # The side view runs along the sheet whatever the fan's roll; the laser is on the positive side.
+    # The side view is along the sheet for any roll of the fan, with the laser on the positive side.
     sideways = math.hypot(*pose.normal[:2])
     across = pose.normal[:2] / sideways * (-1 if pose.normal[:2] @ pose.origin_mm[:2] < 0 else 1)
     side_axes = np.array([[*across, 0.0], [0.0, 0.0, 1.0]])
@@ -160,25 +193,35 @@ def views_of(sensor: Sensor, medium: Medium) -> tuple[SideView, FrontView]:
 
 
 def _crossing_mm(pose: LaserPose, outer: float) -> float:
-    """Depth at which the sheet crosses the camera's axis; DesignError if it does not do so ahead of the window."""
-    steep = abs(pose.normal[2]) > 1e-9  # otherwise the sheet is parallel to the axis, up to rounding
+    """Return the depth of the sheet on the camera's axis; DesignError if it is not beyond the window."""
+    steep = abs(pose.normal[2]) > 1e-9  # otherwise the sheet is parallel to the axis
     depth = float(pose.normal @ pose.origin_mm / pose.normal[2]) if steep else math.inf
-    # Beyond 100 m nothing is a design; a normal along the axis has no side view.
+    # Limit of 100 m. For a normal along the axis, there is no side view.
     if not outer < depth < 1e5 or math.hypot(*pose.normal[:2]) < 1e-9:
         raise DesignError(
-            f"the sheet crosses the camera's axis {depth:.1f} mm from the entrance pupil; it must cross it aslant, in "
-            f"front of the window's outer face at {outer:.1f} mm"
+            f"the sheet crosses the camera's axis {depth:.1f} mm from the entrance pupil; it must cross the axis at an "
+            f"angle, in front of the window's outer face at {outer:.1f} mm"
         )
     if pose.axis[2] <= 0:
-        raise DesignError("the laser shines back towards the camera: turn its axis")
+        raise DesignError("the laser points back towards the camera: turn its axis")
     return depth
 
 
 def _reach(sensor: Sensor, p: SensorArrays, aside: float) -> tuple[np.ndarray, ...]:
-    """N depths of the volume from the window, and from where to where (N,) camera and laser reach there, in mm from the
-    laser's axis, NaN where they reach nothing; three depths to show, and the ends (3, 2) of the line there.
+    """Return the region that both camera and laser reach, and three lines to draw.
 
-    ``aside`` is where Y = 0 lies, from the laser's axis.
+    ``aside`` is the position of Y = 0 from the laser's axis, mm.
+
+    Returns
+    -------
+    depths : (N,)
+        Depths of the volume from the window.
+    low, high : (N,)
+        Ends of the reached part at each depth, from the laser's axis; NaN if there is none.
+    shown : (3,)
+        Depths of the lines to draw: near end, middle and far end of the volume in view.
+    line : (3, 2)
+        Ends of these lines.
     """
     places = np.linspace(-1, 1, _PLACES) * (1 - 1e-9)
     depths = np.linspace(sensor.volume.near_mm, sensor.volume.far_mm, _DEPTHS)
@@ -200,7 +243,7 @@ def _reach(sensor: Sensor, p: SensorArrays, aside: float) -> tuple[np.ndarray, .
 
 @dataclass(frozen=True, eq=False)
 class _Mounted:
-    """A module: its origin and axis in the camera frame, and its window, as described and where one is mounted."""
+    """Module (camera or laser): origin and axis in the camera frame, and window, described and mounted."""
 
     origin: np.ndarray
     axis: np.ndarray
@@ -209,12 +252,12 @@ class _Mounted:
 
     @classmethod
     def of(cls, sensor: Sensor, window: Window, medium: Medium, origin: np.ndarray, rotation: np.ndarray) -> _Mounted:
-        """A module whose frame, with z along its axis, ``rotation`` (3, 3) turns into the camera frame."""
+        """Make a module; ``rotation`` (3, 3) rotates from its frame, with z along its axis, to the camera frame."""
         flat = WindowGeometry.of(window, medium, sensor.laser.wavelength_nm, rotation) if window.mounted else None
         return cls(origin, rotation[:, 2], window, flat)
 
     def rays(self, directions: np.ndarray, place: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Rays (N, K, 3) from the origin through the window on to a plane; NaN for a ray that does not get there."""
+        """Trace rays (N, K, 3) from the origin through the window to a plane; NaN for rays that miss the plane."""
         points = np.broadcast_to(self.origin, directions.shape)[:, None]
         if self.window is not None:
             points, directions = traced(self.window, self.origin, directions)
@@ -225,7 +268,7 @@ class _Mounted:
         return np.concatenate([points, end[:, None]], axis=1)
 
     def seen_along(self, axes: np.ndarray, about: np.ndarray | float) -> Module:
-        """The module in a picture spanned by ``axes`` (2, 3), with its origin at ``about``."""
+        """Project the module onto ``axes`` (2, 3), with the drawing's origin at ``about``."""
         forward = axes @ self.axis / np.linalg.norm(axes @ self.axis)
         sideways = np.array([forward[1], -forward[0]])
         place = axes @ (self.origin - about)
@@ -245,7 +288,7 @@ class _Mounted:
 
 
 def _border_towards(camera: Camera, across: np.ndarray) -> np.ndarray:
-    """Pixels (2, 2) where lines from the principal point along +-``across`` (2,) leave the image."""
+    """Return the border pixels (2, 2) in the directions +-``across`` (2,) from the principal point."""
     centre = np.array(camera.principal_point())
     least, most = np.array([-0.5, -0.5]), np.array([camera.width_px - 0.5, camera.height_px - 0.5])
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -264,15 +307,15 @@ _VOLUME = "#f1ecd9"
 _VOLUME_END = "#bda96b"
 _INCHES = (11.5, 7.0)
 _MARGIN = 0.1
-"""Room for dimensions around a view, as a share of its larger side."""
+"""Margin around a view for dimensions, relative to its larger side."""
 _LABELS = 0.35
-"""Room for labels at the right, as a share of the width."""
+"""Margin at the right for labels, relative to the width."""
 _ARC = 0.4
-"""Radius of the arc at the triangulation angle, as a share of the way from the window to the sheet's crossing."""
+"""Radius of the arc at the triangulation angle, relative to the stand-off from the window."""
 
 
 def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | None = None) -> Figure:
-    """Draw a design's views beside each other, to scale; another design is dashed behind them where it fits in."""
+    """Draw a design's two views to scale; another design is drawn behind them as dashed lines, as far as it fits."""
     boxes = [_box(view) for view in (side, front)]
     widths = [float(np.ptp(box[:, 0])) for box in boxes]
     figure, panels = new_figure(*_INCHES, columns=2, width_ratios=widths)
@@ -289,7 +332,7 @@ def draw(side: SideView, front: FrontView, other: tuple[SideView, FrontView] | N
 
 
 def _box(view: SideView | FrontView) -> np.ndarray:
-    """Least and largest coordinates (2, 2) of a view with a margin, and with room for labels at the right."""
+    """Return the smallest and largest coordinates (2, 2) of a view with its margins."""
     points = np.concatenate(view.outlines())
     points = points[np.isfinite(points).all(axis=1)]
     margin = _MARGIN * np.ptp(points, axis=0).max()
@@ -298,13 +341,13 @@ def _box(view: SideView | FrontView) -> np.ndarray:
 
 
 def _labels_at(axes: Axes) -> float:
-    """Where the room for labels begins."""
+    """Return the x coordinate of the labels' start."""
     left, right = axes.get_xlim()
     return left + (right - left) / (1 + _LABELS)
 
 
 def _fill(axes: Axes, points: np.ndarray, colour: str, alpha: float, edge: str = "none") -> None:
-    """A filled outline (N, 2), nothing if a point is not finite."""
+    """Fill an outline (N, 2) if all its points are finite."""
     if len(points) and np.isfinite(points).all():
         axes.fill(*points.T, facecolor=colour, edgecolor=edge, alpha=alpha, linewidth=0.8)
 
@@ -316,7 +359,7 @@ def _draw_module(axes: Axes, module: Module, name: str) -> None:
 
 
 def _dimension(axes: Axes, start: tuple[float, float], end: tuple[float, float], words: str) -> None:
-    """A dimension line between two places, with words beside its middle."""
+    """Draw a dimension line between two points, with a text beside its middle."""
     arrow = {"arrowstyle": "<->", "color": INK, "linewidth": 0.8, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", start, end, arrowprops=arrow)
     turned, aside = (90, (-7, 0)) if start[0] == end[0] else (0, (0, 7))
@@ -343,7 +386,7 @@ def _draw_side(axes: Axes, view: SideView) -> None:
         axes.plot(*view.in_view.T, color=RED, linewidth=3.4)
     axes.plot([-view.pupil_mm / 2, view.pupil_mm / 2], [0, 0], color=INK, linewidth=2.6)
     axes.plot(*np.stack([view.laser.origin, view.crossing], axis=1), "o", color=INK, markersize=4.5)
-    # An arc between the camera's axis and the sheet, above their crossing.
+    # Arc between the camera's axis and the sheet, above their intersection.
     angles = np.linspace(0, math.copysign(view.angle_rad, float(view.sheet[0, 0] - view.sheet[-1, 0])), 60)
     arc = view.crossing + _ARC * (cross - outer) * np.stack([np.sin(angles), -np.cos(angles)], axis=1)
     axes.plot(*arc.T, color=INK, linewidth=0.8)
@@ -352,7 +395,7 @@ def _draw_side(axes: Axes, view: SideView) -> None:
     shown = float(view.laser.origin[0])
     words = f"baseline {number_text(view.baseline_mm)} mm"
     if abs(view.baseline_mm - shown) > 1e-3 * view.baseline_mm:
-        # The baseline does not run square to the sheet.
+        # The baseline is not perpendicular to the stripe.
         words = f"{number_text(shown)} mm of the {words}"
     _dimension(axes, (0.0, 0.75 * top), (shown, 0.75 * top), words)
     _dimension(axes, (0.8 * left, outer), (0.8 * left, cross), f"stand-off {number_text(cross - outer)} mm")

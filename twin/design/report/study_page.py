@@ -1,4 +1,4 @@
-"""Page of a study: what was asked, and which design to build; one HTML file that loads nothing from the network."""
+"""Page of a study: the question and the design to build, as one HTML file without network resources."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from uwlts.pages.toolkit import FigureCollector, render_page, svg_of
 _BEST = 20
 """Designs in the table of the best."""
 _DRAWN = (
-    "Lengths in mm; near, far and stand-off from the window. Left: along the sheet; the camera's view in blue, the "
-    "sheet in red, thick where the camera sees it within the measuring volume (tinted). Right: onto the sheet; the "
-    "laser's fan, the image's border in blue, and the line's lengths. Windows and rays are to scale, the housings only "
-    "hint at where they are."
+    "Lengths in mm; near, far and stand-off are measured from the window. Left: along the sheet, with the camera's "
+    "view in blue and the sheet in red (thick: in the camera's view and in the tinted measuring volume). Right: onto "
+    "the sheet, with the laser's fan, the image's border in blue, and the line's lengths. Windows and rays are to "
+    "scale; the housings are only indicated."
 )
 
 
@@ -34,11 +34,25 @@ def page_text(
     agreements: Sequence[Agreement],
     notes: Sequence[str] = (),
 ) -> str:
-    """The page of a study as HTML, from all its judged designs (none where ``columns`` is empty).
+    """Return the page of a study as HTML.
 
-    ``marked`` are designs to point out, the chosen one last; ``agreements`` compare formulas and rendering of each
-    rendered design, ``notes`` are sentences for the page's head. EvaluationError where the columns are of another
-    study.
+    Parameters
+    ----------
+    study : Study
+        The study.
+    columns : Columns
+        All evaluated designs; can be empty.
+    marked : sequence of Marked
+        Designs to highlight, the chosen one last.
+    agreements : sequence of Agreement
+        Comparison of formulas and rendering for each rendered design.
+    notes : sequence of str
+        Sentences for the top of the page.
+
+    Raises
+    ------
+    EvaluationError
+        The columns belong to another study.
     """
     judged, collected = Judged(study, columns), FigureCollector()
     over_free_title, over_free = _over_what_is_free(judged, marked)
@@ -58,7 +72,7 @@ def page_text(
         over_free_title=over_free_title,
         pareto=pareto and collected.add(*pareto),
         parallel=parallel and collected.add(*parallel),
-        nothing=nothing if len(judged) else "No design has been judged.",
+        nothing=nothing if len(judged) else "No design has been evaluated.",
         number=tables.number_text,
         value=tables.value_text,
         verdicts=[
@@ -78,7 +92,7 @@ def _shown(drawn: charts.Static | None) -> tuple[Markup, str] | None:
 
 
 def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Markup | None, str]:
-    """The chosen design's drawing and what it shows, or why there is none."""
+    """Return the drawing of the chosen design and its caption, or None and the reason."""
     if not marked:
         return None, "There is no design to draw."
     chosen, base = marked[-1], marked[0]
@@ -95,7 +109,7 @@ def _drawing(study: Study, marked: Sequence[Marked]) -> tuple[Markup | None, str
 
 
 def _over_what_is_free(judged: Judged, marked: Sequence[Marked]) -> tuple[str, tuple[Markup, str] | None]:
-    """Title of the chart that suits what is free, and the chart; None where no design works."""
+    """Return the title and the chart of figures over the free variables; no chart if no design works."""
     ranges = [name for name, variable in judged.study.variables.items() if variable.values is None][:2]
     title = f"Figures over {' and '.join(map(tables.words_of, ranges))}" if ranges else "Figures of the choices"
     if not judged.works.any():
@@ -110,7 +124,7 @@ def _over_what_is_free(judged: Judged, marked: Sequence[Marked]) -> tuple[str, t
 
 
 def _best(judged: Judged) -> tuple[list[str], list[list[str]]]:
-    """Head and rows of the table of the best designs."""
+    """Return the head and rows of the table of the best designs."""
     study = judged.study
     more = ("sigma_z_rms_mm", "line_mm", "depth_mm", "standoff_mm", "required_ms", "laser_class")
     figures = dict.fromkeys([*study.wanted(), *more])

@@ -1,4 +1,4 @@
-"""Texts, numbers and tables of a study's page: names, tiles, judged designs, and verdicts of the verification."""
+"""Texts, numbers and tables of a study's page: names, tiles, evaluated designs, and verdicts of the verification."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ _UNITS = {
     "_c": "°C",
     "_k": "K",
 } | {f"_{unit}": unit for unit in ("mm", "nm", "px", "ms", "s", "m")}
-"""Units by the ends of names; the first that fits counts."""
+"""Units by suffix of names; the first match counts."""
 
 
 def words_and_unit(name: str) -> tuple[str, str]:
-    """A figure's, a path's or a choice's name in words, and its unit ("" if it has none)."""
+    """Return the label of a figure, path or choice, and its unit ("" without a unit)."""
     if name in FIGURES:
         return FIGURES[name]
     *parents, key = name.split(".")
@@ -60,32 +60,32 @@ def words_and_unit(name: str) -> tuple[str, str]:
 
 
 def words_of(name: str) -> str:
-    """A name in words, without its unit."""
+    """Return the label of a name without its unit."""
     return words_and_unit(name)[0]
 
 
 def label_of(name: str) -> str:
-    """A name in words with its unit, as an axis has it."""
+    """Return the label of a name with its unit, as for an axis."""
     words, unit = words_and_unit(name)
     return f"{words} ({unit})" if unit else words
 
 
 def number_text(value: float | None, digits: int = 4) -> str:
-    """A number with some significant digits and a proper minus sign; a dash for what is missing or not finite."""
+    """Format a number with significant digits and a minus sign; a dash if it is missing or not finite."""
     if value is None or not math.isfinite(value):
         return MISSING
     if float(value).is_integer() and abs(value) < 1e6:
         text = f"{value:.0f}"
     else:
         text = f"{value:.{digits}g}"
-        # Scientific notation is for what no sensor has.
+        # Scientific notation is only for values outside the range of any sensor.
         if "e" in text and 1e-6 < abs(value) < 1e9:
             text = f"{value:.0f}" if abs(value) >= 1 else f"{value:.{digits + 5}f}".rstrip("0")
     return text.replace("-", "\N{MINUS SIGN}")
 
 
 def value_text(name: str, value: Value | None, *, unit: bool = True) -> str:
-    """A value of a figure or of something free, with its unit."""
+    """Format the value of a figure or a free variable with its unit."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if value is None:
@@ -103,34 +103,34 @@ def value_text(name: str, value: Value | None, *, unit: bool = True) -> str:
 
 
 def listed(words: Sequence[str]) -> str:
-    """Words in a row: "a, b and c"."""
+    """Join words as "a, b and c"."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
 def rounded(values: Iterable[float]) -> list[float | None]:
-    """Numbers to five significant digits, as JSON holds them: None for what is not finite."""
+    """Round numbers to five significant digits for JSON: None if not finite."""
     numbers = np.asarray(values, dtype=float).tolist()
     return [float(f"{value:.5g}") if math.isfinite(value) else None for value in numbers]
 
 
 def without_numbers(text: str) -> str:
-    """A text with its numbers left out, so that reasons of the same kind are the same."""
+    """Replace the numbers in a text by "…", so that reasons of the same kind are equal."""
     return re.sub(r"(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "…", text)
 
 
 def text_at(judged: Judged, name: str, place: int, *, unit: bool = True) -> str:
-    """A design's value in words, with its unit."""
+    """Format a design's value with its unit."""
     return value_text(name, judged.columns[name][place : place + 1].tolist()[0], unit=unit)
 
 
 def failure_counts(judged: Judged) -> list[tuple[str, str]]:
-    """Reasons why designs cannot work, without the numbers, and how many; the most frequent first."""
+    """Return reasons of failure without numbers, and their counts, the most frequent first."""
     counts = Counter(without_numbers(text) for text in judged.failures if text)
     return [(text, f"{count:,}") for text, count in counts.most_common()]
 
 
 def miss_counts(judged: Judged) -> list[tuple[str, str]]:
-    """Constraints in words, and how many of the working designs miss each."""
+    """Return the constraints as texts, and the number of working designs that violate each."""
     return [
         (bound_text(name, sign, bound), f"{(sign * (judged.figure(name)[judged.works] - bound) > 0).sum():,}")
         for name, sign, bound in judged.study.bounds()
@@ -138,7 +138,7 @@ def miss_counts(judged: Judged) -> list[tuple[str, str]]:
 
 
 def bound_text(name: str, sign: int, bound: float) -> str:
-    """A bound in words."""
+    """Format a bound as a text."""
     return f"{words_of(name)} {_limit(name, sign, bound)}"
 
 
@@ -147,13 +147,13 @@ def _limit(name: str, sign: int, bound: float) -> str:
 
 
 def misses(study: Study, row: Mapping[str, Value | None]) -> dict[str, tuple[str, str]]:
-    """Figures of which a design misses a bound, each with the miss in words and with the bound alone."""
+    """Return the figures that violate a bound, each with a text of value and bound, and a text of the bound alone."""
     found = {}
     for name, sign, bound in study.bounds():
         value = row.get(name)
         if isinstance(value, int | float) and sign * (value - bound) > 0:
-            asked = f"{_limit(name, sign, bound)} is asked"
-            found[name] = f"{words_of(name)} is {value_text(name, value)}, {asked}", asked
+            required = f"{_limit(name, sign, bound)} is required"
+            found[name] = f"{words_of(name)} is {value_text(name, value)}, {required}", required
     return found
 
 
@@ -167,12 +167,12 @@ _GOALS = {"minimise": "smallest", "maximise": "largest"}
 _FOLLOW = {
     "focus": "the lens is focused on it",
     "waist": "the laser is focused on it",
-    "volume": "the volume lies about it",
+    "volume": "the volume is centred on it",
 }
 
 
 def introduction(judged: Judged) -> list[tuple[str, str]]:
-    """The question and the number of designs judged, by key words."""
+    """Return the study's question and the number of evaluated designs, as pairs of keyword and text."""
     study, bounds = judged.study, judged.study.bounds()
     facts = [
         ("base sensor", f"{study.sensor.name}, in {study.medium}, on surfaces of reflectance {study.reflectance:g}"),
@@ -183,7 +183,7 @@ def introduction(judged: Judged) -> list[tuple[str, str]]:
         facts.append(("constraints", "; ".join(bound_text(*bound) for bound in bounds)))
     if study.follow:
         facts.append(("at each stand-off", listed([_FOLLOW[name] for name in study.follow])))
-    counted = f"{len(judged):,} judged, {_CHOSEN[study.sampling.kind]}; {judged.works.sum():,} work"
+    counted = f"{len(judged):,} evaluated, {_CHOSEN[study.sampling.kind]}; {judged.works.sum():,} work"
     facts.append(("designs", counted + (f", {judged.feasible.sum():,} meet all constraints" if bounds else "")))
     return facts
 
@@ -199,7 +199,10 @@ _ALWAYS_SHOWN = ("sigma_z_near_mm", "sigma_z_middle_mm", "sigma_z_far_mm", "line
 
 
 def tiles(study: Study, chosen: Marked, compared: Marked | None) -> list[Tile]:
-    """Everything free, wanted and otherwise decisive of the chosen design, beside the values of another one."""
+    """Return tiles with the chosen design's values: free variables, objectives, constraints and other key figures.
+
+    The values of the ``compared`` design are shown as notes.
+    """
     row, missed = chosen.design.table(), misses(study, chosen.design.table())
     label, other = ("", {}) if compared is None else (compared.label, compared.design.table())
     window, needed = chosen.sensor.camera.window, chosen.design.number_of("window_mm")
@@ -209,7 +212,7 @@ def tiles(study: Study, chosen: Marked, compared: Marked | None) -> list[Tile]:
         notes = (
             note,
             f"misses its bound: {missed[name][1]}" if name in missed else "",
-            "camera or laser do not reach it" if name.startswith("sigma_z_") and text == MISSING else "",
+            "not reached by camera or laser" if name.startswith("sigma_z_") and text == MISSING else "",
             f"{label}: {beside}" if beside not in (MISSING, label, "base") else "",
         )
         return Tile(words_of(name), text, "\n".join(filter(None, notes)), accent)
@@ -220,7 +223,8 @@ def tiles(study: Study, chosen: Marked, compared: Marked | None) -> list[Tile]:
     found += [tile(name, accent=True, note="an objective") for name in objectives]
     found += [tile(name) for name in others]
     required, used = (chosen.design.number_of(name) for name in ("required_ms", "exposure_ms"))
-    darker = f"the wanted brightness takes {value_text('required_ms', required)}" if required > 1.001 * used else ""
+    darker = f"required for the wanted brightness: {value_text('required_ms', required)}"
+    darker = darker if required > 1.001 * used else ""
     last = (("exposure_ms", darker), ("laser_class", "estimate, IEC 60825-1"))
     found += [tile(name, note=note) for name, note in last if name not in (*objectives, *others)]
     if "window_mm" not in objectives:
@@ -232,14 +236,14 @@ def tiles(study: Study, chosen: Marked, compared: Marked | None) -> list[Tile]:
 
 
 def agreement_text(study: Study, found: Agreement) -> str:
-    """Whether formulas and rendering agree on a design, in a sentence."""
+    """Return a sentence on the agreement of formulas and rendering for a design."""
     if found.failure:
         return f"It could not be verified: {found.failure}."
     factor = number_text(found.ratio, 3)
     if found.agrees:
         return (
-            f"Formulas and rendering agree: their scatters differ by a factor {factor}, up to "
-            f"{number_text(study.verify_tolerance, 3)} is allowed."
+            f"Formulas and rendering agree: their scatters differ by a factor {factor} (limit "
+            f"{number_text(study.verify_tolerance, 3)})."
         )
     predicted, rendered = np.array(found.predicted_mm, float), np.array(found.rendered_mm, float)
     with np.errstate(all="ignore"):
@@ -248,8 +252,7 @@ def agreement_text(study: Study, found: Agreement) -> str:
         return "Formulas and rendering could not be compared: rendering found no scatter at any depth."
     worst = int(np.argmax(np.where(np.isfinite(off), off, -1.0)))
     return (
-        f"Formulas and rendering disagree by a factor {factor}, more than the {number_text(study.verify_tolerance, 3)} "
-        f"allowed: most at Z = {number_text(found.z_mm[worst])} mm, where "
-        f"{number_text(1e3 * predicted[worst])} µm were predicted and {number_text(1e3 * rendered[worst])} µm "
-        "rendered. Do not rely on the formulas for designs like this one."
+        f"Formulas and rendering disagree by a factor {factor} (limit {number_text(study.verify_tolerance, 3)}), most "
+        f"at Z = {number_text(found.z_mm[worst])} mm: {number_text(1e3 * predicted[worst])} µm predicted, "
+        f"{number_text(1e3 * rendered[worst])} µm rendered. Do not rely on the formulas for designs like this one."
     )

@@ -364,7 +364,7 @@ def renamed(sensor, **changes):
         (
             lambda s: {"sensor": renamed(s, name="other")},
             CalibrationError,
-            r"step.h5 is by the sensor 'other', .*right one\?",
+            r"step.h5 is of the sensor 'other', .*right one",
         ),
         (
             lambda s: {"sensor": renamed(s, laser=renamed(s.laser, wavelength_nm=s.laser.wavelength_nm + 3.0))},

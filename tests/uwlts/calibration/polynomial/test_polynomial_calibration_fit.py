@@ -424,7 +424,7 @@ def edit(content, name):
         ("infinite", "finite"),
         ("domain", "domains_px"),
         ("range", "depth_range_mm"),
-        ("lines", "do not lie in an image"),
+        ("lines", "do not fit an image"),
         ("unknown", "surprise"),
         ("format", 'expected "format"'),
     ],
