@@ -36,7 +36,7 @@ demo: setup
 
 test: PYTEST_OPTIONS := -m "not slow"
 test-full: BESIDE := oldest
-# Threads of two test processes on two cores would wait for each other in every small product of matrices.
+# Threads of several test processes on two cores would wait for each other in every small product of matrices.
 test test-full: export OPENBLAS_NUM_THREADS := 1
 test test-full: style
 	@$(WITH_ARAVIS)
