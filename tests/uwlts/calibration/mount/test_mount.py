@@ -97,7 +97,7 @@ def least_scatter_mm(campaign: Campaign) -> float:
     return float(np.sqrt(np.mean(least_squares(distances, np.zeros(10), x_scale="jac").fun ** 2)))
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 @pytest.mark.parametrize("radius", [RADIUS_MM, None])
 def test_smooth_errors_of_the_profiler_are_weighed(seed, radius):
     """2,000 points with little noise, along which the profiler errs smoothly by more, as real ones do.
