@@ -4,6 +4,8 @@ VENV := .venv
 PYTHON := $(VENV)/bin/python
 INSTALLED := $(VENV)/.installed
 OLDEST := .venv-oldest
+# A recipe with the word MAKE would run even by make -n.
+BY_ITSELF = $(MAKE) --no-print-directory
 WITH_ARAVIS = $(call with_packages,$(PYTHON) -m uwlts.runtime.shared_library,libaravis-0.8-0)
 WITH_BROWSER = $(call with_packages,$(PYTHON) -m tests.browser,chromium-headless-shell fonts-dejavu-core)
 
@@ -33,19 +35,21 @@ demo: setup
 	@$(PYTHON) -m twin demo
 
 test: PYTEST_OPTIONS := -m "not slow"
-# Threads of two test processes on two cores would wait for each other in every small product of matrices.
+test-full: BESIDE := oldest
+# Threads of several test processes on two cores would wait for each other in every small product of matrices.
 test test-full: export OPENBLAS_NUM_THREADS := 1
 test test-full: style
 	@$(WITH_ARAVIS)
 	@# Without a browser only the tests of pages fail; without any font a page shows no text.
 	-@$(WITH_BROWSER)
-	@# Types are checked beside the tests, in time that those leave: many wait for simulated hardware and for pages.
-	@found=$$(mktemp); nice $(VENV)/bin/basedpyright >$$found 2>&1 & checking=$$!; \
-	trap 'kill $$checking 2>/dev/null; rm -f $$found' EXIT; trap 'exit 130' INT TERM; \
-	$(PYTHON) -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations=10 $(PYTEST_OPTIONS); tested=$$?; \
-	wait $$checking; typed=$$?; echo "types:"; cat $$found; exit $$((tested ? tested : typed))
-
-test-full: oldest
+	@# Beside the tests, in time that those leave: many wait for simulated hardware and for pages.
+	@folder=$$(mktemp -d); jobs=; \
+	trap 'kill $$jobs 2>/dev/null; rm -rf $$folder' EXIT; trap 'exit 130' INT TERM; \
+	nice $(VENV)/bin/basedpyright >$$folder/types 2>&1 & jobs="$$jobs $$!"; \
+	for name in $(BESIDE); do nice $(BY_ITSELF) $$name >$$folder/$$name 2>&1 & jobs="$$jobs $$!"; done; \
+	$(PYTHON) -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder --durations=10 $(PYTEST_OPTIONS); failed=$$?; \
+	for job in $$jobs; do wait $$job || failed=$$((failed ? failed : $$?)); done; jobs=; \
+	for name in types $(BESIDE); do echo "$$name:"; cat $$folder/$$name; done; exit $$failed
 
 # Compiled loops are kept apart: both environments would replace those of the other.
 oldest: export NUMBA_CACHE_DIR := $(CURDIR)/$(OLDEST)/numba

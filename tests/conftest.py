@@ -88,6 +88,9 @@ SERVING = {
     "test_documented_hardware.py",
 }
 
+NICE = 5
+"""Niceness of test processes beside the one that serves: its tests judge times."""
+
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
@@ -104,8 +107,10 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
 
 @pytest.fixture(scope="module", autouse=True)
 def serving_alone(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Let only one of several test processes serve cameras and pages."""
+    """Let only one of several test processes serve cameras and pages, and the others leave processor time to it."""
     if request.path.name not in SERVING:
+        if "PYTEST_XDIST_WORKER" in os.environ:
+            os.nice(max(0, NICE - os.nice(0)))
         yield
         return
     with open(Path(tempfile.gettempdir()) / "uwlts-tests-serving.lock", "w") as lock:

@@ -8,7 +8,7 @@ from hypothesis import given, settings, strategies as st
 
 from tests.fuzz.past_failures import PAST
 from tests.fuzz.readers import READERS
-from tests.fuzz.running import MOST_MIB, MOST_S, watched
+from tests.fuzz.running import MOST_MIB, MOST_S, Outcome, watched
 from uwlts.errors import CaptureError, OutputError
 from uwlts.files.reading import parsed_json, parsed_toml, read_bytes
 from uwlts.files.writing import written_aside
@@ -40,10 +40,22 @@ def test_corpus(tmp_path: Path):
     assert [each for each in outcomes if each.fault] == []
 
 
+@pytest.fixture(scope="module")
+def outcomes_of(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Outcome]]:
+    """Outcomes of changed files by reader: one process imports once and reads for all chosen tests of this module."""
+    items = [item for item in request.session.items if isinstance(item, pytest.Function) and item.path == request.path]
+    params = [item.callspec.params for item in items if hasattr(item, "callspec")]
+    chosen = [values["reader"] for values in params if "reader" in values]
+    outcomes = watched(
+        tmp_path_factory.mktemp("changed"), [(reader, str(number)) for reader in chosen for number in range(CASES)]
+    )
+    return {reader: [outcome for outcome in outcomes if outcome.reader == reader] for reader in chosen}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("reader", READERS)
-def test_changed_files_are_read_or_refused(tmp_path: Path, reader: str):
-    outcomes = watched(tmp_path, [(reader, str(number)) for number in range(CASES)])
+def test_changed_files_are_read_or_refused(outcomes_of: dict[str, list[Outcome]], reader: str):
+    outcomes = outcomes_of[reader]
     assert [each for each in outcomes if each.fault] == []
     # The changes reach something: not all files are still read.
     assert len(outcomes) == CASES and sum(bool(each.refusal) for each in outcomes) > 0.1 * CASES

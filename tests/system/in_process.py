@@ -2,7 +2,8 @@
 
 import subprocess
 import sys
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stderr, redirect_stdout
 from io import StringIO
 
 import pytest
@@ -10,6 +11,7 @@ from cyclopts import App
 
 from uwlts import cli
 from uwlts.runtime import console
+from uwlts.runtime.workers import Workers, open_workers
 
 
 def uwlts(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -27,3 +29,16 @@ def run_program(app: App, program: str, *arguments: object) -> subprocess.Comple
         except SystemExit as ended:
             code = ended.code
     return subprocess.CompletedProcess(words, code, said.getvalue(), errors.getvalue())
+
+
+@contextmanager
+def shared_workers() -> Iterator[Workers]:
+    """Let all sweeps of this process use the same working processes, unless they are told how many or where."""
+    with open_workers() as pool, pytest.MonkeyPatch.context() as patch:
+
+        def opened(*, workers: int | None = None, scheduler: str | None = None) -> AbstractContextManager[Workers]:
+            usual = workers is None and scheduler is None
+            return nullcontext(pool) if usual else open_workers(workers=workers, scheduler=scheduler)
+
+        patch.setattr("twin.design.sweep.open_workers", opened)
+        yield pool

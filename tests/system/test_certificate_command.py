@@ -3,12 +3,13 @@
 import json
 import shutil
 import subprocess
-import sys
+from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.system.in_process import uwlts
 from tests.uwlts.calibration_views import built_sensor
 from tests.uwlts.joint_views import Noise, gathered, target_series
 from uwlts.calibration.joint.procedure import solve_jointly
@@ -16,18 +17,10 @@ from uwlts.calibration.sequential.sequential_calibration import CalibrationOptio
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parents[2]
 
-
-def run(*arguments, folder: Path) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, "-m", "uwlts", *map(str, arguments)],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
+def run(*arguments: object, folder: Path) -> subprocess.CompletedProcess[str]:
+    with chdir(folder):
+        return uwlts(*arguments)
 
 
 @pytest.fixture(scope="module")

@@ -297,7 +297,7 @@ MOBILE = (
 """Quasar opens choices as dialogs there."""
 
 
-@pytest.fixture(params=SIZES)
+@pytest.fixture(params=["desktop", "phone", pytest.param("tablet", marks=pytest.mark.slow)])
 def sized(request: pytest.FixtureRequest, desk: Desk, chromium: "Browser") -> "Iterator[Page]":
     """The operator's page on a screen of this size, where it is a mobile one with a finger in place of a mouse."""
     width, height = SIZES[request.param]

@@ -6,6 +6,7 @@ stage and samples. `test_documented_hardware.py` runs the pages that need a came
 
 import csv
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from scipy.spatial.transform import Rotation
 import uwlts
 from tests.documented import PAGES, ROOT, blocks, name_of
 from tests.system.documented_runs import Page, Runner, run_page, write_small_descriptions
+from tests.system.in_process import shared_workers
 from tests.system.test_documented_hardware import PAGES_RUN as HARDWARE_PAGES
 from tests.uwlts.mount_views import RADIUS_MM, SPHERE_MM, STANDOFF_MM, profile_of, sphere_campaign
 
@@ -261,6 +263,12 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("small")
     write_small_descriptions(folder)
     return folder
+
+
+@pytest.fixture(scope="module", autouse=True)
+def workers() -> Iterator[None]:
+    with shared_workers():
+        yield
 
 
 @pytest.fixture(scope="module")

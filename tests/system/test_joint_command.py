@@ -4,17 +4,18 @@ import json
 import math
 import re
 import subprocess
-import sys
+from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.system.in_process import uwlts
+from tests.system.in_process import run_program, uwlts
+from twin.cli import app as twin_app
+from uwlts.cli import app as uwlts_app
 from uwlts.model.sensor import Sensor
 from uwlts.storage.calibration_file import read_calibration
 
-ROOT = Path(__file__).parents[2]
 QUICK = ("--without", "multiple-scattering", "secondary-light", "haze", "--as-built", "thesis-as-built")
 SCENE = """
 base = "target-through-window"
@@ -26,12 +27,12 @@ count = 6
 direction = [0.0, 0.0, 1.0]
 lights = ["lamp", "laser"]
 """
+APPS = {"twin": twin_app, "uwlts": uwlts_app}
 
 
-def run(package: str, *arguments, folder: Path) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", package, *map(str, arguments)], cwd=folder, capture_output=True, text=True, check=False
-    )
+def run(program: str, *arguments: object, folder: Path) -> str:
+    with chdir(folder):
+        done = run_program(APPS[program], program, *arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

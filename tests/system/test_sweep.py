@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.system.in_process import run_program
+from tests.system.in_process import run_program, shared_workers
 from tests.waiting import within
 from twin import cli
 from twin.design.screening import parts, read_parts, screen
 from twin.design.study import load_study
 from uwlts.model.library import load_sensor
-from uwlts.runtime.workers import open_workers
+from uwlts.runtime.workers import Workers
 
 pytestmark = pytest.mark.slow
 
@@ -37,8 +37,8 @@ least = 15.0
 most = 60.0
 [sampling]
 kind = "sobol"
-designs = 12000
-batch = 250
+designs = 8000
+batch = 200
 [[objectives]]
 figure = "sigma_z_rms_mm"
 [[objectives]]
@@ -56,13 +56,19 @@ def study(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.fixture(scope="module", autouse=True)
+def workers() -> Iterator[Workers]:
+    """Working processes of all sweeps in this process; those of the sweeps that are stopped are their own."""
+    with shared_workers() as pool:
+        yield pool
+
+
 @pytest.fixture(scope="module")
-def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, np.ndarray]:
+def expected(tmp_path_factory: pytest.TempPathFactory, workers: Workers) -> dict[str, np.ndarray]:
     """All designs of the study, judged in one go."""
     folder = tmp_path_factory.mktemp("expected")
     (folder / "study.toml").write_text(STUDY, encoding="utf-8")
-    with open_workers(workers=2) as pool:
-        screen(load_study(folder / "study.toml"), folder / "out", pool)
+    screen(load_study(folder / "study.toml"), folder / "out", workers)
     return read_parts(folder / "out" / "screen")
 
 
@@ -90,7 +96,7 @@ def contents(out: Path) -> dict[str, int]:
 
 def same(out: Path, expected: dict[str, np.ndarray]) -> None:
     found = read_parts(out / "screen")
-    assert found["design"].tolist() == list(range(12000))
+    assert found["design"].tolist() == list(range(8000))
     np.testing.assert_array_equal(found["sigma_z_rms_mm"], expected["sigma_z_rms_mm"])
     assert found["failure"].tolist() == expected["failure"].tolist()
 
@@ -103,7 +109,7 @@ def test_a_stopped_sweep_goes_on_without_repeating_or_losing(study, tmp_path, ex
     first.send_signal(sent)
     _, said = first.communicate(timeout=60)
     kept = contents(out)
-    assert 5 <= len(kept) < 48
+    assert 5 <= len(kept) < 40
     if sent == signal.SIGINT:
         assert first.returncode == 130 and "Traceback" not in said
     done = run(study, out)
@@ -123,7 +129,7 @@ def test_a_finished_sweep_has_page_table_summary_and_a_sensor_that_works(study, 
     same(out, expected)
     summary = json.loads((out / "summary.json").read_text())
     works = expected["failure"] == ""
-    assert (summary["designs"], summary["work"]) == (12000, int(works.sum()))
+    assert (summary["designs"], summary["work"]) == (8000, int(works.sum()))
     meets = expected["violation"] == 0
     assert summary["meet_all_constraints"] == int(meets.sum()) > 100
     best = next(one for one in summary["marked"] if one["label"].startswith("best"))
@@ -132,7 +138,7 @@ def test_a_finished_sweep_has_page_table_summary_and_a_sensor_that_works(study, 
     assert winner["sigma_z_rms_mm"] <= best["sigma_z_rms_mm"] and winner["line_mm"] >= 150.0
     sensor = load_sensor(out / "winner.toml")
     assert sensor.laser.baseline_mm == pytest.approx(winner["laser.baseline_mm"])
-    assert len((out / "designs.csv").read_text().splitlines()) == 12001
+    assert len((out / "designs.csv").read_text().splitlines()) == 8001
     assert "<html" in (out / "report.html").read_text(encoding="utf-8")
     # Run again there is nothing left to judge.
     before = contents(out)
@@ -184,7 +190,7 @@ def test_more_designs_may_be_asked_for(study, tmp_path, expected):
 
 
 def test_an_optimiser_beats_chance_and_goes_on_where_it_was(study, tmp_path):
-    study.write_text(STUDY.replace('"sobol"', '"optimise"').replace("batch = 250", "batch = 64"), encoding="utf-8")
+    study.write_text(STUDY.replace('"sobol"', '"optimise"').replace("batch = 200", "batch = 64"), encoding="utf-8")
     out = tmp_path / "out"
     for count in (256, 512):
         done = run(study, out, "--designs", str(count))
@@ -200,7 +206,7 @@ def test_an_optimiser_beats_chance_and_goes_on_where_it_was(study, tmp_path):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (("least = 60.0\nmost = 400.0", "least = 1.0\nmost = 2.0"), "none of 12000 designs can work"),
+        (("least = 60.0\nmost = 400.0", "least = 1.0\nmost = 2.0"), "none of 8000 designs can work"),
         (("least = 60.0\nmost = 400.0", "least = 1.0\nmost = 2.0\nunit = 1"), "unknown key"),
     ],
 )

@@ -6,14 +6,13 @@ what was measured; the injected errors show that 0.02 mm more or less does not p
 """
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.system.in_process import uwlts
 from twin.recording.campaigns import record_campaigns
 from twin.scene.campaign import Campaign, load_campaign
 from uwlts.model.calibration import Calibration
@@ -203,9 +202,9 @@ def test_the_joint_calibration_measures_closer_than_the_thesis_s_ways(imperfect:
 def test_models_are_chosen_as_the_sensor_was_built(edition: CampaignFolder, tmp_path: Path):
     """Camera's and laser's windows are tilted by 0.08 and 0.1 deg, the lens has k1 and k2, and the sheet no bow."""
     page, folder = tmp_path / "models.html", edition.path
-    command = [sys.executable, "-m", "uwlts", "models", "--air", folder / "target-bare.h5", "--out", page]
-    command += ["--water", folder / "target-water.h5", "--step", *sorted(folder.glob("step-*-water.h5"))]
-    done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
+    steps = sorted(folder.glob("step-*-water.h5"))
+    water = ("--water", folder / "target-water.h5", "--step", *steps)
+    done = uwlts("models", "--air", folder / "target-bare.h5", "--out", page, *water)
     assert done.returncode == 0, done.stderr
     content = json.loads(page.with_suffix(".json").read_text(encoding="utf-8"))
     assert content["simplest"] == "sheet without bow"

@@ -154,6 +154,7 @@ def test_waves_have_their_height_and_die_out_below():
     assert 0.15 < below[:, 0].std() / surface[:, 0].std() < 0.4
 
 
+@pytest.mark.slow
 def test_the_navigation_states_the_covariance_of_its_errors():
     """200 vehicles: chi-square of the errors after 100 s by the stated covariance, 6 degrees of freedom each.
 

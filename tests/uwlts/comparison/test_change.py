@@ -59,6 +59,7 @@ def scanned(rng, *, change=None, common=True, surface=height, calibration=None):
     return PointCloud(seen, np.ones(count), image, np.zeros(count, int), uncertainty=known)
 
 
+@pytest.mark.slow
 def test_nothing_is_claimed_where_nothing_changed():
     rng = np.random.default_rng(2)
     shares = []
@@ -73,6 +74,7 @@ def test_nothing_is_claimed_where_nothing_changed():
     assert 0.005 < claimed < 0.08
 
 
+@pytest.mark.slow
 def test_the_level_is_that_of_the_distances():
     """Over many pairs distances scatter by the level over 1.96, common errors included."""
     rng = np.random.default_rng(3)
@@ -118,6 +120,7 @@ def share(change):
     return np.average(change.significant[change.compared], weights=change.area_mm2[change.compared])
 
 
+@pytest.mark.slow
 def test_a_registration_takes_up_what_looks_like_a_movement():
     """Shift and tilt that all points share no longer count, and what is claimed stays at most the level's 5 %."""
     rng = np.random.default_rng(12)

@@ -44,6 +44,7 @@ def assert_stated(error, surface):
     assert 0.8 < np.sqrt(np.mean((error / surface.std_mm) ** 2)) < 1.25
 
 
+@pytest.mark.slow
 def test_a_sphere_and_what_is_stated():
     rng, radius = np.random.default_rng(1), 20.0
 

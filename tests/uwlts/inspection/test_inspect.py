@@ -251,6 +251,7 @@ def test_depths_are_within_their_intervals():
     assert all(pit["depth"].systematic < 0.2 * pit["depth"].random for pit in pits)
 
 
+@pytest.mark.slow
 def test_what_the_footprint_of_points_smooths_is_put_back():
     """25 pits of 2.5 mm diameter and 0.5 mm depth; without the footprint correction they are a tenth too shallow."""
     sizes, places = (0.22, 0.2), list(product(np.arange(-12, 13, 6.0), np.arange(-12, 13, 6.0)))

@@ -70,6 +70,7 @@ def errors_of(mount):
     return np.concatenate([mount[:3, 3] - MOUNT[:3, 3], turn])
 
 
+@pytest.mark.slow
 def test_the_covariance_is_that_of_the_errors():
     rng = np.random.default_rng(5)
     inside, ratios = [], []
