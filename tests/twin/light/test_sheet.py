@@ -200,7 +200,7 @@ def test_in_air_the_bow_is_a_cone(thesis, bow, fan):
 def test_a_fan_bent_too_unevenly_is_refused(thesis):
     window = {"tilt_x_deg": 24.0, "tilt_y_deg": 30.0, "aperture_diameter_mm": 2000.0}
     sensor = altered(thesis, {"laser": {"fan_angle_deg": 119.0, "window": window}})
-    with pytest.raises(DesignError, match=r"119 deg fan so unevenly .* to \d+\.\d+ mm only, not to 0\.001 mm"):
+    with pytest.raises(DesignError, match=r"119 deg fan too unevenly: .* error of \d+\.\d+ mm \(limit 0\.001 mm\)"):
         Sheet(sensor, WATER)
 
 
