@@ -171,7 +171,7 @@ class Walker:
         return walks, found, alive
 
     def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Point2f, Bool]:
-        """Trace the next segment of all walks; return their new state, both kinds of light, and whether they continue."""
+        """Trace the next segment of all walks; return their new state, both kinds of light, and the live mask."""
         state, sequence = mi.sample_tea_32(seed, walks.number)
         random = cast(Any, mi.PCG32)
         rng: PCG32 = random(size=dr.width(walks.number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
