@@ -81,7 +81,7 @@ def check_scene(renderer: Renderer, scene: Scene) -> None:
     if not ((low[:, 2] <= farthest) & (high[:, 2] >= nearest)).any():
         raise DesignError(
             f"the objects are at Z = {low[:, 2].min():.1f} to {high[:, 2].max():.1f} mm from the stand-off, outside "
-            f"the measuring volume of {nearest:.1f} to {farthest:.1f} mm: choose another placement or volume"
+            f"the measuring volume from {nearest:.1f} to {farthest:.1f} mm: choose another placement or volume"
         )
     if not ((low[:, 0] <= 0) & (high[:, 0] >= 0)).any():
         raise DesignError(
@@ -370,7 +370,7 @@ class Studio:
         return window.distance_mm + window.thickness_mm / window.index(wavelength) + in_medium
 
     def _exposure(self, light: Light, probe: Literal["scan", "middle"]) -> float:
-        """Return the described exposure in ms, or the one at which the brightest shot reaches the wanted level."""
+        """Return the described exposure in ms, or that which brings the brightest shot to the wanted level."""
         wanted = self.sensor.exposure.laser_ms if light == "laser" else self.sensor.exposure.lamp_ms
         if wanted != "auto":
             return wanted

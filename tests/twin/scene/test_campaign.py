@@ -406,7 +406,7 @@ def test_campaigns_that_are_wrong(tmp_path: Path, text: str, says: str):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (HEAD + PLANE + PLANE, "several recordings would be called plane-standoff-water: give them names"),
+        (HEAD + PLANE + PLANE, "several recordings would be called plane-standoff-water: give each its own name"),
         (HEAD + f'{PLANE}name = "a"\nmedia = ["air", "water"]\n', "several recordings would be called a"),
         (HEAD + '[[recordings]]\nscene = "teapot"\n', "nothing is called 'teapot'; known are"),
         (HEAD + '[[recordings]]\nscene = "teapot.toml"\n', "no description at"),

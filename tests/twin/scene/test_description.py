@@ -186,9 +186,9 @@ BAD_SCENES = {
     "backwards in time": ("base = 'plane'\n[motion]\nspeed_mm_per_s = -1.0", r"motion\.speed_mm_per_s: .*found -1"),
     "unknown finish": (PLATE + "finish = 'velvet'", r"finish: .*'diffuse', 'painted', 'pvc' or 'metal'.*'velvet'"),
     "too smooth": (PLATE + "finish = 'metal'\nalpha = 0.001", r"alpha: .*0\.02.*found 0\.001"),
-    "rough gloss of none": (PLATE + "alpha = 0.2", r"alpha 0\.2 .* finish 'diffuse' has none: leave alpha out"),
+    "rough gloss of none": (PLATE + "alpha = 0.2", r"alpha 0\.2 .* finish is 'diffuse': omit alpha"),
     "negative height": (PLATE + "roughness_um = -1.0", r"roughness_um: .*found -1"),
-    "more than all light": (PLATE + "mirror = 0.5", r"reflectance 0\.8 and mirror 0\.5 add up to more than all light"),
+    "more than all light": (PLATE + "mirror = 0.5", r"reflectance 0\.8 and mirror 0\.5 add up to more than 1"),
     "coated mirror": (PLATE + "reflectance = 0.1\nfinish = 'pvc'\nmirror = 0.5", r"mirror 0\.5 under a coat"),
     "round mirror": (
         "title = 't'\n[[objects]]\nkind = 'sphere'\ndiameter_mm = 5.0\nmirror = 0.1",

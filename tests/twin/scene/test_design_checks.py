@@ -143,7 +143,7 @@ def test_a_scan_that_never_meets_the_sheet_is_refused(thesis, water):
     ball = {"kind": "sphere", "diameter_mm": 20.0, "position_mm": (50.0, 0.0, 0.0)}
     short = scene_of(ball, motion={"start_mm": 0.0, "step_mm": 1.0, "count": 40})
     renderer = Renderer(thesis, water, short)
-    with pytest.raises(DesignError, match=r"between X = 1\.0 and 60\.0 mm, the sheet is at X = 0"):
+    with pytest.raises(DesignError, match=r"between X = 1\.0 and 60\.0 mm, but the sheet is at X = 0"):
         check_scene(renderer, short)
     check_scene(renderer, scene_of(ball, motion={"start_mm": 0.0, "step_mm": 1.0, "count": 42}))
 
