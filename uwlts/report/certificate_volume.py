@@ -1,4 +1,4 @@
-"""Uncertainty of lengths and points over the volume that a joint calibration covers, and its change by another one."""
+"""Uncertainty of lengths and points over the calibrated volume, and differences between two calibrations."""
 
 from dataclasses import dataclass
 
@@ -22,20 +22,20 @@ from uwlts.model.sensor import Uncertainty
 from uwlts.optics.triangulation import points_on_sheet
 
 LENGTHS_MM = (10.0, 20.0, 50.0, 100.0, 150.0, 200.0, 300.0, 500.0)
-# Places tried along each axis for the largest uncertainty, which changes slowly over the volume.
+# Number of positions along each axis searched for the largest uncertainty, which varies slowly over the volume.
 _PLACES = 9
 # Mesh of the maps: rows along Z, columns along Y; finer meshes look the same.
 _ROWS, _COLUMNS = 17, 21
 _SHORT_SHARE = 0.25
-"""Of the volume's depth and width: a length whose uncertainty is shown where it is measured."""
+"""Largest short length of the maps, relative to the smaller of the volume's depth and width."""
 
 
 @dataclass(frozen=True)
 class LengthUncertainty:
-    """Expanded uncertainties (k = 2) in mm of one length along X, Y or Z, the largest over the volume.
+    """Expanded uncertainties (k = 2) in mm of a length along X, Y or Z, the largest in the volume.
 
-    ``calibration_mm`` is by the calibration alone, as for points averaged over surfaces; along X by the stage alone.
-    ``point_mm`` includes the noise of a single stripe centre at each end.
+    ``calibration_mm`` is the contribution of the calibration alone, as for points averaged over surfaces; along X, that
+    of the stage. ``point_mm`` includes the noise of a single stripe centre at each end.
     """
 
     axis: str
@@ -46,10 +46,10 @@ class LengthUncertainty:
 
 @dataclass(frozen=True, eq=False)
 class InUse:
-    """A joint estimate as it holds for measurements, in the region that it covers.
+    """A joint estimate as used for measurements, in the region that it covers.
 
-    ``covariance`` (P, P) is that of the estimate with the drift of the medium's index since; ``noise_px`` the standard
-    deviation of a stripe's centre.
+    ``covariance`` (P, P) includes the drift of the medium's index since calibration. ``noise_px`` is the standard
+    deviation of a stripe centre.
     """
 
     calibration: Calibration
@@ -61,7 +61,7 @@ class InUse:
 
 
 def in_use(calibration: Calibration, region: SheetRegion) -> InUse:
-    """A joint calibration in one of its regions; CalibrationError where it is damaged."""
+    """Return a joint calibration for measurements in one of its regions; CalibrationError if it is damaged."""
     known = estimate_in(calibration, region)
     uncertainty = calibration.origin().known_before
     covariance, keys = known.covariance.copy(), known.parameters.keys
@@ -74,12 +74,12 @@ def in_use(calibration: Calibration, region: SheetRegion) -> InUse:
 
 
 def index_key(known: StoredEstimate) -> MediumIndex | None:
-    """The index of what the camera looks into; None in air."""
+    """Return the parameter key of the index of the camera's medium; None in air."""
     return None if known.view.medium is None else known.parameters.index_key(known.view.medium)
 
 
 def length_uncertainties(use: InUse) -> list[LengthUncertainty]:
-    """Every length that fits into the volume, along X, Y and Z."""
+    """Return the uncertainty of every length that fits into the volume, along X, Y and Z."""
     found = []
     for axis in "YZ":
         for length in LENGTHS_MM:
@@ -87,21 +87,21 @@ def length_uncertainties(use: InUse) -> list[LengthUncertainty]:
             if len(ends):
                 std = [lengths_of(use, ends).std_mm(use.covariance, noise_px=noise) for noise in (0.0, use.noise_px)]
                 found.append(LengthUncertainty(axis, length, *(2 * float(each.max()) for each in std)))
-    # Along the stage's motion the same place of the sheet sees both ends, so that only the stage counts.
+    # Along the stage's motion, the same point of the sheet measures both ends, so only the stage contributes.
     position, scale = np.sqrt(2.0) * use.uncertainty.stage_position_mm, use.uncertainty.stage_scale
     along_x = {length: 2 * float(np.hypot(position, scale * length)) for length in sorted({e.length_mm for e in found})}
     return [LengthUncertainty("X", length, stage, stage) for length, stage in along_x.items()] + found
 
 
 def lengths_of(use: InUse, ends: np.ndarray) -> Lengths:
-    """Lengths between Y and Z (M, 2, 2)."""
+    """Return lengths between points given by Y and Z (M, 2, 2)."""
     points = points_at(use.known, ends.reshape(-1, 2))
     first = 2 * np.arange(len(ends))
     return lengths_between(points, first, first + 1)
 
 
 def ends_over(region: SheetRegion, axis: str, length_mm: float) -> np.ndarray:
-    """Ends (M, 2, 2) of lengths along an axis all over a region; none where it does not fit."""
+    """Return end points (M, 2, 2) of lengths along an axis throughout a region; empty if the length does not fit."""
     depths = region.mesh(_PLACES, 2)[:, 0, 1]
     found = []
     if axis == "Y":
@@ -118,11 +118,11 @@ def ends_over(region: SheetRegion, axis: str, length_mm: float) -> np.ndarray:
 
 
 def uncertainty_maps(use: InUse) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Y and Z (R, C, 2) of a mesh of the sheet, and maps of standard uncertainties (R, C) over it, mm, by their titles.
+    """Return Y and Z (R, C, 2) of a mesh of the sheet, and maps of standard uncertainties (R, C) in mm by title.
 
-    For points they are those of the coordinates of the form, without a rigid motion of the whole volume: by the
-    calibration alone, and with the stripe's noise. For a length that fits well into the volume they are those by the
-    calibration, about each point as far as the volume reaches.
+    For points, they are uncertainties of the coordinates without rigid motion of the whole volume: from the calibration
+    alone, and with stripe noise. For a short length about each point, they are from the calibration; its centre is
+    moved inwards if the length would exceed the volume.
     """
     mesh = use.region.mesh(_ROWS, _COLUMNS)
     at = mesh.reshape(-1, 2)
@@ -144,7 +144,7 @@ def uncertainty_maps(use: InUse) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 
 def without_rigid_motion(at_mm: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Displacements (R, N, 3) of points at Y and Z (N, 2) less the rigid motions that fit them best."""
+    """Return displacements (R, N, 3) of points at Y and Z (N, 2) after subtracting the best-fit rigid motions."""
     points = np.column_stack([np.zeros(len(at_mm)), at_mm - at_mm.mean(axis=0)])
     turns = np.cross(np.eye(3)[:, None], points[None])
     shifts = np.broadcast_to(np.eye(3)[:, None], turns.shape)
@@ -154,7 +154,7 @@ def without_rigid_motion(at_mm: np.ndarray, moved: np.ndarray) -> np.ndarray:
 
 
 def _of_length(use: InUse, mesh: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Standard uncertainty (R, C) of a length (2,) whose middle is at each point of the mesh, or as near as it fits."""
+    """Return the standard uncertainty (R, C) of a length vector (2,) centred at, or near, each mesh point."""
     middle = mesh.reshape(-1, 2).copy()
     low, high = use.region.outline_mm[:, 1].min(), use.region.outline_mm[:, 1].max()
     half = length / 2
@@ -169,10 +169,10 @@ def _of_length(use: InUse, mesh: np.ndarray, length: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Displacement in mm of points of the same pixels by a calibration against another one.
+    """Displacement in mm of points of the same pixels between two calibrations.
 
-    ``moved_mm`` (R, C, 3) is that in X, Y and Z of the OCS at Y and Z ``at_mm`` (R, C, 2), with a rigid motion of all
-    taken out; ``largest_mm`` is the largest distance before that.
+    ``moved_mm`` (R, C, 3) is the displacement in X, Y and Z of the OCS at Y and Z ``at_mm`` (R, C, 2). A rigid motion
+    of all points is subtracted; ``largest_mm`` is the largest distance before that.
     """
 
     at_mm: np.ndarray
@@ -181,7 +181,7 @@ class Change:
 
 
 def require_same_sensor(calibration: Calibration, other: Calibration) -> None:
-    """CalibrationError where two calibrations cannot be of one sensor."""
+    """Check that two calibrations can be of the same sensor; CalibrationError if not."""
     sizes = [f"{c.camera.width_px} x {c.camera.height_px} px" for c in (calibration, other)]
     for name, (one, two) in {
         "image size": sizes,
@@ -194,9 +194,12 @@ def require_same_sensor(calibration: Calibration, other: Calibration) -> None:
 
 
 def change_from(calibration: Calibration, other: Calibration, region: SheetRegion) -> Change:
-    """Change of a calibration against another one, in its region.
+    """Return the displacements between a calibration and another one, in its region.
 
-    Raises CalibrationError: the other one is of another sensor, or sees no sheet somewhere in the region.
+    Raises
+    ------
+    CalibrationError
+        The other calibration is of another sensor, or does not see the sheet in part of the region.
     """
     require_same_sensor(calibration, other)
     mesh = region.mesh(_ROWS, _COLUMNS)
@@ -206,7 +209,9 @@ def change_from(calibration: Calibration, other: Calibration, region: SheetRegio
         through = each if region.view.window else each.model_copy(update={"window": None})
         found = points_on_sheet(through, pixels, medium_index=each.index_of(region.medium)).points_mm
         if not np.isfinite(found).all():
-            raise CalibrationError("one of the calibrations sees no sheet somewhere in the volume: they do not compare")
+            raise CalibrationError(
+                "one of the calibrations does not see the sheet in part of the volume: they cannot be compared"
+            )
         points.append(found)
     moved = (points[0] - points[1]) @ calibration.object_transform()[:3, :3]
     form = without_rigid_motion(mesh.reshape(-1, 2), moved[None])[0]

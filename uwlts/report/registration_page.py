@@ -1,4 +1,4 @@
-"""Page of a registration: the scans, their overlaps, the distances in each of them, and what is not determined."""
+"""Page of a registration: scans, overlaps with their distances, and undetermined movements."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,12 +14,12 @@ from uwlts.registration.register import RegisteredScans
 from uwlts.report.plot import surface_limit_mm
 
 _SHOWN = 30_000
-"""Points of all scans in a picture: more cover each other."""
+"""Number of points shown per picture for all scans together; more would overlap."""
 _VIEWS = ((0, 1), (0, 2), (1, 2))
 
 
 REGISTRATION = "registration"
-"""Kind of the page, in the name of the JSON beside it."""
+"""Kind of the page, in the name of its JSON file."""
 
 
 def write_registration(
@@ -27,7 +27,10 @@ def write_registration(
 ) -> None:
     """Write the page of a registration, and its figures, poses and their covariance as JSON beside it.
 
-    OutputError if a file exists and ``overwrite`` is not given, or cannot be written.
+    Raises
+    ------
+    OutputError
+        A file exists and ``overwrite`` is not given, or cannot be written.
     """
     text = render_page(
         "uwlts.report",
@@ -79,7 +82,7 @@ def _overlaps(registered: RegisteredScans) -> str:
 
 
 def _seen(draw: Callable[[Any, int, int], Any], *, label: str | None = None) -> str:
-    """Three views along the axes, side by side."""
+    """Draw three views along the axes, side by side."""
     figure, axes = new_figure(11.0, 3.8, columns=3)
     drawn = None
     for (first, second), ax in zip(_VIEWS, axes, strict=True):

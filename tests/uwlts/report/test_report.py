@@ -682,7 +682,7 @@ def test_the_histogram_counts_every_point_once():
     cloud = PointCloud(np.zeros((len(deviation), 3)), nothing, nothing, nothing, deviation_mm=deviation)
     ax = plot.deviation_histogram(cloud)
     (bars,) = ax.containers
-    beyond = int(re.search(r"(\d+) of 5,001 lie farther out", bars.get_label()).group(1))
+    beyond = int(re.search(r"(\d+) of 5,001 outside", bars.get_label()).group(1))
     assert beyond >= 1 and sum(bar.get_height() for bar in bars) == 5001 - beyond
     with pytest.raises(ValueError, match="evaluate it first"):
         plot.deviation_histogram(replace(cloud, deviation_mm=None))
