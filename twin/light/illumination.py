@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Bool, Float, Point2f, Point3f, Vector3f, opaque, opaque_transform
+from twin.backend.arrays import Bool, Float, Point3f, Vector3f, opaque, opaque_transform
 from twin.light.pose import Rays, SensorPose
 from twin.light.sheet import Sheet, SheetLight
 from twin.light.water import AngleTable, one_minus_cosine
@@ -211,10 +211,6 @@ class SheetLobe:
         """Return the mask of points whose lobe is not empty."""
         return self.least < _LARGEST_SLOPE
 
-    def draw(self, u: Point2f) -> tuple[Vector3f, Bool]:
-        """Sample directions and the mask of valid ones; u.x selects the angle and u.y the azimuth."""
-        return self.at_angles(self.angles.heights(self.share_below(u.x)), u.y)
-
     def share_below(self, u: Float) -> Float:
         """Return the value of the table's cumulative distribution that ``u`` selects."""
         return dr.lerp(self._share_left_out(), 1.0, u)
@@ -237,7 +233,7 @@ class SheetLobe:
         return dr.normalize(mi.Vector3f(drawn)), self.present() & (sine > self.least)
 
     def density(self, direction: Vector3f) -> Float:
-        """Return the density in 1/sr of the directions sampled by `draw`."""
+        """Return the density in 1/sr of the sampled directions."""
         before = one_minus_cosine(self.towards, direction)
         sine = dr.sqrt(dr.maximum(before * (2 - before), 0.0))
         slope = dr.dot(direction, self.side)

@@ -119,14 +119,8 @@ class Renderer:
     """Renderer of one sensor in one medium and one scene.
 
     ``uneven_lamp`` is the relative loss of lamp light away from its spot. ``caustics`` is the contrast of daylight on
-    surfaces. ``drifting`` is the number of bodies of each kind per litre (`twin.options.Flaws`).
-
-    Raises
-    ------
-    DesignError
-        The sensor cannot work in the medium.
-    DescriptionError
-        An object cannot be built.
+    surfaces. ``drifting`` is the number of bodies of each kind per litre (`twin.options.Flaws`). DesignError if the
+    sensor cannot work in the medium; DescriptionError if an object cannot be built.
     """
 
     def __init__(

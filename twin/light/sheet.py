@@ -68,12 +68,8 @@ class Sheet:
 
     ``power_w`` is the power behind the window, before absorption. ``begins_at_z_mm`` is the smallest Z of the window's
     outer face in the OCS, before which there is no light. The sheet of another laser has its own OCS;
-    ``own_from_object`` (4, 4) transforms from the sensor's OCS to it.
-
-    Raises
-    ------
-    DesignError
-        Part of the fan does not pass the window, or the window bends the fan too unevenly.
+    ``own_from_object`` (4, 4) transforms from the sensor's OCS to it. DesignError if part of the fan does not pass the
+    window, or the window bends the fan too unevenly.
     """
 
     def __init__(self, sensor: Sensor, medium: Medium, laser: Laser | None = None):

@@ -97,14 +97,6 @@ class Walker:
         """True if any indirect light is rendered."""
         return self.scatters or self.effects.secondary_light
 
-    def radiance(self, bundle: Rays, cell: UInt32, cells: int, *, seed: int) -> np.ndarray:
-        """Return the sum (cells,) of indirect light times ray weight over the rays of each cell."""
-        total = np.zeros(cells)
-        for where, *parts in self.found(bundle, cell, seed=seed):
-            for light in parts:
-                total += np.bincount(where, light, cells)
-        return total
-
     def found(self, bundle: Rays, cell: UInt32, *, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Trace walks; yield for each group of segments the cells (N,) and two kinds of light (N,).
 

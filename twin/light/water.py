@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Bool, Float, Point2f, UInt32, Vector3f, opaque, to_jit
+from twin.backend.arrays import Bool, Float, UInt32, Vector3f, opaque, to_jit
 from uwlts.model.phase_functions import Molecular, PhaseFunction, Scatterer
 from uwlts.model.sensor import Medium
 
@@ -93,11 +93,7 @@ class Scattering:
     ``coefficient`` is b, ``absorption`` a and ``extinction`` c = a + b; ``b`` and ``c`` are opaque copies for kernels.
     ``backward_share`` is the fraction of b at scattering angles above 90 deg. ``angles`` tabulates the phase function,
     ``over_sine`` the phase function divided by the sine of the angle, and ``narrow`` the mean of both densities.
-
-    Raises
-    ------
-    RangeError
-        The wavelength is outside the medium's tables.
+    RangeError if the wavelength is outside the medium's tables.
     """
 
     def __init__(self, medium: Medium, wavelength_nm: float):
@@ -120,14 +116,6 @@ class Scattering:
         small angles in single precision.
         """
         return self.angles.density(one_minus_cosine)
-
-    def sample(self, direction: Vector3f, u: Point2f) -> tuple[Vector3f, Float]:
-        """Sample a direction after scattering; return it and its density in 1/sr, the phase function.
-
-        The scattering angle increases with ``u.x``, the azimuth with ``u.y``.
-        """
-        turned = self.angles.turned(direction, u)
-        return turned, self.phase(0.5 * dr.squared_norm(turned - direction))
 
 
 @dataclass(frozen=True)
@@ -192,10 +180,6 @@ class AngleTable:
         before = dr.select(forward, FORWARD_END * u / first, before)
         after = dr.select(backward, BACKWARD_END * (1 - u) / (1 - last), after)
         return dr.select(backward, 2 - after, before), dr.select(forward, 2 - before, after)
-
-    def turned(self, axis: Vector3f, u: Point2f) -> Vector3f:
-        """Return directions about an axis: the angle increases with ``u.x``, the azimuth with ``u.y``."""
-        return turned(axis, self.heights(u.x), u.y)
 
     def _cell(self, before: Float) -> tuple[UInt32, Float]:
         """Return the cell of 1 - cos, which is within the table, and the position in the cell from 0 to 1."""

@@ -196,12 +196,8 @@ def keep_to_plan(
     """Write the settings of a folder's contents, or check that they are unchanged.
 
     ``files`` belong to the plan, ``recorded`` is the glob pattern of such files, and ``called`` is their name in
-    messages.
-
-    Raises
-    ------
-    DescriptionError
-        The folder contains files of another plan, and ``overwrite`` does not replace all of them.
+    messages. DescriptionError if the folder contains files of another plan, and ``overwrite`` does not replace all of
+    them.
     """
     path = folder / PLAN
     text = json.dumps(plan, indent=2) + "\n"

@@ -43,14 +43,8 @@ def record_scene(
 
     Images show ``as_built`` (default: ``sensor``), the capture states ``sensor``. An interrupted run leaves
     ``path.part`` with all complete frames. ``resume`` continues from there, with the same result as an uninterrupted
-    run. ``progress(done, total)`` is called after every frame.
-
-    Raises
-    ------
-    DesignError, DescriptionError
-        The sensor or the scene cannot work.
-    OutputError
-        A file exists, or cannot be written.
+    run. ``progress(done, total)`` is called after every frame. DesignError or DescriptionError if the sensor or the
+    scene cannot work; OutputError if a file exists, or cannot be written.
     """
     path = Path(path)
     if truth_path(path).exists() and not (overwrite or resume):

@@ -65,10 +65,7 @@ def true_pose(scene: Scene, shot: Shot) -> np.ndarray:
 def check_scene(renderer: Renderer, scene: Scene) -> None:
     """Check that a scan reaches the objects.
 
-    Raises
-    ------
-    DesignError
-        The objects are outside the depth range of the measuring volume, or the sheet never meets them.
+    DesignError if the objects are outside the depth range of the measuring volume, or the sheet never meets them.
     """
     volume, axis = renderer.sensor.volume, camera_from_object(renderer.sensor)[:3, 2]
     # The sheet's centre line is along Z; outside the window, its camera depth is standoff + Z axis_z.
@@ -159,10 +156,7 @@ class Studio:
     def _period_s(self, shortest_s: float) -> float:
         """Return the time between shots: motion or settling of the platform, exposure and read-out of the camera.
 
-        Raises
-        ------
-        DesignError
-            A moving platform leaves the camera less time than it needs.
+        DesignError if a moving platform leaves the camera less time than it needs.
         """
         motion = self.scene.motion
         if not motion.moves():

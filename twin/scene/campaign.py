@@ -106,10 +106,7 @@ def load_campaign(name_or_path: str | Path) -> Campaign:
 def takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
     """Return all recordings of a campaign with the imperfections of a seed; scans keep every n-th profile.
 
-    Raises
-    ------
-    DescriptionError
-        A scene, placement or sensor is unknown, or two recordings have the same name.
+    DescriptionError if a scene, placement or sensor is unknown, or two recordings have the same name.
     """
     drawn = _Drawn(campaign, seed)
     found = [
@@ -216,10 +213,7 @@ def _shows_step(scene: Scene) -> bool:
 def _lower_block(scene: Scene) -> int:
     """Return the index of the block whose front face is farthest from the sensor.
 
-    Raises
-    ------
-    DescriptionError
-        There are fewer than two blocks.
+    DescriptionError if there are fewer than two blocks.
     """
     blocks = {
         number: thing.position_mm[2] - thing.size_mm[2] / 2

@@ -54,10 +54,7 @@ _IRON = np.array(
 def iron_index(*, wavelength_nm: float) -> complex:
     """Return the refractive index n + i k of iron, for steel, in air; interpolated linearly.
 
-    Raises
-    ------
-    RangeError
-        The wavelength is outside the visible part of the table.
+    RangeError if the wavelength is outside the visible part of the table.
     """
     wavelength, n, k = _IRON
     source = "the table of Johnson and Christy (1974)"
@@ -69,14 +66,8 @@ def finish_bsdf(thing: Placed, *, medium_index: float, wavelength_nm: float, glo
     """Return the BSDF of an object in a medium, without its mirror reflection.
 
     Without ``gloss`` all surfaces are diffuse: a body without its coat, and a metal with the reflectance |(m - 1) / (m
-    + 1)|^2 of its smooth surface at normal incidence (Fresnel).
-
-    Raises
-    ------
-    DescriptionError
-        The texture is missing, unreadable, or has values outside 0 to 1.
-    RangeError
-        The wavelength is outside the table of iron.
+    + 1)|^2 of its smooth surface at normal incidence (Fresnel). DescriptionError if the texture is missing, unreadable,
+    or has values outside 0 to 1; RangeError if the wavelength is outside the table of iron.
     """
     if gloss and thing.finish != "diffuse":
         return _glossy(thing, _reflectance(thing), medium_index=medium_index, wavelength_nm=wavelength_nm)
@@ -114,12 +105,8 @@ def _reflectance(thing: Placed, scale: float = 1.0) -> float | mi.Texture:
 def read_grey(path: str | Path) -> np.ndarray:
     """Read the grey values (H, W) of a picture, relative to full scale and without gamma correction.
 
-    Colours are converted to luminance (ITU-R BT.709).
-
-    Raises
-    ------
-    DescriptionError
-        The file is missing, damaged, or not a PNG, JPEG, TIFF or BMP of 8 or 16 bits without transparency.
+    Colours are converted to luminance (ITU-R BT.709). DescriptionError if the file is missing, damaged, or not a PNG,
+    JPEG, TIFF or BMP of 8 or 16 bits without transparency.
     """
     try:
         picture = read_image(Path(path))

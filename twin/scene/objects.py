@@ -106,12 +106,8 @@ class Objects:
 def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> Objects:
     """Build all objects of a scene in a medium for the laser's wavelength; without ``gloss`` diffuse, without mirrors.
 
-    Raises
-    ------
-    DescriptionError
-        A mesh or texture file is missing, unreadable or empty.
-    RangeError
-        The wavelength is outside the table of a metal.
+    DescriptionError if a mesh or texture file is missing, unreadable or empty; RangeError if the wavelength is outside
+    the table of a metal.
     """
     register_pattern()
     optics = {"medium_index": medium_index, "wavelength_nm": wavelength_nm}

@@ -13,12 +13,8 @@ Value = float | int | str | bool
 def value_at(described: Description, path: str, source: str | Path, *, called: str = "sensor") -> Value | None:
     """Return the value at a path of a description.
 
-    ``called`` names the described thing, and ``source`` the origin of the path, for error messages.
-
-    Raises
-    ------
-    DescriptionError
-        The path does not exist, or leads to a table or list.
+    ``called`` names the described thing, and ``source`` the origin of the path, for error messages. DescriptionError if
+    the path does not exist, or leads to a table or list.
     """
     found: object = described.model_dump()
     for key in path.split("."):

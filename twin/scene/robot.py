@@ -99,12 +99,7 @@ def _flange(angles: np.ndarray, links: np.ndarray) -> np.ndarray:
 def _joint_angles(poses: np.ndarray, links: np.ndarray) -> np.ndarray:
     """Return joint angles (N, 6) in rad that move the flange to poses (N, 4, 4) of the base.
 
-    The angles of each pose are close to the previous ones.
-
-    Raises
-    ------
-    DescriptionError
-        The arm does not reach a pose.
+    The angles of each pose are close to the previous ones. DescriptionError if the arm does not reach a pose.
     """
     length = float(np.abs(links[:, :2]).sum())
 

@@ -49,12 +49,8 @@ def grey_values(
     With ``rng`` None there is no temporal noise, with ``pattern`` None no fixed-pattern noise. Signal and dark current
     have Poisson shot noise. Blooming and full well are applied before the read-out, which adds offset pattern and
     noise; the only quantisation is the final rounding. Bands of rows have independent random numbers, so that the image
-    does not depend on the number of parallel tasks.
-
-    Raises
-    ------
-    ImageError
-        ``electrons`` is not a two-dimensional image of finite numbers from 0 to 1e15, or ``pattern`` has another size.
+    does not depend on the number of parallel tasks. ImageError if ``electrons`` is not a two-dimensional image of
+    finite numbers from 0 to 1e15, or ``pattern`` has another size.
     """
     electrons = np.asarray(electrons, np.float32)
     if electrons.ndim != 2 or electrons.size == 0:

@@ -63,14 +63,8 @@ class Speckle:
 
     A pattern depends only on seed, travel and pixel: frames, or parts of a frame, can be computed in any order. After
     ``2 renewal_mm`` of travel it is independent. ``wavelength_nm`` is that in air, between lens and image sensor.
-    Different non-negative seeds give independent patterns.
-
-    Raises
-    ------
-    DesignError
-        The lens is focused within its focal length, or grains are wider than 64 pixels.
-    RangeError
-        The wavelength is not finite, or below 1 nm.
+    Different non-negative seeds give independent patterns. DesignError if the lens is focused within its focal length,
+    or grains are wider than 64 pixels; RangeError if the wavelength is not finite, or below 1 nm.
     """
 
     def __init__(self, camera: Camera, *, wavelength_nm: float, seed: int) -> None:

@@ -206,10 +206,7 @@ AnyCertificate = JointCertificate | SequentialCertificate
 def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -> AnyCertificate:
     """Return the sealed content of the certificate of a calibration file, issued at a time in ISO 8601.
 
-    Raises
-    ------
-    CalibrationError
-        The joint estimate is damaged.
+    CalibrationError if the joint estimate is damaged.
     """
     base = Certificate(
         format=FORMAT,

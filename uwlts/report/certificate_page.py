@@ -91,10 +91,7 @@ def certificate_page(
 ) -> str:
     """Return the page as text; ``before`` is the name and content of another calibration of the sensor to compare with.
 
-    Raises
-    ------
-    CalibrationError
-        The joint estimate is damaged, or the other calibration is of another sensor.
+    CalibrationError if the joint estimate is damaged, or the other calibration is of another sensor.
     """
     if before is not None:
         require_same_sensor(calibration, before[1])

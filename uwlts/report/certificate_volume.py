@@ -196,10 +196,7 @@ def require_same_sensor(calibration: Calibration, other: Calibration) -> None:
 def change_from(calibration: Calibration, other: Calibration, region: SheetRegion) -> Change:
     """Return the displacements between a calibration and another one, in its region.
 
-    Raises
-    ------
-    CalibrationError
-        The other calibration is of another sensor, or does not see the sheet in part of the region.
+    CalibrationError if the other calibration is of another sensor, or does not see the sheet in part of the region.
     """
     require_same_sensor(calibration, other)
     mesh = region.mesh(_ROWS, _COLUMNS)

@@ -47,12 +47,8 @@ def write_change(
     """Write the page of a change, its figures as JSON beside it, and its points as a cloud (``coloured``).
 
     The cloud is PLY, LAZ or LAS, depending on its ending. Its fields are x, y, z (mm in PLY, else m), the colours of
-    the map, nx, ny, nz, distance, level (mm; NaN if not compared) and significant (0, 1).
-
-    Raises
-    ------
-    OutputError
-        A file exists and ``overwrite`` is not given, or cannot be written.
+    the map, nx, ny, nz, distance, level (mm; NaN if not compared) and significant (0, 1). OutputError if a file exists
+    and ``overwrite`` is not given, or cannot be written.
     """
     text = render_page(
         "uwlts.report",

@@ -125,12 +125,8 @@ def gather_campaign(folder: str | Path) -> GatheredCampaign:
 
     It contains captures ``NAME.h5``, their truth ``NAME.truth.h5``, clouds ``NAME.ply`` or ``.h5``, evaluations
     ``NAME.evaluation.json``, calibrations ``calibration*.json``, and times ``seconds.json``. The metadata of a cloud
-    name its capture; otherwise the capture of the same name is used.
-
-    Raises
-    ------
-    CaptureError
-        The folder is missing or contains nothing to report, or a file (named in the message) is damaged.
+    name its capture; otherwise the capture of the same name is used. CaptureError if the folder is missing or contains
+    nothing to report, or a file (named in the message) is damaged.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -226,10 +222,7 @@ class Reference(Description):
 def load_reference(name_or_path: str | Path) -> Reference:
     """Read published values by name (``thesis``) or path of a TOML file.
 
-    Raises
-    ------
-    DescriptionError
-        The name is unknown, or the file contains anything but numbers by measurement and figure.
+    DescriptionError if the name is unknown, or the file contains anything but numbers by measurement and figure.
     """
     path = find(name_or_path, "references")
     table = read_table(path, "references")

@@ -84,10 +84,7 @@ class MeasurementPictures:
 def draw_pictures(campaign: GatheredCampaign, *, workers: int = 1) -> list[MeasurementPictures]:
     """Draw the pictures of a campaign's measurements, in order, in ``workers`` processes.
 
-    Raises
-    ------
-    CaptureError
-        An image of a capture is damaged.
+    CaptureError if an image of a capture is damaged.
     """
     return work_through(_drawn, campaign.measurements, workers=workers)
 
@@ -119,10 +116,7 @@ def write_pictures(
 ) -> list[Path]:
     """Write ``stripe-NAME.png`` and ``cloud-NAME.png`` of every measurement, if available; return the paths.
 
-    Raises
-    ------
-    OutputError
-        The folder is missing, or a picture exists and ``overwrite`` is not given.
+    OutputError if the folder is missing, or a picture exists and ``overwrite`` is not given.
     """
     written = []
     for each in pictures:

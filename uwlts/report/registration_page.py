@@ -27,10 +27,7 @@ def write_registration(
 ) -> None:
     """Write the page of a registration, and its figures, poses and their covariance as JSON beside it.
 
-    Raises
-    ------
-    OutputError
-        A file exists and ``overwrite`` is not given, or cannot be written.
+    OutputError if a file exists and ``overwrite`` is not given, or cannot be written.
     """
     text = render_page(
         "uwlts.report",

@@ -9,8 +9,8 @@ from hypothesis import given, settings, strategies as st
 from scipy.special import chdtrc
 
 from tests.virtual_sensors import clear, gauss_legendre
-from twin.backend.arrays import to_jit, to_numpy
-from twin.light.water import NODES, Scattering, node_angles, tabulated
+from twin.backend.arrays import Float, Point2f, Vector3f, to_jit, to_numpy
+from twin.light.water import NODES, Scattering, node_angles, tabulated, turned
 from uwlts.model.phase_functions import (
     FournierForand,
     HenyeyGreenstein,
@@ -255,13 +255,19 @@ def test_a_medium_that_does_not_scatter_has_no_coefficient():
 # --- what is drawn ----------------------------------------------------------------------------------------------------
 
 
+def directions_after(scattering: Scattering, direction: Vector3f, u: Point2f) -> tuple[Vector3f, Float]:
+    """Return directions after scattering, sampled as in random walks, and their densities in 1/sr."""
+    after = turned(direction, scattering.angles.heights(u.x), u.y)
+    return after, scattering.phase(0.5 * dr.squared_norm(after - direction))
+
+
 def drawn(medium: Medium, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Direction (3,) before, directions (count, 3) after scattering and their densities (count,) in 1/sr."""
     rng = np.random.default_rng(20)
     before = rng.normal(size=3)
     before = np.float32(before / np.linalg.norm(before))
     u = mi.Point2f(*(to_jit(mi.Float, rng.random(count)) for _ in range(2)))
-    after, density = Scattering(medium, 635.0).sample(mi.Vector3f(*map(float, before)), u)
+    after, density = directions_after(Scattering(medium, 635.0), mi.Vector3f(*map(float, before)), u)
     return before.astype(float), to_numpy(after).astype(float), density.numpy()
 
 
@@ -310,7 +316,7 @@ def test_directions_are_even_about_the_axis(name):
 def test_angles_grow_with_the_number_from_which_they_are_drawn(name):
     u = np.linspace(0, 1 - 2**-24, 200_001)
     numbers = mi.Point2f(to_jit(mi.Float, u), 0.3)
-    after, density = Scattering(MEDIA[name], 635.0).sample(mi.Vector3f(0.0, 0.0, 1.0), numbers)
+    after, density = directions_after(Scattering(MEDIA[name], 635.0), mi.Vector3f(0.0, 0.0, 1.0), numbers)
     directions = to_numpy(after).astype(float)
     assert np.isfinite(directions).all()
     assert (density.numpy() > 0).all()
@@ -324,7 +330,7 @@ def test_another_water_needs_no_new_kernel():
     def use(medium: Medium) -> None:
         scattering = Scattering(medium, 635.0)
         u = mi.Point2f(to_jit(mi.Float, np.linspace(0, 0.99, 1234)), to_jit(mi.Float, np.linspace(0, 0.99, 1234)))
-        after, density = scattering.sample(mi.Vector3f(0.0, 0.6, 0.8), u)
+        after, density = directions_after(scattering, mi.Vector3f(0.0, 0.6, 0.8), u)
         dr.eval(after, density, scattering.phase(u.x))
 
     use(MEDIA["petzold"])

@@ -54,8 +54,11 @@ def walked(renderer: Renderer, pixels: np.ndarray, walks: int, *, seed: int = 0)
     cell = np.repeat(np.arange(len(pixels) * BATCHES), each)
     x, y = pixels[cell // BATCHES].T
     bundle = renderer.view.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
-    sums = walker.radiance(bundle, to_jit(mi.UInt32, cell), len(pixels) * BATCHES, seed=seed)
-    batches = sums.astype(float).reshape(len(pixels), BATCHES) / each
+    sums = np.zeros(len(pixels) * BATCHES)
+    for where, *parts in walker.found(bundle, to_jit(mi.UInt32, cell), seed=seed):
+        for light in parts:
+            sums += np.bincount(where, light, len(sums))
+    batches = sums.reshape(len(pixels), BATCHES) / each
     return batches.mean(axis=1), batches.std(axis=1, ddof=1) / math.sqrt(BATCHES)
 
 

@@ -77,12 +77,8 @@ class Flange(FreeForm):
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the closed surface of the ring, and those of the bolt heads, each closed separately.
 
-        Facets deviate from the round edges and from `flange_face` by `_SAG_MM`.
-
-        Raises
-        ------
-        DescriptionError
-            Small gaps between holes on a large ring require too many vertices.
+        Facets deviate from the round edges and from `flange_face` by `_SAG_MM`. DescriptionError if small gaps between
+        holes on a large ring require too many vertices.
         """
         flat, faces, circles = self._ring()
         z = flange_face(self, *flat.T, edges=True)

@@ -49,12 +49,7 @@ class PittedPipe(FreeForm):
         """Return a tube with open ends.
 
         Facets deviate from `pitted_radius` by `_PIT_SAG_MM`, by up to ten times that at creases between overlapping
-        pits.
-
-        Raises
-        ------
-        DescriptionError
-            Small and deep pits on a large pipe require too many vertices.
+        pits. DescriptionError if small and deep pits on a large pipe require too many vertices.
         """
         # The second derivative of a pit is largest at its rim.
         radius = self.diameter_mm / 2

@@ -68,10 +68,7 @@ class Weld(FreeForm):
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
         """Return an open surface whose facets deviate from `weld_height` by `_SAG_MM`.
 
-        Raises
-        ------
-        DescriptionError
-            Small or steep ripples on long beads require too many vertices.
+        DescriptionError if small or steep ripples on long beads require too many vertices.
         """
         ripple = 0.5 * self.ripple_height_mm * (2 * np.pi / self.ripple_pitch_mm) ** 2
         toe = 8 * self.height_mm / (0.5 * self.width_mm) ** 2
