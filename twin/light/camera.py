@@ -60,7 +60,7 @@ class LensRays:
         self._distortion = {name: opaque(value) for name, value in camera.distortion.model_dump().items()}
         self._distorts = any(camera.distortion.model_dump().values())
 
-    def through_pupil(self, chief: Vector3f, pupil: Point2f) -> tuple[Point3f, Vector3f]:
+    def trace_through_pupil(self, chief: Vector3f, pupil: Point2f) -> tuple[Point3f, Vector3f]:
         """Return origin and unit direction in the camera frame of the ray through ``pupil``, a point of the unit disc.
 
         ``chief`` is the direction of the chief ray; both rays meet in the plane z = focus distance (thin lens). The
@@ -72,10 +72,10 @@ class LensRays:
 
     def directions(self, x: Float, y: Float) -> Vector3f:
         """Return unit directions of chief rays in the camera frame; pixel (0, 0) is the centre of the first pixel."""
-        true = self._undistorted(mi.Point2f((x - self._cx) / self._fx, (y - self._cy) / self._fy))
+        true = self._undistort(mi.Point2f((x - self._cx) / self._fx, (y - self._cy) / self._fy))
         return dr.normalize(mi.Vector3f(true.x, true.y, 1.0))
 
-    def _undistorted(self, seen: Point2f) -> Point2f:
+    def _undistort(self, seen: Point2f) -> Point2f:
         """Invert the distortion, a rational Brown-Conrady model (`Distortion`), by Newton's method."""
         if not self._distorts:
             return seen
@@ -98,7 +98,7 @@ class LensRays:
         return point
 
 
-def frame_about(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
+def build_frame(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
     """Return the right-handed rotation (3, 3) with columns x, y, z.
 
     The column z is ``axis``, normalised; x is the component of ``across`` perpendicular to it, normalised.
@@ -135,7 +135,7 @@ class WindowFaces:
         self._radius = opaque(window.aperture_diameter_mm / 2)
         self._faces = [(opaque_point(inner), opaque(glass)), (opaque_point(outer), opaque(index / glass))]
 
-    def through(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> Rays:
+    def trace(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> Rays:
         """Trace rays from the module through both faces; rays that do not pass get the weight 0.
 
         ``mode`` is Radiance for rays traced backwards from the camera, whose weights contain 1 / n^2. It is Importance
@@ -183,13 +183,13 @@ class CameraView:
         ``pupil`` gives points of the unit disc. Without it, the chief rays through the pupil's centre are returned.
         """
         chief = self.lens.directions(x, y)
-        origin, direction = (mi.Point3f(0.0), chief) if pupil is None else self.lens.through_pupil(chief, pupil)
-        path = self._faces.through(origin, direction, mode=mi.TransportMode.Radiance)
+        origin, direction = (mi.Point3f(0.0), chief) if pupil is None else self.lens.trace_through_pupil(chief, pupil)
+        path = self._faces.trace(origin, direction, mode=mi.TransportMode.Radiance)
         cosine = dr.square(dr.square(chief.z))
         weight = dr.select(path.weight > 0, path.weight * cosine * self.lens.irradiance_on_axis, 0.0)
         return Rays(self._to_object @ path.origin, self._to_object @ path.direction, weight)
 
-    def grid(self, spacing: int) -> tuple[Rays, tuple[int, int]]:
+    def trace_grid(self, spacing: int) -> tuple[Rays, tuple[int, int]]:
         """Return the chief rays of pixel corners every ``spacing`` pixels, and the grid shape (rows, columns)."""
         if spacing not in self._grids:
             columns, rows = -(-self.camera.width_px // spacing) + 1, -(-self.camera.height_px // spacing) + 1
@@ -263,7 +263,7 @@ class RaySegment:
         return mi.Point3f(self.origin + self.direction * dr.select(self.valid, self.si.t, 1.0))
 
 
-def ray_segments(
+def trace_segments(
     objects: Objects, extinction: Float, pose: SensorPose, bundle: Rays, after_s: Float | None, *, mirrors: int
 ) -> Iterator[RaySegment]:
     """Yield the first segment of camera rays, then one for each of up to ``mirrors`` successive mirrors."""

@@ -36,26 +36,28 @@ class SheetCrossing:
     exit_mm: Float
 
 
-def crossing(light: Light, scattering: Scattering, rays: Rays) -> SheetCrossing:
+def intersect_sheet(light: Light, scattering: Scattering, rays: Rays) -> SheetCrossing:
     """Intersect camera rays with a sheet; for a direct light the result is the same at all poses.
 
     The line integral of a Gaussian along a straight ray is b p(angle) E sigma sqrt(2 pi) / |cos|. Here p is the phase
     function and E the irradiance in the sheet's centre.
     """
-    origin, direction = light.in_own_frame(rays.origin, rays.direction)
-    t, middle = light.crossing(origin, direction)
+    origin, direction = light.to_sheet_frame(rays.origin, rays.direction)
+    t, middle = light.intersect(origin, direction)
     towards = dr.dot(direction, middle.normal)
     peak = middle.irradiance * middle.sigma_mm * math.sqrt(2 * math.pi)
     # Light travels against the camera ray, so the difference of both directions is a sum here.
     phase = scattering.phase(0.5 * dr.squared_norm(middle.direction + direction))
     radiance = scattering.b * phase * peak / dr.maximum(dr.abs(towards), 1e-3) * dr.exp(-scattering.c * t)
-    here = light.at(mi.Point3f(rays.origin + rays.direction * t))
+    here = light.evaluate(mi.Point3f(rays.origin + rays.direction * t))
     return SheetCrossing(
         t, dr.sign(towards), rays.weight * dr.select(t > 0, radiance, 0.0), here.direction, here.exit_mm
     )
 
 
-def haze(crossed: SheetCrossing, light: Light, scene: mi.Scene, segment: RaySegment, at_end: SheetLight) -> Float:
+def compute_haze(
+    crossed: SheetCrossing, light: Light, scene: mi.Scene, segment: RaySegment, at_end: SheetLight
+) -> Float:
     """Return the haze on the image sensor in W/mm2; ``at_end`` is the sheet's light at the surfaces that end the rays.
 
     A surface removes the part of the Gaussian behind it. If the surface is in front of the sheet's centre, shadows are

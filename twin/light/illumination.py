@@ -39,7 +39,7 @@ class Light:
         self._to_own = None if own is None else opaque_transform(own)
         self._from_own = None if own is None else opaque_transform(np.linalg.inv(own))
 
-    def in_own_frame(self, origin: Point3f, direction: Vector3f) -> tuple[Point3f, Vector3f]:
+    def to_sheet_frame(self, origin: Point3f, direction: Vector3f) -> tuple[Point3f, Vector3f]:
         """Transform a ray from the sensor's OCS into the frame of the sheet, where the nominal sheet is X = 0."""
         if self._mirror is not None:
             origin, direction = self._reflection @ mi.Point3f(origin), self._reflection @ mi.Vector3f(direction)
@@ -47,29 +47,29 @@ class Light:
             return origin, direction
         return self._to_own @ mi.Point3f(origin), self._to_own @ mi.Vector3f(direction)
 
-    def at(self, p: Point3f, after_s: Float | None = None) -> SheetLight:
+    def evaluate(self, p: Point3f, after_s: Float | None = None) -> SheetLight:
         """Return the sheet's light at points in the sensor's OCS, without shadows; 0 where the mirror reflects none."""
         if self._mirror is None:
-            return self._unfolded(p)
+            return self._evaluate_direct(p)
         # Mirrors do not move with the sensor.
-        resting = self._pose.at_rest(p, after_s)
-        light = self._unfolded(self._pose.moving(self._reflection @ resting, after_s))
-        direction = self._reflection @ self._pose.direction_at_rest(light.direction, after_s)
-        normal = self._reflection @ self._pose.direction_at_rest(light.normal, after_s)
-        _, meets = self._on_mirror(resting, -direction)
+        resting = self._pose.to_rest_frame(p, after_s)
+        light = self._evaluate_direct(self._pose.to_moving_frame(self._reflection @ resting, after_s))
+        direction = self._reflection @ self._pose.rotate_to_rest_frame(light.direction, after_s)
+        normal = self._reflection @ self._pose.rotate_to_rest_frame(light.normal, after_s)
+        _, meets = self._intersect_mirror(resting, -direction)
         return replace(
             light,
-            direction=self._pose.moving_direction(direction, after_s),
-            normal=self._pose.moving_direction(normal, after_s),
+            direction=self._pose.rotate_to_moving_frame(direction, after_s),
+            normal=self._pose.rotate_to_moving_frame(normal, after_s),
             irradiance=dr.select(meets, light.irradiance * self._share, 0.0),
             in_middle=dr.select(meets, light.in_middle * self._share, 0.0),
         )
 
-    def _unfolded(self, p: Point3f) -> SheetLight:
+    def _evaluate_direct(self, p: Point3f) -> SheetLight:
         """Return the light of the sheet without mirrors at points in the OCS."""
         if self._to_own is None:
-            return self.sheet.at(p)
-        light = self.sheet.at(self._to_own @ mi.Point3f(p))
+            return self.sheet.evaluate(p)
+        light = self.sheet.evaluate(self._to_own @ mi.Point3f(p))
         return replace(light, direction=self._from_own @ light.direction, normal=self._from_own @ light.normal)
 
     @property
@@ -79,67 +79,67 @@ class Light:
 
     def may_reach(self, p: Point3f, light: SheetLight) -> Bool | None:
         """Return the mask of points that the mirror can illuminate; None for a direct light, which has no limit."""
-        return None if self._mirror is None else self._on_mirror(p, -light.direction)[1]
+        return None if self._mirror is None else self._intersect_mirror(p, -light.direction)[1]
 
     def reaches(self, objects: mi.Scene, p: Point3f, light: SheetLight, after_s: Float | None, active: Bool):
         """Return the mask of points in the sensor's OCS with a free path to the laser's window."""
         towards = -light.direction
         if self._mirror is None:
-            return active & ~self._blocked(objects, p, towards, light.exit_mm, after_s, active)
-        resting = self._pose.direction_at_rest(towards, after_s)
-        t, meets = self._on_mirror(self._pose.at_rest(p, after_s), resting)
-        active = active & meets & ~self._blocked(objects, p, towards, t, after_s, active & meets)
+            return active & ~self._is_blocked(objects, p, towards, light.exit_mm, after_s, active)
+        resting = self._pose.rotate_to_rest_frame(towards, after_s)
+        t, meets = self._intersect_mirror(self._pose.to_rest_frame(p, after_s), resting)
+        active = active & meets & ~self._is_blocked(objects, p, towards, t, after_s, active & meets)
         folded = self._to_face @ resting
         folded.z = -folded.z
-        onward = self._pose.moving_direction(self._from_face @ folded, after_s)
+        onward = self._pose.rotate_to_moving_frame(self._from_face @ folded, after_s)
         turn = mi.Point3f(p + towards * t)
-        return active & ~self._blocked(objects, turn, onward, light.exit_mm - t, after_s, active)
+        return active & ~self._is_blocked(objects, turn, onward, light.exit_mm - t, after_s, active)
 
-    def _on_mirror(self, p: Point3f, direction: Vector3f) -> tuple[Float, Bool]:
+    def _intersect_mirror(self, p: Point3f, direction: Vector3f) -> tuple[Float, Bool]:
         """Return the distances of rays to the mirror face, and the mask of those that hit its front."""
         start, along = self._to_face @ mi.Point3f(p), self._to_face @ direction
         t = -start.z / along.z
         inside = (dr.abs(start.x + t * along.x) <= self._half.x) & (dr.abs(start.y + t * along.y) <= self._half.y)
         return t, (start.z > 0) & (along.z < 0) & inside
 
-    def _blocked(
+    def _is_blocked(
         self, objects: mi.Scene, p: Point3f, towards: Vector3f, length: Float, after_s: Float | None, active: Bool
     ) -> Bool:
         ray = self._pose.ray(p + towards * _CLEAR_MM, towards, after_s)
         ray.maxt = length - 2 * _CLEAR_MM
         return objects.ray_test(ray, active & (length > 2 * _CLEAR_MM))
 
-    def rays(self, u: Point3f) -> Rays:
+    def sample_rays(self, u: Point3f) -> Rays:
         """Sample rays of a direct light in the sensor's OCS with a density proportional to power."""
         rays = self.sheet.sample(u)
         if self._from_own is None:
             return rays
         return Rays(self._from_own @ mi.Point3f(rays.origin), self._from_own @ rays.direction, rays.weight)
 
-    def crossing(self, origin: Point3f, direction: Vector3f) -> tuple[Float, SheetLight]:
+    def intersect(self, origin: Point3f, direction: Vector3f) -> tuple[Float, SheetLight]:
         """Intersect rays in the sheet's frame with its centre; return distances along them, and the light."""
         t = -origin.x / direction.x
-        light = self.sheet.at(mi.Point3f(origin + direction * t))
+        light = self.sheet.evaluate(mi.Point3f(origin + direction * t))
         t -= light.distance_mm / dr.dot(direction, light.normal)
-        light = self.sheet.at(mi.Point3f(origin + direction * t))
+        light = self.sheet.evaluate(mi.Point3f(origin + direction * t))
         if self._mirror is not None:
             share = self._share
             light = replace(light, irradiance=light.irradiance * share, in_middle=light.in_middle * share)
         return t, light
 
-    def passage(self, origin: Point3f, direction: Vector3f, length: Float) -> Passage:
+    def locate_sheet(self, origin: Point3f, direction: Vector3f, length: Float) -> Passage:
         """Return the position of the sheet's centre along rays of length ``length`` in the sensor's OCS."""
-        o, d = self.in_own_frame(origin, direction)
+        o, d = self.to_sheet_frame(origin, direction)
         back = (self.sheet.begins_at_z_mm - o.z) / d.z
         length = dr.select((d.z < 0) & (back > 0), dr.minimum(length, back), length)
 
         def step(middle: Float) -> tuple[SheetLight, Float, Float]:
             t = dr.clip(middle, 0.0, length)
-            light = self.sheet.at(mi.Point3f(o + d * t))
-            slope = _away_from_zero(dr.dot(d, light.normal))
+            light = self.sheet.evaluate(mi.Point3f(o + d * t))
+            slope = _bound_slope(dr.dot(d, light.normal))
             return light, slope, t - light.distance_mm / slope
 
-        _, _, middle = step(-o.x / _away_from_zero(d.x))
+        _, _, middle = step(-o.x / _bound_slope(d.x))
         light, slope, middle = step(middle)
         return Passage(length, middle, light.sigma_mm / dr.abs(slope))
 
@@ -156,7 +156,7 @@ class Passage:
     middle_mm: Float
     sigma_mm: Float
 
-    def nearest(self) -> tuple[Float, Float]:
+    def find_nearest(self) -> tuple[Float, Float]:
         """Return the ray position nearest to the sheet and its distance from the sheet, both in mm along the ray.
 
         The standard deviation of the sheet is added to the distance, which is therefore never 0.
@@ -164,7 +164,7 @@ class Passage:
         t = dr.clip(self.middle_mm, 0.0, self.length_mm)
         return t, dr.abs(self.middle_mm - t) + self.sigma_mm
 
-    def pick(self, u: Float) -> tuple[Float, Float]:
+    def sample(self, u: Float) -> tuple[Float, Float]:
         """Sample a ray position from the sheet's Gaussian profile along the ray; return it and its density in 1/mm.
 
         The density is 0 for rays that stay clear of the sheet. Only the sampling depends on it: the caller evaluates
@@ -197,7 +197,7 @@ class SheetLobe:
     angles: AngleTable
 
     @classmethod
-    def at(cls, light: SheetLight, angles: AngleTable) -> SheetLobe:
+    def from_light(cls, light: SheetLight, angles: AngleTable) -> SheetLobe:
         """Build the lobe from the sheet's light at points; ``angles`` tabulates p(a) / sin a."""
         towards, across = -light.direction, dr.abs(light.distance_mm)
         side = -dr.mulsign(mi.Vector3f(light.normal), light.distance_mm)
@@ -207,15 +207,15 @@ class SheetLobe:
         away = dr.sqrt(dr.square(across) + dr.square(light.sigma_mm))
         return cls(towards, side, 0.5 * away / dr.maximum(light.exit_mm, 1e-3), share, angles)
 
-    def present(self) -> Bool:
+    def has_directions(self) -> Bool:
         """Return the mask of points whose lobe is not empty."""
         return self.least < _LARGEST_SLOPE
 
     def share_below(self, u: Float) -> Float:
         """Return the value of the table's cumulative distribution that ``u`` selects."""
-        return dr.lerp(self._share_left_out(), 1.0, u)
+        return dr.lerp(self._excluded_share(), 1.0, u)
 
-    def at_angles(self, heights: tuple[Float, Float], u: Float) -> tuple[Vector3f, Bool]:
+    def rotate_to_angles(self, heights: tuple[Float, Float], u: Float) -> tuple[Vector3f, Bool]:
         """Return directions at angles given by 1 - cos and 1 + cos, and the mask of valid ones.
 
         ``u`` selects the azimuth.
@@ -230,20 +230,20 @@ class SheetLobe:
         x = dr.select(on_side, sine / cosh, -sine / cosh)
         beside = dr.cross(self.towards, self.side)
         drawn = self.towards * (1 - before) + self.side * x + beside * (sine * tanh)
-        return dr.normalize(mi.Vector3f(drawn)), self.present() & (sine > self.least)
+        return dr.normalize(mi.Vector3f(drawn)), self.has_directions() & (sine > self.least)
 
     def density(self, direction: Vector3f) -> Float:
         """Return the density in 1/sr of the sampled directions."""
         before = one_minus_cosine(self.towards, direction)
         sine = dr.sqrt(dr.maximum(before * (2 - before), 0.0))
         slope = dr.dot(direction, self.side)
-        share = dr.select(slope > 0, self.share_on_side, 1 - self.share_on_side) / (1 - self._share_left_out())
+        share = dr.select(slope > 0, self.share_on_side, 1 - self.share_on_side) / (1 - self._excluded_share())
         slope = dr.abs(slope)
-        drawn = self.present() & (sine > self.least) & (slope > (1 - 1e-3) * self.least)
+        drawn = self.has_directions() & (sine > self.least) & (slope > (1 - 1e-3) * self.least)
         density = share * self.angles.density(before) * math.pi * sine / (slope * self._reach(sine))
         return dr.select(drawn, density, 0.0)
 
-    def _share_left_out(self) -> Float:
+    def _excluded_share(self) -> Float:
         """Return the fraction of angles too small for any direction steeper than ``least``."""
         squared = dr.square(dr.minimum(self.least, _LARGEST_SLOPE))
         return self.angles.share_below(squared / (1 + dr.sqrt(1 - squared)))
@@ -262,6 +262,6 @@ def lights(
     return direct, [Light(sheet, pose, mirror) for sheet in sheets for mirror in mirrors]
 
 
-def _away_from_zero(x: Float) -> Float:
+def _bound_slope(x: Float) -> Float:
     """Return slopes with a magnitude of at least 1e-4, so that they can be divisors."""
     return dr.select(dr.abs(x) < 1e-4, dr.mulsign(mi.Float(1e-4), x), x)

@@ -28,7 +28,7 @@ def golden_step(count: int) -> int:
 
 
 @cache
-def lattice(count: int, axes: int) -> np.ndarray:
+def make_lattice(count: int, axes: int) -> np.ndarray:
     """Return a rank-1 lattice (axes, count) in the unit cube, each point centred in its interval along every axis.
 
     The first two generators are 1 and the golden step. Each further generator minimises the worst-case error of the
@@ -74,19 +74,19 @@ def _kernel(x: np.ndarray) -> np.ndarray:
     return 1 + 2 * math.pi**2 * (x * x - x + 1 / 6)
 
 
-def over_corners(combine: np.ufunc, nodes: np.ndarray) -> np.ndarray:
+def combine_corners(combine: np.ufunc, nodes: np.ndarray) -> np.ndarray:
     """Combine the four corners of every cell (rows - 1, columns - 1) with a binary ufunc such as `numpy.maximum`."""
     beside = combine(nodes[:, :-1], nodes[:, 1:])
     return combine(beside[:-1], beside[1:])
 
 
-def places(marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_marked(marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rows and columns of the nonzero pixels of an image (H, W); faster than `numpy.nonzero` if they are few."""
     row, column = np.divmod(np.flatnonzero(marked), marked.shape[1])
     return row, column
 
 
-def repeated(cells: np.ndarray, height: int, width: int) -> np.ndarray:
+def expand_cells(cells: np.ndarray, height: int, width: int) -> np.ndarray:
     """Expand cell values of the coarse grid to pixels (H, W); faster than `numpy.repeat`."""
     side = NODE_SPACING_PX
     full = np.empty((cells.shape[0], side, cells.shape[1], side), cells.dtype)
@@ -96,7 +96,7 @@ def repeated(cells: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.ascontiguousarray(full.reshape(side * cells.shape[0], -1)[:height, :width])
 
 
-def near_sheet(across: np.ndarray, reached: np.ndarray | bool = True) -> np.ndarray:
+def mark_near_sheet(across: np.ndarray, reached: np.ndarray | bool = True) -> np.ndarray:
     """Return the mask of cells near the sheet: a corner within `LIT_SIGMAS` of its centre, or corners on both sides.
 
     ``across`` is the distance of the nodes from the sheet's centre in standard deviations, infinite if there is no
@@ -104,13 +104,13 @@ def near_sheet(across: np.ndarray, reached: np.ndarray | bool = True) -> np.ndar
     """
     seen = np.isfinite(across)
     close, before, behind, there = (
-        over_corners(np.logical_or, np.broadcast_to(nodes, across.shape))
+        combine_corners(np.logical_or, np.broadcast_to(nodes, across.shape))
         for nodes in (np.abs(across) < LIT_SIGMAS, seen & (across < 0), seen & (across > 0), reached)
     )
     return there & (close | before & behind)
 
 
-def widened(cells: np.ndarray, radius_px: np.ndarray, *, cell_px: int = NODE_SPACING_PX) -> np.ndarray:
+def dilate_cells(cells: np.ndarray, radius_px: np.ndarray, *, cell_px: int = NODE_SPACING_PX) -> np.ndarray:
     """Dilate each marked cell by its own radius in px; radii are rounded up to one of eight levels."""
     marked = np.flatnonzero(cells)
     radius = radius_px.ravel()[marked] / cell_px
@@ -120,11 +120,11 @@ def widened(cells: np.ndarray, radius_px: np.ndarray, *, cell_px: int = NODE_SPA
     for k in np.unique(level[level > 0]).tolist():
         of_level = np.zeros(cells.shape, np.uint8)
         of_level.ravel()[marked[level == k]] = 1
-        wide |= _within(of_level, k * step)
+        wide |= _dilate(of_level, k * step)
     return wide
 
 
-def _within(marked: np.ndarray, radius: float) -> np.ndarray:
+def _dilate(marked: np.ndarray, radius: float) -> np.ndarray:
     """Return the mask of cells within a radius in cells of the nonzero cells of ``marked`` (uint8)."""
     if radius > _LARGEST_DISC:
         return cv2.distanceTransform(1 - marked, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= radius

@@ -18,8 +18,8 @@ import numpy as np
 
 from twin.backend.arrays import Bool, Float, to_jit
 from twin.light.camera import CameraView
-from twin.light.image_sampling import NODE_SPACING_PX, over_corners, places
-from twin.light.smoothing import FoundLight, blurred, estimated, interpolated
+from twin.light.image_sampling import NODE_SPACING_PX, combine_corners, find_marked
+from twin.light.smoothing import FoundLight, blur_cells, estimate_light, interpolate_cells
 from twin.light.walk import Walker
 
 WALK_CELL_PX = 8
@@ -45,7 +45,7 @@ _WALKS_IN_STRIPE = 4
 
 
 @dataclass(frozen=True)
-class Sources:
+class LightSources:
     """Light sources of random walks: images (H, W) of the stripe and the haze in W/mm2, and images of lit surfaces.
 
     ``surfaces`` are images (rows + 1, columns + 1) at the corners of the small cells. Each shows the light that
@@ -57,12 +57,12 @@ class Sources:
     surfaces: list[np.ndarray]
 
 
-def falling_off(reflected: Float, distance_mm: Float, active: Bool) -> list[Float]:
+def decay_with_distance(reflected: Float, distance_mm: Float, active: Bool) -> list[Float]:
     """Return the reflected light, decayed with the distance from the sheet over each of `SPREAD_MM`."""
     return [dr.select(active, reflected * dr.exp(-dr.abs(distance_mm) / spread), 0.0) for spread in SPREAD_MM]
 
 
-class LongerWays:
+class IndirectLight:
     """Multiply scattered light and light between surfaces, traced on construction; ``walks`` start in most large cells.
 
     ``lit`` (rows, columns) marks the small cells of the stripe's pixels. `image` smooths the result without the
@@ -73,9 +73,9 @@ class LongerWays:
         self._lit, self._walks, self._scatters = lit, walks, walker.scatters
         height, width = view.camera.height_px, view.camera.width_px
         rows, columns = self._shape = -(-height // WALK_CELL_PX), -(-width // WALK_CELL_PX)
-        self._times = np.where(_beside_stripe(lit, rows, columns), _WALKS_BESIDE_STRIPE, 1)
+        self._times = np.where(_mark_near_stripe(lit, rows, columns), _WALKS_BESIDE_STRIPE, 1)
         self._times_in_stripe = 1 if walker.scatters else _WALKS_IN_STRIPE
-        self._in_stripe = row_in_stripe, column_in_stripe = places(lit)
+        self._in_stripe = row_in_stripe, column_in_stripe = find_marked(lit)
         large = np.repeat(np.arange(rows * columns), self._times.ravel())
         small = np.repeat(np.arange(len(row_in_stripe)), self._times_in_stripe)
         self._found = [(FoundLight(rows, columns), FoundLight(1, len(row_in_stripe))) for _ in NOISE_SHARES]
@@ -95,7 +95,7 @@ class LongerWays:
                 in_large.add(large[where[is_large]], light[is_large])
                 in_small.add(small[where[~is_large] - len(large)], light[~is_large])
 
-    def image(self, sources: Sources) -> np.ndarray:
+    def image(self, sources: LightSources) -> np.ndarray:
         """Return the irradiance (H, W) in W/mm2."""
         height, width = sources.stripe.shape
         cells, inside = self._smooth(sources) if self._scatters else self._means()
@@ -109,17 +109,17 @@ class LongerWays:
             image[row[there], column[there]] = inside[there]
         return image
 
-    def _smooth(self, sources: Sources) -> tuple[np.ndarray, np.ndarray]:
+    def _smooth(self, sources: LightSources) -> tuple[np.ndarray, np.ndarray]:
         """Return smoothed light in large cells (rows, columns) and in the small cells of the stripe (P,)."""
-        row, column = map(_in_large_cells, self._in_stripe)
-        features, fine = _features(sources, self._lit, *self._shape, row, column)
+        row, column = map(_to_large_cells, self._in_stripe)
+        features, fine = _build_features(sources, self._lit, *self._shape, row, column)
         tolerance = TOLERANCE * float(sources.stripe.max(initial=0.0))
         cells, inside = np.zeros(self._shape), np.zeros(len(row))
         for (in_large, in_small), noise_share in zip(self._found, NOISE_SHARES, strict=True):
             walks = self._walks * self._times
-            estimate = estimated(in_large, walks, features, tolerance=tolerance, noise_share=noise_share)
+            estimate = estimate_light(in_large, walks, features, tolerance=tolerance, noise_share=noise_share)
             cells += estimate.cells
-            inside += estimate.at(row, column, fine, in_small, self._walks * self._times_in_stripe)
+            inside += estimate.evaluate(row, column, fine, in_small, self._walks * self._times_in_stripe)
         return cells, inside
 
     def _means(self) -> tuple[np.ndarray, np.ndarray]:
@@ -132,7 +132,7 @@ class LongerWays:
 def walked(
     view: CameraView, walker: Walker, rows: np.ndarray, columns: np.ndarray, sides: np.ndarray, *, seed: int, walks: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Trace random walks; yield cells (N,) and both kinds of irradiance (N,) in W/mm2 as `Walker.found` does.
+    """Trace random walks; yield cells (N,) and both kinds of irradiance (N,) in W/mm2 as `Walker.trace` does.
 
     ``rows`` and ``columns`` (C,) give the first pixel of each square cell, ``sides`` (C,) its side length in pixels.
     ``walks`` start in each cell.
@@ -148,41 +148,41 @@ def walked(
         u, v = (mi.sample_tea_float32(place, key) for key in keys)
         left, above, width = (dr.gather(mi.Float, values, cell) for values in (x, y, side))
         bundle = view.bundle(left + u * width, above + v * width)
-        yield from walker.found(bundle, cell, seed=seed + 1013 * part)
+        yield from walker.trace(bundle, cell, seed=seed + 1013 * part)
 
 
-def _beside_stripe(lit: np.ndarray, rows: int, columns: int) -> np.ndarray:
+def _mark_near_stripe(lit: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """Return the mask of large cells (rows, columns) on or next to the stripe, whose small cells are ``lit``."""
     on_stripe = np.zeros((rows, columns), np.uint8)
-    row, column = places(lit)
+    row, column = find_marked(lit)
     on_stripe[row * NODE_SPACING_PX // WALK_CELL_PX, column * NODE_SPACING_PX // WALK_CELL_PX] = 1
     across = 2 * _CELLS_BESIDE_STRIPE + 1
     return cv2.dilate(on_stripe, np.ones((across, across), np.uint8)) > 0
 
 
-def _features(
-    sources: Sources, lit: np.ndarray, rows: int, columns: int, place_rows: np.ndarray, place_columns: np.ndarray
+def _build_features(
+    sources: LightSources, lit: np.ndarray, rows: int, columns: int, place_rows: np.ndarray, place_columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return images that may describe the light: a constant, the haze, lit surfaces, and blurred stripe and haze.
 
     They are sampled in the large cells (J, rows, columns), and in the small cells of the stripe (J, P). ``place_rows``
     and ``place_columns`` (P,) are the positions of the small cells in units of large cells.
     """
-    stripe, haze = (_in_cells(image, rows, columns) for image in (sources.stripe, sources.haze))
-    surfaces = [0.25 * over_corners(np.add, nodes) for nodes in sources.surfaces]
+    stripe, haze = (_average_cells(image, rows, columns) for image in (sources.stripe, sources.haze))
+    surfaces = [0.25 * combine_corners(np.add, nodes) for nodes in sources.surfaces]
     widths = [_NARROWEST_CELLS]
     while widths[-1] < 0.2 * max(rows, columns):
         widths.append(3 * widths[-1])
-    blurs = [blurred(source, width) for source in (stripe, haze) for width in widths]
+    blurs = [blur_cells(source, width) for source in (stripe, haze) for width in widths]
     fine_haze = sources.haze[::NODE_SPACING_PX, ::NODE_SPACING_PX][lit]
-    fine_blurs = [interpolated(blur, place_rows, place_columns) for blur in blurs]
+    fine_blurs = [interpolate_cells(blur, place_rows, place_columns) for blur in blurs]
     return (
-        np.stack([np.ones_like(haze), haze, *(_in_cells(image, rows, columns) for image in surfaces), *blurs]),
+        np.stack([np.ones_like(haze), haze, *(_average_cells(image, rows, columns) for image in surfaces), *blurs]),
         np.stack([np.ones_like(fine_haze), fine_haze, *(image[lit] for image in surfaces), *fine_blurs]),
     )
 
 
-def _in_cells(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
+def _average_cells(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """Return means over large cells (rows, columns) of an image of pixels or small cells."""
     height, width = (-(-size // cells) * cells for size, cells in zip(image.shape, (rows, columns), strict=True))
     missing = height - image.shape[0], width - image.shape[1]
@@ -191,6 +191,6 @@ def _in_cells(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
     return cv2.resize(image.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
 
 
-def _in_large_cells(small: np.ndarray) -> np.ndarray:
+def _to_large_cells(small: np.ndarray) -> np.ndarray:
     """Convert rows or columns of small cells to positions in large cells, relative to the centre of the first one."""
     return ((small + 0.5) * (NODE_SPACING_PX / WALK_CELL_PX) - 0.5).astype(np.float32)

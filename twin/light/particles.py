@@ -52,7 +52,7 @@ class Spots:
     light: np.ndarray
     radius_px: np.ndarray
 
-    def drawn(self, height: int, width: int) -> np.ndarray:
+    def draw(self, height: int, width: int) -> np.ndarray:
         """Draw all spots as an irradiance image (H, W), float32; the edge of a disc is one pixel wide."""
         image = np.zeros((height, width), np.float32)
         for x, y, light, radius in zip(self.x, self.y, self.light, self.radius_px, strict=True):
@@ -68,7 +68,7 @@ class Spots:
         return image
 
 
-def spots(
+def sample_spots(
     view: CameraView,
     light: Light,
     objects: Objects,
@@ -95,13 +95,13 @@ def spots(
         """Return volume (mm3) per pixel, light of the sheet, and area per pixel at image positions ``x`` and ``y``."""
         at = [(to_jit(mi.Float, x + dx), to_jit(mi.Float, y + dy)) for dx, dy in ((0, 0), (1, 0), (0, 1))]
         bundles = [view.bundle(*each) for each in at]
-        crossed = [light.crossing(*light.in_own_frame(each.origin, each.direction)) for each in bundles]
+        crossed = [light.intersect(*light.to_sheet_frame(each.origin, each.direction)) for each in bundles]
         t, bundle = crossed[0][0], bundles[0]
         points = [each.origin + each.direction * where for each, (where, _) in zip(bundles, crossed, strict=True)]
         area = dr.norm(dr.cross(points[1] - points[0], points[2] - points[0]))
-        middle = light.at(mi.Point3f(points[0]))
+        middle = light.evaluate(mi.Point3f(points[0]))
         place = mi.Point3f(points[0] + middle.normal * (middle.sigma_mm * to_jit(mi.Float, aside)))
-        lit = light.at(place)
+        lit = light.evaluate(place)
         hit = objects.scene.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction))
         free = (bundle.weight > 0) & (t > 0) & (~hit.is_valid() | (t < hit.t)) & (lit.irradiance > 0)
         free &= light.reaches(objects.scene, place, lit, None, free)

@@ -40,12 +40,12 @@ class Travel:
     row_s: float = 0.0
     middle_row: float = 0.0
 
-    def at(self, row: Float, moment: Float | float) -> Float:
+    def compute_times(self, row: Float, moment: Float | float) -> Float:
         """Return the time in s of image rows at a fraction ``moment`` (0 to 1) of their exposure."""
         exposure, per_row = opaque(self.exposure_s), opaque(self.row_s)
         return (row - opaque(self.middle_row)) * per_row + (moment - 0.5) * exposure
 
-    def ends(self, rows: int) -> tuple[float, float]:
+    def time_range(self, rows: int) -> tuple[float, float]:
         """Return the first and last time in s of a frame of ``rows`` rows."""
         at_edges = [(row - self.middle_row) * self.row_s for row in (0, rows - 1)]
         half = self.exposure_s / 2
@@ -82,7 +82,7 @@ class SensorPose:
         pairs = zip(vars(self.travel).values(), vars(other.travel).values(), strict=True)
         return all(np.array_equal(mine, theirs) for mine, theirs in pairs)
 
-    def moved(self, after_s: float) -> SensorPose:
+    def displace(self, after_s: float) -> SensorPose:
         """Return the pose after a time, without motion."""
         assert self.travel is not None
         transform = self.scene_from_object.copy()
@@ -92,27 +92,27 @@ class SensorPose:
             transform[:3, :3] = turned @ transform[:3, :3]
         return SensorPose(transform)
 
-    def at_rest(self, point: Point3f, after_s: Float | None) -> Point3f:
+    def to_rest_frame(self, point: Point3f, after_s: Float | None) -> Point3f:
         """Transform points from the moving OCS at a time to the OCS of the sensor at rest."""
         if after_s is None:
             return mi.Point3f(point)
-        return mi.Point3f(self.direction_at_rest(mi.Vector3f(point), after_s) + self._velocity * after_s)
+        return mi.Point3f(self.rotate_to_rest_frame(mi.Vector3f(point), after_s) + self._velocity * after_s)
 
-    def moving(self, point: Point3f, after_s: Float | None) -> Point3f:
+    def to_moving_frame(self, point: Point3f, after_s: Float | None) -> Point3f:
         """Transform points from the OCS of the sensor at rest to the moving OCS at a time."""
         if after_s is None:
             return mi.Point3f(point)
-        return mi.Point3f(self.moving_direction(mi.Vector3f(point) - self._velocity * after_s, after_s))
+        return mi.Point3f(self.rotate_to_moving_frame(mi.Vector3f(point) - self._velocity * after_s, after_s))
 
-    def direction_at_rest(self, direction: Vector3f, after_s: Float | None) -> Vector3f:
+    def rotate_to_rest_frame(self, direction: Vector3f, after_s: Float | None) -> Vector3f:
         """Transform directions from the moving OCS at a time to the OCS of the sensor at rest."""
-        return self._turned(direction, after_s, sign=1.0)
+        return self._rotate(direction, after_s, sign=1.0)
 
-    def moving_direction(self, direction: Vector3f, after_s: Float | None) -> Vector3f:
+    def rotate_to_moving_frame(self, direction: Vector3f, after_s: Float | None) -> Vector3f:
         """Transform directions from the OCS of the sensor at rest to the moving OCS at a time."""
-        return self._turned(direction, after_s, sign=-1.0)
+        return self._rotate(direction, after_s, sign=-1.0)
 
-    def _turned(self, vector: Vector3f, after_s: Float | None, *, sign: float) -> Vector3f:
+    def _rotate(self, vector: Vector3f, after_s: Float | None, *, sign: float) -> Vector3f:
         """Rotate vectors by the sensor's rotation within a time (Rodrigues' formula)."""
         if after_s is None or self._axis is None:
             return mi.Vector3f(vector)
@@ -123,14 +123,14 @@ class SensorPose:
     def ray(self, origin: Point3f, direction: Vector3f, after_s: Float | None = None) -> mi.Ray3f:
         """Transform a ray from the OCS at a time to the scene."""
         # Dr.Jit returns a vector for a transformed point plus a vector; the conversion restores the point.
-        start = self._to_scene @ self.at_rest(origin, after_s)
+        start = self._to_scene @ self.to_rest_frame(origin, after_s)
         return mi.Ray3f(mi.Point3f(start), self.direction(direction, after_s))
 
     def direction(self, direction: Vector3f, after_s: Float | None = None) -> Vector3f:
         """Transform a direction from the OCS at a time to the scene."""
         # Dr.Jit returns a point for the difference of two points; a transform would translate it.
-        return self._to_scene @ self.direction_at_rest(mi.Vector3f(direction), after_s)
+        return self._to_scene @ self.rotate_to_rest_frame(mi.Vector3f(direction), after_s)
 
     def object_direction(self, direction: Vector3f, after_s: Float | None = None) -> Vector3f:
         """Transform a direction from the scene to the OCS at a time."""
-        return self.moving_direction(self._to_object @ mi.Vector3f(direction), after_s)
+        return self.rotate_to_moving_frame(self._to_object @ mi.Vector3f(direction), after_s)

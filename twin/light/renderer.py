@@ -22,21 +22,21 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import Float, Point3f, begin_kernels, opaque, to_jit
-from twin.light.camera import CameraView, RaySegment, ray_segments
-from twin.light.haze import SheetCrossing, crossing, haze
+from twin.light.camera import CameraView, RaySegment, trace_segments
+from twin.light.haze import SheetCrossing, compute_haze, intersect_sheet
 from twin.light.illumination import Light, lights
 from twin.light.image_sampling import (
     NODE_SPACING_PX,
-    lattice,
-    near_sheet,
-    over_corners,
-    places,
+    combine_corners,
+    dilate_cells,
+    expand_cells,
+    find_marked,
+    make_lattice,
+    mark_near_sheet,
     pupil_shifts,
-    repeated,
-    widened,
 )
-from twin.light.multiple_scattering import LongerWays, Sources, falling_off
-from twin.light.particles import Body, spots
+from twin.light.multiple_scattering import IndirectLight, LightSources, decay_with_distance
+from twin.light.particles import Body, sample_spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet, SheetLight
 from twin.light.walk import Walker
@@ -169,7 +169,7 @@ class Renderer:
             return day + self.laser_frame(scene_from_object, spp=spp, seed=seed, travel=travel).irradiance()
         if light == "day" and not (self.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0):
             return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
-        return self._lamp_frame(SensorPose(scene_from_object, travel), spp=spp, ambient=light == "day")
+        return self._render_lamp_frame(SensorPose(scene_from_object, travel), spp=spp, ambient=light == "day")
 
     def laser_frame(
         self, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
@@ -179,31 +179,31 @@ class Renderer:
         pose = SensorPose(scene_from_object, travel)
         direct, mirrored = lights(self._sheets, pose, self._mirrors)
         lit, haze, surfaces = self._laser_nodes(pose, direct, mirrored)
-        rows, columns = places(self._repeated(lit))
-        stripe_means = self._stripe(pose, rows, columns, direct + mirrored, spp=spp)
+        rows, columns = find_marked(self._expand_cells(lit))
+        stripe_means = self._render_stripe(pose, rows, columns, direct + mirrored, spp=spp)
         walker, walked = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm), None
         if walker.finds_light:
             walks = math.ceil(spp * self._walks_per_sample)
-            walked = LongerWays(self.view, walker, lit, seed=seed, walks=walks)
+            walked = IndirectLight(self.view, walker, lit, seed=seed, walks=walks)
         stripe, polarised, rough = stripe_means()
         longer = None
         if walked is not None:
             image = np.zeros_like(haze)
             image[rows, columns] = stripe
-            longer = partial(walked.image, Sources(image, haze, surfaces))
+            longer = partial(walked.image, LightSources(image, haze, surfaces))
         haze = haze if self.effects.haze else np.zeros_like(haze)
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
-        particles, polarisation = self._particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
+        particles, polarisation = self._render_particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
         return LaserFrame(longer, haze, particles, rows, columns, stripe, polarisation, rough / bright)
 
-    def _particles(self, direct: list[Light], pose: SensorPose, *, seed: int) -> np.ndarray:
+    def _render_particles(self, direct: list[Light], pose: SensorPose, *, seed: int) -> np.ndarray:
         """Return the irradiance (H, W) in W/mm2 of particles and bubbles in the sheets."""
         camera = self.sensor.camera
         image = np.zeros((camera.height_px, camera.width_px), np.float32)
         rng = np.random.default_rng([seed, _DRIFTING_STREAM])
         for body, per_litre in self._drifting.items():
             for light in direct if per_litre > 0 else ():
-                seen = spots(
+                seen = sample_spots(
                     self.view,
                     light,
                     self.objects,
@@ -216,20 +216,20 @@ class Renderer:
                     sparkle=self.effects.speckle,
                     rng=rng,
                 )
-                image += seen.drawn(camera.height_px, camera.width_px)
+                image += seen.draw(camera.height_px, camera.width_px)
         return image
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
         """Return rows and columns of the pixels whose chief rays meet the stripe of the first laser."""
         if self._own_stripe is None or not pose.equals(self._own_stripe[0]):
-            bundle, shape = self.view.grid(NODE_SPACING_PX)
+            bundle, shape = self.view.trace_grid(NODE_SPACING_PX)
             direct, _ = lights(self._sheets[:1], pose)
             own = np.zeros((shape[0] - 1, shape[1] - 1), bool)
             for moment, (light, *_) in self._moments(pose, direct):
                 segment = next(self._segments(moment, bundle, None))
-                own |= near_sheet(_sigmas(light.at(segment.end()), segment).numpy().reshape(shape))
+                own |= mark_near_sheet(_sigmas(light.evaluate(segment.end()), segment).numpy().reshape(shape))
             self._own_stripe = pose, own
-        return places(self._repeated(self._own_stripe[1]))
+        return find_marked(self._expand_cells(self._own_stripe[1]))
 
     def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> tuple[Float, RaySegment]:
         """Return the irradiance in W/mm2 per ray of the first laser on directly visible surfaces, and the rays."""
@@ -241,13 +241,13 @@ class Renderer:
 
     def _segments(self, pose: SensorPose, bundle: Rays, after_s: Float | None) -> Iterator[RaySegment]:
         mirrors = _MIRRORS if self._mirrors else 0
-        return ray_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=mirrors)
+        return trace_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=mirrors)
 
     def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None) -> Float:
         """Return the radiance in W/mm2/sr of lit surfaces along segments, attenuated to the segments' start."""
         radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
-            here = light.at(end, after_s)
+            here = light.evaluate(end, after_s)
             lit = light.reaches(self.objects.scene, end, here, after_s, segment.valid & (here.irradiance > 0))
             towards = segment.si.to_local(pose.direction(-here.direction, after_s))
             radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), segment.si, towards, lit)[0] * here.irradiance, 0.0)
@@ -258,8 +258,8 @@ class Renderer:
     def _laser_nodes(
         self, pose: SensorPose, direct: list[Light], mirrored: list[Light]
     ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Return cells (rows, columns) near the stripe, the haze (H, W) in W/mm2, and the surfaces for `Sources`."""
-        bundle, shape = self.view.grid(NODE_SPACING_PX)
+        """Return cells (rows, columns) near the stripe, the haze (H, W) in W/mm2, and lit surfaces (`LightSources`)."""
+        bundle, shape = self.view.trace_grid(NODE_SPACING_PX)
         lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
         own, reach = lit.copy(), np.zeros_like(lit, np.float32)
         image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
@@ -267,7 +267,7 @@ class Renderer:
         for moment, sources in self._moments(pose, direct + mirrored):
             scattered = mi.Float(0.0)
             for index, segment in enumerate(self._segments(moment, bundle, None)):
-                ends = [light.at(segment.end()) for light in sources]
+                ends = [light.evaluate(segment.end()) for light in sources]
                 across = [_sigmas(here, segment) for here in ends]
                 straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
                 depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
@@ -275,11 +275,13 @@ class Renderer:
                     surfaces = self._surfaces(pose, segment, ends)
                     for light, here in zip(sources, ends, strict=True):
                         crossed = self._crossing(light, bundle)
-                        scattered += haze(crossed, light, self.objects.scene, segment, here)
+                        scattered += compute_haze(crossed, light, self.objects.scene, segment, here)
                 reached = [light.may_reach(segment.end(), here) for light, here in zip(sources, ends, strict=True)]
                 dr.eval(depth, scattered, surfaces, *across, *reached)
                 stripes = [
-                    near_sheet(sigmas.numpy().reshape(shape), True if there is None else there.numpy().reshape(shape))
+                    mark_near_sheet(
+                        sigmas.numpy().reshape(shape), True if there is None else there.numpy().reshape(shape)
+                    )
                     for sigmas, there in zip(across, reached, strict=True)
                 ]
                 near = np.any(stripes, axis=0)
@@ -289,33 +291,33 @@ class Renderer:
                     reach = np.fmax(reach, self._blur_px(near, depth.numpy().reshape(shape)))
                 lit |= near
             if moment is pose and dr.width(scattered) > 1:
-                image = self._repeated(0.25 * over_corners(np.add, scattered.numpy().reshape(shape)))
+                image = self._expand_cells(0.25 * combine_corners(np.add, scattered.numpy().reshape(shape)))
         self._own_stripe = pose, own
-        return widened(lit, reach), image, [each.numpy().reshape(shape) for each in surfaces]
+        return dilate_cells(lit, reach), image, [each.numpy().reshape(shape) for each in surfaces]
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
         """Yield the pose and its lights, and further poses during the exposure if the sensor moves."""
         yield pose, sources
         if pose.travel is not None:
-            first, last = pose.travel.ends(self.sensor.camera.height_px)
+            first, last = pose.travel.time_range(self.sensor.camera.height_px)
             way_mm = (last - first) * pose.travel.fastest_mm_s(_REACH_SHARE * self.design.standoff_mm)
             for after_s in np.linspace(first, last, 2 + int(way_mm / _TRAVEL_STEP_MM)):
-                moved = pose.moved(float(after_s))
+                moved = pose.displace(float(after_s))
                 direct, mirrored = lights(self._sheets, moved, self._mirrors)
                 yield moved, direct + mirrored
 
     def _crossing(self, light: Light, bundle: Rays) -> SheetCrossing:
         """Return the intersections of the nodes' rays with a sheet, cached for direct lights."""
         if light.mirrored:
-            return crossing(light, self.scattering, bundle)
+            return intersect_sheet(light, self.scattering, bundle)
         if light.sheet not in self._crossings:
-            found = crossing(light, self.scattering, bundle)
+            found = intersect_sheet(light, self.scattering, bundle)
             dr.eval(vars(found))
             self._crossings[light.sheet] = found
         return self._crossings[light.sheet]
 
     def _surfaces(self, pose: SensorPose, segment: RaySegment, ends: list[SheetLight]) -> list[Float]:
-        """Return irradiance per ray of surfaces near the sheets for `Sources`; ``ends`` is the sheets' light there."""
+        """Return irradiance per ray of surfaces near the sheets for `LightSources`; ``ends`` is the light there."""
         bsdf = segment.si.bsdf()
         seen = segment.weight * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
         parts = []
@@ -324,36 +326,36 @@ class Renderer:
             towards = segment.si.to_local(pose.direction(-here.direction))
             sent = bsdf.eval(mi.BSDFContext(), segment.si, towards, active)[0]
             sent *= seen * here.in_middle * here.sigma_mm
-            parts.append(falling_off(sent, here.distance_mm, active))
+            parts.append(decay_with_distance(sent, here.distance_mm, active))
         return [sum(each, mi.Float(0.0)) for each in zip(*parts, strict=True)]
 
     # --- lamp ---------------------------------------------------------------------------------------------------------
 
-    def _lamp_frame(self, pose: SensorPose, *, spp: int, ambient: bool = False) -> np.ndarray:
+    def _render_lamp_frame(self, pose: SensorPose, *, spp: int, ambient: bool = False) -> np.ndarray:
         """Return the light (H, W) of lamp or daylight in W/mm2; only pixels with changes are sampled finely."""
         begin_kernels()
-        bundle, shape = self.view.grid(1)
+        bundle, shape = self.view.trace_grid(1)
         segment = next(self._segments(pose, bundle, None))
-        value = self._evenly_lit(segment, ambient)
+        value = self._compute_even_light(segment, ambient)
         depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
         dr.eval(value, depth)
         nodes = value.numpy().reshape(shape)
-        low, high = over_corners(np.minimum, nodes), over_corners(np.maximum, nodes)
+        low, high = combine_corners(np.minimum, nodes), combine_corners(np.maximum, nodes)
         changes = high - low > CHANGE_SHARE * nodes.max()
         if self.effects.defocus:
-            changes = widened(changes, self._blur_px(changes, depth.numpy().reshape(shape)), cell_px=1)
+            changes = dilate_cells(changes, self._blur_px(changes, depth.numpy().reshape(shape)), cell_px=1)
         if pose.travel is not None:
             changes[:] = True  # motion may change any pixel
-        image = 0.25 * over_corners(np.add, nodes)
+        image = 0.25 * combine_corners(np.add, nodes)
 
         def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None) -> tuple[Float]:
-            return (self._evenly_lit(next(self._segments(pose, bundle, after_s)), ambient),)
+            return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient),)
 
-        for rows, columns in _parts(*places(changes), spp=spp):
-            image[rows, columns] = self._fine(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
+        for rows, columns in _split_pixels(*find_marked(changes), spp=spp):
+            image[rows, columns] = self._render_pixels(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
         return image
 
-    def _evenly_lit(self, segment: RaySegment, ambient: bool) -> Float:
+    def _compute_even_light(self, segment: RaySegment, ambient: bool) -> Float:
         """Return the irradiance per ray in W/mm2 for evenly lit surfaces, seen through the water and its veiling light.
 
         A surface of albedo A at the irradiance E has the radiance A E / pi. Daylight is isotropic, so the water
@@ -408,7 +410,7 @@ class Renderer:
 
     # --- pixels -------------------------------------------------------------------------------------------------------
 
-    def _stripe(
+    def _render_stripe(
         self, pose: SensorPose, rows: np.ndarray, columns: np.ndarray, sources: list[Light], *, spp: int
     ) -> Callable[[], np.ndarray]:
         """Render the stripe; return a function that fetches the means (3, P) of `_stripe_sums` over pixels.
@@ -416,18 +418,18 @@ class Renderer:
         Rendering is asynchronous. In a wide stripe, pixels with smooth light take few samples.
         """
 
-        def begun(where: np.ndarray, spp: int) -> Callable[[], np.ndarray]:
+        def start(where: np.ndarray, spp: int) -> Callable[[], np.ndarray]:
             found: list[Callable[[], np.ndarray]] = []
-            for part in _parts(rows[where], columns[where], spp=spp):
+            for part in _split_pixels(rows[where], columns[where], spp=spp):
                 if found:
                     dr.sync_thread()  # limits memory to the samples of one part
-                found.append(self._fine(self._stripe_sums, pose, *part, sources, spp=spp))
+                found.append(self._render_pixels(self._stripe_sums, pose, *part, sources, spp=spp))
             return lambda: np.concatenate([np.zeros((3, 0), np.float32), *(means() for means in found)], axis=1)
 
         everywhere, lines = np.arange(len(rows)), self.sensor.camera.lines()
         if len(rows) < _WIDE_PX * lines or spp < _LEAST_SPP * _FEWER_SAMPLES:
-            return begun(everywhere, spp)
-        sums = begun(everywhere, spp // _FEWER_SAMPLES)()
+            return start(everywhere, spp)
+        sums = start(everywhere, spp // _FEWER_SAMPLES)()
         image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
         image[rows, columns] = sums[0]
         bends = np.zeros(image.shape, np.uint8)
@@ -435,7 +437,7 @@ class Renderer:
             second = cv2.Sobel(image, cv2.CV_32F, along_x, along_y, ksize=1)
             bends |= (np.abs(second) > BEND_SHARE * sums[0].max(initial=0.0)).view(np.uint8)
         again = np.flatnonzero(cv2.dilate(bends, np.ones((3, 3), np.uint8))[rows, columns])
-        sums[:, again] = begun(again, spp)()
+        sums[:, again] = start(again, spp)()
         return lambda: sums
 
     def _stripe_sums(
@@ -453,7 +455,7 @@ class Renderer:
             rough += value * self.objects.roughness_um(segment.si)
         return total, polarised, rough
 
-    def _fine(
+    def _render_pixels(
         self,
         light: Callable[..., tuple[Float, ...]],
         pose: SensorPose,
@@ -473,7 +475,7 @@ class Renderer:
         pixel = index // per_pixel
         sample = index - pixel * per_pixel
         # Adjacent values are read together, which is much faster.
-        axes = lattice(spp, 2 + 2 * self.effects.defocus + (pose.travel is not None))
+        axes = make_lattice(spp, 2 + 2 * self.effects.defocus + (pose.travel is not None))
         places = np.zeros((spp, 4))
         places[:, : 2 + 2 * self.effects.defocus] = axes[: 2 + 2 * self.effects.defocus].T
         across, down, u, v = dr.gather(mi.Vector4f, to_jit(mi.Float, places), sample)
@@ -487,7 +489,7 @@ class Renderer:
             pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
         after_s = None
         if pose.travel is not None:
-            after_s = pose.travel.at(y, dr.gather(mi.Float, to_jit(mi.Float, axes[-1]), sample))
+            after_s = pose.travel.compute_times(y, dr.gather(mi.Float, to_jit(mi.Float, axes[-1]), sample))
         bundle = self.view.bundle(x + across - 0.5, y + down - 0.5, pupil)
         values = light(pose, bundle, after_s, *rest)
         dr.eval(values)  # together: separate sums would trace the rays again
@@ -497,15 +499,15 @@ class Renderer:
 
     def _blur_px(self, marked: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
         """Return the largest blur in px at the corners of marked cells, 0 elsewhere, from the depths at all nodes."""
-        row, column = places(marked)
+        row, column = find_marked(marked)
         corners = np.stack([depth_mm[row + down, column + right] for down, right in np.ndindex(2, 2)])
         blur = np.zeros(marked.shape, np.float32)
         blur[row, column] = np.fmax(np.fmax.reduce(self.view.blur_radius_px(corners)), 0)
         return blur
 
-    def _repeated(self, cells: np.ndarray) -> np.ndarray:
+    def _expand_cells(self, cells: np.ndarray) -> np.ndarray:
         """Expand values of grid cells to pixels (H, W)."""
-        return repeated(cells, self.sensor.camera.height_px, self.sensor.camera.width_px)
+        return expand_cells(cells, self.sensor.camera.height_px, self.sensor.camera.width_px)
 
 
 def _sigmas(here: SheetLight, segment: RaySegment) -> Float:
@@ -513,7 +515,7 @@ def _sigmas(here: SheetLight, segment: RaySegment) -> Float:
     return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
 
 
-def _parts(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _split_pixels(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield pixels in parts of at most `SAMPLES_AT_ONCE` samples."""
     if len(rows):
         count = -(-len(rows) * spp // SAMPLES_AT_ONCE)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.polynomial import Chebyshev
 
 from twin.backend.arrays import Float, Point3f, UInt32, Vector3f, opaque, opaque_point, to_jit
-from twin.light.camera import WindowFaces, frame_about
+from twin.light.camera import WindowFaces, build_frame
 from twin.light.pose import Rays
 from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object, laser_pose
@@ -78,12 +78,12 @@ class Sheet:
             None if laser is None else np.linalg.inv(camera_from_object(own)) @ camera_from_object(sensor)
         )
         laser = own.laser
-        origin, angle, fan = _traced(own, medium)
+        origin, angle, fan = _trace_fan(own, medium)
         self._origin = opaque_point(origin)
         o, d = fan.origin, fan.direction
         slope, tilt = d[1] / d[2], d[0] / d[2]
-        y0, x0 = _series(slope, o[1] - slope * o[2], _SERIES_MM), _series(slope, o[0] - tilt * o[2], _SERIES_MM)
-        k, exit_z = _series(slope, tilt, _SERIES_SLOPE), _series(slope, o[2], _SERIES_MM)
+        y0, x0 = _fit_series(slope, o[1] - slope * o[2], _SERIES_MM), _fit_series(slope, o[0] - tilt * o[2], _SERIES_MM)
+        k, exit_z = _fit_series(slope, tilt, _SERIES_SLOPE), _fit_series(slope, o[2], _SERIES_MM)
         self.begins_at_z_mm = opaque(float(o[2].min()))
         far = o + 1e3 * d
         miss = np.hypot(y0(slope) + slope * far[2] - far[1], x0(slope) + k(slope) * far[2] - far[0]).max()
@@ -99,14 +99,14 @@ class Sheet:
         self._start_y0, self._start_dy0 = opaque(float(straight(0.0))), opaque(float(straight.deriv()(0.0)))
         self._least, self._most = opaque(low - 0.05 * (high - low)), opaque(high + 0.05 * (high - low))
         self._offset, self._scale = opaque(offset), opaque(scale)
-        self._power, self.power_w = _power_along(laser, slope, angle, fan.weight)
+        self._power, self.power_w = _tabulate_power(laser, slope, angle, fan.weight)
         waist = laser.waist_radius_mm
         index = medium.refractive_index(laser.wavelength_nm)
         rayleigh = math.pi * waist**2 * index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
         self._waist, self._rayleigh, self._waist_at = map(opaque, (waist, rayleigh, laser.waist_distance_mm))
         self._extinction = opaque(medium.extinction_per_mm(laser.wavelength_nm))
 
-    def at(self, p: Point3f) -> SheetLight:
+    def evaluate(self, p: Point3f) -> SheetLight:
         """Return the light of the sheet at points in the OCS.
 
         The slope m of the fan ray through a point solves y0(m) + m Z = Y (Newton). The power between two fan rays is
@@ -116,10 +116,10 @@ class Sheet:
         """
         m = (p.y - self._start_y0) / (self._start_dy0 + p.z)
         for _ in range(_NEWTON_STEPS):
-            t = self._normalised(m)
+            t = self._normalise(m)
             m -= (self._y0(t) + m * p.z - p.y) / (self._dy0(t) + p.z)
             m = dr.clip(m, self._least, self._most)
-        t = self._normalised(m)
+        t = self._normalise(m)
         tilt, normal = self._tilt(t), self._normal(m, t, p.z)
         distance = (p.x - self._x0(t) - tilt * p.z) * normal.x
         stretch = dr.sqrt(1 + m * m + tilt * tilt)
@@ -127,7 +127,7 @@ class Sheet:
         away = dr.norm(p - self._origin) - self._waist_at
         sigma = 0.5 * self._waist * dr.sqrt(1 + dr.square(away / self._rayleigh))
         # In a plane Z = const the power per length along Y is P'(m) dm / dY; normal.x projects the profile onto it.
-        density = self._power.at(m) / (self._dy0(t) + p.z) * normal.x
+        density = self._power.evaluate(m) / (self._dy0(t) + p.z) * normal.x
         in_middle = density / (sigma * math.sqrt(2 * math.pi)) * stretch * dr.exp(-self._extinction * exit_mm)
         in_middle = dr.select(exit_mm > 0, in_middle, 0.0)
         irradiance = in_middle * dr.exp(-0.5 * dr.square(distance / sigma))
@@ -141,7 +141,7 @@ class Sheet:
         2 at the waist and w0 / (2 zR). As both are independent, straight rays spread by w(s) / 2 at every s.
         """
         m = self._power.draw(u.x)
-        t = self._normalised(m)
+        t = self._normalise(m)
         tilt, z = self._tilt(t), self._exit_z(t)
         stretch = dr.sqrt(1 + m * m + tilt * tilt)
         along = cast(Vector3f, mi.Vector3f(tilt, m, 1.0))
@@ -157,7 +157,7 @@ class Sheet:
         along.x += turned * stretch
         return Rays(leaves, dr.normalize(along), mi.Float(1.0))
 
-    def _normalised(self, m: Float) -> Float:
+    def _normalise(self, m: Float) -> Float:
         return dr.fma(m, self._scale, self._offset)
 
     def _normal(self, m: Float, t: Float, z: Float) -> Vector3f:
@@ -168,18 +168,18 @@ class Sheet:
         return dr.normalize(mi.Vector3f(1.0, -by_y, m * by_y - self._tilt(t)))
 
 
-def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, np.ndarray, Rays]:
+def _trace_fan(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, np.ndarray, Rays]:
     """Trace the fan; return the laser's origin (3,), ray angles (N,) and rays (3, N) behind the window in the OCS."""
     laser, pose = sensor.laser, laser_pose(sensor)
     to_object = np.linalg.inv(camera_from_object(sensor))
-    rotation = frame_about(pose.axis, pose.normal)
+    rotation = build_frame(pose.axis, pose.normal)
     faces = WindowFaces(
         laser.window, medium, wavelength_nm=laser.wavelength_nm, origin_mm=pose.origin_mm, rotation=rotation
     )
     # Chebyshev nodes, denser towards the edges, prevent oscillation of the series.
     angle = -math.radians(laser.fan_angle_deg / 2) * np.cos(np.linspace(0, math.pi, _RAYS))
     fan = mi.Vector3f(rotation @ _fan_directions(laser, angle))
-    path = faces.through(mi.Point3f(pose.origin_mm), fan, mode=mi.TransportMode.Importance)
+    path = faces.trace(mi.Point3f(pose.origin_mm), fan, mode=mi.TransportMode.Importance)
     if not bool(dr.all(path.weight > 0)):
         raise DesignError(
             f"part of the laser's {laser.fan_angle_deg:g} deg fan does not pass its window of "
@@ -191,19 +191,19 @@ def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, np.ndarray, Ray
     return to_object[:3, :3] @ pose.origin_mm + to_object[:3, 3], angle, Rays(o, d, passed)
 
 
-def _power_along(laser: Laser, slope: np.ndarray, angle: np.ndarray, passed: np.ndarray) -> tuple[PowerTable, float]:
+def _tabulate_power(laser: Laser, slope: np.ndarray, angle: np.ndarray, passed: np.ndarray) -> tuple[PowerTable, float]:
     """Return the power behind the window per slope, and the total power in W, from fan rays (N,)."""
     lit = _fan_lit_angles(laser)
     first, last = np.interp(lit[[0, -1]], angle, slope)
     nodes = np.linspace(first, last, _NODES)
-    angle_of, passes = _series(slope, angle, _SERIES_SLOPE), _series(slope, passed, 1e-6)
+    angle_of, passes = _fit_series(slope, angle, _SERIES_SLOPE), _fit_series(slope, passed, 1e-6)
     density = _power_per_angle(laser, np.clip(angle_of(nodes), lit[0], lit[-1])) * passes(nodes)
     between = np.union1d(lit, angle[(angle > lit[0]) & (angle < lit[-1])])
     total = float(np.trapezoid(_power_per_angle(laser, between) * np.interp(between, angle, passed), between))
     return PowerTable(nodes, density * angle_of.deriv()(nodes), power_w=total), total
 
 
-def _series(slope: np.ndarray, values: np.ndarray, tolerance: float) -> Chebyshev:
+def _fit_series(slope: np.ndarray, values: np.ndarray, tolerance: float) -> Chebyshev:
     """Fit a Chebyshev series in the slope, truncated as far as the sum of the omitted terms allows."""
     fit = Chebyshev.fit(slope, values, _LARGEST_DEGREE, domain=(slope.min(), slope.max()))
     left = np.cumsum(np.abs(fit.coef[::-1]))[::-1]
@@ -276,7 +276,7 @@ class PowerTable:
         below = np.concatenate([[0.0], np.cumsum(0.5 * (share[1:] + share[:-1]))])
         self._share, self._below = to_jit(mi.Float, share), to_jit(mi.Float, below / below[-1])
 
-    def at(self, x: Float) -> Float:
+    def evaluate(self, x: Float) -> Float:
         """Return the power in W per unit of the coordinate."""
         place = (x - self._low) / self._step
         # The second bound catches NaN, which clipping does not.

@@ -90,19 +90,19 @@ class FoundLight:
 
     def light(self, kinds: range) -> np.ndarray:
         """Return the light (rows, columns) of the walks in some classes."""
-        found = self._light[self._among(kinds)]
+        found = self._light[self._slice_of(kinds)]
         return (found[0] if len(found) == 1 else found.sum(axis=0)).reshape(self.shape)
 
     def squares(self, kinds: range) -> float:
         """Return the sum of squared light of the walks in some classes."""
-        return float(self._squares[self._among(kinds)].sum())
+        return float(self._squares[self._slice_of(kinds)].sum())
 
     def total(self) -> np.ndarray:
         """Return the light (rows, columns) of all walks."""
         self._sort()
         return self._light.sum(axis=0).reshape(self.shape)
 
-    def _among(self, kinds: range) -> slice:
+    def _slice_of(self, kinds: range) -> slice:
         """Return the slice of contiguous classes within the stored ones."""
         self._sort()
         return slice(max(kinds.start - self._first, 0), max(kinds.stop - self._first, 0))
@@ -124,7 +124,7 @@ class SmoothLight:
     tolerance: float
     noise_share: float
 
-    def at(
+    def evaluate(
         self, rows: np.ndarray, columns: np.ndarray, features: np.ndarray, findings: FoundLight, walks: int
     ) -> np.ndarray:
         """Return the light (P,) at positions in cells, with features (J, P) of these positions.
@@ -133,15 +133,15 @@ class SmoothLight:
         weights and from the interpolated ratio of the cells to their description.
         """
         ratio = np.divide(self.cells, self.described, out=np.ones_like(self.cells), where=self.described > 0)
-        expected = interpolated(ratio, rows, columns) * (self.weights @ features)
+        expected = interpolate_cells(ratio, rows, columns) * (self.weights @ features)
         allowed = np.maximum(self.tolerance, self.noise_share * expected.sum(axis=0))
         light = np.zeros_like(allowed)
         for kinds, each, portion in zip(self.classes, expected, self.portions / walks, strict=True):
-            light += np.where(_quiet(each, portion, allowed), findings.light(kinds).ravel() / walks, each)
+            light += np.where(_is_quiet(each, portion, allowed), findings.light(kinds).ravel() / walks, each)
         return light
 
 
-def estimated(
+def estimate_light(
     findings: FoundLight, walks: np.ndarray, features: np.ndarray, *, tolerance: float, noise_share: float
 ) -> SmoothLight:
     """Estimate the light in cells with ``walks`` (rows, columns) each, described by features (J, rows, columns).
@@ -158,19 +158,19 @@ def estimated(
     portions = np.array(
         [findings.squares(kinds) / found.sum() for kinds, found in zip(classes, each_found, strict=True)]
     )
-    weights = _weights(light, features, exposure)
+    weights = _fit_weights(light, features, exposure)
     each_described = (weights @ features.reshape(len(features), -1)).reshape(light.shape)
     described = each_described.sum(axis=0)
     allowed = np.maximum(tolerance, noise_share * described)
     cells = np.zeros(total.shape, np.float32)
     for found, expected, portion in zip(light, each_described, portions / mean_walks, strict=True):
-        cells += _corrected(found, expected, exposure, portion, allowed)
+        cells += _correct_locally(found, expected, exposure, portion, allowed)
     # Preserve the sum over all walks.
     cells *= light.sum(dtype=float) / max((exposure * cells).sum(dtype=float), float(_TINY))
     return SmoothLight(cells, described, classes, weights, portions, tolerance, noise_share)
 
 
-def _corrected(
+def _correct_locally(
     found: np.ndarray, expected: np.ndarray, exposure: np.ndarray, portion: float, allowed: np.ndarray
 ) -> np.ndarray:
     """Return the light (rows, columns) of one class: as found if its noise is tolerated, else as predicted.
@@ -178,21 +178,21 @@ def _corrected(
     The prediction is corrected locally. ``portion`` is the contribution of one walk of the class to the light at
     exposure 1.
     """
-    accepted = _quiet(expected, portion / exposure, allowed)
+    accepted = _is_quiet(expected, portion / exposure, allowed)
     estimate = np.where(accepted, found / exposure, expected)
     for width in _WIDTHS:
         if accepted.all():
             break
-        nearby = np.maximum(_under_gaussian(exposure * expected, width), _TINY)
+        nearby = np.maximum(_blur(exposure * expected, width), _TINY)
         share = expected / nearby
-        suffices = ~accepted & _quiet(expected, portion * share / (4 * math.pi * width**2), allowed)
+        suffices = ~accepted & _is_quiet(expected, portion * share / (4 * math.pi * width**2), allowed)
         if suffices.any():
-            estimate = np.where(suffices, share * _under_gaussian(found, width), estimate)
+            estimate = np.where(suffices, share * _blur(found, width), estimate)
             accepted |= suffices
     return estimate
 
 
-def _quiet(light: np.ndarray, per_walk: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+def _is_quiet(light: np.ndarray, per_walk: np.ndarray, allowed: np.ndarray) -> np.ndarray:
     """Return the mask of light with tolerated noise and no prominent single walk.
 
     Each walk contributes ``per_walk``. The number of walks is Poisson distributed, so the variance of the light is the
@@ -201,14 +201,14 @@ def _quiet(light: np.ndarray, per_walk: np.ndarray, allowed: np.ndarray) -> np.n
     return (light * per_walk <= np.square(allowed) / _CLASSES_ADD) & (per_walk <= _PORTION * allowed)
 
 
-def _weights(light: np.ndarray, features: np.ndarray, exposure: np.ndarray) -> np.ndarray:
+def _fit_weights(light: np.ndarray, features: np.ndarray, exposure: np.ndarray) -> np.ndarray:
     """Return the feature weights (K, J) with the largest likelihood.
 
     ``light`` (K, rows, columns) is the light of all walks, whose number is proportional to ``exposure`` (rows,
     columns).
     """
     # Blocks of cells suffice for the weights because all features are blurred.
-    counts, seen = _in_blocks(light), _in_blocks(features * exposure)
+    counts, seen = _average_blocks(light), _average_blocks(features * exposure)
     norm = seen.sum(axis=1)
     # The inverse of a smaller number overflows.
     bright = norm >= np.finfo(norm.dtype).tiny
@@ -256,7 +256,7 @@ def _maximise(
             weights[j] = weights[j] * gain[j] if weights[j] * gain[j] >= least[j] else np.float32(0)
 
 
-def _in_blocks(cells: np.ndarray) -> np.ndarray:
+def _average_blocks(cells: np.ndarray) -> np.ndarray:
     """Return means (K, B) over blocks of about 2 x 2 cells (K, rows, columns)."""
     rows, columns = cells.shape[1:]
     size = max(1, columns // 2), max(1, rows // 2)
@@ -264,20 +264,20 @@ def _in_blocks(cells: np.ndarray) -> np.ndarray:
     return np.array(blocks, np.float32).reshape(len(cells), size[0] * size[1])
 
 
-def interpolated(cells: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def interpolate_cells(cells: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Interpolate cells (rows, columns) linearly at positions (P,)."""
     return map_coordinates(cells, [rows, columns], order=1, mode="nearest")
 
 
-def blurred(cells: np.ndarray, sigma: float) -> np.ndarray:
+def blur_cells(cells: np.ndarray, sigma: float) -> np.ndarray:
     """Blur cells (rows, columns) by a Gaussian; a wide one is applied to coarser cells."""
     rows, columns = cells.shape
     coarse = cells.astype(np.float32)
     while sigma > 4 and min(coarse.shape) > 8:
         size = coarse.shape[1] // 2, coarse.shape[0] // 2
         coarse, sigma = cv2.resize(coarse, size, interpolation=cv2.INTER_AREA), 0.5 * sigma
-    return cv2.resize(_under_gaussian(coarse, sigma), (columns, rows), interpolation=cv2.INTER_LINEAR)
+    return cv2.resize(_blur(coarse, sigma), (columns, rows), interpolation=cv2.INTER_LINEAR)
 
 
-def _under_gaussian(cells: np.ndarray, sigma: float) -> np.ndarray:
+def _blur(cells: np.ndarray, sigma: float) -> np.ndarray:
     return cv2.GaussianBlur(cells, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)

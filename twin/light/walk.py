@@ -32,7 +32,7 @@ from twin.backend.arrays import PCG32, Bool, BSDFPtr, Float, Point2f, Point3f, S
 from twin.light.illumination import Light, Passage, SheetLobe
 from twin.light.pose import Rays, SensorPose
 from twin.light.sheet import SheetLight
-from twin.light.water import Scattering, one_minus_cosine, turned
+from twin.light.water import Scattering, one_minus_cosine, rotate_about
 from twin.options import Effects
 from twin.scene.objects import Objects
 
@@ -71,7 +71,7 @@ class _Walks:
     reflected: Bool
     scattered: Bool
 
-    def of(self, kept: UInt32) -> _Walks:
+    def select(self, kept: UInt32) -> _Walks:
         """Return the walks with the given indices."""
         return _Walks(*(dr.gather(type(each), each, kept) for each in vars(self).values()))
 
@@ -97,7 +97,7 @@ class Walker:
         """True if any indirect light is rendered."""
         return self.scatters or self.effects.secondary_light
 
-    def found(self, bundle: Rays, cell: UInt32, *, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    def trace(self, bundle: Rays, cell: UInt32, *, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Trace walks; yield for each group of segments the cells (N,) and two kinds of light (N,).
 
         The first kind was scattered by water, the second only reflected between surfaces. Both include the ray's
@@ -122,7 +122,9 @@ class Walker:
         while True:
             number = dr.opaque(mi.UInt32, (seed * _STEPS + step) % 2**32)
             # Camera rays have a separate kernel, as most of their state is constant.
-            walks, found, alive = self._steps(walks, number, stretches) if step else self._step(walks, number)
+            walks, found, alive = (
+                self._trace_segments(walks, number, stretches) if step else self._trace_segment(walks, number)
+            )
             dr.eval(found, alive, *vars(walks).values())
             # Returned unsummed: parallel sums in Dr.Jit are not reproducible.
             yield walks.cell.numpy(), found.x.numpy(), found.y.numpy()
@@ -134,14 +136,14 @@ class Walker:
                 # Arrays of one entry would compile another kernel: use two halves.
                 kept = mi.UInt32([kept[0], kept[0]])
                 walks.weight *= 0.5
-            walks = walks.of(kept)
+            walks = walks.select(kept)
             stretches = 1 if dr.width(kept) > _FEW else _STEPS - step
 
-    def _steps(self, walks: _Walks, seed: UInt32, stretches: int) -> tuple[_Walks, Point2f, Bool]:
-        """Trace several segments of the walks in one kernel, which does not depend on their number; see `_step`."""
+    def _trace_segments(self, walks: _Walks, seed: UInt32, stretches: int) -> tuple[_Walks, Point2f, Bool]:
+        """Trace several segments of the walks in one kernel, which does not depend on their number."""
 
         def following(walks: _Walks, found: Point2f, alive: Bool, seed: UInt32, left: UInt32):
-            walks, more, alive = self._step(walks, seed)
+            walks, more, alive = self._trace_segment(walks, seed)
             return walks, mi.Point2f(found + more), alive, seed + 1, left - 1
 
         width = dr.width(walks.cell)
@@ -162,7 +164,7 @@ class Walker:
             )
         return walks, found, alive
 
-    def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Point2f, Bool]:
+    def _trace_segment(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Point2f, Bool]:
         """Trace the next segment of all walks; return their new state, both kinds of light, and the live mask."""
         state, sequence = mi.sample_tea_32(seed, walks.number)
         random = cast(Any, mi.PCG32)
@@ -177,7 +179,7 @@ class Walker:
         mirror = dr.select(hit, self.objects.mirror_share(si), 0.0)
 
         from_sheet, from_surfaces = mi.Float(0.0), mi.Float(0.0)
-        passages = [light.passage(o, d, length) for light in self.lights if self.scatters]
+        passages = [light.locate_sheet(o, d, length) for light in self.lights if self.scatters]
         for light, passage in zip(self.lights, passages, strict=False):
             from_sheet += self._scattered_by_sheet(light, passage, o, d, walks.away, rng.next_float32())
         for light in self.lights:
@@ -187,9 +189,9 @@ class Walker:
         in_water, distance, passed = self._free_path(passages, length, hit, rng)
         vertex = mi.Point3f(o + d * distance)
         reflected, scattered_now = cast(Bool, walks.reflected | ~in_water), cast(Bool, walks.scattered | in_water)
-        here = [light.at(vertex) for light in self.lights]
+        here = [light.evaluate(vertex) for light in self.lights]
         towards_laser = [-each.direction for each in here]
-        sheets = [SheetLobe.at(each, self.scattering.over_sine) for each in here]
+        sheets = [SheetLobe.from_light(each, self.scattering.over_sine) for each in here]
         by_water = walks.strength * (from_sheet + dr.select(walks.scattered, from_surfaces, 0.0))
         between_surfaces = walks.strength * dr.select(walks.scattered, 0.0, from_surfaces)
         strength = walks.strength * passed
@@ -220,7 +222,7 @@ class Walker:
         may_connect = alive if self.effects.secondary_light else alive & ~reflected
         for light in self.lights:
             u = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
-            connected = strength * self._connected(light, vertex, scattered, u, may_connect)
+            connected = strength * self._connect(light, vertex, scattered, u, may_connect)
             by_water += dr.select(scattered_now, connected, 0.0)
             between_surfaces += dr.select(scattered_now, 0.0, connected)
 
@@ -240,15 +242,15 @@ class Walker:
                 first += of_laser
                 chosen = (which >= first) & (which < first + of_sheet)
                 first += of_sheet
-                table = table.or_where(about, self.scattering.narrow).or_where(chosen, sheet.angles)
+                table = table.select(about, self.scattering.narrow).select(chosen, sheet.angles)
                 axis = dr.select(about, towards, axis)
                 share = dr.select(chosen, sheet.share_below(u2.x), share)
                 laser |= about
                 by_sheet.append((sheet, chosen))
             heights = table.heights(share)
-            onward = dr.select(in_water | laser, turned(axis, heights, u2.y), onward)
+            onward = dr.select(in_water | laser, rotate_about(axis, heights, u2.y), onward)
             for sheet, chosen in by_sheet:
-                drawn, valid = sheet.at_angles(heights, u2.y)
+                drawn, valid = sheet.rotate_to_angles(heights, u2.y)
                 onward = dr.select(chosen & valid, drawn, onward)
                 strength = dr.select(chosen & ~valid & ~specular, 0.0, strength)
         onward = dr.select(specular, self.pose.object_direction(si.to_world(mi.reflect(si.wi))), onward)
@@ -273,9 +275,9 @@ class Walker:
         self, light: Light, passage: Passage, o: Point3f, d: Vector3f, active: Bool, u: Float
     ) -> Float:
         """Return the radiance that the sheet scatters once into rays, estimated at one position of each."""
-        t, density = passage.pick(u)
+        t, density = passage.sample(u)
         p = mi.Point3f(o + d * t)
-        here = light.at(p)
+        here = light.evaluate(p)
         active = active & (density > 0) & (here.irradiance > 0)
         lit = light.reaches(self.objects.scene, p, here, None, active)
         source = here.irradiance * self.scattering.phase(one_minus_cosine(-here.direction, d))
@@ -286,7 +288,7 @@ class Walker:
         self, light: Light, walks: _Walks, si: SurfaceInteraction3f, bsdf: BSDFPtr, end: Point3f, hit: Bool
     ) -> Float:
         """Return the radiance of the lit surface at the segment's end, with its balance-heuristic weight."""
-        here = light.at(end)
+        here = light.evaluate(end)
         towards = si.to_local(self.pose.direction(-here.direction))
         active = hit & (walks.density > 0) & (here.irradiance > 0)
         if not self.effects.secondary_light:
@@ -299,16 +301,16 @@ class Walker:
         return dr.select(active & (by_walk > 0), radiance * by_walk / (by_walk + by_light), 0.0)
 
     def _light_density(self, light: Light, here: SheetLight, cosine: Float) -> Float:
-        """Return the density per mm2 of the lit points sampled by `_connected`: the fraction of power per area."""
+        """Return the density per mm2 of the lit points sampled by `_connect`: the fraction of power per area."""
         unweakened = here.irradiance * dr.exp(self.scattering.c * here.exit_mm)
         return unweakened * dr.abs(cosine) / light.power_w
 
-    def _connected(self, light: Light, vertex: Point3f, scattered, u: Point3f, active: Bool) -> Float:
+    def _connect(self, light: Light, vertex: Point3f, scattered, u: Point3f, active: Bool) -> Float:
         """Return the light that the vertex receives from a sampled lit point and scatters into the walk.
 
         Lit points are sampled in proportion to power.
         """
-        rays = light.rays(u)
+        rays = light.sample_rays(u)
         ray = self.pose.ray(rays.origin, rays.direction)
         si = self.objects.scene.ray_intersect(ray, active)
         lit = mi.Point3f(rays.origin + rays.direction * si.t)
@@ -323,7 +325,7 @@ class Walker:
         shadow.maxt = distance - 2 * _CLEAR_MM
         active &= (sent * value > 0) & (distance > 2 * _CLEAR_MM)
         active &= ~self.objects.scene.ray_test(shadow, active)
-        here = light.at(lit)
+        here = light.evaluate(lit)
         by_light = self._light_density(light, here, mi.Frame3f.cos_theta(si.wi))
         by_walk = density * dr.abs(mi.Frame3f.cos_theta(local)) / dr.square(distance)
         way = here.exit_mm + distance
@@ -350,7 +352,7 @@ class Walker:
         in_water = choice < likely
         distance = -dr.log(1 - u * share) / fall
         each = _NEAR_SHEET / len(passages)
-        crossings = [passage.nearest() for passage in passages]
+        crossings = [passage.find_nearest() for passage in passages]
         spans = [(dr.log(1 + t / apart), dr.log(1 + (length - t) / apart)) for t, apart in crossings]
         for k, ((t, apart), (before, after)) in enumerate(zip(crossings, spans, strict=True)):
             place = u * (before + after) - before

@@ -48,22 +48,22 @@ def node_angles() -> np.ndarray:
     return 2 * np.arctan(np.exp((FIRST_PLACE + STEP * np.arange(NODES)) / 2))
 
 
-def tabulated(scatterers: Sequence[Scatterer]) -> PhaseTable:
+def tabulate_phase_function(scatterers: Sequence[Scatterer]) -> PhaseTable:
     """Tabulate the phase function of a mixture: normalised phase functions weighted by their scattering coefficients.
 
     Without scatterers, the phase function of molecules is returned; its coefficient is then 0.
     """
     if not scatterers:
-        return _table_of(Molecular())
+        return _make_table(Molecular())
     whole = sum(part.coefficient_per_mm for part in scatterers)
-    tables = [_table_of(part.phase) for part in scatterers]
+    tables = [_make_table(part.phase) for part in scatterers]
     shares = [part.coefficient_per_mm / whole for part in scatterers]
     mixed = sum(share * np.exp(table.log_density) for share, table in zip(shares, tables, strict=True))
     forward = sum(share * table.cumulative[0] for share, table in zip(shares, tables, strict=True))
-    return _normalised(np.log(mixed), forward)
+    return _normalise(np.log(mixed), forward)
 
 
-def _table_of(phase: PhaseFunction) -> PhaseTable:
+def _make_table(phase: PhaseFunction) -> PhaseTable:
     angle = node_angles()
     # p times 2 pi d(1 - cos) / dx = pi (1 - cos) (1 + cos)
     log_density = np.log(phase.per_sr(angle) * math.pi * np.sin(angle) ** 2)
@@ -71,10 +71,10 @@ def _table_of(phase: PhaseFunction) -> PhaseTable:
     if forward is None:
         # The integral of a power of the angle.
         forward = STEP * math.exp(log_density[0]) / (log_density[1] - log_density[0])
-    return _normalised(log_density, forward)
+    return _normalise(log_density, forward)
 
 
-def _normalised(log_density: np.ndarray, forward: float) -> PhaseTable:
+def _normalise(log_density: np.ndarray, forward: float) -> PhaseTable:
     """Normalise a table to the integral 1; ``forward`` is the integral before the first node."""
     slope = np.diff(log_density)
     flat = np.abs(slope) < 1e-12
@@ -101,13 +101,13 @@ class Scattering:
         self.coefficient = medium.scattering_per_mm(wavelength_nm)
         self.extinction = self.absorption + self.coefficient
         self.b, self.c = opaque(self.coefficient), opaque(self.extinction)
-        table = tabulated(medium.scatterers(wavelength_nm))
+        table = tabulate_phase_function(medium.scatterers(wavelength_nm))
         self.backward_share = 1 - float(np.interp(math.pi / 2, node_angles(), table.cumulative))
         sine = np.sin(node_angles())
-        over_sine = _normalised(table.log_density - np.log(sine), float(table.cumulative[0] / sine[0]))
+        over_sine = _normalise(table.log_density - np.log(sine), float(table.cumulative[0] / sine[0]))
         halves = np.log(0.5 * (np.exp(table.log_density) + np.exp(over_sine.log_density)))
-        narrow = _normalised(halves, float(table.cumulative[0] + over_sine.cumulative[0]) / 2)
-        self.angles, self.over_sine, self.narrow = AngleTable.together(table, over_sine, narrow)
+        narrow = _normalise(halves, float(table.cumulative[0] + over_sine.cumulative[0]) / 2)
+        self.angles, self.over_sine, self.narrow = AngleTable.join(table, over_sine, narrow)
 
     def phase(self, one_minus_cosine: Float) -> Float:
         """Return the phase function in 1/sr at 1 - cos of the scattering angle.
@@ -131,7 +131,7 @@ class AngleTable:
     start: UInt32
 
     @classmethod
-    def together(cls, *tables: PhaseTable) -> list[AngleTable]:
+    def join(cls, *tables: PhaseTable) -> list[AngleTable]:
         """Return tables that share the same arrays."""
         log_density = to_jit(mi.Float, np.concatenate([each.log_density for each in tables]))
         cumulative = to_jit(mi.Float, np.concatenate([each.cumulative for each in tables]))
@@ -140,7 +140,7 @@ class AngleTable:
             for k, each in enumerate(tables)
         ]
 
-    def or_where(self, mask: Bool, other: AngleTable) -> AngleTable:
+    def select(self, mask: Bool, other: AngleTable) -> AngleTable:
         """Return this table, replaced by ``other``, which shares its arrays, where ``mask`` is True."""
         forward, start = (dr.select(mask, *pair) for pair in ((other.forward, self.forward), (other.start, self.start)))
         return AngleTable(self.log_density, self.cumulative, forward, start)
@@ -197,7 +197,7 @@ class AngleTable:
         return dr.gather(mi.Float, self.cumulative, self.start + node)
 
 
-def turned(axis: Vector3f, heights: tuple[Float, Float], u: Float) -> Vector3f:
+def rotate_about(axis: Vector3f, heights: tuple[Float, Float], u: Float) -> Vector3f:
     """Return directions at angles from an axis, given by 1 - cos and 1 + cos; the azimuth increases with ``u``."""
     before, after = heights
     sine = dr.sqrt(before * after)

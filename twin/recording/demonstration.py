@@ -77,7 +77,7 @@ def demo(out: str | Path = "runs/demo") -> Path:
                 (folder / "seconds.json").write_text(json.dumps(seconds, indent=2) + "\n", encoding="utf-8")
             start = time.perf_counter()
             # Commands of one stage are independent.
-            for line, ended in workers.completed(_run, _announced([line for _, line in rows])):
+            for line, ended in workers.completed(_run, _announce([line for _, line in rows])):
                 if isinstance(ended, Lost):
                     raise SetupError(f"{line}: {ended.reason}")
                 code, output, complaints = ended
@@ -92,7 +92,7 @@ def demo(out: str | Path = "runs/demo") -> Path:
     return report
 
 
-def _announced(lines: Iterable[str]) -> Iterator[str]:
+def _announce(lines: Iterable[str]) -> Iterator[str]:
     """Yield the commands; print each one when it starts."""
     for line in lines:
         print(f"$ {line}", flush=True)

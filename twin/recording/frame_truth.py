@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import Float, UInt32, to_jit, to_numpy
-from twin.light.image_sampling import places
+from twin.light.image_sampling import find_marked
 from twin.light.pose import SensorPose, Travel
 from twin.light.renderer import Renderer
 from uwlts.model.placement import camera_from_object
@@ -106,19 +106,19 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
         return (at, across) if along_width else (across, at)
 
     def travelled(across: Float, at: Float) -> Float | None:
-        return None if travel is None else travel.at(position(across, at)[1], 0.5)
+        return None if travel is None else travel.compute_times(position(across, at)[1], 0.5)
 
     def distance(across: Float, at: Float) -> Float:
         bundle = renderer.view.bundle(*position(across, at))
         ray = pose.ray(bundle.origin, bundle.direction, travelled(across, at))
         hit = renderer.objects.scene.ray_intersect_preliminary(ray)
-        light = renderer.sheet.at(bundle.origin + bundle.direction * dr.select(hit.is_valid(), hit.t, 1.0))
+        light = renderer.sheet.evaluate(bundle.origin + bundle.direction * dr.select(hit.is_valid(), hit.t, 1.0))
         return dr.select(hit.is_valid() & (bundle.weight > 0), light.distance_mm, dr.nan)
 
     # Adjacent pixels across the stripe share an edge.
     marked = np.zeros((camera.lines(), (camera.height_px if along_width else camera.width_px) + 1), bool)
     marked[line, cell] = marked[line, cell + 1] = True
-    edge_line, edge = places(marked)
+    edge_line, edge = find_marked(marked)
     edges = np.empty(marked.shape, np.float32)
     edges[edge_line, edge] = distance(to_jit(mi.Float, edge - 0.5), to_jit(mi.Float, edge_line)).numpy()
     below, above = edges[line, cell], edges[line, cell + 1]
@@ -150,7 +150,7 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
     dr.eval(centre)
     bundle = renderer.view.bundle(*position(centre, at))
     brightness, seen = renderer.laser(pose, bundle, travelled(centre, at))
-    si, offset = seen.si, dr.select(seen.valid, renderer.sheet.at(seen.end()).distance_mm, dr.nan)
+    si, offset = seen.si, dr.select(seen.valid, renderer.sheet.evaluate(seen.end()).distance_mm, dr.nan)
     thing = renderer.objects.number(si.shape, seen.valid)
     dr.eval(centre, brightness, si.p, si.n, offset, thing)
     good = np.abs(offset.numpy()) < _TOLERANCE_MM

@@ -15,7 +15,7 @@ from twin.scene.finish import shift_points
 from twin.scene.motion import Light, Shot
 from twin.scene.platforms import Platform
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
-from twin.sensor.flaws import as_built, delivered, dirt, laser_shares, veiled, vignette
+from twin.sensor.flaws import add_glare, as_built, deliver_image, dirt, laser_shares, vignette
 from twin.sensor.peak_finder import INVALID, PeakFinder
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.errors import DesignError
@@ -231,9 +231,9 @@ class Studio:
         self, even: np.ndarray, laser: LaserFrame | None, shot: Shot, *, speckle: bool = True
     ) -> np.ndarray:
         """Return the mean photo-electrons per ms (H, W) of the light from `_light`, with speckle if it is enabled."""
-        light = self._through_lens(even)
+        light = self._apply_lens(even)
         if laser is not None:
-            seen = self._through_lens(self._speckled(laser, shot) if speckle else laser.irradiance())
+            seen = self._apply_lens(self._add_speckle(laser, shot) if speckle else laser.irradiance())
             light = light + (seen if self._laser_shares is None else self._laser_shares * seen)
         return self._to_electrons(light)
 
@@ -245,12 +245,12 @@ class Studio:
         """Return whether the laser or the lamp is on in a shot."""
         return shot.light == light or (self.options.flaws.lamp_and_laser and shot.light != "day")
 
-    def _through_lens(self, irradiance: np.ndarray) -> np.ndarray:
+    def _apply_lens(self, irradiance: np.ndarray) -> np.ndarray:
         """Return the irradiance (H, W) behind the lens, with vignetting and glare."""
         passed, glare = irradiance if self._passed is None else irradiance * self._passed, self.options.flaws.glare
-        return veiled(passed, glare) if glare else passed
+        return add_glare(passed, glare) if glare else passed
 
-    def _speckled(self, frame: LaserFrame, shot: Shot) -> np.ndarray:
+    def _add_speckle(self, frame: LaserFrame, shot: Shot) -> np.ndarray:
         """Return the irradiance (H, W) of the laser in W/mm2, with speckle."""
         if not self.options.effects.speckle:
             return frame.irradiance()
@@ -288,7 +288,7 @@ class Studio:
             pose = course.reported[number]
             covariance = None if course.covariance is None else course.covariance[number]
         return Frame(
-            self._seen(light, shot, index),
+            self._observe(light, shot, index),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
             exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
@@ -298,9 +298,9 @@ class Studio:
             speed_mm_per_s=self.speed_mm_per_s(),
         )
 
-    def _seen(self, light: ShotLight, shot: Shot, index: int) -> Seen:
+    def _observe(self, light: ShotLight, shot: Shot, index: int) -> Seen:
         """Return the image of a shot, or the centre line that a 3D camera finds in it."""
-        image = self._image_of(light, shot, index)
+        image = self._render_image(light, shot, index)
         if self.peak_finder is None or shot.light != "laser":
             return image
         camera = self.sensor.camera
@@ -310,11 +310,11 @@ class Studio:
 
     def image(self, shot: Shot, index: int) -> np.ndarray:
         """Return the grey values (H, W) of a shot; noise depends only on seed, position and index."""
-        return self._image_of(self.light(shot, index), shot, index)
+        return self._render_image(self.light(shot, index), shot, index)
 
-    def _image_of(self, light: ShotLight, shot: Shot, index: int) -> np.ndarray:
+    def _render_image(self, light: ShotLight, shot: Shot, index: int) -> np.ndarray:
         electrons_per_ms = self._electrons_per_ms(*light, shot)
-        return self._taken(electrons_per_ms, index, exposure_ms=self.exposure_ms[shot.light] * shot.exposure)
+        return self._expose(electrons_per_ms, index, exposure_ms=self.exposure_ms[shot.light] * shot.exposure)
 
     def exposed(self, shot: Shot, index: int, *, exposure: float = 1.0) -> Exposed:
         """Return the image of a shot as `image` does, with its light; ``exposure`` multiplies the exposure time."""
@@ -325,12 +325,12 @@ class Studio:
         if laser is not None:
             parts = [laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles]
         shares = 1.0 if self._laser_shares is None else self._laser_shares
-        parts = [shares * self._through_lens(part) if part.any() else nothing for part in parts]
-        parts = [exposure_ms * self._to_electrons(part) for part in (*parts, self._through_lens(even))]
-        image = self._taken(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)
+        parts = [shares * self._apply_lens(part) if part.any() else nothing for part in parts]
+        parts = [exposure_ms * self._to_electrons(part) for part in (*parts, self._apply_lens(even))]
+        image = self._expose(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)
         return Exposed(image, exposure_ms, *(np.maximum(part, 0, dtype=np.float32) for part in parts))
 
-    def _taken(self, electrons_per_ms: np.ndarray, index: int, *, exposure_ms: float) -> np.ndarray:
+    def _expose(self, electrons_per_ms: np.ndarray, index: int, *, exposure_ms: float) -> np.ndarray:
         noise_seed = [self.options.seed, index]
         return self.detected(exposure_ms * electrons_per_ms, exposure_ms=exposure_ms, noise_seed=noise_seed)
 
@@ -338,7 +338,7 @@ class Studio:
         """Return grey values (H, W) for mean photo-electrons (H, W), with seeded noise if noise is enabled."""
         rng = np.random.default_rng(noise_seed) if self.options.effects.noise else None
         image = grey_values(electrons, self.sensor.detector, exposure_ms=exposure_ms, rng=rng, pattern=self._pattern)
-        return delivered(image, self.options.flaws)
+        return deliver_image(image, self.options.flaws)
 
     def truth(self, shot: Shot) -> FrameTruth:
         """Return the ground truth of every profile line of a shot."""

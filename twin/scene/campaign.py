@@ -108,7 +108,7 @@ def takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
 
     DescriptionError if a scene, placement or sensor is unknown, or two recordings have the same name.
     """
-    drawn = _Drawn(campaign, seed)
+    drawn = _SampledImperfections(campaign, seed)
     found = [
         _take(recording, place, medium, drawn, every=every)
         for recording in campaign.recordings
@@ -121,7 +121,9 @@ def takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
     return found
 
 
-def _take(recording: CampaignRecording, place: str | None, medium: str | None, drawn: "_Drawn", *, every: int) -> Take:
+def _take(
+    recording: CampaignRecording, place: str | None, medium: str | None, drawn: "_SampledImperfections", *, every: int
+) -> Take:
     motion = load_scene(recording.scene, placement=place, medium=medium).motion.model_dump() | recording.motion
     scene = load_scene(recording.scene, placement=place, medium=medium, motion=motion)
     name = recording.name or f"{Path(recording.scene).stem}-{scene.placement}-{scene.medium}"
@@ -136,8 +138,8 @@ def _take(recording: CampaignRecording, place: str | None, medium: str | None, d
         scene = _with_motion(scene, step_mm=stage.step_mm * every, count=-(-stage.count // every))
     rng = np.random.default_rng([drawn.seed, *name.encode()])
     if not recording.as_described:
-        scene = drawn.as_it_really_is(scene, rng)
-        built = drawn.with_true_water(built, calibrating=scene.target is not None or _shows_step(scene))
+        scene = drawn.apply_imperfections(scene, rng)
+        built = drawn.set_true_water(built, calibrating=scene.target is not None or _shows_step(scene))
     return Take(name, scene, sensor, built, int(rng.integers(2**31)))
 
 
@@ -146,7 +148,7 @@ def _with_motion(scene: Scene, **changes: object) -> Scene:
     return scene.model_copy(update={"motion": motion})
 
 
-class _Drawn:
+class _SampledImperfections:
     """Imperfections of one campaign, drawn from their distributions."""
 
     def __init__(self, campaign: Campaign, seed: int):
@@ -169,13 +171,13 @@ class _Drawn:
         }
         self._lower_step = size.step_height_half_width_mm * rng.uniform(-1, 1)
 
-    def with_true_water(self, sensor: Sensor, *, calibrating: bool) -> Sensor:
+    def set_true_water(self, sensor: Sensor, *, calibrating: bool) -> Sensor:
         """Return the sensor in water of the true temperature."""
         warmer = self._warmer_calibrating if calibrating else self._warmer_measuring
         media = {key: each if each.kind == "air" else each.warmer_by(warmer) for key, each in sensor.media.items()}
         return altered(sensor, media=media)
 
-    def as_it_really_is(self, scene: Scene, rng: np.random.Generator) -> Scene:
+    def apply_imperfections(self, scene: Scene, rng: np.random.Generator) -> Scene:
         """Return the scene with the errors of target, step and stage; ``rng`` draws the errors of this recording."""
         size, motion, objects = self._size, scene.motion, list(scene.objects)
         for number, thing in enumerate(objects):
@@ -184,7 +186,7 @@ class _Drawn:
                 turned = np.array(thing.rotation_deg) + (*tilt, 0.0)
                 objects[number] = altered(thing, **self._target, rotation_deg=tuple(turned.tolist()))
         if self._lower_step != 0 and _shows_step(scene):
-            number = _lower_block(scene)
+            number = _find_lower_block(scene)
             x, y, z = objects[number].position_mm
             objects[number] = altered(objects[number], position_mm=(x, y, z + self._lower_step))
         scene = altered(scene, objects=tuple(objects))
@@ -199,7 +201,7 @@ class _Drawn:
             angles = size.stage_misalignment_std_deg * rng.standard_normal(2)
         return _with_motion(
             scene,
-            direction=_turned_slightly(motion.unit_direction(), angles),
+            direction=_tilt_direction(motion.unit_direction(), angles),
             nominal_direction=motion.recorded_direction(),
             position_errors_mm=tuple(errors.tolist()),
         )
@@ -210,7 +212,7 @@ def _shows_step(scene: Scene) -> bool:
     return (scene.artefact or {}).get("kind") == "step"
 
 
-def _lower_block(scene: Scene) -> int:
+def _find_lower_block(scene: Scene) -> int:
     """Return the index of the block whose front face is farthest from the sensor.
 
     DescriptionError if there are fewer than two blocks.
@@ -228,7 +230,7 @@ def _lower_block(scene: Scene) -> int:
     return max(blocks, key=lambda number: blocks[number])
 
 
-def _turned_slightly(direction: np.ndarray, angles_deg: np.ndarray) -> tuple[float, float, float]:
+def _tilt_direction(direction: np.ndarray, angles_deg: np.ndarray) -> tuple[float, float, float]:
     """Return a unit direction (3,) rotated by two small angles about two axes perpendicular to it."""
     least = np.eye(3)[np.argmin(np.abs(direction))]
     first = np.cross(direction, least)

@@ -16,7 +16,7 @@ from pydantic import BeforeValidator, Discriminator, Field, SerializeAsAny, Tag,
 from twin.scene.forms import AnyForm
 from twin.scene.guide_and_table import LinearGuide, RotaryTable
 from twin.scene.motion import Motion
-from twin.scene.placed import Flat, Placed, Pose, Reflectance
+from twin.scene.placed import FlatObject, Pose, Reflectance, SceneObject
 from twin.scene.platforms import IdealPath, Platform
 from twin.scene.robot import Robot
 from twin.scene.vehicle import Vehicle
@@ -41,14 +41,14 @@ def altered(described: Kind, **changes: object) -> Kind:
     )
 
 
-class Sphere(Placed):
+class Sphere(SceneObject):
     """A sphere centred at its own origin."""
 
     kind: Literal["sphere"]
     diameter_mm: Positive
 
 
-class Plate(Flat):
+class Plate(FlatObject):
     """A flat rectangle in its own x-y plane, facing -z (towards the sensor)."""
 
     kind: Literal["plate"]
@@ -56,14 +56,14 @@ class Plate(Flat):
     height_mm: Positive
 
 
-class Block(Flat):
+class Block(FlatObject):
     """A box centred at its own origin."""
 
     kind: Literal["block"]
     size_mm: tuple[Positive, Positive, Positive]
 
 
-class Pipe(Placed):
+class Pipe(SceneObject):
     """The outer surface of a pipe along its own x axis, centred at its origin."""
 
     kind: Literal["pipe"]
@@ -71,7 +71,7 @@ class Pipe(Placed):
     length_mm: Positive
 
 
-class Mesh(Placed):
+class Mesh(SceneObject):
     """A surface from a file in a format that trimesh reads, in mm; a relative path starts at the scene's folder."""
 
     kind: Literal["mesh"]
@@ -79,7 +79,7 @@ class Mesh(Placed):
     scale: Positive = 1.0
 
 
-class Printed(Placed, ABC):
+class Printed(SceneObject, ABC):
     """Base of calibration targets on a flat plate that faces -z; its own frame is the target's.
 
     A real target differs from its description: each point (circle or corner) has an error of ``centre_std_mm`` along x
@@ -107,7 +107,7 @@ class Printed(Placed, ABC):
     def ink_and_gap_reflectance(self) -> tuple[float, float]:
         """Return the reflectance of printed patches with ink and of patches without."""
 
-    def dimmed(self, scale: float) -> Self:
+    def scale_reflectance(self, scale: float) -> Self:
         """Return the plate with all reflectances multiplied by ``scale``."""
         names = [name for name in type(self).model_fields if name.endswith("reflectance")]
         return self.model_copy(update={name: scale * getattr(self, name) for name in names})

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, to_jit
-from twin.scene.description import AnyObject, Flat, Placed, Printed
+from twin.scene.description import AnyObject, FlatObject, Printed, SceneObject
 from uwlts.errors import DescriptionError, ImageError
 from uwlts.model.media import check_range
 from uwlts.storage.image_file import read_image
@@ -62,7 +62,7 @@ def iron_index(*, wavelength_nm: float) -> complex:
     return complex(np.interp(wavelength_nm, wavelength, n), np.interp(wavelength_nm, wavelength, k))
 
 
-def finish_bsdf(thing: Placed, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> mi.BSDF:
+def finish_bsdf(thing: SceneObject, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> mi.BSDF:
     """Return the BSDF of an object in a medium, without its mirror reflection.
 
     Without ``gloss`` all surfaces are diffuse: a body without its coat, and a metal with the reflectance |(m - 1) / (m
@@ -70,7 +70,7 @@ def finish_bsdf(thing: Placed, *, medium_index: float, wavelength_nm: float, glo
     or has values outside 0 to 1; RangeError if the wavelength is outside the table of iron.
     """
     if gloss and thing.finish != "diffuse":
-        return _glossy(thing, _reflectance(thing), medium_index=medium_index, wavelength_nm=wavelength_nm)
+        return _make_glossy(thing, _reflectance(thing), medium_index=medium_index, wavelength_nm=wavelength_nm)
     scale = 1.0
     if thing.finish == "metal":
         index = iron_index(wavelength_nm=wavelength_nm) / medium_index
@@ -78,7 +78,9 @@ def finish_bsdf(thing: Placed, *, medium_index: float, wavelength_nm: float, glo
     return mi.load_dict({"type": "diffuse", "reflectance": _reflectance(thing, scale)})
 
 
-def _glossy(thing: Placed, reflectance: float | mi.Texture, *, medium_index: float, wavelength_nm: float) -> mi.BSDF:
+def _make_glossy(
+    thing: SceneObject, reflectance: float | mi.Texture, *, medium_index: float, wavelength_nm: float
+) -> mi.BSDF:
     """Return the BSDF of a metal or coated body; indices are relative to the surrounding medium."""
     rough = {"distribution": "ggx", "alpha": thing.gloss_alpha()}
     if thing.finish == "metal":
@@ -89,16 +91,16 @@ def _glossy(thing: Placed, reflectance: float | mi.Texture, *, medium_index: flo
     return mi.load_dict(coat | rough | {"diffuse_reflectance": reflectance})
 
 
-def _reflectance(thing: Placed, scale: float = 1.0) -> float | mi.Texture:
+def _reflectance(thing: SceneObject, scale: float = 1.0) -> float | mi.Texture:
     """Return the reflectance of an object, a number or a texture, multiplied by ``scale``."""
     if isinstance(thing, Printed):
-        return pattern_texture(thing.dimmed(scale))
+        return pattern_texture(thing.scale_reflectance(scale))
     if thing.texture is None:
         return scale * thing.reflectance
     # Texture coordinate v starts at the last row of the picture, but Mitsuba's rows start at the first.
     grey = scale * thing.reflectance * read_grey(thing.texture)[::-1]
     picture = mi.Bitmap(np.ascontiguousarray(grey[..., None], dtype=np.float32))
-    wrap_mode = "clamp" if isinstance(thing, Flat) else "repeat"
+    wrap_mode = "clamp" if isinstance(thing, FlatObject) else "repeat"
     return mi.load_dict({"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": wrap_mode})
 
 
@@ -135,21 +137,23 @@ def directional_albedo(bsdf: mi.BSDF, cosines: np.ndarray, *, samples: int = 409
 
 
 def albedo_parts(
-    thing: Placed, cosines: np.ndarray, *, medium_index: float, wavelength_nm: float
+    thing: SceneObject, cosines: np.ndarray, *, medium_index: float, wavelength_nm: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the directional albedo (N,) of a glossy finish over a black body, and its increase per unit reflectance.
 
     The albedo of coated bodies and of metals is linear in ``reflectance``, so the two parts apply to textures too.
     """
-    black, white = (_glossy(thing, grey, medium_index=medium_index, wavelength_nm=wavelength_nm) for grey in (0.0, 1.0))
+    black, white = (
+        _make_glossy(thing, grey, medium_index=medium_index, wavelength_nm=wavelength_nm) for grey in (0.0, 1.0)
+    )
     # For a metal, without diffuse reflectance, Mitsuba returns pi times its BSDF at normal incidence.
-    square = square_on(dr.zeros(mi.SurfaceInteraction3f))
+    square = view_along_normal(dr.zeros(mi.SurfaceInteraction3f))
     unit = float(cast(Float, white.eval_diffuse_reflectance(square))[0][0])
     without = directional_albedo(black, cosines)
     return without, (directional_albedo(white, cosines) - without) / unit
 
 
-def square_on(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+def view_along_normal(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
     """Return the same surface points viewed along their normals from outside."""
     straight = mi.SurfaceInteraction3f(si)
     straight.wi = mi.Vector3f(0.0, 0.0, 1.0)
@@ -179,7 +183,7 @@ def register_pattern() -> None:
             self.points_end = target.indices.max(axis=0).tolist()
             corner, beside = target.points_at(np.array([(0, 0), (1, 1)]))[:, :2]
             self.corner_point, self.spacing = corner.tolist(), (beside - corner).tolist()
-            self.shift_mm = to_jit(mi.Float, printed_shifts(self.plate).ravel())
+            self.shift_mm = to_jit(mi.Float, draw_print_errors(self.plate).ravel())
             patches = _patch_table(self.plate)
             lists, self.cell_mm = _patches_by_cell(patches, first, last)
             self.rows, self.columns, self.depth = lists.shape
@@ -271,7 +275,7 @@ def _patches_by_cell(patches: np.ndarray, first: np.ndarray, last: np.ndarray) -
     return lists.reshape(rows, columns, -1), cell_mm
 
 
-def printed_shifts(plate: Printed) -> np.ndarray:
+def draw_print_errors(plate: Printed) -> np.ndarray:
     """Return the print errors (rows, columns, 2) in mm of a target's points along x and y."""
     return plate.centre_std_mm * _standard_normal(plate, 0)
 
@@ -281,7 +285,7 @@ def shift_points(scene: mi.Scene, plate: Printed, *, mm_per_px: float, image: in
     noise = mm_per_px * plate.detection_std_px * _standard_normal(plate, 1, image)
     parameters = mi.traverse(scene)
     (key,) = (key for key in dict(parameters) if key.endswith(_SHIFT))
-    parameters[key] = to_jit(mi.Float, (printed_shifts(plate) + noise).ravel())
+    parameters[key] = to_jit(mi.Float, (draw_print_errors(plate) + noise).ravel())
     parameters.update()
 
 

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
 from twin.scene.placed import Pose
-from twin.scene.platforms import SPOT_MM, Carried, Platform, Route, displaced
+from twin.scene.platforms import SPOT_MM, Platform, PlatformMotion, Route, displace_poses
 from uwlts.model.sensor import NotNegative, Positive
 
 
@@ -39,7 +39,7 @@ class LinearGuide(Route):
             raise ValueError("a linear guide needs two or more waypoints; the last must differ from the first")
         return self
 
-    def carried(self, rng: np.random.Generator) -> Carried:
+    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
         commanded = self.commanded()
         first, last = (self.waypoints[end].matrix()[:3, 3] for end in (0, -1))
         travel = float(np.linalg.norm(last - first))
@@ -54,9 +54,9 @@ class LinearGuide(Route):
             along = (poses[:, :3, 3] - begun) @ guide[:, 0]
             errors = np.stack([bend(along / travel) for bend in bends], axis=1)
             errors[:, 0] += 1e-3 * self.periodic_um * np.sin(2 * np.pi * along / self.pitch_mm + phase)
-            return displaced(poses, np.hstack([errors[:, :3] @ guide.T, errors[:, 3:] @ guide.T]))
+            return displace_poses(poses, np.hstack([errors[:, :3] @ guide.T, errors[:, 3:] @ guide.T]))
 
-        return Carried(true, commanded)
+        return PlatformMotion(true, commanded)
 
 
 class RotaryTable(Platform):
@@ -100,7 +100,7 @@ class RotaryTable(Platform):
     def places(self) -> int:
         return self.count
 
-    def carried(self, rng: np.random.Generator) -> Carried:
+    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
         nominal, true_axis = self.axis.matrix(), (self.true_axis or self.axis).matrix()
         sizes = np.array([self.radial_um, self.radial_um, self.axial_um]) * 1e-3
         tilt, scale = np.radians(self.tilt_arcsec / 3600), np.radians(self.angle_arcsec / 3600)
@@ -129,7 +129,7 @@ class RotaryTable(Platform):
             waves = np.sin(by[:, None, None] * (1, 2) + phases) @ (1, 1 / 3)
             return turned(true_axis, by, waves * (*sizes, tilt, tilt, scale))
 
-        return Carried(true, lambda times: turned(nominal, angle(times), None))
+        return PlatformMotion(true, lambda times: turned(nominal, angle(times), None))
 
 
 def _axes(along: np.ndarray) -> np.ndarray:

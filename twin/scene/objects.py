@@ -13,7 +13,7 @@ import trimesh
 
 from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
 from twin.scene.description import AnyObject, Block, CirclePlate, Mesh, Pipe, Plate, Scene, Sphere, TargetPlate
-from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, square_on
+from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, view_along_normal
 from twin.scene.forms.triangles import bowed_plate
 from twin.scene.placed import FreeForm
 from uwlts.errors import DescriptionError
@@ -82,7 +82,7 @@ class Objects:
         diffuse surface; for glossy surfaces it depends on direction. It is 0 on the back of one-sided surfaces.
         """
         active = active & si.is_valid() & ((si.wi.z > 0) | (self._fact("two_sided", si) > 0))
-        reflectance = si.bsdf().eval_diffuse_reflectance(square_on(si), active)[0]
+        reflectance = si.bsdf().eval_diffuse_reflectance(view_along_normal(si), active)[0]
         if not self.glossy:
             return dr.select(active, reflectance, 0.0)
         last = len(_ALBEDO_COSINES) - 1

@@ -34,7 +34,7 @@ class Pose(Description):
         return transform
 
 
-class Placed(Pose):
+class SceneObject(Pose):
     """Base of all objects: a pose and a finish.
 
     ``finish`` selects the reflection model: "diffuse" is Lambertian; "painted" and "pvc" are a diffuse body under a
@@ -79,7 +79,7 @@ class Placed(Pose):
         return 1.0 if self.finish == "metal" or self.mirror_share() > 0 else 0.0
 
 
-class Flat(Placed):
+class FlatObject(SceneObject):
     """Base of objects with flat faces, which may be mirrors.
 
     ``mirror`` is the specular reflectance of the faces, in addition to scattering. A small ``reflectance`` causes the
@@ -89,7 +89,7 @@ class Flat(Placed):
     mirror: Reflectance = 0.0
 
     @model_validator(mode="after")
-    def _reflects_at_most_all(self) -> "Flat":
+    def _reflects_at_most_all(self) -> "FlatObject":
         if self.reflectance + self.mirror > 1:
             both = f"reflectance {self.reflectance:g} and mirror {self.mirror:g}"
             raise ValueError(f"{both} add up to more than 1: reduce one of them")
@@ -98,7 +98,7 @@ class Flat(Placed):
         return self
 
 
-class FreeForm(Placed, ABC):
+class FreeForm(SceneObject, ABC):
     """Base of free-form surfaces given by closed-form equations. They have no uv coordinates for a texture.
 
     Each class is a module of `twin.scene.forms`, with its description, formula and triangles.
@@ -113,11 +113,11 @@ class FreeForm(Placed, ABC):
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the arrays of `triangles`, cached and read-only."""
         # Frozen models are hashable, which type checkers do not see.
-        return _kept(cast(Hashable, self))
+        return _cache_triangles(cast(Hashable, self))
 
 
 @lru_cache(maxsize=4)
-def _kept(form: FreeForm) -> tuple[np.ndarray, np.ndarray]:
+def _cache_triangles(form: FreeForm) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = form.triangles()
     vertices.flags.writeable = faces.flags.writeable = False
     return vertices, faces

@@ -60,7 +60,7 @@ class Course:
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class PlatformMotion:
     """Motion of a platform: true poses, reported poses, and covariances (N, 6, 6) if it states them."""
 
     true: Poses
@@ -107,7 +107,7 @@ class Platform(Description, ABC):
         """Return the number of image positions."""
 
     @abstractmethod
-    def carried(self, rng: np.random.Generator) -> Carried:
+    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
         """Return the motion of the platform, with errors drawn from a generator."""
 
     @model_validator(mode="after")
@@ -142,9 +142,9 @@ class Platform(Description, ABC):
         # Frozen descriptions are hashable.
         return _course(self)  # pyright: ignore[reportArgumentType]
 
-    def _drawn(self) -> Course:
+    def _draw_course(self) -> Course:
         rng = np.random.default_rng(self.errors_seed)
-        carried, mount = self.carried(rng), (self.true_mount or self.mount).matrix()
+        motion, mount = self.draw_motion(rng), (self.true_mount or self.mount).matrix()
         period_s = self.stop_s if self.frame_rate_hz is None else 1 / self.frame_rate_hz
         kinds: list[tuple[Light, float]]
         kinds = [(light, each) for light in self.lights for each in (self.bracket if light == "laser" else (1.0,))]
@@ -152,34 +152,34 @@ class Platform(Description, ABC):
         times = period_s / len(kinds) * (np.arange(self.images()) + (0.5 if self.stops else 0.0))
 
         def sensor(at_s: np.ndarray) -> np.ndarray:
-            return carried.true(at_s) @ mount
+            return motion.true(at_s) @ mount
 
-        way = _way_mm(sensor(times))
+        way = _path_lengths_mm(sensor(times))
         shots = tuple(
             Shot(stage_mm=0.0, travelled_mm=float(way[number]), light=light, exposure=exposure, time_s=float(time))
             for number, time in enumerate(times)
             for light, exposure in [kinds[number % len(kinds)]]
         )
         # Images are stored with the pose reported at the same reading of both clocks, despite their offset.
-        reported, covariance = self._said(carried, times - self.clock_offset_s, rng)
+        reported, covariance = self._report_poses(motion, times - self.clock_offset_s, rng)
         report = None
         if not self.stops:
             own = np.arange(-LEAD_S, times[-1] + LEAD_S, 1 / self.report_hz)
-            report = (own + self.clock_offset_s, *self._said(carried, own, rng))
+            report = (own + self.clock_offset_s, *self._report_poses(motion, own, rng))
         return Course(shots, sensor, reported, covariance, report)
 
-    def _said(
-        self, carried: Carried, times: np.ndarray, rng: np.random.Generator
+    def _report_poses(
+        self, motion: PlatformMotion, times: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray | None]:
         """Return the poses that the platform reports at times of the camera's clock, and their covariances."""
         turn_std = np.radians(self.rotation_std_deg)
         shifts = self.position_std_mm * rng.standard_normal((len(times), 3))
         turns = turn_std * rng.standard_normal((len(times), 3))
-        poses = displaced(carried.reported(times), np.hstack([shifts, turns]))
+        poses = displace_poses(motion.reported(times), np.hstack([shifts, turns]))
         if not self.states_covariance:
             return poses, None
         white = np.diag([self.position_std_mm**2] * 3 + [turn_std**2] * 3)
-        drift = np.zeros((len(times), 6, 6)) if carried.covariance is None else carried.covariance(times)
+        drift = np.zeros((len(times), 6, 6)) if motion.covariance is None else motion.covariance(times)
         return poses, drift + white
 
 
@@ -233,9 +233,9 @@ class IdealPath(Route):
 
     kind: Literal["path"]
 
-    def carried(self, rng: np.random.Generator) -> Carried:
+    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
         commanded = self.commanded()
-        return Carried(commanded, commanded)
+        return PlatformMotion(commanded, commanded)
 
 
 # Cached outside the descriptions, whose comparison would fail with array fields.
@@ -257,7 +257,7 @@ def _knots(route: Route) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=8)
 def _course(platform: Platform) -> Course:
-    return platform._drawn()
+    return platform._draw_course()
 
 
 # --- geometry -------------------------------------------------------------------------------------------------------
@@ -266,7 +266,7 @@ def _course(platform: Platform) -> Course:
 def _path(times: np.ndarray, poses: np.ndarray, *, stops: bool) -> Poses:
     """Interpolate poses (K, 4, 4) at times (K,): stepwise at stops, else by splines with linear extrapolation."""
     if stops or len(times) == 1:
-        return lambda wanted: poses[stop_at(times, wanted)]
+        return lambda wanted: poses[find_stop(times, wanted)]
     # Akima interpolation does not overshoot at tight turns, as cubic splines do.
     positions = Akima1DInterpolator(times, poses[:, :3, 3], method="makima")
     velocities = positions.derivative()
@@ -283,7 +283,7 @@ def _path(times: np.ndarray, poses: np.ndarray, *, stops: bool) -> Poses:
     return at
 
 
-def displaced(poses: np.ndarray, errors: np.ndarray) -> np.ndarray:
+def displace_poses(poses: np.ndarray, errors: np.ndarray) -> np.ndarray:
     """Return poses (N, 4, 4) with errors (N, 6): a translation, and a rotation in rad about their position.
 
     Both are in scene axes.
@@ -294,17 +294,17 @@ def displaced(poses: np.ndarray, errors: np.ndarray) -> np.ndarray:
     return moved
 
 
-def interpolated(times: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def interpolate_values(times: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Return values (N, K), interpolated linearly from values (T, K) at times."""
     return np.stack([np.interp(wanted, times, column) for column in values.T], axis=1)
 
 
-def stop_at(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def find_stop(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Return the index of the stop at times."""
     return np.clip(np.searchsorted(times, np.asarray(wanted) + 1e-9, side="right") - 1, 0, len(times) - 1)
 
 
-def _way_mm(poses: np.ndarray) -> np.ndarray:
+def _path_lengths_mm(poses: np.ndarray) -> np.ndarray:
     """Return the path length (N,) of the sensor's origin at each pose."""
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     return np.append(0.0, np.cumsum(steps))

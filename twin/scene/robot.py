@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from twin.scene.placed import Pose
-from twin.scene.platforms import LEAD_S, Carried, Route, interpolated, stop_at
+from twin.scene.platforms import LEAD_S, PlatformMotion, Route, find_stop, interpolate_values
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import NotNegative, Positive, Vector
 
@@ -47,7 +47,7 @@ class Robot(Route):
     gear_ratio: Positive = 101.0
     link_std_mm: NotNegative = 0.0
 
-    def carried(self, rng: np.random.Generator) -> Carried:
+    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
         times = self._knots[0]
         if not self.stops:
             times = np.linspace(-LEAD_S, times[-1] + LEAD_S, 2 + int((times[-1] + 2 * LEAD_S) / _ARC_S))
@@ -63,8 +63,8 @@ class Robot(Route):
 
         def over_time(at: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
             if self.stops:
-                return values[stop_at(at, wanted)]
-            return interpolated(at, values, wanted)
+                return values[find_stop(at, wanted)]
+            return interpolate_values(at, values, wanted)
 
         smooth = None if self.stops else CubicSpline(times, angles)
 
@@ -76,7 +76,7 @@ class Robot(Route):
             errors = zero + over_time(self._knots[0], repeat, wanted) + gear * np.sin(2 * self.gear_ratio * at + phases)
             return base @ _flange(at + errors, wrong)
 
-        return Carried(true, lambda wanted: base @ _flange(joints(wanted), links))
+        return PlatformMotion(true, lambda wanted: base @ _flange(joints(wanted), links))
 
 
 def _flange(angles: np.ndarray, links: np.ndarray) -> np.ndarray:

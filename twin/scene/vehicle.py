@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from pydantic import model_validator
 
-from twin.scene.platforms import LEAD_S, Carried, Route, displaced, interpolated
+from twin.scene.platforms import LEAD_S, PlatformMotion, Route, displace_poses, interpolate_values
 from uwlts.model.sensor import Description, NotNegative, Positive
 
 _GRAVITY = 9.81
@@ -35,7 +35,7 @@ class Sea(Description):
     tilt_deg: NotNegative = 0.0
 
 
-def waves_of(sea: Sea, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+def sample_waves(sea: Sea, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function from times (N,) in s to displacements in mm and rotations in rad, (N, 6) in the scene.
 
     Pierson-Moskowitz spectrum for the significant height H (Fossen, section 8.2.1), with the peak at w0 = 0.4 sqrt(g /
@@ -102,15 +102,15 @@ class Drift:
 
     def errors(self, times_s: np.ndarray) -> np.ndarray:
         """Return linearly interpolated errors (N, 6)."""
-        return interpolated(self.times_s, self.values, times_s)
+        return interpolate_values(self.times_s, self.values, times_s)
 
     def covariance(self, times_s: np.ndarray) -> np.ndarray:
         """Return the covariances (N, 6, 6) stated by the navigation."""
         flat = self.covariances.reshape(len(self.times_s), -1)
-        return interpolated(self.times_s, flat, times_s).reshape(-1, 6, 6)
+        return interpolate_values(self.times_s, flat, times_s).reshape(-1, 6, 6)
 
 
-def drift_of(
+def simulate_drift(
     navigation: Navigation,
     poses: Callable[[np.ndarray], np.ndarray],
     *,
@@ -171,18 +171,18 @@ class Vehicle(Route):
             raise ValueError("a vehicle does not stop: give speed_mm_per_s, or a trajectory")
         return self
 
-    def carried(self, rng: np.random.Generator) -> Carried:
+    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
         commanded = self.commanded()
-        waves, phases = waves_of(self.sea, rng), rng.uniform(0, 2 * np.pi, 6)
+        waves, phases = sample_waves(self.sea, rng), rng.uniform(0, 2 * np.pi, 6)
         sizes = np.append(np.full(3, self.vibration_mm), np.full(3, np.radians(self.vibration_deg)))
 
         def true(times: np.ndarray) -> np.ndarray:
             vibrations = sizes * np.sin(2 * np.pi * self.vibration_hz * times[:, None] + phases)
-            return displaced(commanded(times), waves(times) + vibrations)
+            return displace_poses(commanded(times), waves(times) + vibrations)
 
-        drift = drift_of(self.navigation, true, lead_s=2 * LEAD_S, lasting_s=float(self._knots[0][-1]), rng=rng)
+        drift = simulate_drift(self.navigation, true, lead_s=2 * LEAD_S, lasting_s=float(self._knots[0][-1]), rng=rng)
 
         def reported(times: np.ndarray) -> np.ndarray:
-            return displaced(true(times), drift.errors(times))
+            return displace_poses(true(times), drift.errors(times))
 
-        return Carried(true, reported, drift.covariance)
+        return PlatformMotion(true, reported, drift.covariance)

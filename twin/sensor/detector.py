@@ -1,7 +1,7 @@
 """Image sensor model after EMVA 1288: photons, electrons, noise, full well, gain, quantisation.
 
 Pixels of a camera differ from each other in the same way in every image (`fixed_pattern`). Charge above the full well
-of a pixel spills along its column (`spilled`). Shot and read noise come from `twin.sensor.random_numbers`.
+of a pixel spills along its column (`spread_blooming`). Shot and read noise come from `twin.sensor.random_numbers`.
 """
 
 from __future__ import annotations
@@ -74,14 +74,16 @@ def grey_values(
         seeds = cast(np.random.SeedSequence, rng.bit_generator.seed_seq).spawn(count)
         rngs = [np.random.Generator(np.random.SFC64(seed)) for seed in seeds]
     with ThreadPoolExecutor() as pool:
-        charges = list(pool.map(_collected, np.array_split(electrons, count), detectors, exposures, patterns, rngs))
+        charges = list(pool.map(_collect, np.array_split(electrons, count), detectors, exposures, patterns, rngs))
         if detector.blooming > 0:
-            bloomed = spilled(np.concatenate(charges), full_well_e=detector.full_well_e, share=detector.blooming)
+            bloomed = spread_blooming(
+                np.concatenate(charges), full_well_e=detector.full_well_e, share=detector.blooming
+            )
             charges = np.array_split(bloomed, count)
-        return np.concatenate(list(pool.map(_digitised, charges, detectors, patterns, rngs)))
+        return np.concatenate(list(pool.map(_digitise, charges, detectors, patterns, rngs)))
 
 
-def _collected(
+def _collect(
     electrons: np.ndarray,
     detector: Detector,
     exposure_ms: float,
@@ -110,7 +112,7 @@ def _mean_electrons(
         mean[i] = light[i] * gain[i] + hot_e_per_s[i] * seconds + everywhere
 
 
-def _digitised(
+def _digitise(
     charge: np.ndarray, detector: Detector, pattern: FixedPattern | None, rng: np.random.Generator | None
 ) -> np.ndarray:
     """Return the grey values of collected electrons, which are overwritten."""
@@ -121,12 +123,12 @@ def _digitised(
         add_normal_numbers(signal, detector.read_noise_e, rng)
     image = np.empty(signal.shape, np.uint8 if detector.bits == 8 else np.uint16)
     scale, offset = np.float32(detector.gain_dn_per_e()), np.float32(detector.black_level_dn)
-    _rounded(signal.ravel(), scale, offset, np.float32(detector.full_scale_dn()), image.ravel())
+    _round(signal.ravel(), scale, offset, np.float32(detector.full_scale_dn()), image.ravel())
     return image
 
 
 @compiled
-def _rounded(signal: np.ndarray, scale: np.float32, offset: np.float32, most: np.float32, image: np.ndarray) -> None:
+def _round(signal: np.ndarray, scale: np.float32, offset: np.float32, most: np.float32, image: np.ndarray) -> None:
     """Scale, offset and round signals (N,), float32, to integers from 0 to ``most`` in the image (N,)."""
     nothing = np.float32(0)
     for i in range(len(signal)):
@@ -174,7 +176,7 @@ def fixed_pattern(detector: Detector, *, height: int, width: int) -> FixedPatter
     return FixedPattern(1 + gain, pixels + rows + columns, hot.reshape(height, width))
 
 
-def spilled(charge: np.ndarray, *, full_well_e: float, share: float) -> np.ndarray:
+def spread_blooming(charge: np.ndarray, *, full_well_e: float, share: float) -> np.ndarray:
     """Return the charge (H, W) in electrons after blooming; the given array itself if no pixel exceeds its full well.
 
     Half of the excess charge of a pixel moves up its column and half down. It fills pixels on its path and passes full
@@ -185,14 +187,14 @@ def spilled(charge: np.ndarray, *, full_well_e: float, share: float) -> np.ndarr
     if columns.size == 0:
         return charge
     before = np.take(charge, columns, axis=1).astype(float)
-    down_first, up_first = (_swept(image, full_well_e, share) for image in (before, before[::-1]))
+    down_first, up_first = (_sweep(image, full_well_e, share) for image in (before, before[::-1]))
     after = charge.copy()
     # If charge of two pixels meets, the result depends on the order: average both orders.
     after[:, columns] = (down_first + up_first[::-1]) / 2
     return after
 
 
-def _swept(charge: np.ndarray, full_well_e: float, share: float) -> np.ndarray:
+def _sweep(charge: np.ndarray, full_well_e: float, share: float) -> np.ndarray:
     """Return the columns after the excess charge has moved down, then up."""
     kept = np.minimum(charge, full_well_e)
     spilt_each_way = share / 2 * (charge - kept)

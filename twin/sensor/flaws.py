@@ -1,7 +1,7 @@
 """Flaws of real recordings that standard rendering does not include; see `twin.options.Flaws`.
 
-Some are properties of the sensor (`as_built`). Others change the light on the image sensor (`vignette`, `veiled`,
-`laser_shares`) or the grey values that the camera delivers (`delivered`).
+Some are properties of the sensor (`as_built`). Others change the light on the image sensor (`vignette`, `add_glare`,
+`laser_shares`) or the grey values that the camera delivers (`deliver_image`).
 """
 
 import math
@@ -101,7 +101,7 @@ def dirt(camera: Camera, share: float, *, seed: int) -> np.ndarray:
     return np.clip(free[margin : margin + camera.height_px, margin : margin + camera.width_px], 0, 1)
 
 
-def veiled(light: np.ndarray, share: float) -> np.ndarray:
+def add_glare(light: np.ndarray, share: float) -> np.ndarray:
     """Return light (H, W), the fraction ``share`` of which is spread as veiling glare.
 
     The kernel is exp(-r / w) / (2 pi w^2) with w = `GLARE_REACH` image widths. Light is lost only beyond the image
@@ -126,7 +126,7 @@ def laser_shares(height: int, width: int) -> np.ndarray:
     return np.tile(cell, (-(-height // 2), -(-width // 2)))[:height, :width]
 
 
-def delivered(image: np.ndarray, flaws: Flaws) -> np.ndarray:
+def deliver_image(image: np.ndarray, flaws: Flaws) -> np.ndarray:
     """Return the grey values (H, W) that the camera delivers.
 
     A colour camera delivers its red channel, with missing colours interpolated linearly. JPEG stores brightness at

@@ -71,18 +71,18 @@ def _start(rng: np.random.Generator) -> np.uint64:
 
 @compiled_part
 def _next(state: np.uint64) -> np.uint64:
-    """Return the next state of SplitMix64 (Steele, Lea and Flood 2014, Fig. 17); `_mixed` turns it into random bits."""
-    return _later(state, 1)
+    """Return the next state of SplitMix64 (Steele, Lea and Flood 2014, Fig. 17); `_mix` turns it into random bits."""
+    return _advance(state, 1)
 
 
 @compiled_part
-def _later(state: np.uint64, steps: int) -> np.uint64:
+def _advance(state: np.uint64, steps: int) -> np.uint64:
     """Return the state after a number of steps."""
     return state + np.uint64(steps) * np.uint64(0x9E3779B97F4A7C15)
 
 
 @compiled_part
-def _mixed(state: np.uint64) -> np.uint64:
+def _mix(state: np.uint64) -> np.uint64:
     """Return 64 random bits from a state."""
     z = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -92,7 +92,7 @@ def _mixed(state: np.uint64) -> np.uint64:
 @compiled_part
 def _uniform(state: np.uint64) -> float:
     """Return a uniform number in [0, 1) from a state."""
-    return np.float64(_mixed(state) >> np.uint64(11)) * 2.0**-53
+    return np.float64(_mix(state) >> np.uint64(11)) * 2.0**-53
 
 
 @compiled
@@ -115,8 +115,8 @@ def _small_poisson_numbers(
             numbers[i] = 0
             continue
         level = np.int64(mean[i] / step)
-        own = _later(state, 2 * i)
-        cell = np.int64(_mixed(own) >> np.uint64(52))
+        own = _advance(state, 2 * i)
+        cell = np.int64(_mix(own) >> np.uint64(52))
         count = np.int64(count_of_cell[level, cell])
         if count == _SEVERAL:
             uniform = (cell + _uniform(_next(own))) / _CELLS
@@ -124,7 +124,7 @@ def _small_poisson_numbers(
             while distribution[level, count] <= uniform:
                 count += 1
         numbers[i] = count
-    state = _later(state, 2 * len(mean))
+    state = _advance(state, 2 * len(mean))
     for _ in range(events):
         state = _next(state)
         i = np.int64(_uniform(state) * len(mean))
@@ -152,7 +152,7 @@ def _add_normal_numbers(
     for i in range(len(values)):
         while True:
             state = _next(state)
-            bits = _mixed(state)
+            bits = _mix(state)
             layer = np.int64(bits & np.uint64(_LAYERS - 1))
             place = np.int64(bits >> np.uint64(40))
             x = place * edges[layer]

@@ -74,7 +74,7 @@ class Speckle:
                 f"focus_distance_mm {focus:g} is not larger than focal_length_mm {focal:g}: the lens forms no image"
             )
         magnification = focal / (focus - focal)  # of the focused plane
-        wavelength_mm = 1e-6 * float(_within("the wavelength in nm", wavelength_nm, 1.0, math.inf))
+        wavelength_mm = 1e-6 * float(_require_range("the wavelength in nm", wavelength_nm, 1.0, math.inf))
         grain_mm = wavelength_mm * camera.f_number * (1 + magnification)
         grain_px = grain_mm / (1e-3 * camera.pixel_size_um)
         if grain_px > _WIDEST_PX:
@@ -137,9 +137,9 @@ class Speckle:
             raise ImageError(
                 f"row {rows[worst]}, column {columns[worst]} is outside the image of {height} rows and {width} columns"
             )
-        position = float(_within("the travel in mm", travel_mm, -math.inf, math.inf)) / self.renewal_mm
-        polarised = np.square(_within("the degree of polarisation", polarisation, 0.0, 1.0))
-        coherent = np.square(np.maximum(_within("the coherence", coherence, 0.0, 1.0), _LEAST_CONTRAST))
+        position = float(_require_range("the travel in mm", travel_mm, -math.inf, math.inf)) / self.renewal_mm
+        polarised = np.square(_require_range("the degree of polarisation", polarisation, 0.0, 1.0))
+        coherent = np.square(np.maximum(_require_range("the coherence", coherence, 0.0, 1.0), _LEAST_CONTRAST))
         squares, cubes = self._pixel
         # A Gaussian line (`coherence`) has weights proportional to r^k, with C^2 = (1 - r) / (1 + r).
         variance = squares * coherent * (1 + polarised) / 2
@@ -147,7 +147,7 @@ class Speckle:
         along, across = (columns, rows) if self._along_width else (rows, columns)
         pattern = self._tile.intensity(_amplitudes(self._tile.size, self._seed, position))
         intensity = pattern[across % self._tile.across_px, along]
-        factors = 1 + np.sqrt(variance) * _shaped(intensity, cubes / variance**1.5)
+        factors = 1 + np.sqrt(variance) * _skew_exponential(intensity, cubes / variance**1.5)
         return np.maximum(factors, 0.0).astype(np.float32)
 
 
@@ -186,9 +186,9 @@ def coherence(
     RangeError
         A value is not finite, or negative.
     """
-    roughness = _within("the roughness in um", roughness_um, 0.0, math.inf)
-    width = _within("the line width in nm", linewidth_nm, 0.0, math.inf)
-    wavelength = _within("the wavelength in nm", wavelength_nm, 1.0, math.inf)
+    roughness = _require_range("the roughness in um", roughness_um, 0.0, math.inf)
+    width = _require_range("the line width in nm", linewidth_nm, 0.0, math.inf)
+    wavelength = _require_range("the wavelength in nm", wavelength_nm, 1.0, math.inf)
     spread_per_um = 1e3 * 2 * math.pi / wavelength**2 * width / math.sqrt(8 * math.log(2))
     return (1 + 4 * (spread_per_um * index * sum(cosines) * roughness) ** 2) ** -0.25
 
@@ -255,7 +255,7 @@ def _power_of_sums(across_px: int, along_px: int, grain_px: float) -> np.ndarray
     # By Mehler's formula for exponential variables (Laguerre polynomials), the n-th term of their transform is
     # correlated by the n-th power of their correlation.
     nodes, weights = np.polynomial.laguerre.laggauss(48)
-    shaped = _shaped(nodes, _third_of_pixel(grain_px) / pixel_contrast(grain_px) ** 3)
+    shaped = _skew_exponential(nodes, _third_of_pixel(grain_px) / pixel_contrast(grain_px) ** 3)
     terms = np.square((weights * shaped) @ np.polynomial.laguerre.lagvander(nodes, 12))[1:]
     drawn = np.linspace(0, 1, 1001)
     reshaped = np.polynomial.polynomial.polyval(drawn, np.concatenate([[0.0], terms / terms.sum()]))
@@ -309,7 +309,7 @@ def _airy(grains: np.ndarray) -> np.ndarray:
     return 2 * j1(z) / z
 
 
-def _shaped(exponential: np.ndarray, skew: ArrayLike) -> np.ndarray:
+def _skew_exponential(exponential: np.ndarray, skew: ArrayLike) -> np.ndarray:
     """Transform exponential numbers monotonically to numbers (P,) of mean 0 and variance 1.
 
     Their half skewness is ``skew``, 0 to 1.
@@ -362,7 +362,7 @@ def _draw(size: int, seed: int, group: int, node: int) -> np.ndarray:
     return parts.view(np.complex64)
 
 
-def _within(name: str, value: ArrayLike, least: float, most: float) -> np.ndarray:
+def _require_range(name: str, value: ArrayLike, least: float, most: float) -> np.ndarray:
     """Return the value as float64; RangeError if it is not finite or outside the range."""
     value = np.asarray(value, float)
     bad = ~(np.isfinite(value) & (value >= least) & (value <= most))

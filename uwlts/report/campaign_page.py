@@ -139,7 +139,7 @@ def report_page(
         title=campaign.folder.resolve().name,
         introduction=introduction(campaign),
         key_figures=headline_tiles(campaign, reference),
-        groups=_grouped(rows),
+        groups=_group_rows(rows),
         published=None if reference is None else reference.title,
         explanations=explanations(rows, reference),
         measurements=[_measurement(measurement, each, collected) for measurement, each in drawn],
@@ -258,7 +258,7 @@ def _calibrations(campaign: GatheredCampaign) -> dict[str, Any]:
     }
 
 
-def _grouped(rows: list[Row]) -> list[tuple[str, list[tuple[str, ...]]]]:
+def _group_rows(rows: list[Row]) -> list[tuple[str, list[tuple[str, ...]]]]:
     """Group rows as text by measurement; the uncertainty follows the calibrated value."""
     groups: dict[str, list[tuple[str, ...]]] = {}
     for row in rows:

@@ -131,15 +131,15 @@ def parameter_table(campaign: GatheredCampaign) -> ComparisonTable:
     columns = [(found.name, _parameters(found.calibration)) for found in campaign.calibrations]
     if campaign.true_sensor is not None:
         columns.append(("true", _parameters(nominal_calibration(campaign.true_sensor))))
-    return _side_by_side(columns)
+    return _combine_columns(columns)
 
 
 def residual_table(calibrations: tuple[GatheredCalibration, ...]) -> ComparisonTable:
     """Return all scalar residual figures of the calibrations by name."""
-    return _side_by_side([(found.name, dict(_figures(found.calibration))) for found in calibrations])
+    return _combine_columns([(found.name, dict(_figures(found.calibration))) for found in calibrations])
 
 
-def _side_by_side(columns: list[tuple[str, dict[tuple[str, str], str]]]) -> ComparisonTable:
+def _combine_columns(columns: list[tuple[str, dict[tuple[str, str], str]]]) -> ComparisonTable:
     """Combine columns given by heading, each a table of texts by words and unit."""
     rows = dict.fromkeys(row for _, table in columns for row in table)
     return ComparisonTable(

@@ -23,7 +23,13 @@ from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parameter_
 from uwlts.model.sensor import Medium
 from uwlts.pages.numbers import as_fine_as, numbers_in
 from uwlts.pages.toolkit import MISSING
-from uwlts.report.certificate_volume import InUse, LengthUncertainty, in_use, index_key, length_uncertainties
+from uwlts.report.certificate_volume import (
+    CalibrationInUse,
+    LengthUncertainty,
+    index_key,
+    length_uncertainties,
+    prepare_use,
+)
 
 FORMAT = "uwlts-certificate"
 VERSION = 1
@@ -33,16 +39,16 @@ _BEST_SHOTS = 3
 NOT_JOINT = "the calibration was not estimated jointly: the uncertainty of lengths measured by it is not known"
 
 
-def canonical(content: Mapping[str, JsonValue]) -> bytes:
+def to_canonical_json(content: Mapping[str, JsonValue]) -> bytes:
     """Return the content without its seal as canonical JSON bytes: sorted keys, no spaces, UTF-8."""
     bare = {key: value for key, value in content.items() if key != _SEAL}
     text = json.dumps(bare, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return text.encode("utf-8")
 
 
-def seal_of(content: Mapping[str, JsonValue]) -> str:
+def compute_seal(content: Mapping[str, JsonValue]) -> str:
     """Return the seal of a content: SHA-256 of its canonical bytes."""
-    return hashlib.sha256(canonical(content)).hexdigest()
+    return hashlib.sha256(to_canonical_json(content)).hexdigest()
 
 
 def read_certificate(path: str | Path) -> dict[str, JsonValue]:
@@ -72,7 +78,7 @@ def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
     """
     content, found = read_certificate(path), sha256_of(calibration)
     against = []
-    if content.get(_SEAL) != seal_of(content):
+    if content.get(_SEAL) != compute_seal(content):
         against.append(f"{path} was changed after it was issued: its seal does not match its content")
     certified = content.get("calibration")
     if not isinstance(certified, dict):
@@ -226,8 +232,8 @@ def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -
         parameters=parameter_rows(calibration),
         uncertainty_known=calibration.joint is not None,
     )
-    content = (_sequential if calibration.joint is None else _joint)(base, calibration)
-    return content.model_copy(update={_SEAL: seal_of(content.in_file())})
+    content = (_complete_sequential if calibration.joint is None else _complete_joint)(base, calibration)
+    return content.model_copy(update={_SEAL: compute_seal(content.in_file())})
 
 
 def certificate_lines(content: AnyCertificate) -> list[str]:
@@ -281,7 +287,7 @@ def _row(key: ParameterKey, value: float, std: float | None = None, before: floa
     )
 
 
-def _sequential(base: Certificate, calibration: Calibration) -> SequentialCertificate:
+def _complete_sequential(base: Certificate, calibration: Calibration) -> SequentialCertificate:
     window = calibration.window
     rms = {}
     for step in calibration.residuals:
@@ -297,11 +303,11 @@ def _sequential(base: Certificate, calibration: Calibration) -> SequentialCertif
     )
 
 
-def _joint(base: Certificate, calibration: Calibration) -> JointCertificate:
+def _complete_joint(base: Certificate, calibration: Calibration) -> JointCertificate:
     joint, found = require_joint(calibration), regions(calibration)
     content = JointCertificate(
         **dict(base),
-        validity=tuple(_validity(in_use(calibration, region)) for region in found),
+        validity=tuple(_validity(prepare_use(calibration, region)) for region in found),
         scatter_px=joint.scatter_px,
         shared_variance=joint.shared_variance,
         residuals=joint.residual_count,
@@ -312,7 +318,7 @@ def _joint(base: Certificate, calibration: Calibration) -> JointCertificate:
         no_area = "the stripes of the evidence cover no area: the uncertainty of lengths is not known"
         none = "the calibration does not state which volume its evidence covers: calibrate again"
         return content.model_copy(update={"remark": no_area if found else none})
-    use = in_use(calibration, found[0])
+    use = prepare_use(calibration, found[0])
     lengths, known = lengths_over(use.known, found[0]), use.known
     weak = weaknesses(lengths, known.parameters.keys, known.covariance)
     return content.model_copy(
@@ -336,7 +342,7 @@ def _shots(outlooks: Sequence[Outlook]) -> tuple[NextShot, ...]:
     )
 
 
-def _validity(use: InUse) -> Validity:
+def _validity(use: CalibrationInUse) -> Validity:
     region, known, index = use.region, use.known, index_key(use.known)
     low, high = region.outline_mm.min(axis=0), region.outline_mm.max(axis=0)
     return Validity(

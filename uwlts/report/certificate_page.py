@@ -32,8 +32,8 @@ from uwlts.pages.toolkit import (
 from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, certificate_of, parameter_rows
 from uwlts.report.certificate_volume import (
     LengthUncertainty,
-    change_from,
-    in_use,
+    compare_calibrations,
+    prepare_use,
     require_same_sensor,
     uncertainty_maps,
 )
@@ -127,11 +127,11 @@ def _pictures(
     if not content.lengths:
         return drawn
     region = regions(calibration)[0]
-    mesh, maps = uncertainty_maps(in_use(calibration, region))
+    mesh, maps = uncertainty_maps(prepare_use(calibration, region))
     drawn["lengths"] = length_chart(content.lengths)
     drawn["maps"] = [heat_map(title, mesh, 1e3 * values) for title, values in maps.items()]
     if before is not None:
-        change = change_from(calibration, before[1], region)
+        change = compare_calibrations(calibration, before[1], region)
         drawn["largest_change_um"] = 1e3 * change.largest_mm
         drawn["changes"] = [
             heat_map(f"change in {axis}", change.at_mm, 1e3 * change.moved_mm[..., "XYZ".index(axis)], signed=True)

@@ -45,7 +45,7 @@ class LengthUncertainty:
 
 
 @dataclass(frozen=True, eq=False)
-class InUse:
+class CalibrationInUse:
     """A joint estimate as used for measurements, in the region that it covers.
 
     ``covariance`` (P, P) includes the drift of the medium's index since calibration. ``noise_px`` is the standard
@@ -60,7 +60,7 @@ class InUse:
     noise_px: float
 
 
-def in_use(calibration: Calibration, region: SheetRegion) -> InUse:
+def prepare_use(calibration: Calibration, region: SheetRegion) -> CalibrationInUse:
     """Return a joint calibration for measurements in one of its regions; CalibrationError if it is damaged."""
     known = estimate_in(calibration, region)
     uncertainty = calibration.origin().known_before
@@ -70,7 +70,7 @@ def in_use(calibration: Calibration, region: SheetRegion) -> InUse:
         covariance[keys.index(index), keys.index(index)] += drift**2
     scatter = require_joint(calibration).scatter_px
     noise = next((scatter[kind] for kind in (STRIPE, STEP, *SCANNED) if kind in scatter), 0.0)
-    return InUse(calibration, region, known, covariance, uncertainty, noise)
+    return CalibrationInUse(calibration, region, known, covariance, uncertainty, noise)
 
 
 def index_key(known: StoredEstimate) -> MediumIndex | None:
@@ -78,14 +78,16 @@ def index_key(known: StoredEstimate) -> MediumIndex | None:
     return None if known.view.medium is None else known.parameters.index_key(known.view.medium)
 
 
-def length_uncertainties(use: InUse) -> list[LengthUncertainty]:
+def length_uncertainties(use: CalibrationInUse) -> list[LengthUncertainty]:
     """Return the uncertainty of every length that fits into the volume, along X, Y and Z."""
     found = []
     for axis in "YZ":
         for length in LENGTHS_MM:
-            ends = ends_over(use.region, axis, length)
+            ends = find_ends(use.region, axis, length)
             if len(ends):
-                std = [lengths_of(use, ends).std_mm(use.covariance, noise_px=noise) for noise in (0.0, use.noise_px)]
+                std = [
+                    compute_lengths(use, ends).std_mm(use.covariance, noise_px=noise) for noise in (0.0, use.noise_px)
+                ]
                 found.append(LengthUncertainty(axis, length, *(2 * float(each.max()) for each in std)))
     # Along the stage's motion, the same point of the sheet measures both ends, so only the stage contributes.
     position, scale = np.sqrt(2.0) * use.uncertainty.stage_position_mm, use.uncertainty.stage_scale
@@ -93,14 +95,14 @@ def length_uncertainties(use: InUse) -> list[LengthUncertainty]:
     return [LengthUncertainty("X", length, stage, stage) for length, stage in along_x.items()] + found
 
 
-def lengths_of(use: InUse, ends: np.ndarray) -> Lengths:
+def compute_lengths(use: CalibrationInUse, ends: np.ndarray) -> Lengths:
     """Return lengths between points given by Y and Z (M, 2, 2)."""
     points = points_at(use.known, ends.reshape(-1, 2))
     first = 2 * np.arange(len(ends))
     return lengths_between(points, first, first + 1)
 
 
-def ends_over(region: SheetRegion, axis: str, length_mm: float) -> np.ndarray:
+def find_ends(region: SheetRegion, axis: str, length_mm: float) -> np.ndarray:
     """Return end points (M, 2, 2) of lengths along an axis throughout a region; empty if the length does not fit."""
     depths = region.mesh(_PLACES, 2)[:, 0, 1]
     found = []
@@ -117,7 +119,7 @@ def ends_over(region: SheetRegion, axis: str, length_mm: float) -> np.ndarray:
     return np.array(found).reshape(-1, 2, 2)
 
 
-def uncertainty_maps(use: InUse) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def uncertainty_maps(use: CalibrationInUse) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Return Y and Z (R, C, 2) of a mesh of the sheet, and maps of standard uncertainties (R, C) in mm by title.
 
     For points, they are uncertainties of the coordinates without rigid motion of the whole volume: from the calibration
@@ -127,7 +129,7 @@ def uncertainty_maps(use: InUse) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     mesh = use.region.mesh(_ROWS, _COLUMNS)
     at = mesh.reshape(-1, 2)
     points = points_at(use.known, at)
-    moved = without_rigid_motion(at, (points.by_parameters @ covariance_root(use.covariance)).transpose(2, 0, 1))
+    moved = remove_rigid_motion(at, (points.by_parameters @ covariance_root(use.covariance)).transpose(2, 0, 1))
     calibration = np.sqrt(np.sum(moved**2, axis=0))
     shown = {"calibration": calibration, "single point": np.hypot(calibration, points.by_px * use.noise_px)}
     maps = {
@@ -139,11 +141,11 @@ def uncertainty_maps(use: InUse) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     power = 10.0 ** np.floor(np.log10(longest))
     short = float(max(step * power for step in (1, 2, 5) if step * power <= longest))
     for axis, length in (("Y", (short, 0.0)), ("Z", (0.0, short))):
-        maps[f"u of {short:g} mm along {axis}"] = _of_length(use, mesh, np.array(length))
+        maps[f"u of {short:g} mm along {axis}"] = _map_length(use, mesh, np.array(length))
     return mesh, maps
 
 
-def without_rigid_motion(at_mm: np.ndarray, moved: np.ndarray) -> np.ndarray:
+def remove_rigid_motion(at_mm: np.ndarray, moved: np.ndarray) -> np.ndarray:
     """Return displacements (R, N, 3) of points at Y and Z (N, 2) after subtracting the best-fit rigid motions."""
     points = np.column_stack([np.zeros(len(at_mm)), at_mm - at_mm.mean(axis=0)])
     turns = np.cross(np.eye(3)[:, None], points[None])
@@ -153,7 +155,7 @@ def without_rigid_motion(at_mm: np.ndarray, moved: np.ndarray) -> np.ndarray:
     return (flat - (flat @ basis) @ basis.T).reshape(moved.shape)
 
 
-def _of_length(use: InUse, mesh: np.ndarray, length: np.ndarray) -> np.ndarray:
+def _map_length(use: CalibrationInUse, mesh: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Return the standard uncertainty (R, C) of a length vector (2,) centred at, or near, each mesh point."""
     middle = mesh.reshape(-1, 2).copy()
     low, high = use.region.outline_mm[:, 1].min(), use.region.outline_mm[:, 1].max()
@@ -164,7 +166,7 @@ def _of_length(use: InUse, mesh: np.ndarray, length: np.ndarray) -> np.ndarray:
         left, right = max(a for a, _ in ranges) + half[0], min(b for _, b in ranges) - half[0]
         at[0] = np.clip(at[0], left, right) if left < right else (left + right) / 2
     ends = np.stack([middle - half, middle + half], axis=1)
-    return lengths_of(use, ends).std_mm(use.covariance).reshape(mesh.shape[:2])
+    return compute_lengths(use, ends).std_mm(use.covariance).reshape(mesh.shape[:2])
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +195,7 @@ def require_same_sensor(calibration: Calibration, other: Calibration) -> None:
             )
 
 
-def change_from(calibration: Calibration, other: Calibration, region: SheetRegion) -> Change:
+def compare_calibrations(calibration: Calibration, other: Calibration, region: SheetRegion) -> Change:
     """Return the displacements between a calibration and another one, in its region.
 
     CalibrationError if the other calibration is of another sensor, or does not see the sheet in part of the region.
@@ -211,5 +213,5 @@ def change_from(calibration: Calibration, other: Calibration, region: SheetRegio
             )
         points.append(found)
     moved = (points[0] - points[1]) @ calibration.object_transform()[:3, :3]
-    form = without_rigid_motion(mesh.reshape(-1, 2), moved[None])[0]
+    form = remove_rigid_motion(mesh.reshape(-1, 2), moved[None])[0]
     return Change(mesh, form.reshape(*mesh.shape[:2], 3), float(np.linalg.norm(moved, axis=1).max()))

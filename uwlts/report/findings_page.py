@@ -270,7 +270,7 @@ def _page(
     )
 
 
-def _with_interval(value: FeatureValue) -> str:
+def _format_interval(value: FeatureValue) -> str:
     half = COVERAGE_FACTOR * value.uncertainty
     if half <= _SMALLEST:
         return f"{value.value:.4g}"
@@ -286,7 +286,7 @@ def _value_row(value: FeatureValue) -> tuple[str, ...]:
     fine = [
         MISSING if part is None else as_fine_as(part, part, digits=2) if part > _SMALLEST else "0" for part in parts
     ]
-    return value.name, value.unit, _with_interval(value), *fine
+    return value.name, value.unit, _format_interval(value), *fine
 
 
 def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str, ...]]] | None:
@@ -298,7 +298,7 @@ def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str,
     rows = []
     for each in features:
         place = " ".join(f"{number:.1f}" for number in each.place_mm)
-        rows.append((each.name, place, *(_with_interval(each[name]) if name in each else MISSING for name in units)))
+        rows.append((each.name, place, *(_format_interval(each[name]) if name in each else MISSING for name in units)))
     return ("finding", "place / mm", *(f"{name} / {unit}" for name, unit in units.items())), rows
 
 
@@ -309,18 +309,18 @@ def _tiles(whole: list[Feature], parts: list[Feature]) -> list[Tile]:
             worst = max(own, key=lambda each: each.values[0].value)
             value = worst.values[0]
             plural = f"{kind}s" if len(own) > 1 else str(kind)
-            note = f"largest {value.name} {_with_interval(value)} {value.unit} ({worst.name})"
+            note = f"largest {value.name} {_format_interval(value)} {value.unit} ({worst.name})"
             tiles.append(Tile(plural, str(len(own)), note, accent=True))
     walls = [each["remaining wall"] for each in parts if "remaining wall" in each]
     if walls:
         least = min(walls, key=lambda value: value.value)
-        tiles.append(Tile("least remaining wall", f"{_with_interval(least)} {least.unit}", accent=True))
+        tiles.append(Tile("least remaining wall", f"{_format_interval(least)} {least.unit}", accent=True))
     if whole and whole[0].kind == FeatureKind.PIPE and not parts:
         tiles.append(Tile("pits, dents, protrusions", "none found", accent=True))
     for each in whole[:1]:
         for value in each.values[:5]:
             if not value.name.startswith("axis"):
-                tiles.append(Tile(f"{each.name}: {value.name}", f"{_with_interval(value)} {value.unit}"))
+                tiles.append(Tile(f"{each.name}: {value.name}", f"{_format_interval(value)} {value.unit}"))
     return tiles
 
 
@@ -331,7 +331,7 @@ def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:
     whole = found.features[0] if found.features else None
     pipe = whole if whole is not None and whole.kind == FeatureKind.PIPE else None
     middle = cloud.points_mm[seen].mean(axis=0)
-    u, v = _flat(cloud.points_mm[seen], pipe, middle)
+    u, v = _map_coordinates(cloud.points_mm[seen], pipe, middle)
     # Width for equal scales at a height of 5 inches, including the colour bar.
     width = 1.8 + 4.5 * float(np.ptp(u)) / max(float(np.ptp(v)), 1e-9)
     figure, (axes,) = new_figure(float(np.clip(width, 4.0, 9.0)), 5.0)
@@ -340,7 +340,7 @@ def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:
     colours = axes.scatter(u, v, c=found.deviation_mm[seen], rasterized=True, **style)
     figure.colorbar(colours, ax=axes, label="above the undamaged surface / mm")
     for each in parts:
-        x, y = _flat(each.place_mm[None], pipe, middle)
+        x, y = _map_coordinates(each.place_mm[None], pipe, middle)
         axes.annotate(each.name, (x[0], y[0]), xytext=(8, 8), textcoords="offset points", fontsize=8, color=INK)
         axes.plot(x, y, "o", markersize=14, markerfacecolor="none", markeredgecolor=RED)
     labels = ("along the axis / mm", "around the circumference / mm") if pipe else ("first extent / mm", "second / mm")
@@ -348,7 +348,7 @@ def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:
     return png_data_uri(figure, dpi=130)
 
 
-def _flat(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return map coordinates (N,) of points: along and around a pipe, centred at ``middle`` (3,), else X and Y."""
     if pipe is None:
         return points[:, 0], points[:, 1]
@@ -379,7 +379,9 @@ def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
     cut.axhline(0, color=INK, linewidth=0.8)
     value = feature.values[0]
     sign = 1 if feature.kind == FeatureKind.PROTRUSION else -1
-    cut.axhline(sign * value.value, color=RED, linewidth=1, label=f"{value.name} {_with_interval(value)} {value.unit}")
+    cut.axhline(
+        sign * value.value, color=RED, linewidth=1, label=f"{value.name} {_format_interval(value)} {value.unit}"
+    )
     cut.set(xlabel="along its length / mm", ylabel="deviation / mm")
     cut.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 1.22), ncols=2, frameon=False)
     return png_data_uri(figure, dpi=110)

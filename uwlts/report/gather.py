@@ -145,7 +145,7 @@ def gather_campaign(folder: str | Path) -> GatheredCampaign:
         )
     by_digest = {calibration.digest: calibration for calibration in calibrations}
     measurements = []
-    for name, cloud in sorted(_paired(clouds, judged).items()):
+    for name, cloud in sorted(_pair_clouds(clouds, judged).items()):
         recorded = None if cloud is None else cloud.metadata.get("capture")
         capture = captures.get(recorded) if isinstance(recorded, str) else None
         found = GatheredMeasurement(name, cloud, judged.get(name), capture or captures.get(f"{name}.h5"), None)
@@ -173,7 +173,7 @@ def _capture(path: Path) -> GatheredCapture:
         return GatheredCapture(path, capture.header, len(capture), laser)
 
 
-def _paired(clouds: dict[str, PointCloud], judged: dict[str, EvaluationRecord]) -> dict[str, PointCloud | None]:
+def _pair_clouds(clouds: dict[str, PointCloud], judged: dict[str, EvaluationRecord]) -> dict[str, PointCloud | None]:
     """Pair clouds with evaluations by name; clouds without evaluation are included.
 
     An evaluation belongs to the cloud of its own name, or else to the cloud that it names. If that cloud has no

@@ -87,9 +87,10 @@ def content_of(comparison: Comparison) -> ModelComparisonContent:
     choice, score, polynomials = comparison.choice, comparison.polynomials, comparison.why_none
     if score is not None:
         polynomials = (
-            f"polynomials, fitted to the target in {score.medium} alone, miss stripes in {score.images} images inside "
-            f"the calibrated volume by {small_length(score.all_mm)} ± {small_length(score.std_mm)}, the simplest model "
-            f"by {small_length(score.model_mm)} ± {small_length(score.model_std_mm)}; outside they do not measure"
+            f"polynomials, fitted to the target in {score.medium} alone, have an error of {small_length(score.all_mm)} "
+            f"± {small_length(score.std_mm)} for stripes in {score.images} images inside the calibrated volume, the "
+            f"simplest model {small_length(score.model_mm)} ± {small_length(score.model_std_mm)}; outside they do not "
+            "measure"
         )
     return ModelComparisonContent(
         format="uwlts-models",
@@ -172,7 +173,7 @@ def _picture(content: ModelComparisonContent) -> Markup | None:
     if not shown:
         return None
     figure, panels = new_figure(5.6 * len(shown), 3.4, columns=len(shown))
-    label = "adds to the misses of the best, with standard error"
+    label = "additional error relative to the best, with standard error"
     # Both charts number all models, including those without additional error.
     count = len(content.models)
     for axes, (where, adding) in zip(panels, shown.items(), strict=True):
@@ -220,21 +221,23 @@ def verdicts(choice: Choice) -> list[str]:
         if without is None:
             continue
         by_window = name in _OF_THE_WINDOW
-        loss = f"there is no calibration, {without.reason}" if without.reason else _costs(choice, without, usual)
+        loss = (
+            f"there is no calibration, {without.reason}" if without.reason else _describe_costs(choice, without, usual)
+        )
         if not loss and by_window and not choice.wet_tallies:
             said.append(
                 f"whether {part} is needed is not shown: of the images held out {min(choice.wet.values())} are in "
                 f"water, at least {FEWEST_HELD} inside and outside the calibrated volume are needed"
             )
             continue
-        loss = loss or (_costs(choice, without, usual, wet=True) if by_window else "")
+        loss = loss or (_describe_costs(choice, without, usual, wet=True) if by_window else "")
         seen = f"{sum(choice.wet.values())} images held out in water" if by_window else "images held out"
         found = f"needed: {lacking} {loss}" if loss else f"not needed: {lacking} {seen} are predicted as well"
         said.append(f"{part} is {found}")
-    return [*said, _of_distortion(choice, list(known)), *_chosen(choice)]
+    return [*said, _describe_distortion(choice, list(known)), *_describe_choice(choice)]
 
 
-def _of_distortion(choice: Choice, candidates: Sequence[Candidate]) -> str:
+def _describe_distortion(choice: Choice, candidates: Sequence[Candidate]) -> str:
     usual = Candidate()
     levels = [c.distortion for c in candidates if replace(c, distortion=usual.distortion) == usual]
     enough = choice.level("distortion", levels)
@@ -243,11 +246,11 @@ def _of_distortion(choice: Choice, candidates: Sequence[Candidate]) -> str:
     fewer = max((level for level in levels if len(level) < len(enough)), key=len, default=None)
     if fewer is not None:
         judged = next(each for each in choice.judged if each.candidate == replace(usual, distortion=fewer))
-        said += f": with {distortion_words(fewer)} {judged.reason or _costs(choice, judged, least)}"
+        said += f": with {distortion_words(fewer)} {judged.reason or _describe_costs(choice, judged, least)}"
     return said
 
 
-def _costs(choice: Choice, without: JudgedModel, usual: Candidate, *, wet: bool = False) -> str:
+def _describe_costs(choice: Choice, without: JudgedModel, usual: Candidate, *, wet: bool = False) -> str:
     """Describe where a model is worse, and by how much; empty if it is as good."""
     found = {where: adds(choice, without.candidate, usual, where, wet=wet) for where in without.scores}
     parts = [
@@ -256,15 +259,15 @@ def _costs(choice: Choice, without: JudgedModel, usual: Candidate, *, wet: bool 
         if cost is not None
     ]
     where = " in water" if wet else ""
-    return f"points{where} are missed by a further {' and '.join(parts)} the calibrated volume" if parts else ""
+    return f"points{where} have an additional error of {' and '.join(parts)} the calibrated volume" if parts else ""
 
 
-def _chosen(choice: Choice) -> list[str]:
+def _describe_choice(choice: Choice) -> list[str]:
     best, simplest, good = choice.best(), choice.simplest(), choice.as_good()
     others = [candidate.words() for candidate in good if candidate not in (best, simplest)]
-    said = f"best predicts: {best.words()}"
+    said = f"best prediction: {best.words()}"
     if simplest != best:
-        said += f"; the simplest that is as good within the standard errors: {simplest.words()}"
+        said += f"; simplest model that is as good within the standard errors: {simplest.words()}"
     elif others:
-        said += ", which is also the simplest of those as good"
-    return [said + (f"; as good are also: {'; '.join(others)}" if others else "")]
+        said += ", which is also the simplest of the equally good models"
+    return [said + (f"; equally good: {'; '.join(others)}" if others else "")]

@@ -86,10 +86,10 @@ def draw_pictures(campaign: GatheredCampaign, *, workers: int = 1) -> list[Measu
 
     CaptureError if an image of a capture is damaged.
     """
-    return work_through(_drawn, campaign.measurements, workers=workers)
+    return work_through(_draw_measurement, campaign.measurements, workers=workers)
 
 
-def _drawn(measurement: GatheredMeasurement, send: Send) -> MeasurementPictures:
+def _draw_measurement(measurement: GatheredMeasurement, send: Send) -> MeasurementPictures:
     view, cloud = None, measurement.cloud
     if measurement.capture is not None:
         with Capture(measurement.capture.path) as capture:

@@ -106,7 +106,7 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviati
     low, high = cloud_limits(cloud.points_mm)
     # The farthest points are drawn first, so that the nearest remain visible.
     points = cloud.points_mm[order := np.argsort(-(cloud.points_mm @ view_direction()), kind="stable")]
-    values, label, scale = _coloured_by(cloud, colour)
+    values, label, scale = _select_values(cloud, colour)
     size = float(np.clip(1e5 / len(cloud), 1.0, 16.0))
     style: dict[str, Any] = {"s": size, "linewidths": 0, "depthshade": False, "rasterized": True}
     if values is None:
@@ -135,7 +135,7 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviati
     return ax
 
 
-def _coloured_by(cloud: PointCloud, colour: Colour) -> tuple[np.ndarray | None, str, dict[str, Any]]:
+def _select_values(cloud: PointCloud, colour: Colour) -> tuple[np.ndarray | None, str, dict[str, Any]]:
     """Return values (N,) with label and style; None if the cloud does not have them."""
     match colour:
         case "deviation":

@@ -60,7 +60,7 @@ def _scans(registered: RegisteredScans) -> str:
         if (first, second) == _VIEWS[-1]:
             axes.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
-    return _seen(draw)
+    return _draw_views(draw)
 
 
 def _overlaps(registered: RegisteredScans) -> str:
@@ -75,10 +75,10 @@ def _overlaps(registered: RegisteredScans) -> str:
         known: dict[str, Any] = {"c": distance, "cmap": "RdBu", "vmin": -limit, "vmax": limit, "linewidths": 0}
         return axes.scatter(places[:, first], places[:, second], s=4, **known)
 
-    return _seen(draw, label="distance / mm")
+    return _draw_views(draw, label="distance / mm")
 
 
-def _seen(draw: Callable[[Any, int, int], Any], *, label: str | None = None) -> str:
+def _draw_views(draw: Callable[[Any, int, int], Any], *, label: str | None = None) -> str:
     """Draw three views along the axes, side by side."""
     figure, axes = new_figure(11.0, 3.8, columns=3)
     drawn = None

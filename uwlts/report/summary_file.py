@@ -186,13 +186,13 @@ def _truth(measurements: Iterable[GatheredMeasurement]) -> TruthSummary:
     compared = {m.name: m.judged.truth for m in measurements if m.judged is not None and m.judged.truth is not None}
     fitted = [truth.after_best_fit for truth in compared.values() if truth.after_best_fit is not None]
     return TruthSummary(
-        **_pooled(list(compared.values())).model_dump(),
-        after_best_fit=_pooled(fitted if len(fitted) == len(compared) else []),
+        **_pool(list(compared.values())).model_dump(),
+        after_best_fit=_pool(fitted if len(fitted) == len(compared) else []),
         by_measurement=compared,
     )
 
 
-def _pooled(compared: Sequence[TruthFigures]) -> PooledTruth:
+def _pool(compared: Sequence[TruthFigures]) -> PooledTruth:
     weights = [truth.matched for truth in compared]
     if not sum(weights) or len({truth.tolerance_mm for truth in compared}) > 1:
         return PooledTruth()

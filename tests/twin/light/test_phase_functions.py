@@ -10,7 +10,7 @@ from scipy.special import chdtrc
 
 from tests.virtual_sensors import clear, gauss_legendre
 from twin.backend.arrays import Float, Point2f, Vector3f, to_jit, to_numpy
-from twin.light.water import NODES, Scattering, node_angles, tabulated, turned
+from twin.light.water import NODES, Scattering, node_angles, rotate_about, tabulate_phase_function
 from uwlts.model.phase_functions import (
     FournierForand,
     HenyeyGreenstein,
@@ -56,13 +56,13 @@ def shares(medium: Medium, edges: np.ndarray) -> np.ndarray:
 
 def within(table_of: PhaseFunction, degrees: float) -> float:
     """Share scattered by less than an angle."""
-    table = tabulated((Scatterer(1.0, table_of),))
+    table = tabulate_phase_function((Scatterer(1.0, table_of),))
     return float(np.interp(math.log(math.radians(degrees)), np.log(node_angles()), table.cumulative))
 
 
 def mean_cosine(phase: PhaseFunction) -> float:
-    """1 less the integral of (1 - cos), to which small angles add nothing."""
-    table = tabulated((Scatterer(1.0, phase),))
+    """Return the mean cosine, 1 minus the integral of (1 - cos); small angles do not contribute."""
+    table = tabulate_phase_function((Scatterer(1.0, phase),))
     return 1 - float(np.diff(table.cumulative) @ (1 - np.cos(np.sqrt(node_angles()[1:] * node_angles()[:-1]))))
 
 
@@ -80,7 +80,7 @@ def test_henyey_and_greenstein_is_its_series(asymmetry):
 
 
 def test_molecules_scatter_by_their_depolarisation_and_as_much_back_as_forth():
-    # Across, light polarised both ways is left: (1 - d) / (1 + d) less than forwards, with d = 0.039.
+    # With the depolarisation d = 0.039, forward / across - 1 is (1 - d) / (1 + d).
     forward, across, backward = Molecular().per_sr(np.radians([1e-6, 90.0, 180.0]))
     assert forward / across - 1 == pytest.approx((1 - 0.039) / (1 + 0.039), abs=1e-4)
     assert forward == pytest.approx(backward)
@@ -110,8 +110,8 @@ MOBLEY = [
 
 def test_petzolds_average_is_mobleys():
     found = [within(PetzoldAverage(), degrees) for degrees, _ in MOBLEY]
-    # The integral depends on how one passes between the angles: taken as powers of the angle, as here, or as straight
-    # lines, it differs by 0.4 % of what lies between 5 and 15 deg, where the angles are farthest apart.
+    # The integral depends on the interpolation between the angles: power laws, as here, and straight lines differ by
+    # 0.4 % of the part between 5 and 15 deg, where the spacing of the angles is largest.
     assert found == pytest.approx([share for _, share in MOBLEY], abs=0.003)
     shares_found = [within(PetzoldAverage(), degrees) for degrees in (0.1, 1.0, 5.0, 10.0)]
     assert [round(100 * share) for share in shares_found] == [5, 23, 52, 67]
@@ -120,7 +120,7 @@ def test_petzolds_average_is_mobleys():
 
 
 def test_petzolds_average_has_the_values_of_the_table_and_its_forward_slope():
-    table = tabulated((Scatterer(1.0, PetzoldAverage()),))
+    table = tabulate_phase_function((Scatterer(1.0, PetzoldAverage()),))
     per_solid_angle = np.exp(table.log_density) / (math.pi * np.sin(node_angles()) ** 2)
     found = np.exp(
         np.interp(np.log(np.radians([0.1, 1.0, 10.0, 90.0])), np.log(node_angles()), np.log(per_solid_angle))
@@ -193,7 +193,7 @@ def test_what_is_evaluated_integrates_to_one(name):
     edges = places(400)
     total = shares(medium, edges).sum()
     ends = one_minus_cosine(edges[[0, -1]])
-    table = tabulated(medium.scatterers(635.0))
+    table = tabulate_phase_function(medium.scatterers(635.0))
     outside = np.interp(math.log(ends[0]), np.log(1 - np.cos(node_angles())), table.cumulative)
     outside += 2 * math.pi * (2 - ends[1]) * scattering.phase(mi.Float(2.0)).numpy()[0]
     # 32 bits leave 1e-6 of the logarithm, and the pole's share is read between nodes.
@@ -257,7 +257,7 @@ def test_a_medium_that_does_not_scatter_has_no_coefficient():
 
 def directions_after(scattering: Scattering, direction: Vector3f, u: Point2f) -> tuple[Vector3f, Float]:
     """Return directions after scattering, sampled as in random walks, and their densities in 1/sr."""
-    after = turned(direction, scattering.angles.heights(u.x), u.y)
+    after = rotate_about(direction, scattering.angles.heights(u.x), u.y)
     return after, scattering.phase(0.5 * dr.squared_norm(after - direction))
 
 

@@ -54,7 +54,7 @@ def written(folder, text: str, *, name: str = "sensor.toml"):
     return path
 
 
-# What is wrong, and what the message must name.
+# Mistake, and expected part of the message.
 BAD_SENSORS = {
     "unknown key": ("[camera]\nfocal_lenght_mm = 12.5", r"camera\.focal_lenght_mm: unknown key"),
     "wrong unit": ("[laser]\nbaseline_m = 0.265", r"laser\.baseline_m: unknown key.*unit"),

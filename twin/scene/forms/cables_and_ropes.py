@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.scene.forms.triangles import require_few, step_of, tube
+from twin.scene.forms.triangles import chord_step, require_few_vertices, tube
 from twin.scene.placed import FreeForm
 from uwlts.model.sensor import Positive
 
@@ -39,12 +39,12 @@ class Cable(FreeForm):
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
         """Return a tube with open ends whose facets deviate by `_SAG_MM`."""
         radius = self.diameter_mm / 2
-        step = step_of(_SAG_MM, 1 / radius)
+        step = chord_step(_SAG_MM, 1 / radius)
         around = np.linspace(0, 2 * np.pi, int(np.ceil(2 * np.pi * radius / step)), endpoint=False)
         bend = self.bend_radius_mm
-        along = self.length_mm if bend is None else step_of(_SAG_MM, 1 / (bend + radius))
+        along = self.length_mm if bend is None else chord_step(_SAG_MM, 1 / (bend + radius))
         rings = int(np.ceil(self.length_mm / along)) + 1
-        require_few(rings * len(around), step_mm=step, advice="make it shorter or thinner")
+        require_few_vertices(rings * len(around), step_mm=step, advice="make it shorter or thinner")
         x = np.linspace(-0.5, 0.5, rings) * self.length_mm
         vertices, faces = tube(x, around, np.full((rings, len(around)), radius))
         if bend is None:
@@ -69,11 +69,13 @@ class Rope(FreeForm):
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
         """Return a tube with open ends whose facets deviate by `_SAG_MM` away from the valleys."""
         strand, _ = _strand(self)
-        step = step_of(_SAG_MM, 1 / strand)
+        step = chord_step(_SAG_MM, 1 / strand)
         around = np.linspace(0, 2 * np.pi, int(np.ceil(np.pi * self.diameter_mm / step)), endpoint=False)
         # A strand turns more slowly along the rope than around it, by this ratio.
         rings = int(np.ceil(self.length_mm / (step * max(1.0, self.lay_mm / (np.pi * self.diameter_mm))))) + 1
-        require_few(rings * len(around), step_mm=step, advice="make it shorter or thinner, or its strands fewer")
+        require_few_vertices(
+            rings * len(around), step_mm=step, advice="make it shorter or thinner, or its strands fewer"
+        )
         x = np.linspace(-0.5, 0.5, rings) * self.length_mm
         return tube(x, around, rope_radius(self, x[:, None], around))
 

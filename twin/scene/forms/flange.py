@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial import Delaunay
 
-from twin.scene.forms.triangles import quads, require_few, step_of
+from twin.scene.forms.triangles import chord_step, quads, require_few_vertices
 from twin.scene.placed import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
@@ -108,11 +108,11 @@ class Flange(FreeForm):
         rings = [((0.0, 0.0), outer), ((0.0, 0.0), bore), *(((x, y), hole) for x, y in self.hole_places())]
         edges, steps = [], []
         for middle, radius in rings:
-            steps.append(min(step_of(_SAG_MM, 1 / radius), 0.5 * width))
+            steps.append(min(chord_step(_SAG_MM, 1 / radius), 0.5 * width))
             angle = np.linspace(0, 2 * np.pi, max(24, int(np.ceil(2 * np.pi * radius / steps[-1]))), endpoint=False)
             edges.append(np.array(middle) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
         coarse = max(steps)
-        require_few(
+        require_few_vertices(
             int(np.pi * outer**2 / coarse**2) + sum(map(len, edges)), step_mm=coarse, advice="leave more between holes"
         )
         x, y = np.meshgrid(*[np.arange(-outer, outer, coarse)] * 2)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.scene.forms.triangles import finer_in_front, require_few, step_of, tube, waves
+from twin.scene.forms.triangles import chord_step, require_few_vertices, space_angles, tube, waves
 from twin.scene.placed import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
@@ -59,12 +59,14 @@ class OvergrownPipe(FreeForm):
         wavy = self.unevenness * self.growth_mm * (2 * np.pi / (_SHORTEST * self.patch_mm)) ** 2 / 4
         # Curvature of a barnacle's flank, and of its narrower crater.
         shell = 24 * self.barnacle_height_mm / (0.5 * self.barnacle_diameter_mm) ** 2 if self.barnacles else 0.0
-        step = step_of(_SAG_MM, 1 / radius + wavy + shell)
-        plain = step_of(_SAG_MM, 1 / radius + wavy)
+        step = chord_step(_SAG_MM, 1 / radius + wavy + shell)
+        plain = chord_step(_SAG_MM, 1 / radius + wavy)
         reach = np.radians(_GROWN_DEG) + 0.5 * self.barnacle_diameter_mm / (self.diameter_mm / 2)
-        around = finer_in_front(reach, radius, step=step, plain=plain)
+        around = space_angles(reach, radius, step=step, plain=plain)
         rings = int(np.ceil(self.length_mm / step)) + 1
-        require_few(rings * len(around), step_mm=step, advice="make its barnacles wider or lower, or the pipe smaller")
+        require_few_vertices(
+            rings * len(around), step_mm=step, advice="make its barnacles wider or lower, or the pipe smaller"
+        )
         x = np.linspace(-0.5, 0.5, rings) * self.length_mm
         return tube(x, around, overgrown_radius(self, x[:, None], np.where(around > np.pi, around - 2 * np.pi, around)))
 

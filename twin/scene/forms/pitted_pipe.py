@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.scene.forms.triangles import finer_in_front, require_few, step_of, tube
+from twin.scene.forms.triangles import chord_step, require_few_vertices, space_angles, tube
 from twin.scene.placed import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
@@ -53,13 +53,13 @@ class PittedPipe(FreeForm):
         """
         # The second derivative of a pit is largest at its rim.
         radius = self.diameter_mm / 2
-        step = step_of(_PIT_SAG_MM, 1 / radius + 8 * self.pit_depth_mm / (0.5 * self.pit_diameter_mm) ** 2)
-        plain = step_of(_PIT_SAG_MM, 1 / radius)
+        step = chord_step(_PIT_SAG_MM, 1 / radius + 8 * self.pit_depth_mm / (0.5 * self.pit_diameter_mm) ** 2)
+        plain = chord_step(_PIT_SAG_MM, 1 / radius)
         reach = np.radians(_PITTED_DEG) + 0.5 * self.pit_diameter_mm / radius if self.pits else 0.0
-        around = finer_in_front(reach, radius, step=step, plain=plain)
+        around = space_angles(reach, radius, step=step, plain=plain)
         rings = int(np.ceil(self.length_mm / (step if self.pits else self.length_mm))) + 1
         advice = "make its pits wider or flatter, or the pipe smaller"
-        require_few(rings * len(around), step_mm=step, advice=advice)
+        require_few_vertices(rings * len(around), step_mm=step, advice=advice)
         x = np.linspace(-0.5, 0.5, rings) * self.length_mm
         # Angles at the back, without pits, exceed pi.
         return tube(x, around, pitted_radius(self, x[:, None], np.where(around > np.pi, around - 2 * np.pi, around)))

@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.scene.forms.triangles import grid_faces, require_few, step_of, tube, waves
+from twin.scene.forms.triangles import chord_step, grid_faces, require_few_vertices, tube, waves
 from twin.scene.placed import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
@@ -66,11 +66,11 @@ class Seabed(FreeForm):
         """Return the open surface of the sediment, and those of the stones, which intersect it."""
         k = 2 * np.pi / self.ripple_pitch_mm
         curvature = 0.5 * self.ripple_height_mm * k**2 + 0.25 * self.roughness_mm * (k / _SHORTEST) ** 2
-        step = step_of(_SAG_MM, max(curvature, 8 * _SAG_MM / min(self.width_mm, self.height_mm) ** 2))
+        step = chord_step(_SAG_MM, max(curvature, 8 * _SAG_MM / min(self.width_mm, self.height_mm) ** 2))
         columns, rows = (int(np.ceil(side / step)) + 1 for side in (self.width_mm, self.height_mm))
         diameters = self.stone_diameters()
         count = rows * columns + sum(int(np.prod(_stone_facets(each))) for each in diameters)
-        require_few(count, step_mm=step, advice="make it smaller, its ripples longer, or its stones fewer")
+        require_few_vertices(count, step_mm=step, advice="make it smaller, its ripples longer, or its stones fewer")
         x, y = (np.linspace(-0.5, 0.5, count) for count in (columns, rows))
         x, y = np.meshgrid(x * self.width_mm, y * self.height_mm, indexing="ij")
         vertices = [np.stack([x, y, -_sediment_height(self, x, y)], axis=-1).reshape(-1, 3)]
@@ -88,7 +88,7 @@ def _stone_facets(diameter_mm: float) -> tuple[int, int]:
 
     On an ellipse with the larger half axis a, a chord over the parameter angle p deviates by at most a p^2 / 8.
     """
-    angle = step_of(2 * _SAG_MM, 0.5 * diameter_mm)
+    angle = chord_step(2 * _SAG_MM, 0.5 * diameter_mm)
     return int(np.ceil(0.5 * np.pi / angle)) + 1, int(np.ceil(2 * np.pi / angle))
 
 

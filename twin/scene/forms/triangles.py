@@ -9,7 +9,7 @@ from uwlts.errors import DescriptionError
 _MOST_VERTICES = 4_000_000
 
 
-def require_few(vertices: int, *, step_mm: float, advice: str) -> None:
+def require_few_vertices(vertices: int, *, step_mm: float, advice: str) -> None:
     """Check the number of vertices; DescriptionError if they would need too much memory."""
     if vertices > _MOST_VERTICES:
         raise DescriptionError(
@@ -17,7 +17,7 @@ def require_few(vertices: int, *, step_mm: float, advice: str) -> None:
         )
 
 
-def step_of(sag_mm: float, curvature: float) -> float:
+def chord_step(sag_mm: float, curvature: float) -> float:
     """Return the step in mm whose chord deviates by ``sag_mm`` from a curve of a curvature in 1/mm.
 
     A chord over a step h deviates by c h^2 / 8.
@@ -37,7 +37,7 @@ def tube(x: np.ndarray, around: np.ndarray, radius: np.ndarray) -> tuple[np.ndar
     return np.stack(places, axis=-1).reshape(-1, 3), faces
 
 
-def finer_in_front(reach: float, radius: float, *, step: float, plain: float) -> np.ndarray:
+def space_angles(reach: float, radius: float, *, step: float, plain: float) -> np.ndarray:
     """Return angles (M,) around a tube from -z towards y.
 
     Steps are ``step`` mm within ``reach`` of -z, else ``plain`` mm.

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.scene.forms.triangles import grid_faces, nodes, require_few, step_of, wave
+from twin.scene.forms.triangles import chord_step, grid_faces, nodes, require_few_vertices, wave
 from twin.scene.placed import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
@@ -73,12 +73,12 @@ class Weld(FreeForm):
         ripple = 0.5 * self.ripple_height_mm * (2 * np.pi / self.ripple_pitch_mm) ** 2
         toe = 8 * self.height_mm / (0.5 * self.width_mm) ** 2
         undercut = 8 * self.undercut_depth_mm / (0.5 * self.undercut_width_mm) ** 2
-        step = step_of(_SAG_MM, 1.3 * ripple + toe + undercut)
+        step = chord_step(_SAG_MM, 1.3 * ripple + toe + undercut)
         plate = self.plate_mm if self.along == "x" else self.plate_mm[::-1]
         along = nodes([0.0], 0.5 * self.length_mm, step=step, length=plate[0])
         across = nodes(_bead_middles(self), self.bead_reach_mm(), step=step, length=plate[1])
         advice = "make its ripples longer or lower, or its beads fewer or shorter"
-        require_few(len(along) * len(across), step_mm=step, advice=advice)
+        require_few_vertices(len(along) * len(across), step_mm=step, advice=advice)
         x, y = np.meshgrid(*((along, across) if self.along == "x" else (across, along)), indexing="ij")
         return np.stack([x, y, -weld_height(self, x, y)], axis=-1).reshape(-1, 3), grid_faces(x.shape)
 
