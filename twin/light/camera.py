@@ -24,7 +24,7 @@ from twin.backend.arrays import (
     to_jit,
     to_numpy,
 )
-from twin.light.pose import Rays, SensorPose
+from twin.light.pose import CLEAR_MM, Rays, SensorPose
 from twin.scene.objects import Objects
 from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object
@@ -38,8 +38,6 @@ _RIM_POINTS = 8
 """Number of rays through the pupil's rim, enough for a stable largest blur radius."""
 _DEPTHS = 200
 """Number of depths in the blur table, spaced logarithmically from 1 mm to 10 m behind the window."""
-_CLEAR_MM = 1e-2
-"""Offset of reflected rays from the mirror, which prevents a second intersection with it."""
 
 
 class LensRays:
@@ -278,5 +276,5 @@ def trace_segments(
             weight = weight * dr.select(front, objects.mirror_share(si), 0.0) * dr.exp(-extinction * length)
             length_before = length_before + length
             d_reflected = pose.object_direction(si.to_world(mi.reflect(si.wi)), after_s)
-            o = mi.Point3f(o + d * length + d_reflected * _CLEAR_MM)
+            o = mi.Point3f(o + d * length + d_reflected * CLEAR_MM)
             d = dr.select(front, d_reflected, d)

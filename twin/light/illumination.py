@@ -11,13 +11,11 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import Bool, Float, Point3f, Vector3f, opaque, opaque_transform
-from twin.light.pose import Rays, SensorPose
+from twin.light.pose import CLEAR_MM, Rays, SensorPose
 from twin.light.sheet import Sheet, SheetLight
 from twin.light.water import AngleTable, one_minus_cosine
 from twin.scene.objects import MirrorFace
 
-_CLEAR_MM = 1e-2
-"""Offset of shadow rays from the surface they start on."""
 _LARGEST_SLOPE = 0.7
 """Largest ratio of the distance from the sheet to the distance from the window that `SheetLobe` handles."""
 
@@ -105,9 +103,9 @@ class Light:
     def _is_blocked(
         self, objects: mi.Scene, p: Point3f, towards: Vector3f, length: Float, after_s: Float | None, active: Bool
     ) -> Bool:
-        ray = self._pose.ray(p + towards * _CLEAR_MM, towards, after_s)
-        ray.maxt = length - 2 * _CLEAR_MM
-        return objects.ray_test(ray, active & (length > 2 * _CLEAR_MM))
+        ray = self._pose.ray(p + towards * CLEAR_MM, towards, after_s)
+        ray.maxt = length - 2 * CLEAR_MM
+        return objects.ray_test(ray, active & (length > 2 * CLEAR_MM))
 
     def sample_rays(self, u: Point3f) -> Rays:
         """Sample rays of a direct light in the sensor's OCS with a density proportional to power."""

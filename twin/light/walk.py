@@ -30,7 +30,7 @@ import numpy as np
 
 from twin.backend.arrays import PCG32, Bool, BSDFPtr, Float, Point2f, Point3f, SurfaceInteraction3f, UInt32, Vector3f
 from twin.light.illumination import Light, Passage, SheetLobe
-from twin.light.pose import Rays, SensorPose
+from twin.light.pose import CLEAR_MM, Rays, SensorPose
 from twin.light.sheet import SheetLight
 from twin.light.water import Scattering, one_minus_cosine, rotate_about
 from twin.options import Effects
@@ -48,7 +48,6 @@ _NEAR_SHEET = 0.5
 """Fraction of scattering distances sampled about the position nearest to the sheet."""
 _SURVIVES_FROM = 0.25
 """Walks with less than this fraction of their initial strength undergo Russian roulette."""
-_CLEAR_MM = 1e-2
 
 
 @dataclass
@@ -261,7 +260,7 @@ class Walker:
         away = walks.away | ~specular
         following = replace(
             walks,
-            origin=mi.Point3f(vertex + onward * dr.select(in_water, 0.0, _CLEAR_MM)),
+            origin=mi.Point3f(vertex + onward * dr.select(in_water, 0.0, CLEAR_MM)),
             direction=onward,
             strength=strength,
             density=dr.select(specular | ~away, 0.0, density),
@@ -321,9 +320,9 @@ class Walker:
         local = si.to_local(self.pose.direction(direction))
         sent = si.bsdf().eval(mi.BSDFContext(), si, local, active)[0]
         value, density = scattered(-direction)
-        shadow = self.pose.ray(lit + direction * _CLEAR_MM, direction)
-        shadow.maxt = distance - 2 * _CLEAR_MM
-        active &= (sent * value > 0) & (distance > 2 * _CLEAR_MM)
+        shadow = self.pose.ray(lit + direction * CLEAR_MM, direction)
+        shadow.maxt = distance - 2 * CLEAR_MM
+        active &= (sent * value > 0) & (distance > 2 * CLEAR_MM)
         active &= ~self.objects.scene.ray_test(shadow, active)
         here = light.evaluate(lit)
         by_light = self._light_density(light, here, mi.Frame3f.cos_theta(si.wi))

@@ -16,9 +16,9 @@ from pydantic import BeforeValidator, Discriminator, Field, SerializeAsAny, Tag,
 from twin.scene.forms import AnyForm
 from twin.scene.guide_and_table import LinearGuide, RotaryTable
 from twin.scene.motion import Motion
-from twin.scene.placed import FlatObject, Pose, Reflectance, SceneObject
 from twin.scene.platforms import IdealPath, Platform
 from twin.scene.robot import Robot
+from twin.scene.scene_object import FlatObject, Pose, Reflectance, SceneObject
 from twin.scene.vehicle import Vehicle
 from uwlts.errors import DescriptionError
 from uwlts.model.library import find, read_table, validated

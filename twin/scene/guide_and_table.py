@@ -7,8 +7,8 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from twin.scene.placed import Pose
 from twin.scene.platforms import SPOT_MM, Platform, PlatformMotion, Route, displace_poses
+from twin.scene.scene_object import Pose
 from uwlts.model.sensor import NotNegative, Positive
 
 

@@ -15,7 +15,7 @@ from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32
 from twin.scene.description import AnyObject, Block, CirclePlate, Mesh, Pipe, Plate, Scene, Sphere, TargetPlate
 from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, view_along_normal
 from twin.scene.forms.triangles import bowed_plate
-from twin.scene.placed import FreeForm
+from twin.scene.scene_object import FreeForm
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import require_regular_file
 

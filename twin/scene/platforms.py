@@ -15,7 +15,7 @@ from scipy.interpolate import Akima1DInterpolator
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from twin.scene.motion import Light, Shot
-from twin.scene.placed import Pose
+from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Bracket, Description, NotNegative, Positive
 from uwlts.storage.pose_files import Unit, read_trajectory

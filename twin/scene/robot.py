@@ -7,8 +7,8 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from twin.scene.placed import Pose
 from twin.scene.platforms import LEAD_S, PlatformMotion, Route, find_stop, interpolate_values
+from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import NotNegative, Positive, Vector
 

@@ -11,7 +11,7 @@ from twin.recording.studio import check_scene, medium_of
 from twin.scene.description import Scene, load_scene
 from twin.scene.motion import Motion
 from twin.scene.objects import Objects, build_objects
-from twin.scene.placed import Pose
+from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError, RangeError
 from uwlts.model.library import library_folder, load_sensor, names
 from uwlts.model.sensor import Sensor

@@ -12,7 +12,7 @@ from twin.scene.forms.cables_and_ropes import rope_radius
 from twin.scene.forms.flange import flange_face
 from twin.scene.forms.overgrown_pipe import overgrown_radius
 from twin.scene.forms.seabed import seabed_height
-from twin.scene.placed import FreeForm
+from twin.scene.scene_object import FreeForm
 
 
 def mesh_of(form: FreeForm) -> trimesh.Trimesh:

@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from twin.scene.guide_and_table import LinearGuide, RotaryTable
-from twin.scene.placed import Pose
 from twin.scene.platforms import IdealPath
 from twin.scene.robot import Robot
+from twin.scene.scene_object import Pose
 from twin.scene.vehicle import Navigation, Sea, Vehicle, sample_waves, simulate_drift
 from uwlts.errors import DescriptionError
 from uwlts.model.trajectory import Trajectory

@@ -6,7 +6,7 @@ import trimesh
 from pydantic import ValidationError
 from scipy.signal import argrelmin
 
-from twin.scene import placed
+from twin.scene import scene_object
 from twin.scene.forms import Head, PittedPipe, Weld
 from twin.scene.forms.head import head_depth
 from twin.scene.forms.pitted_pipe import pit_places, pitted_radius
@@ -149,7 +149,7 @@ def test_irregular_beads_follow_their_seed():
 def test_surfaces_are_the_same_every_time_and_kept_unharmed():
     for make in (lambda: Head(kind="head", height_mm=20.0).surface(), lambda: Weld(kind="weld", beads=1).surface()):
         first = make()
-        placed._cache_triangles.cache_clear()
+        scene_object._cache_triangles.cache_clear()
         for old, new in zip(first, make(), strict=True):
             assert old is not new
             np.testing.assert_array_equal(old, new)

@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from twin.scene.forms.triangles import chord_step, require_few_vertices, tube
-from twin.scene.placed import FreeForm
+from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import Positive
 
 _SAG_MM = 0.005

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from scipy.spatial import Delaunay
 
 from twin.scene.forms.triangles import chord_step, quads, require_few_vertices
-from twin.scene.placed import FreeForm
+from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
 _SAG_MM = 0.004

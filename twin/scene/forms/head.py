@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 
 from twin.scene.forms.triangles import quads
-from twin.scene.placed import FreeForm
+from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import Positive
 
 # Tables in units of the head's height, from the end of the neck at y = -0.5 to the crown at 0.5.

@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from twin.scene.forms.triangles import chord_step, grid_faces, nodes, require_few_vertices, wave
-from twin.scene.placed import FreeForm
+from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
 _TRAIL = 1 / 3
