@@ -166,7 +166,7 @@ def test_an_imperfection_alone_changes_what_it_is_about_and_nothing_else(name: s
 def test_any_printed_target_has_a_targets_imperfections():
     board = {"kind": "chessboard", "columns": 7, "rows": 6, "square_mm": 10.0}
     scene = scene_of({"kind": "target_plate"}, target=board)
-    found = _SampledImperfections(campaign(**SIZES), 1).as_it_really_is(scene, np.random.default_rng(1)).objects[0]
+    found = _SampledImperfections(campaign(**SIZES), 1).apply_imperfections(scene, np.random.default_rng(1)).objects[0]
     assert (found.centre_std_mm, found.detection_std_px, found.errors_seed) == (0.002, 0.03, 1)
     assert found.bow_mm != 0
     assert np.count_nonzero(found.rotation_deg) == 2
