@@ -79,7 +79,7 @@ def test_beside_another_calibration_and_without_a_joint_estimate(folder: Path):
     assert run("nominal", "thesis", "--medium", "water", "--out", "nominal.json", folder=folder).returncode == 0
     done = run("certificate", "calibration.json", "--before", "nominal.json", "--out", "cert.html", folder=folder)
     assert done.returncode == 0, done.stderr
-    assert "Against nominal.json" in (folder / "cert.html").read_text(encoding="utf-8")
+    assert "Comparison with nominal.json" in (folder / "cert.html").read_text(encoding="utf-8")
     plain = run("certificate", "nominal.json", folder=folder)
     assert plain.returncode == 0, plain.stderr
     assert "the uncertainty of lengths measured by it is not known" in plain.stdout

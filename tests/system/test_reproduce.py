@@ -332,7 +332,7 @@ def test_a_take_that_fails_is_named(reproduce, described: Path, tmp_path: Path):
     code, said = reproduce(described / "impossible.toml", "--out", tmp_path / "runs", "--campaigns", 1, "--spp", 2)
     assert code == 2
     assert said.startswith("error: ")
-    assert "campaign-0/board-moon-air.h5: the objects lie from Z = " in said
+    assert "campaign-0/board-moon-air.h5: the objects are at Z = " in said
     assert len(said.splitlines()) == 1
     assert not list(tmp_path.rglob("board-moon-air*"))
 

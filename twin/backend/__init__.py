@@ -1,1 +1,1 @@
-"""The compiler library that the renderer needs."""
+"""LLVM library and array types of the renderer."""

@@ -1,8 +1,8 @@
-"""Numbers and arrays between Python and Dr.Jit, moved so that equal work always gives equal kernels.
+"""Conversion of numbers and arrays between Python and Dr.Jit, such that equal work gives equal kernels.
 
-Dr.Jit wraps NumPy's memory without copying and compiles its alignment into the kernel; it also compiles the size into
-the kernel that gathers a vector's components, and every plain number. Any of these would compile kernels anew, which
-takes seconds, from frame to frame or from sensor to sensor.
+Dr.Jit wraps NumPy's memory without copying and compiles its alignment into the kernel. It also compiles every plain
+number and, if a vector's components are gathered, the size. Any of these would cause recompilation, which takes
+seconds, between frames or sensors.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# Mitsuba's arrays are those of the variant in use. The stubs give them two unrelated families of types (`mitsuba.Float`
-# and `drjit.auto.ad.Float`) and refuse sums of points and vectors: annotations name the arrays without checking them.
+# Mitsuba's array types depend on the variant. The stubs declare two unrelated families (`mitsuba.Float` and
+# `drjit.auto.ad.Float`) and reject sums of points and vectors: annotations name the types without checking them.
 Float: TypeAlias = Any
 Bool: TypeAlias = Any
 UInt32: TypeAlias = Any
@@ -30,7 +30,7 @@ _ALIGNMENT_BYTES = 64
 
 
 def to_jit(kind: type, values: np.ndarray) -> Float:
-    """A one-dimensional array as ``mi.Float`` or ``mi.UInt32`` whose memory is always aligned."""
+    """Return a one-dimensional array as ``mi.Float`` or ``mi.UInt32`` with aligned memory."""
     dtype = np.dtype(np.float32 if kind is mi.Float else np.uint32)
     size = values.size * dtype.itemsize
     memory = np.empty(size + _ALIGNMENT_BYTES, np.uint8)
@@ -41,39 +41,39 @@ def to_jit(kind: type, values: np.ndarray) -> Float:
 
 
 def to_numpy(vector: Point3f) -> np.ndarray:
-    """The components of N vectors as (N, 3)."""
+    """Return the components of N vectors as (N, 3)."""
     return np.stack([component.numpy() for component in vector], axis=1)
 
 
 def scalar_transform(matrix: np.ndarray) -> mi.ScalarTransform4f:
-    """A transform (4, 4) of a shape, fixed in the scene."""
+    """Return the transform (4, 4) of a shape fixed in the scene."""
     return mi.ScalarTransform4f(matrix)
 
 
 def opaque(value: float) -> Float:
-    """A number that is not compiled into kernels, but for 0, which saves work where something is absent.
+    """Return a number that is not compiled into kernels; 0 is, which removes work for absent effects.
 
-    Two of the same value are two inputs of a kernel: what is computed from both is computed twice.
+    Two opaque numbers of equal value are separate kernel inputs: expressions of each are computed separately.
     """
     return dr.opaque(mi.Float, value) if value else mi.Float(0.0)
 
 
 def opaque_point(place: np.ndarray) -> Point3f:
-    """A point (3,) whose numbers are not compiled into kernels."""
+    """Return a point (3,) whose components are not compiled into kernels."""
     return mi.Point3f(*(opaque(float(x)) for x in place))
 
 
 def opaque_transform(matrix: np.ndarray) -> mi.Transform4f:
-    """A transform (4, 4) whose numbers are not compiled into kernels."""
+    """Return a transform (4, 4) whose elements are not compiled into kernels."""
     opaque = mi.Matrix4f(matrix)
     dr.make_opaque(opaque)
     return mi.Transform4f(opaque)
 
 
 def begin_kernels() -> None:
-    """Begin to write down kernels that are the same in every frame, whatever arrays are still in use from before.
+    """Start a new scope of Dr.Jit, so that kernels are the same in every frame, regardless of existing arrays.
 
-    Dr.Jit shares a plain number among all arrays of one basic block that need it, and orders kernels by where each
-    number came up first: those of a block of their own never meet older ones.
+    Within a scope, Dr.Jit shares plain numbers among all arrays and orders kernels by their first use. A new scope
+    shares none with older arrays.
     """
     dr.detail.new_scope(dr.backend_v(mi.Float))

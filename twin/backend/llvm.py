@@ -1,10 +1,10 @@
-"""Finds and checks the libLLVM with which Dr.Jit compiles its kernels.
+"""Search and check of the libLLVM that Dr.Jit uses to compile kernels.
 
-Call `prepare_llvm` before mitsuba or drjit is imported. Versions 14 to 16 are refused: with them the first kernel can
-abort the whole process (`LLVM ERROR: Cannot select: ... fminimum`), which no program can catch. On x86-64 Linux a
-suitable library is a dependency of this project; elsewhere it comes from the system.
+Call `prepare_llvm` before mitsuba or drjit is imported. Versions 14 to 16 are refused: their first kernel can abort the
+whole process (`LLVM ERROR: Cannot select: ... fminimum`), which no program can catch. On x86-64 Linux a suitable
+library is a dependency of this project; elsewhere it comes from the system.
 
-`python -m twin.backend.llvm` chooses a library and runs a kernel with it. Exit status 0, or 2 if there is none.
+`python -m twin.backend.llvm` chooses a library and runs a kernel with it. The exit status is 0, or 2 without a library.
 """
 
 import ctypes
@@ -22,13 +22,13 @@ from uwlts.errors import SetupError
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 MINIMUM_MAJOR = 17
-"""The oldest version with which Dr.Jit's kernels do not abort."""
+"""Oldest version whose kernels do not abort."""
 RUNTIME_LIBRARY = "libatomic.so.1"
-"""Dr.Jit's own wheel is linked against it, and minimal systems without a compiler lack it."""
+"""Dr.Jit's wheel is linked against it; minimal systems without a compiler lack it."""
 TRIAL_SECONDS = 300
-"""A kernel takes a few seconds, and imports may come from a slow network drive."""
+"""Time limit of the trial kernel: it takes a few seconds, but imports from a network drive may be slow."""
 SINGLE_PRECISION_INTEGERS = 2**24
-"""Integers below this are exact as 32-bit floats."""
+"""Integers below this are exact in single precision."""
 
 _NAME = re.compile(r"libLLVM(-\d+(\.\d+)*)?\.so(\..+)?")
 _SYSTEM_FOLDERS = ("local/lib", "local/lib64", "lib", "lib64", "lib/*-linux-gnu", "lib/llvm*/lib", "lib64/llvm*/lib")
@@ -38,7 +38,7 @@ Install what is missing:
   Debian, Ubuntu:  apt-get install libllvm19 libatomic1   (as root; any of libllvm17 and newer)
   Fedora:          dnf install llvm-libs libatomic   (as root)
   Arch:            pacman -S llvm-libs gcc-libs   (as root)"""
-# The number makes the kernel a new one, so that it is compiled rather than taken from Dr.Jit's cache on disk.
+# The number makes the kernel unique, so that it is compiled and not loaded from Dr.Jit's cache on disk.
 _TRIAL = """
 from twin.backend.llvm import prepare_llvm
 prepare_llvm()
@@ -50,7 +50,7 @@ dr.eval(dr.minimum(dr.arange(Float, 4) + {number!r}, 2))
 
 @dataclass(frozen=True)
 class LlvmLibrary:
-    """A libLLVM that Dr.Jit can use, with the version that the library itself states."""
+    """A libLLVM that Dr.Jit can use, with the version stated by the library itself."""
 
     path: Path
     version: tuple[int, int, int]
@@ -60,9 +60,9 @@ class LlvmLibrary:
 
 
 def prepare_llvm() -> LlvmLibrary:
-    """Choose a libLLVM and set DRJIT_LIBLLVM_PATH, which Dr.Jit reads when it is imported.
+    """Choose a libLLVM and set DRJIT_LIBLLVM_PATH, which Dr.Jit reads on import.
 
-    If Dr.Jit is imported already, check its library instead, because it cannot be exchanged any more.
+    If Dr.Jit has already been imported, check its library, which can no longer be exchanged.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def prepare_llvm() -> LlvmLibrary:
 
 @contextmanager
 def threads_kept() -> Iterator[int]:
-    """The number of Dr.Jit's threads, restored afterwards."""
+    """Provide the number of Dr.Jit's threads, and restore it afterwards."""
     import drjit as dr
 
     threads = dr.thread_count()
@@ -96,15 +96,15 @@ def threads_kept() -> Iterator[int]:
 
 
 def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
-    """Return the first libLLVM that Dr.Jit can work with, and check that Dr.Jit's runtime library exists.
+    """Return the first libLLVM that Dr.Jit can use, and check that Dr.Jit's runtime library exists.
 
-    The search covers ``folders`` (default: `search_folders`) in their order. A library named by the environment
-    variable DRJIT_LIBLLVM_PATH is the user's choice and the only one considered: it is used or refused, never replaced.
+    ``folders`` (default: `search_folders`) are searched in order. A library named by the environment variable
+    DRJIT_LIBLLVM_PATH is the only one considered: it is used or refused, never replaced.
 
     Raises
     ------
     SetupError
-        None is suitable; the message lists what was found and how to install one.
+        No library is suitable; the message lists what was found and how to install one.
     """
     chosen, faults = os.environ.get(VARIABLE), ""
     for path in [Path(chosen)] if chosen else list_candidates(folders):
@@ -134,7 +134,7 @@ def find_llvm(folders: Iterable[Path] | None = None) -> LlvmLibrary:
 
 
 def examine(path: Path) -> LlvmLibrary:
-    """Load a library and ask for its version, as the file name is not trusted.
+    """Load a library and query its version, as the file name is not reliable.
 
     Raises
     ------
@@ -156,18 +156,21 @@ def examine(path: Path) -> LlvmLibrary:
 
 
 def list_candidates(folders: Iterable[Path] | None = None) -> list[Path]:
-    """Files named like a libLLVM in the folders, links resolved, each file once; unreadable folders hold none."""
+    """Return files named like a libLLVM in the folders, with links resolved and without duplicates.
+
+    Unreadable folders are skipped.
+    """
     found: dict[Path, None] = {}
     for folder in search_folders() if folders is None else folders:
         with suppress(OSError):
-            # Newer ones first, as their names sort mostly by version.
+            # Newest first: names sort mostly by version.
             paths = [path for path in sorted(folder.iterdir(), reverse=True) if _NAME.fullmatch(path.name)]
             found |= dict.fromkeys(path.resolve() for path in paths if path.is_file())
     return list(found)
 
 
 def search_folders() -> list[Path]:
-    """Folders of LD_LIBRARY_PATH and of the environment in use, then the usual ones of the system."""
+    """Return the folders of LD_LIBRARY_PATH and of the current environment, then those of the system."""
     folders = [Path(folder) for folder in os.environ.get("LD_LIBRARY_PATH", "").split(":") if folder]
     folders += [Path(prefix, "lib") for prefix in (sys.prefix, os.environ.get("CONDA_PREFIX")) if prefix]
     folders += [folder for pattern in _SYSTEM_FOLDERS for folder in sorted(Path("/usr").glob(pattern))]
@@ -175,7 +178,7 @@ def search_folders() -> list[Path]:
 
 
 def main() -> int:
-    """Command line of this module; returns the exit status."""
+    """Run the command line of this module; return the exit status."""
     try:
         print(f"chosen: {find_llvm()}")
         _try_kernel()
@@ -186,12 +189,12 @@ def main() -> int:
 
 
 def _try_kernel() -> None:
-    """Compile and run a kernel in a child process, where an abort inside LLVM does no harm."""
+    """Compile and run a kernel in a child process, which survives an abort inside LLVM."""
     trial = [sys.executable, "-c", _TRIAL.format(number=float(time.time_ns() % SINGLE_PRECISION_INTEGERS))]
     try:
         done = subprocess.run(trial, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=TRIAL_SECONDS)
     except subprocess.TimeoutExpired as error:
-        raise SetupError(f"a trial kernel of Dr.Jit did not end within {TRIAL_SECONDS} s") from error
+        raise SetupError(f"a trial kernel of Dr.Jit did not finish within {TRIAL_SECONDS} s") from error
     if done.returncode != 0:
         end = "\n  ".join(done.stderr.strip().splitlines()[-5:])
         raise SetupError(f"a trial kernel of Dr.Jit failed, exit status {done.returncode}:\n  {end}")

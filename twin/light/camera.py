@@ -1,4 +1,4 @@
-"""Rays of the camera from the image through lens, pupil and window into the scene, and on by way of its mirrors."""
+"""Camera rays from the image through lens, pupil and window into the scene, with reflections at mirrors."""
 
 from __future__ import annotations
 
@@ -24,30 +24,28 @@ from twin.backend.arrays import (
     to_jit,
     to_numpy,
 )
-from twin.light.pose import Rays, SensorPose
+from twin.light.pose import CLEAR_MM, Rays, SensorPose
 from twin.scene.objects import Objects
 from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object
 from uwlts.model.sensor import Camera, Medium, Sensor, Window
 
 _NEWTON_STEPS = 6
-"""Lead to the rounding of 32 bits for the distortion of real lenses."""
+"""Steps after which the inverse distortion of real lenses is exact in single precision."""
 _FIELD = 0.96
-"""Blur is measured in the image's middle and at this share of the way to its edges and corners."""
+"""The blur is measured at the image centre and at this fraction of the distance to its edges and corners."""
 _RIM_POINTS = 8
-"""Rays through the pupil's rim; the blur's largest radius changes little from one to the next."""
+"""Number of rays through the pupil's rim, enough for a stable largest blur radius."""
 _DEPTHS = 200
-"""Depths of the blur's table, evenly spread on a logarithmic scale from 1 mm to 10 m behind the window."""
-_CLEAR_MM = 1e-2
-"""Reflected rays start this far from the mirror."""
+"""Number of depths in the blur table, spaced logarithmically from 1 mm to 10 m behind the window."""
 
 
 class LensRays:
-    """Ray generator of a camera; the entrance pupil is a disc about the origin of the camera frame, square to z.
+    """Ray generator of a camera; the entrance pupil is a disc in the plane z = 0 of the camera frame.
 
-    ``irradiance_on_axis`` is the irradiance on the image sensor per radiance at the pupil, in sr, on the axis; off it
-    cos^4 comes on top. E = L (pi / 4) / (N (1 + m))^2 with the magnification m at the focus distance (Smith, Modern
-    Optical Engineering, 4th ed., Eqs. 8.7 and 8.10).
+    ``irradiance_on_axis`` is the image irradiance divided by the radiance at the pupil, in sr, on the optical axis;
+    off-axis values follow cos^4. E = L (pi / 4) / (N (1 + m))^2 with the magnification m at the focus distance (Smith,
+    Modern Optical Engineering, 4th ed., Eqs. 8.7 and 8.10).
     """
 
     def __init__(self, camera: Camera):
@@ -60,22 +58,22 @@ class LensRays:
         self._distortion = {name: opaque(value) for name, value in camera.distortion.model_dump().items()}
         self._distorts = any(camera.distortion.model_dump().values())
 
-    def through_pupil(self, chief: Vector3f, pupil: Point2f) -> tuple[Point3f, Vector3f]:
-        """Origin and unit direction in the camera frame of the ray through ``pupil``, a point of the unit disc.
+    def trace_through_pupil(self, chief: Vector3f, pupil: Point2f) -> tuple[Point3f, Vector3f]:
+        """Return origin and unit direction in the camera frame of the ray through ``pupil``, a point of the unit disc.
 
-        ``chief`` is the chief ray's direction; both rays meet in the plane z = focus distance (thin lens). The pupil's
-        radius is D / 2 = c / (2 N (1 + m)) with the image distance c (camera constant).
+        ``chief`` is the direction of the chief ray; both rays meet in the plane z = focus distance (thin lens). The
+        pupil radius is D / 2 = c / (2 N (1 + m)) with the image distance c (camera constant).
         """
         origin = self._pupil_radius_mm * mi.Point3f(pupil.x, pupil.y, 0.0)
         focused = chief * (self._focus_mm / chief.z)
         return origin, dr.normalize(mi.Vector3f(focused - origin))
 
     def directions(self, x: Float, y: Float) -> Vector3f:
-        """Unit directions of chief rays in the camera frame; pixel (0, 0) is the centre of the first pixel."""
-        true = self._undistorted(mi.Point2f((x - self._cx) / self._fx, (y - self._cy) / self._fy))
+        """Return unit directions of chief rays in the camera frame; pixel (0, 0) is the centre of the first pixel."""
+        true = self._undistort(mi.Point2f((x - self._cx) / self._fx, (y - self._cy) / self._fy))
         return dr.normalize(mi.Vector3f(true.x, true.y, 1.0))
 
-    def _undistorted(self, seen: Point2f) -> Point2f:
+    def _undistort(self, seen: Point2f) -> Point2f:
         """Invert the distortion, a rational Brown-Conrady model (`Distortion`), by Newton's method."""
         if not self._distorts:
             return seen
@@ -98,8 +96,11 @@ class LensRays:
         return point
 
 
-def frame_about(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Right-handed rotation (3, 3) with columns x, y, z where z = ``axis`` and x is ``across`` made square to it."""
+def build_frame(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Return the right-handed rotation (3, 3) with columns x, y, z.
+
+    The column z is ``axis``, normalised; x is the component of ``across`` perpendicular to it, normalised.
+    """
     z = axis / np.linalg.norm(axis)
     x = across - (across @ z) * z
     x /= np.linalg.norm(x)
@@ -107,10 +108,11 @@ def frame_about(axis: np.ndarray, across: np.ndarray) -> np.ndarray:
 
 
 class WindowFaces:
-    """Both faces of a window, which lets rays pass unchanged if it is not mounted.
+    """Both faces of a window. Rays pass unchanged if the window is not mounted.
 
-    Rays meet the faces in a known order, so each is intersected alone, as a disc of a plane. ``origin_mm`` (3,) and
-    ``rotation`` (3, 3) are the module's frame in the camera frame; the third column is the module's axis.
+    Rays meet the faces in a known order, so each face is intersected on its own as a disc. ``origin_mm`` (3,) and
+    ``rotation`` (3, 3) give the frame of the module (camera or laser) in the camera frame; the third column is its
+    axis.
     """
 
     def __init__(
@@ -120,7 +122,7 @@ class WindowFaces:
         self.mounted = window.mounted
         if not window.mounted:
             if medium.kind != "air":
-                raise DesignError("a window is left out although the sensor is in water: mount it or measure in air")
+                raise DesignError("the sensor is in water without a window: mount the window or measure in air")
             return
         glass = window.index(wavelength_nm)
         self._absorption = opaque(window.absorption_per_mm())
@@ -131,11 +133,11 @@ class WindowFaces:
         self._radius = opaque(window.aperture_diameter_mm / 2)
         self._faces = [(opaque_point(inner), opaque(glass)), (opaque_point(outer), opaque(index / glass))]
 
-    def through(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> Rays:
-        """Send rays from the module's side through both faces; the weight of those that do not pass is 0.
+    def trace(self, origin: Point3f, direction: Vector3f, *, mode: mi.TransportMode) -> Rays:
+        """Trace rays from the module through both faces; rays that do not pass get the weight 0.
 
-        ``mode`` is Radiance for rays traced backwards from the camera (weights carry 1 / n^2) and Importance for light
-        sent forwards from the laser.
+        ``mode`` is Radiance for rays traced backwards from the camera, whose weights contain 1 / n^2. It is Importance
+        for light traced forwards from the laser.
         """
         width = dr.width(direction)
         weight, valid = dr.full(mi.Float, 1.0, width), dr.full(mi.Bool, True, width)
@@ -155,7 +157,7 @@ class WindowFaces:
                 weight *= dr.square(inverse)
             if number == 1:
                 weight *= dr.exp(-self._absorption * t)
-            # Snell's law: the part along the face is stretched by the ratio of the indices.
+            # Snell's law: the tangential component scales with the ratio of the indices.
             d = mi.Vector3f((d - normal * cosine) * inverse - normal * refracted_cosine)
         return Rays(p, d, dr.select(valid & (weight > 0), weight, 0.0))
 
@@ -174,19 +176,19 @@ class CameraView:
         self._grids: dict[int, tuple[Rays, tuple[int, int]]] = {}
 
     def bundle(self, x: Float, y: Float, pupil: Point2f | None = None) -> Rays:
-        """Rays behind the window of image points; pixel (0, 0) is the centre of the first pixel.
+        """Trace rays of image points to behind the window; pixel (0, 0) is the centre of the first pixel.
 
-        ``pupil`` holds points of the unit disc; without them chief rays through the pupil's centre are returned.
+        ``pupil`` gives points of the unit disc. Without it, the chief rays through the pupil's centre are returned.
         """
         chief = self.lens.directions(x, y)
-        origin, direction = (mi.Point3f(0.0), chief) if pupil is None else self.lens.through_pupil(chief, pupil)
-        path = self._faces.through(origin, direction, mode=mi.TransportMode.Radiance)
+        origin, direction = (mi.Point3f(0.0), chief) if pupil is None else self.lens.trace_through_pupil(chief, pupil)
+        path = self._faces.trace(origin, direction, mode=mi.TransportMode.Radiance)
         cosine = dr.square(dr.square(chief.z))
         weight = dr.select(path.weight > 0, path.weight * cosine * self.lens.irradiance_on_axis, 0.0)
         return Rays(self._to_object @ path.origin, self._to_object @ path.direction, weight)
 
-    def grid(self, spacing: int) -> tuple[Rays, tuple[int, int]]:
-        """Chief rays of nodes at pixel corners every ``spacing`` pixels, and the grid's shape (rows, columns)."""
+    def trace_grid(self, spacing: int) -> tuple[Rays, tuple[int, int]]:
+        """Return the chief rays of pixel corners every ``spacing`` pixels, and the grid shape (rows, columns)."""
         if spacing not in self._grids:
             columns, rows = -(-self.camera.width_px // spacing) + 1, -(-self.camera.height_px // spacing) + 1
             x, y = np.meshgrid(np.arange(columns) * spacing - 0.5, np.arange(rows) * spacing - 0.5)
@@ -196,19 +198,19 @@ class CameraView:
         return self._grids[spacing]
 
     def slopes(self, p: Point3f) -> Point2f:
-        """Slopes (x / z, y / z) in the camera frame of the straight lines from the pupil to points of the OCS."""
+        """Return the slopes (x / z, y / z) in the camera frame of lines from the pupil to points in the OCS."""
         seen = self._to_camera @ mi.Point3f(p)
         return mi.Point2f(seen.x / seen.z, seen.y / seen.z)
 
     def depth_mm(self, p: Point3f) -> Float:
-        """Depth z in the camera frame of points of the OCS."""
+        """Return the depth z in the camera frame of points in the OCS."""
         return (self._to_camera @ mi.Point3f(p)).z
 
     def blur_radius_px(self, depth_mm: np.ndarray) -> np.ndarray:
-        """Largest distance in the image between a point's chief ray and its other rays, for depths of any shape.
+        """Return the largest distance in the image of a point's rays from its chief ray, for depths of any shape.
 
-        Rays through the pupil's rim and chief rays of neighbouring pixels are followed through the window to every
-        depth; the largest blur anywhere in the image counts.
+        Rays through the pupil's rim and chief rays of neighbouring pixels are traced through the window to every depth.
+        The largest blur of all image positions is taken.
         """
         return np.interp(depth_mm, *self._blur_table)
 
@@ -220,7 +222,7 @@ class CameraView:
         image = field * (camera.width_px, camera.height_px) + middle
         angle = 2 * np.pi * np.arange(_RIM_POINTS) / _RIM_POINTS
         rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-        # Per field point: the chief ray, its neighbours in x and y, then the rays through the rim.
+        # Rays of each field point: its chief ray, the neighbours in x and y, then the rim rays.
         shift = np.concatenate([[(0, 0), (1, 0), (0, 1)], np.zeros((_RIM_POINTS, 2))])
         at = (image[:, None] + shift).reshape(-1, 2)
         through = np.tile(np.concatenate([np.zeros((3, 2)), rim]), (len(image), 1))
@@ -242,7 +244,10 @@ class CameraView:
 
 @dataclass(frozen=True)
 class RaySegment:
-    """A segment of camera rays in the OCS up to a surface, with the weight and length in mm of the path before it."""
+    """Segment of camera rays in the OCS that ends on a surface.
+
+    ``weight`` and ``length_before`` (mm) belong to the path before the segment.
+    """
 
     origin: Point3f
     direction: Vector3f
@@ -252,14 +257,14 @@ class RaySegment:
     valid: Bool
 
     def end(self) -> Point3f:
-        """End of the segment, in the OCS."""
+        """Return the end point in the OCS."""
         return mi.Point3f(self.origin + self.direction * dr.select(self.valid, self.si.t, 1.0))
 
 
-def ray_segments(
+def trace_segments(
     objects: Objects, extinction: Float, pose: SensorPose, bundle: Rays, after_s: Float | None, *, mirrors: int
 ) -> Iterator[RaySegment]:
-    """The first segment of camera rays, then one for each of up to ``mirrors`` mirrors that they meet in turn."""
+    """Yield the first segment of camera rays, then one for each of up to ``mirrors`` successive mirrors."""
     o, d, weight, length_before = bundle.origin, bundle.direction, bundle.weight, mi.Float(0.0)
     for met in range(mirrors + 1):
         si = objects.scene.ray_intersect(pose.ray(o, d, after_s), mi.RayFlags.All, objects.coherent, weight > 0)
@@ -271,5 +276,5 @@ def ray_segments(
             weight = weight * dr.select(front, objects.mirror_share(si), 0.0) * dr.exp(-extinction * length)
             length_before = length_before + length
             d_reflected = pose.object_direction(si.to_world(mi.reflect(si.wi)), after_s)
-            o = mi.Point3f(o + d * length + d_reflected * _CLEAR_MM)
+            o = mi.Point3f(o + d * length + d_reflected * CLEAR_MM)
             d = dr.select(front, d_reflected, d)

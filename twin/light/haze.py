@@ -1,7 +1,7 @@
-"""Haze: the light that the water scatters once out of a sheet into the camera's rays, where they cross it.
+"""Haze: light of the sheet that the water scatters once into the camera's rays.
 
-The windows and the sheets stand still before the camera, so that everything but what surfaces cut off and shade is the
-same in all frames.
+Windows and sheets are fixed relative to the camera. Only shadows and the surfaces that end the rays differ between
+frames.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ from twin.light.water import Scattering
 
 @dataclass(frozen=True)
 class SheetCrossing:
-    """Crossings of camera rays with the middle of a sheet, at ``distance_mm`` along them.
+    """Intersections of camera rays with the centre surface of a sheet, at ``distance_mm`` along them.
 
-    ``sense`` is 1 where a ray goes on to the side of the sheet's normal, else -1; ``irradiance`` on the image sensor in
-    W/mm2 is that of the water's scattering where nothing is in the way; ``direction`` and ``exit_mm`` are the light's.
+    ``sense`` is 1 if a ray crosses in the direction of the sheet's normal, else -1. ``irradiance`` is that of the
+    scattered light on the image sensor in W/mm2, without occlusion. ``direction`` and ``exit_mm`` describe the sheet's
+    light there.
     """
 
     distance_mm: Float
@@ -35,30 +36,32 @@ class SheetCrossing:
     exit_mm: Float
 
 
-def crossing(light: Light, scattering: Scattering, rays: Rays) -> SheetCrossing:
-    """Where camera rays cross a sheet; of a direct light it is the same at all poses.
+def intersect_sheet(light: Light, scattering: Scattering, rays: Rays) -> SheetCrossing:
+    """Intersect camera rays with a sheet; for a direct light the result is the same at all poses.
 
-    The line integral of a Gaussian along a straight ray is b p(angle) E sigma sqrt(2 pi) / |cos|, p being the phase
-    function and E the irradiance in the sheet's middle.
+    The line integral of a Gaussian along a straight ray is b p(angle) E sigma sqrt(2 pi) / |cos|. Here p is the phase
+    function and E the irradiance in the sheet's centre.
     """
-    origin, direction = light.in_own_frame(rays.origin, rays.direction)
-    t, middle = light.crossing(origin, direction)
+    origin, direction = light.to_sheet_frame(rays.origin, rays.direction)
+    t, middle = light.intersect(origin, direction)
     towards = dr.dot(direction, middle.normal)
     peak = middle.irradiance * middle.sigma_mm * math.sqrt(2 * math.pi)
-    # The light leaves against the camera ray, so that the difference of both directions is a sum here.
+    # Light travels against the camera ray, so the difference of both directions is a sum here.
     phase = scattering.phase(0.5 * dr.squared_norm(middle.direction + direction))
     radiance = scattering.b * phase * peak / dr.maximum(dr.abs(towards), 1e-3) * dr.exp(-scattering.c * t)
-    here = light.at(mi.Point3f(rays.origin + rays.direction * t))
+    here = light.evaluate(mi.Point3f(rays.origin + rays.direction * t))
     return SheetCrossing(
         t, dr.sign(towards), rays.weight * dr.select(t > 0, radiance, 0.0), here.direction, here.exit_mm
     )
 
 
-def haze(crossed: SheetCrossing, light: Light, scene: mi.Scene, segment: RaySegment, at_end: SheetLight) -> Float:
-    """Irradiance on the image sensor in W/mm2 of rays that end on surfaces, where ``at_end`` is the sheet's light.
+def compute_haze(
+    crossed: SheetCrossing, light: Light, scene: mi.Scene, segment: RaySegment, at_end: SheetLight
+) -> Float:
+    """Return the haze on the image sensor in W/mm2; ``at_end`` is the sheet's light at the surfaces that end the rays.
 
-    A surface cuts off what of the Gaussian lies behind it. One just before the sheet's middle does so, but does not
-    shadow what lies before it: there, shadows are those of the surface itself.
+    A surface removes the part of the Gaussian behind it. If the surface is in front of the sheet's centre, shadows are
+    tested at the surface: it must not shadow the haze in front of it.
     """
     end_sigmas = dr.select(segment.valid, crossed.sense * at_end.distance_mm / at_end.sigma_mm, dr.inf)
     scattered = crossed.irradiance * (0.5 * (1 + dr.erf(end_sigmas / math.sqrt(2.0))))

@@ -1,9 +1,9 @@
-"""Grains and bubbles in the laser sheet: each is seen as a spot of its own, unlike the water's even scattering.
+"""Particles and bubbles in the laser sheet, each imaged as a separate spot.
 
-Their places are drawn in the image: a piece of it sees a piece of the sheet, and in its volume so many of them drift.
-A body in the irradiance E that sends the radiant intensity I (W/sr) towards the camera adds as much light to the image
-as a surface of the radiance I / F in one pixel, F being the area square to the ray that a pixel sees there; defocus and
-the body's own size spread it over a disc.
+Their positions are sampled in the image: each image area sees an area of the sheet, and its volume gives their number.
+A body at the irradiance E that sends the radiant intensity I (W/sr) to the camera adds light to the image. The amount
+is that of one pixel that sees a surface of radiance I / F. F is the area perpendicular to the ray that a pixel covers
+there. Defocus and the size of the body spread the light over a disc.
 """
 
 from __future__ import annotations
@@ -25,33 +25,35 @@ from twin.scene.objects import Objects
 Body = Literal["particles", "bubbles"]
 
 _LEAST_MM = 0.1
-"""Least diameter that is resolved one by one; smaller bodies are the water's turbidity."""
+"""Smallest diameter of bodies rendered individually; smaller ones are part of the water's turbidity."""
 _MOST_MM = 5.0
-"""Largest diameter: of N(> d) as d^-3 one body in 125,000 is larger."""
+"""Largest diameter: with N(> d) ~ d^-3, one body in 125,000 is larger."""
 _SLOPE = 3.0
-"""N(> d) goes as d^-3 (Bader, J. Geophys. Res. 75, 2822, 1970; Sheldon et al., Limnol. Oceanogr. 17, 327, 1972: equal
-volume in equal logarithmic intervals)."""
+"""Exponent of the size distribution N(> d) ~ d^-3: equal volume in equal logarithmic intervals.
+
+Bader, J. Geophys. Res. 75, 2822, 1970; Sheldon et al., Limnol. Oceanogr. 17, 327, 1972.
+"""
 _REFLECTANCE = 0.3
-"""Of the grains' matter, as a diffuse sphere: assumed, aggregates are grey to brownish white."""
+"""Diffuse reflectance of particles (assumed): aggregates are grey to brownish white."""
 _SIGMAS = 3.0
-"""Bodies farther than so many standard deviations from the sheet's middle are dark."""
+"""Bodies farther from the sheet's centre than this many standard deviations are treated as dark."""
 _MOST_BODIES = 50_000
-"""In one image; more of them are a haze."""
+"""Largest number of bodies in one image; more of them would look like haze."""
 _MARGIN_PX = 20.0
-"""Bodies so far beside the image still reach into it."""
+"""Width of the border around the image whose bodies are included, because their discs may reach into it."""
 
 
 @dataclass(frozen=True)
 class Spots:
-    """Bodies seen in an image: places (N,) in px, their light in W/mm2 times pixels, and radii (N,) of their discs."""
+    """Imaged bodies: positions (N,) in px, their light in W/mm2 times pixels, and radii (N,) of their discs."""
 
     x: np.ndarray
     y: np.ndarray
     light: np.ndarray
     radius_px: np.ndarray
 
-    def drawn(self, height: int, width: int) -> np.ndarray:
-        """Irradiance (H, W), float32, of all spots; a disc's border is as wide as a pixel."""
+    def draw(self, height: int, width: int) -> np.ndarray:
+        """Draw all spots as an irradiance image (H, W), float32; the edge of a disc is one pixel wide."""
         image = np.zeros((height, width), np.float32)
         for x, y, light, radius in zip(self.x, self.y, self.light, self.radius_px, strict=True):
             reach = radius + 1
@@ -60,13 +62,13 @@ class Spots:
             columns = np.arange(first_column, min(width, math.ceil(x + reach) + 1))
             if rows.size and columns.size:
                 disc = np.clip(radius + 0.5 - np.hypot(rows - y, columns - x), 0, 1)
-                # Of a disc that the border cuts only a part is there.
+                # Discs cut by the image border contribute only their visible part.
                 whole = max(math.pi * radius**2, 1.0)
                 image[rows, columns] += light * disc / (max(disc.sum(), whole) if reach > 3 else max(disc.sum(), 1e-9))
         return image
 
 
-def spots(
+def sample_spots(
     view: CameraView,
     light: Light,
     objects: Objects,
@@ -80,25 +82,26 @@ def spots(
     sparkle: bool,
     rng: np.random.Generator,
 ) -> Spots:
-    """Bodies in a light's sheet as a camera sees them at a pose, ``per_litre`` of them larger than 0.1 mm in diameter.
+    """Sample bodies in a light's sheet as the camera sees them, ``per_litre`` of them larger than 0.1 mm.
 
-    Bodies behind and within objects, and in their shadow, are left out. With ``sparkle`` the light of each is that of
-    as many independent grains of speckle as its disc holds (gamma distributed: Goodman, Speckle Phenomena, Sec. 4.6).
+    Only visible bodies are returned: those behind, inside or shadowed by objects are omitted. ``extinction`` is in
+    1/mm; ``defocus`` blurs the spots. ``sparkle`` varies the light of each spot by speckle, with as many independent
+    grains as its disc holds (gamma distribution: Goodman, Speckle Phenomena, Sec. 4.6).
     """
     camera = view.camera
     width, height = camera.width_px + 2 * _MARGIN_PX, camera.height_px + 2 * _MARGIN_PX
 
     def seen(x: np.ndarray, y: np.ndarray, aside: np.ndarray) -> dict[str, np.ndarray]:
-        """Of places in the image: volume (mm3) per pixel, the sheet's light there, and the area that a pixel sees."""
+        """Return volume (mm3) per pixel, light of the sheet, and area per pixel at image positions ``x`` and ``y``."""
         at = [(to_jit(mi.Float, x + dx), to_jit(mi.Float, y + dy)) for dx, dy in ((0, 0), (1, 0), (0, 1))]
         bundles = [view.bundle(*each) for each in at]
-        crossed = [light.crossing(*light.in_own_frame(each.origin, each.direction)) for each in bundles]
+        crossed = [light.intersect(*light.to_sheet_frame(each.origin, each.direction)) for each in bundles]
         t, bundle = crossed[0][0], bundles[0]
         points = [each.origin + each.direction * where for each, (where, _) in zip(bundles, crossed, strict=True)]
         area = dr.norm(dr.cross(points[1] - points[0], points[2] - points[0]))
-        middle = light.at(mi.Point3f(points[0]))
+        middle = light.evaluate(mi.Point3f(points[0]))
         place = mi.Point3f(points[0] + middle.normal * (middle.sigma_mm * to_jit(mi.Float, aside)))
-        lit = light.at(place)
+        lit = light.evaluate(place)
         hit = objects.scene.ray_intersect_preliminary(pose.ray(bundle.origin, bundle.direction))
         free = (bundle.weight > 0) & (t > 0) & (~hit.is_valid() | (t < hit.t)) & (lit.irradiance > 0)
         free &= light.reaches(objects.scene, place, lit, None, free)
@@ -111,14 +114,14 @@ def spots(
         dr.eval(*values.values())
         return {name: value.numpy().astype(float) for name, value in values.items()}
 
-    # The largest volume per pixel, found on a coarse grid, limits how many places are tried.
+    # The largest volume per pixel, found on a coarse grid, bounds the number of candidates.
     x, y = (g.ravel() for g in np.meshgrid(np.linspace(0, 1, 24) * width, np.linspace(0, 1, 24) * height))
     coarse = seen(x - _MARGIN_PX, y - _MARGIN_PX, np.zeros_like(x))["volume"]
     if not coarse.any():
         return Spots(*(np.zeros(0) for _ in range(4)))
     largest = 1.5 * coarse.max()
     tried = min(rng.poisson(1e-6 * per_litre * largest * width * height), _MOST_BODIES)
-    # Never none, which would take kernels of their own.
+    # At least two: empty arrays would compile separate kernels.
     x, y = (rng.uniform(-_MARGIN_PX, side - _MARGIN_PX, max(tried, 2)) for side in (width, height))
     found = seen(x, y, rng.uniform(-_SIGMAS, _SIGMAS, len(x)))
     kept = (rng.uniform(0, largest, len(x)) < found["volume"]) & (np.arange(len(x)) < tried)
@@ -146,22 +149,22 @@ def spots(
 
 
 def diffuse_sphere(cosine: np.ndarray) -> np.ndarray:
-    """Radiant intensity in 1/sr of a diffuse sphere per irradiance and squared radius.
+    """Return the radiant intensity in 1/sr of a diffuse sphere per irradiance and squared radius.
 
-    2 / 3 rho (sin a + (pi - a) cos a) / pi, a being the angle between the directions to the light and to the viewer,
-    whose negative cosine is that of scattering (Lambert's sphere: H. N. Russell, Astrophys. J. 43, 173, 1916).
-    ``cosine`` is that between the light's direction and that to the viewer, i.e. of scattering.
+    2 / 3 rho (sin a + (pi - a) cos a) / pi, where a is the phase angle between the directions to the light and to the
+    viewer (Lambert's sphere: H. N. Russell, Astrophys. J. 43, 173, 1916). ``cosine`` is that of the scattering angle pi
+    - a.
     """
     angle = np.pi - np.arccos(np.clip(cosine, -1, 1))
     return 2 / 3 * _REFLECTANCE * (np.sin(angle) + (np.pi - angle) * np.cos(angle)) / np.pi
 
 
 def bubble(cosine: np.ndarray, *, index: float = 1.33) -> np.ndarray:
-    """Radiant intensity in 1/sr that an air bubble reflects, per irradiance and squared radius.
+    """Return the radiant intensity in 1/sr reflected by an air bubble per irradiance and squared radius.
 
-    A reflecting sphere sends R / 4 into every direction (Davis, J. Opt. Soc. Am. 45, 572, 1955), with Fresnel's R of
-    its surface at the angle of incidence (180 deg - scattering) / 2: all is reflected up to a scattering angle of some
-    83 deg. ``cosine`` is that of the scattering angle. What passes through the bubble is left out.
+    A reflecting sphere sends R / 4 into every direction (Davis, J. Opt. Soc. Am. 45, 572, 1955). R is the Fresnel
+    reflectance at the incidence angle (180 deg - scattering angle) / 2: reflection is total up to a scattering angle of
+    about 83 deg. ``cosine`` is that of the scattering angle. Light transmitted through the bubble is neglected.
     """
     incidence = (np.pi - np.arccos(np.clip(cosine, -1, 1))) / 2
     inside = index * np.sin(incidence)

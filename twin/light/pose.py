@@ -1,4 +1,4 @@
-"""Rays, the pose of the sensor in the scene, and its travel during an exposure."""
+"""Rays, the pose of the sensor in the scene, and its motion during an exposure."""
 
 from __future__ import annotations
 
@@ -11,12 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from twin.backend.arrays import Float, Point3f, Vector3f, opaque, opaque_point, opaque_transform
 
+CLEAR_MM = 1e-2
+"""Offset of rays from the surface they start on, which prevents an intersection with it."""
+
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays of one frame: origins in mm, unit directions, and what each carries, 0 if a window does not let it pass.
+    """Rays of one frame: origins in mm, unit directions, and weights, which are 0 for rays that a window blocks.
 
-    Of camera rays ``weight`` is the image sensor's irradiance per radiance in sr, of rays through a window their share.
+    The weight of a camera ray is image irradiance divided by radiance, in sr. The weight of a laser ray is the
+    transmitted fraction.
     """
 
     origin: Point3f
@@ -26,11 +30,11 @@ class Rays:
 
 @dataclass(frozen=True)
 class Travel:
-    """Motion of the sensor during an exposure: its OCS goes at a velocity and turns about its origin at a rate.
+    """Motion of the sensor during an exposure: its OCS translates at a velocity and rotates about its origin.
 
-    ``velocity_mm_s`` (3,) and ``turn_rad_s`` (3,), a rotation vector per second, are in the scene; both are constant.
-    Time counts from the pose of the frame, that of ``middle_row``. An image row is exposed from -``exposure_s`` / 2 to
-    +``exposure_s`` / 2 about its own middle, which a rolling shutter shifts by ``row_s`` from row to row.
+    ``velocity_mm_s`` (3,) and ``turn_rad_s`` (3,), a rotation vector per second, are constant and in scene coordinates.
+    Time is relative to the pose of the frame, that of ``middle_row``. Each image row is exposed for ``exposure_s``,
+    centred on its own time. With a rolling shutter, successive rows are ``row_s`` later.
     """
 
     velocity_mm_s: np.ndarray
@@ -39,25 +43,25 @@ class Travel:
     row_s: float = 0.0
     middle_row: float = 0.0
 
-    def at(self, row: Float, moment: Float | float) -> Float:
-        """Time in s of image rows at a moment of their exposure, from 0 to 1."""
+    def compute_times(self, row: Float, moment: Float | float) -> Float:
+        """Return the time in s of image rows at a fraction ``moment`` (0 to 1) of their exposure."""
         exposure, per_row = opaque(self.exposure_s), opaque(self.row_s)
         return (row - opaque(self.middle_row)) * per_row + (moment - 0.5) * exposure
 
-    def ends(self, rows: int) -> tuple[float, float]:
-        """First and last time in s within a frame of ``rows`` rows."""
+    def time_range(self, rows: int) -> tuple[float, float]:
+        """Return the first and last time in s of a frame of ``rows`` rows."""
         at_edges = [(row - self.middle_row) * self.row_s for row in (0, rows - 1)]
         half = self.exposure_s / 2
         return min(at_edges) - half, max(at_edges) + half
 
     def fastest_mm_s(self, reach_mm: float) -> float:
-        """Largest speed in mm/s of points up to so far from the OCS's origin."""
+        """Return the largest speed in mm/s of points within ``reach_mm`` of the OCS's origin."""
         turn = 0.0 if self.turn_rad_s is None else float(np.linalg.norm(self.turn_rad_s))
         return float(np.linalg.norm(self.velocity_mm_s)) + turn * reach_mm
 
 
 class SensorPose:
-    """The sensor's OCS in the scene, kept opaque so that moving it never recompiles a kernel."""
+    """Pose of the sensor's OCS in the scene, stored opaquely so that a new pose does not recompile kernels."""
 
     def __init__(self, scene_from_object: np.ndarray, travel: Travel | None = None):
         self.scene_from_object, self.travel = np.asarray(scene_from_object, float), travel
@@ -65,7 +69,7 @@ class SensorPose:
         self._to_object = opaque_transform(np.linalg.inv(self.scene_from_object))
         self._axis, self._rate = None, 0.0
         if travel is not None:
-            # Everything that moves does so in the OCS of the resting sensor.
+            # The motion is expressed in the OCS of the sensor at rest.
             into = self.scene_from_object[:3, :3].T
             self._velocity = mi.Vector3f(opaque_point(into @ travel.velocity_mm_s))
             turn = np.zeros(3) if travel.turn_rad_s is None else into @ travel.turn_rad_s
@@ -73,7 +77,7 @@ class SensorPose:
                 self._axis, self._rate = mi.Vector3f(opaque_point(turn / rate)), opaque(rate)
 
     def equals(self, other: SensorPose) -> bool:
-        """Whether the sensor stands and travels as at another pose."""
+        """Return whether pose and motion equal those of ``other``."""
         if not np.array_equal(self.scene_from_object, other.scene_from_object):
             return False
         if self.travel is None or other.travel is None:
@@ -81,8 +85,8 @@ class SensorPose:
         pairs = zip(vars(self.travel).values(), vars(other.travel).values(), strict=True)
         return all(np.array_equal(mine, theirs) for mine, theirs in pairs)
 
-    def moved(self, after_s: float) -> SensorPose:
-        """The pose after a time, standing still."""
+    def displace(self, after_s: float) -> SensorPose:
+        """Return the pose after a time, without motion."""
         assert self.travel is not None
         transform = self.scene_from_object.copy()
         transform[:3, 3] += after_s * self.travel.velocity_mm_s
@@ -91,28 +95,28 @@ class SensorPose:
             transform[:3, :3] = turned @ transform[:3, :3]
         return SensorPose(transform)
 
-    def at_rest(self, point: Point3f, after_s: Float | None) -> Point3f:
-        """Points of the moving OCS after a time, in the OCS of the resting sensor."""
+    def to_rest_frame(self, point: Point3f, after_s: Float | None) -> Point3f:
+        """Transform points from the moving OCS at a time to the OCS of the sensor at rest."""
         if after_s is None:
             return mi.Point3f(point)
-        return mi.Point3f(self.direction_at_rest(mi.Vector3f(point), after_s) + self._velocity * after_s)
+        return mi.Point3f(self.rotate_to_rest_frame(mi.Vector3f(point), after_s) + self._velocity * after_s)
 
-    def moving(self, point: Point3f, after_s: Float | None) -> Point3f:
-        """Points of the OCS of the resting sensor, in the moving OCS after a time."""
+    def to_moving_frame(self, point: Point3f, after_s: Float | None) -> Point3f:
+        """Transform points from the OCS of the sensor at rest to the moving OCS at a time."""
         if after_s is None:
             return mi.Point3f(point)
-        return mi.Point3f(self.moving_direction(mi.Vector3f(point) - self._velocity * after_s, after_s))
+        return mi.Point3f(self.rotate_to_moving_frame(mi.Vector3f(point) - self._velocity * after_s, after_s))
 
-    def direction_at_rest(self, direction: Vector3f, after_s: Float | None) -> Vector3f:
-        """Directions of the moving OCS after a time, in the OCS of the resting sensor."""
-        return self._turned(direction, after_s, sign=1.0)
+    def rotate_to_rest_frame(self, direction: Vector3f, after_s: Float | None) -> Vector3f:
+        """Transform directions from the moving OCS at a time to the OCS of the sensor at rest."""
+        return self._rotate(direction, after_s, sign=1.0)
 
-    def moving_direction(self, direction: Vector3f, after_s: Float | None) -> Vector3f:
-        """Directions of the OCS of the resting sensor, in the moving OCS after a time."""
-        return self._turned(direction, after_s, sign=-1.0)
+    def rotate_to_moving_frame(self, direction: Vector3f, after_s: Float | None) -> Vector3f:
+        """Transform directions from the OCS of the sensor at rest to the moving OCS at a time."""
+        return self._rotate(direction, after_s, sign=-1.0)
 
-    def _turned(self, vector: Vector3f, after_s: Float | None, *, sign: float) -> Vector3f:
-        """Vectors turned by as much as the sensor turns within a time (Rodrigues)."""
+    def _rotate(self, vector: Vector3f, after_s: Float | None, *, sign: float) -> Vector3f:
+        """Rotate vectors by the sensor's rotation within a time (Rodrigues' formula)."""
         if after_s is None or self._axis is None:
             return mi.Vector3f(vector)
         sine, cosine = dr.sincos(sign * self._rate * after_s)
@@ -120,16 +124,16 @@ class SensorPose:
         return along + (vector - along) * cosine + dr.cross(self._axis, vector) * sine
 
     def ray(self, origin: Point3f, direction: Vector3f, after_s: Float | None = None) -> mi.Ray3f:
-        """A ray of the OCS in the scene, as the sensor stands after a time."""
-        # A point plus a vector is a vector to Dr.Jit, and vectors are not moved.
-        start = self._to_scene @ self.at_rest(origin, after_s)
+        """Transform a ray from the OCS at a time to the scene."""
+        # Dr.Jit returns a vector for a transformed point plus a vector; the conversion restores the point.
+        start = self._to_scene @ self.to_rest_frame(origin, after_s)
         return mi.Ray3f(mi.Point3f(start), self.direction(direction, after_s))
 
     def direction(self, direction: Vector3f, after_s: Float | None = None) -> Vector3f:
-        """A direction of the OCS in the scene."""
-        # The difference of two points is a point to Dr.Jit, which a transform would also shift.
-        return self._to_scene @ self.direction_at_rest(mi.Vector3f(direction), after_s)
+        """Transform a direction from the OCS at a time to the scene."""
+        # Dr.Jit returns a point for the difference of two points; a transform would translate it.
+        return self._to_scene @ self.rotate_to_rest_frame(mi.Vector3f(direction), after_s)
 
     def object_direction(self, direction: Vector3f, after_s: Float | None = None) -> Vector3f:
-        """A direction of the scene in the OCS."""
-        return self.moving_direction(self._to_object @ mi.Vector3f(direction), after_s)
+        """Transform a direction from the scene to the OCS at a time."""
+        return self.rotate_to_moving_frame(self._to_object @ mi.Vector3f(direction), after_s)

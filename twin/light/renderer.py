@@ -1,10 +1,12 @@
-"""Renders what reaches the image sensor: laser and lamp images as irradiance, only where there is light.
+"""Rendering of the irradiance on the image sensor, from the laser, the lamp and daylight.
 
-A laser frame is made in three passes. Rays through the nodes of a coarse grid find the pixels near the lit stripe and
-the haze of the sheet; the stripe's pixels are rendered with many samples over pixel, pupil and exposure, with fewer
-within a wide stripe; random walks add the light that came on longer ways, which is smooth
-(`twin.light.multiple_scattering`). The windows stand still before the camera, so the nodes' rays behind the window are
-traced once; the objects stand still in the scene, so nothing is rebuilt or recompiled between frames.
+A laser frame takes three passes. Rays through the nodes of a coarse grid locate the pixels near the lit stripe and give
+the haze of the sheet. The pixels of the stripe are rendered with many samples over pixel, pupil and exposure, and with
+fewer inside a wide stripe. Random walks add multiply scattered and reflected light, which is smooth
+(`twin.light.multiple_scattering`).
+
+The windows are fixed relative to the camera, so the nodes' rays behind the window are traced once. The objects are
+fixed in the scene, so nothing is rebuilt or recompiled between frames.
 """
 
 from __future__ import annotations
@@ -20,21 +22,21 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import Float, Point3f, begin_kernels, opaque, to_jit
-from twin.light.camera import CameraView, RaySegment, ray_segments
-from twin.light.haze import SheetCrossing, crossing, haze
+from twin.light.camera import CameraView, RaySegment, trace_segments
+from twin.light.haze import SheetCrossing, compute_haze, intersect_sheet
 from twin.light.illumination import Light, lights
 from twin.light.image_sampling import (
     NODE_SPACING_PX,
-    lattice,
-    near_sheet,
-    over_corners,
-    places,
+    combine_corners,
+    dilate_cells,
+    expand_cells,
+    find_marked,
+    make_lattice,
+    mark_near_sheet,
     pupil_shifts,
-    repeated,
-    widened,
 )
-from twin.light.multiple_scattering import LongerWays, Sources, falling_off
-from twin.light.particles import Body, spots
+from twin.light.multiple_scattering import IndirectLight, LightSources, decay_with_distance
+from twin.light.particles import Body, sample_spots
 from twin.light.pose import Rays, SensorPose, Travel
 from twin.light.sheet import Sheet, SheetLight
 from twin.light.walk import Walker
@@ -47,43 +49,43 @@ from uwlts.model.placement import camera_from_object, check_design
 from uwlts.model.sensor import Medium, Sensor
 
 SAMPLES_AT_ONCE = 2**23
-"""More samples are rendered one part after the other; this many take some 100 MB."""
+"""Largest number of samples rendered together; this many take about 100 MB."""
 CHANGE_SHARE = 2e-3
-"""Under the lamp, pixels whose corners differ by more than this share of the brightest are rendered finely."""
+"""In lamp images, pixels are sampled finely if their corners differ by more than this fraction of the maximum."""
 BEND_SHARE = 1e-3
-"""Of a wide stripe, pixels are rendered finely where second differences exceed this share of the brightest light."""
+"""In a wide stripe, pixels are sampled finely if second differences exceed this fraction of the maximum."""
 _FEWER_SAMPLES = 4
-"""Elsewhere so many times fewer samples are taken."""
+"""Divisor of the number of samples in other pixels of a wide stripe."""
 _LEAST_SPP = 4
-"""But no fewer than these: one for each quarter of the pupil."""
+"""Smallest number of samples there: one for each quarter of the pupil."""
 _WIDE_PX = 64
-"""In stripes narrower than so many pixels on average, most pixels would be rendered twice."""
+"""Mean width of a stripe in px below which all pixels are sampled finely: most would need it."""
 _MIRRORS = 2
-"""Largest number of mirrors that the camera looks into one after the other."""
+"""Largest number of successive mirror reflections of a camera ray."""
 _WALKS_PER_SAMPLE = 0.15
 """Random walks per cell and sample of a lit pixel in clear water; turbid water takes more."""
 _SPOT_ASIDE = 0.25
-"""Slope of an uneven lamp's axis against the camera's over that of the view's corner: the lamp is mounted beside it."""
+"""Offset of an uneven lamp's axis from the camera's axis, as a fraction of the view's corner slope."""
 _DRIFTING_STREAM = 7
-"""Keeps the random numbers of grains and bubbles apart from those of walks and noise."""
+"""Random number stream of particles and bubbles, separate from those of walks and noise."""
 _CAUSTIC_WAVES = 10
-"""Waves of the surface that throw caustics."""
+"""Number of surface waves that form caustics."""
 _CAUSTIC_MM = (20.0, 120.0)
-"""Their wavelengths where they fall: a rippled tank or harbour."""
+"""Range of their wavelengths on the lit surfaces, for a rippled tank or harbour."""
 _TRAVEL_STEP_MM = 0.2
-"""While the sensor travels, the lit pixels are looked for at places this far apart."""
+"""While the sensor moves, lit pixels are located at positions of this spacing."""
 _REACH_SHARE = 1.5
-"""Distance of what is seen from the OCS's origin, at most about, over the stand-off."""
+"""Largest distance of visible surfaces from the OCS's origin, divided by the stand-off (approximate)."""
 
 
 @dataclass(frozen=True)
 class LaserFrame:
-    """Irradiance on the image sensor in W/mm2: (H, W) of the scattered light, and the stripe's pixels on their own.
+    """Irradiance of the laser on the image sensor in W/mm2, separated by origin.
 
-    ``haze`` (H, W) is what the water scattered once out of the sheet into the camera's rays, ``particles`` (H, W) the
-    light of grains and bubbles in the sheet, which is not among it; ``longer`` makes the image (H, W) of what random
-    walks found. ``rows`` and ``columns`` (P,) name the stripe's pixels, ``stripe`` (P,) is the light that came straight
-    from the lit surface; ``polarisation`` and ``roughness_um`` (P,) are that surface's, for speckle.
+    ``rows`` and ``columns`` (P,) are the pixels of the stripe, and ``stripe`` (P,) is their direct light from lit
+    surfaces. ``polarisation`` and ``roughness_um`` (P,) are properties of these surfaces, for speckle. ``haze`` (H, W)
+    is light that the water scatters once from the sheet into the camera's rays. ``particles`` (H, W) is the light of
+    particles and bubbles in the sheet. ``longer`` computes the image (H, W) of multiply scattered and reflected light.
     """
 
     longer: Callable[[], np.ndarray] | None
@@ -97,28 +99,28 @@ class LaserFrame:
 
     @cached_property
     def scattered(self) -> np.ndarray:
-        """All light on longer ways (H, W), the haze among it; what the walks found is made smooth when first needed."""
+        """All indirect light (H, W), including haze; the random walks are smoothed on first access."""
         return self.haze if self.longer is None else self.longer() + self.haze
 
     def irradiance(self, factors: np.ndarray | float = 1.0) -> np.ndarray:
-        """All light (H, W), the stripe's multiplied by ``factors`` (P,)."""
+        """Return all light (H, W), with the stripe multiplied by ``factors`` (P,)."""
         image = self.scattered + self.particles
         image[self.rows, self.columns] += self.stripe * factors
         return image
 
     def direct(self) -> np.ndarray:
-        """The stripe's light alone (H, W), without speckle."""
+        """Return the light of the stripe alone (H, W), without speckle."""
         image = np.zeros_like(self.haze)
         image[self.rows, self.columns] = self.stripe
         return image
 
 
 class Renderer:
-    """One sensor in one medium before one scene.
+    """Renderer of one sensor in one medium and one scene.
 
-    ``uneven_lamp`` is the relative loss of the lamp's light away from its spot, ``caustics`` the contrast of the day's
-    on surfaces, ``drifting`` how many bodies of each kind drift in a litre (`twin.options.Flaws`).
-    DesignError or DescriptionError where the sensor cannot work in the medium, or an object cannot be built.
+    ``uneven_lamp`` is the relative loss of lamp light away from its spot. ``caustics`` is the contrast of daylight on
+    surfaces. ``drifting`` is the number of bodies of each kind per litre (`twin.options.Flaws`). DesignError if the
+    sensor cannot work in the medium; DescriptionError if an object cannot be built.
     """
 
     def __init__(
@@ -145,63 +147,63 @@ class Renderer:
         self._sheets = [self.sheet, *(Sheet(sensor, medium, laser) for laser in sensor.more_lasers)]
         self._crossings: dict[Sheet, SheetCrossing] = {}
         self._mirrors = self.objects.mirrors if effects.secondary_light else ()
-        # Through the water to the stand-off and back, light is scattered so many times.
+        # Mean number of scattering events from the sensor to the stand-off and back.
         scatterings = 2 * self.scattering.coefficient * self.design.standoff_mm
         self._walks_per_sample = _WALKS_PER_SAMPLE * (1 + 4 * scatterings * (1 + scatterings))
         self._scatters = self.scattering.coefficient > 0 and (effects.haze or effects.multiple_scattering)
         self._reach_mm = opaque(4 * float(np.linalg.norm(camera_from_object(sensor)[:3, 3])))
-        # Where the first laser's own stripe is, of the last frame: its truth asks for the same.
+        # Pose and cells of the first laser's stripe in the last frame; the ground truth needs them again.
         self._own_stripe: tuple[SensorPose, np.ndarray] | None = None
 
     def irradiance(
         self, light: LightName, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
     ) -> np.ndarray:
-        """Irradiance (H, W) on the image sensor in W/mm2, float32, with the sensor's OCS at a pose (4, 4) in the scene.
+        """Return the irradiance (H, W) on the image sensor in W/mm2, float32, at a pose (4, 4) of the OCS in the scene.
 
-        With "laser" that is the laser's light and the day's; with "day" laser and lamp are off.
-        ``spp`` samples are taken per lit pixel, the same places in every pixel; ``seed`` chooses the random walks.
-        Equal arguments give equal images.
+        "laser" includes daylight; "day" is daylight with laser and lamp off. ``spp`` is the number of samples per lit
+        pixel, at the same positions in every pixel. ``seed`` determines the random walks. Equal arguments give equal
+        images.
         """
         if light == "laser":
             day = self.irradiance("day", scene_from_object, spp=spp, travel=travel)
             return day + self.laser_frame(scene_from_object, spp=spp, seed=seed, travel=travel).irradiance()
         if light == "day" and not (self.effects.ambient and self.sensor.lamp.ambient_w_per_m2 > 0):
             return np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
-        return self._lamp_frame(SensorPose(scene_from_object, travel), spp=spp, ambient=light == "day")
+        return self._render_lamp_frame(SensorPose(scene_from_object, travel), spp=spp, ambient=light == "day")
 
     def laser_frame(
         self, scene_from_object: np.ndarray, *, spp: int, seed: int = 0, travel: Travel | None = None
     ) -> LaserFrame:
-        """The light of the laser on the image sensor; see `irradiance`."""
+        """Return the light of the laser on the image sensor; see `irradiance`."""
         begin_kernels()
         pose = SensorPose(scene_from_object, travel)
         direct, mirrored = lights(self._sheets, pose, self._mirrors)
         lit, haze, surfaces = self._laser_nodes(pose, direct, mirrored)
-        rows, columns = places(self._repeated(lit))
-        stripe_means = self._stripe(pose, rows, columns, direct + mirrored, spp=spp)
+        rows, columns = find_marked(self._expand_cells(lit))
+        stripe_means = self._render_stripe(pose, rows, columns, direct + mirrored, spp=spp)
         walker, walked = Walker(self.objects, self.scattering, self.effects, pose, direct, self._reach_mm), None
         if walker.finds_light:
             walks = math.ceil(spp * self._walks_per_sample)
-            walked = LongerWays(self.view, walker, lit, seed=seed, walks=walks)
+            walked = IndirectLight(self.view, walker, lit, seed=seed, walks=walks)
         stripe, polarised, rough = stripe_means()
         longer = None
         if walked is not None:
             image = np.zeros_like(haze)
             image[rows, columns] = stripe
-            longer = partial(walked.image, Sources(image, haze, surfaces))
+            longer = partial(walked.image, LightSources(image, haze, surfaces))
         haze = haze if self.effects.haze else np.zeros_like(haze)
         bright = np.maximum(stripe, np.finfo(np.float32).tiny)
-        particles, polarisation = self._particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
+        particles, polarisation = self._render_particles(direct, pose, seed=seed), np.clip(polarised / bright, 0, 1)
         return LaserFrame(longer, haze, particles, rows, columns, stripe, polarisation, rough / bright)
 
-    def _particles(self, direct: list[Light], pose: SensorPose, *, seed: int) -> np.ndarray:
-        """Irradiance (H, W) in W/mm2 of grains and bubbles in the sheets."""
+    def _render_particles(self, direct: list[Light], pose: SensorPose, *, seed: int) -> np.ndarray:
+        """Return the irradiance (H, W) in W/mm2 of particles and bubbles in the sheets."""
         camera = self.sensor.camera
         image = np.zeros((camera.height_px, camera.width_px), np.float32)
         rng = np.random.default_rng([seed, _DRIFTING_STREAM])
         for body, per_litre in self._drifting.items():
             for light in direct if per_litre > 0 else ():
-                seen = spots(
+                seen = sample_spots(
                     self.view,
                     light,
                     self.objects,
@@ -214,23 +216,23 @@ class Renderer:
                     sparkle=self.effects.speckle,
                     rng=rng,
                 )
-                image += seen.drawn(camera.height_px, camera.width_px)
+                image += seen.draw(camera.height_px, camera.width_px)
         return image
 
     def lit_pixels(self, pose: SensorPose) -> tuple[np.ndarray, np.ndarray]:
-        """Rows and columns of the pixels whose chief rays meet the first laser's own stripe."""
+        """Return rows and columns of the pixels whose chief rays meet the stripe of the first laser."""
         if self._own_stripe is None or not pose.equals(self._own_stripe[0]):
-            bundle, shape = self.view.grid(NODE_SPACING_PX)
+            bundle, shape = self.view.trace_grid(NODE_SPACING_PX)
             direct, _ = lights(self._sheets[:1], pose)
             own = np.zeros((shape[0] - 1, shape[1] - 1), bool)
             for moment, (light, *_) in self._moments(pose, direct):
                 segment = next(self._segments(moment, bundle, None))
-                own |= near_sheet(_sigmas(light.at(segment.end()), segment).numpy().reshape(shape))
+                own |= mark_near_sheet(_sigmas(light.evaluate(segment.end()), segment).numpy().reshape(shape))
             self._own_stripe = pose, own
-        return places(self._repeated(self._own_stripe[1]))
+        return find_marked(self._expand_cells(self._own_stripe[1]))
 
     def laser(self, pose: SensorPose, bundle: Rays, after_s: Float | None = None) -> tuple[Float, RaySegment]:
-        """Irradiance of the first laser's light per ray in W/mm2, of the surface seen straight alone, and the rays."""
+        """Return the irradiance in W/mm2 per ray of the first laser on directly visible surfaces, and the rays."""
         direct, _ = lights(self._sheets[:1], pose)
         segment = next(self._segments(pose, bundle, after_s))
         return segment.weight * self._radiance(pose, segment, direct, after_s), segment
@@ -239,13 +241,13 @@ class Renderer:
 
     def _segments(self, pose: SensorPose, bundle: Rays, after_s: Float | None) -> Iterator[RaySegment]:
         mirrors = _MIRRORS if self._mirrors else 0
-        return ray_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=mirrors)
+        return trace_segments(self.objects, self.scattering.c, pose, bundle, after_s, mirrors=mirrors)
 
     def _radiance(self, pose: SensorPose, segment: RaySegment, sources: list[Light], after_s: Float | None) -> Float:
-        """Radiance in W/mm2/sr that lit surfaces send back along segments, as it arrives at their beginning."""
+        """Return the radiance in W/mm2/sr of lit surfaces along segments, attenuated to the segments' start."""
         radiance, end, bsdf = mi.Float(0.0), segment.end(), segment.si.bsdf()
         for light in sources:
-            here = light.at(end, after_s)
+            here = light.evaluate(end, after_s)
             lit = light.reaches(self.objects.scene, end, here, after_s, segment.valid & (here.irradiance > 0))
             towards = segment.si.to_local(pose.direction(-here.direction, after_s))
             radiance += dr.select(lit, bsdf.eval(mi.BSDFContext(), segment.si, towards, lit)[0] * here.irradiance, 0.0)
@@ -256,8 +258,8 @@ class Renderer:
     def _laser_nodes(
         self, pose: SensorPose, direct: list[Light], mirrored: list[Light]
     ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Cells (rows, columns) close to the lit stripe, the haze (H, W) in W/mm2, and the surfaces of `Sources`."""
-        bundle, shape = self.view.grid(NODE_SPACING_PX)
+        """Return cells (rows, columns) near the stripe, the haze (H, W) in W/mm2, and lit surfaces (`LightSources`)."""
+        bundle, shape = self.view.trace_grid(NODE_SPACING_PX)
         lit = np.zeros((shape[0] - 1, shape[1] - 1), bool)
         own, reach = lit.copy(), np.zeros_like(lit, np.float32)
         image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
@@ -265,7 +267,7 @@ class Renderer:
         for moment, sources in self._moments(pose, direct + mirrored):
             scattered = mi.Float(0.0)
             for index, segment in enumerate(self._segments(moment, bundle, None)):
-                ends = [light.at(segment.end()) for light in sources]
+                ends = [light.evaluate(segment.end()) for light in sources]
                 across = [_sigmas(here, segment) for here in ends]
                 straight = mi.Point3f(bundle.origin + bundle.direction * (segment.length_before + segment.si.t))
                 depth = dr.select(segment.valid, self.view.depth_mm(straight), dr.nan)
@@ -273,11 +275,13 @@ class Renderer:
                     surfaces = self._surfaces(pose, segment, ends)
                     for light, here in zip(sources, ends, strict=True):
                         crossed = self._crossing(light, bundle)
-                        scattered += haze(crossed, light, self.objects.scene, segment, here)
+                        scattered += compute_haze(crossed, light, self.objects.scene, segment, here)
                 reached = [light.may_reach(segment.end(), here) for light, here in zip(sources, ends, strict=True)]
                 dr.eval(depth, scattered, surfaces, *across, *reached)
                 stripes = [
-                    near_sheet(sigmas.numpy().reshape(shape), True if there is None else there.numpy().reshape(shape))
+                    mark_near_sheet(
+                        sigmas.numpy().reshape(shape), True if there is None else there.numpy().reshape(shape)
+                    )
                     for sigmas, there in zip(across, reached, strict=True)
                 ]
                 near = np.any(stripes, axis=0)
@@ -287,33 +291,33 @@ class Renderer:
                     reach = np.fmax(reach, self._blur_px(near, depth.numpy().reshape(shape)))
                 lit |= near
             if moment is pose and dr.width(scattered) > 1:
-                image = self._repeated(0.25 * over_corners(np.add, scattered.numpy().reshape(shape)))
+                image = self._expand_cells(0.25 * combine_corners(np.add, scattered.numpy().reshape(shape)))
         self._own_stripe = pose, own
-        return widened(lit, reach), image, [each.numpy().reshape(shape) for each in surfaces]
+        return dilate_cells(lit, reach), image, [each.numpy().reshape(shape) for each in surfaces]
 
     def _moments(self, pose: SensorPose, sources: list[Light]) -> Iterator[tuple[SensorPose, list[Light]]]:
-        """The pose, and more of them over the exposure if the sensor travels, with the lights there."""
+        """Yield the pose and its lights, and further poses during the exposure if the sensor moves."""
         yield pose, sources
         if pose.travel is not None:
-            first, last = pose.travel.ends(self.sensor.camera.height_px)
+            first, last = pose.travel.time_range(self.sensor.camera.height_px)
             way_mm = (last - first) * pose.travel.fastest_mm_s(_REACH_SHARE * self.design.standoff_mm)
             for after_s in np.linspace(first, last, 2 + int(way_mm / _TRAVEL_STEP_MM)):
-                moved = pose.moved(float(after_s))
+                moved = pose.displace(float(after_s))
                 direct, mirrored = lights(self._sheets, moved, self._mirrors)
                 yield moved, direct + mirrored
 
     def _crossing(self, light: Light, bundle: Rays) -> SheetCrossing:
-        """Where the nodes' rays cross a sheet, kept from frame to frame unless a mirror shows it."""
+        """Return the intersections of the nodes' rays with a sheet, cached for direct lights."""
         if light.mirrored:
-            return crossing(light, self.scattering, bundle)
+            return intersect_sheet(light, self.scattering, bundle)
         if light.sheet not in self._crossings:
-            found = crossing(light, self.scattering, bundle)
+            found = intersect_sheet(light, self.scattering, bundle)
             dr.eval(vars(found))
             self._crossings[light.sheet] = found
         return self._crossings[light.sheet]
 
     def _surfaces(self, pose: SensorPose, segment: RaySegment, ends: list[SheetLight]) -> list[Float]:
-        """Irradiance per ray of surfaces lit from where the laser is, as `Sources` has it; ``ends`` are the lights."""
+        """Return irradiance per ray of surfaces near the sheets for `LightSources`; ``ends`` is the light there."""
         bsdf = segment.si.bsdf()
         seen = segment.weight * dr.exp(-self.scattering.c * dr.select(segment.valid, segment.si.t, 0.0))
         parts = []
@@ -322,42 +326,42 @@ class Renderer:
             towards = segment.si.to_local(pose.direction(-here.direction))
             sent = bsdf.eval(mi.BSDFContext(), segment.si, towards, active)[0]
             sent *= seen * here.in_middle * here.sigma_mm
-            parts.append(falling_off(sent, here.distance_mm, active))
+            parts.append(decay_with_distance(sent, here.distance_mm, active))
         return [sum(each, mi.Float(0.0)) for each in zip(*parts, strict=True)]
 
     # --- lamp ---------------------------------------------------------------------------------------------------------
 
-    def _lamp_frame(self, pose: SensorPose, *, spp: int, ambient: bool = False) -> np.ndarray:
-        """Light (H, W) of the lamp or the day in W/mm2; only the pixels in which it changes are rendered finely."""
+    def _render_lamp_frame(self, pose: SensorPose, *, spp: int, ambient: bool = False) -> np.ndarray:
+        """Return the light (H, W) of lamp or daylight in W/mm2; only pixels with changes are sampled finely."""
         begin_kernels()
-        bundle, shape = self.view.grid(1)
+        bundle, shape = self.view.trace_grid(1)
         segment = next(self._segments(pose, bundle, None))
-        value = self._evenly_lit(segment, ambient)
+        value = self._compute_even_light(segment, ambient)
         depth = dr.select(segment.valid, self.view.depth_mm(segment.end()), dr.nan)
         dr.eval(value, depth)
         nodes = value.numpy().reshape(shape)
-        low, high = over_corners(np.minimum, nodes), over_corners(np.maximum, nodes)
+        low, high = combine_corners(np.minimum, nodes), combine_corners(np.maximum, nodes)
         changes = high - low > CHANGE_SHARE * nodes.max()
         if self.effects.defocus:
-            changes = widened(changes, self._blur_px(changes, depth.numpy().reshape(shape)), cell_px=1)
+            changes = dilate_cells(changes, self._blur_px(changes, depth.numpy().reshape(shape)), cell_px=1)
         if pose.travel is not None:
-            changes[:] = True  # what moves by may change any pixel
-        image = 0.25 * over_corners(np.add, nodes)
+            changes[:] = True  # motion may change any pixel
+        image = 0.25 * combine_corners(np.add, nodes)
 
         def evenly_lit(pose: SensorPose, bundle: Rays, after_s: Float | None) -> tuple[Float]:
-            return (self._evenly_lit(next(self._segments(pose, bundle, after_s)), ambient),)
+            return (self._compute_even_light(next(self._segments(pose, bundle, after_s)), ambient),)
 
-        for rows, columns in _parts(*places(changes), spp=spp):
-            image[rows, columns] = self._fine(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
+        for rows, columns in _split_pixels(*find_marked(changes), spp=spp):
+            image[rows, columns] = self._render_pixels(evenly_lit, pose, rows, columns, spp=spp, shifted=True)()[0]
         return image
 
-    def _evenly_lit(self, segment: RaySegment, ambient: bool) -> Float:
-        """Irradiance per ray in W/mm2 where every surface is evenly lit, seen through the water and its veil.
+    def _compute_even_light(self, segment: RaySegment, ambient: bool) -> Float:
+        """Return the irradiance per ray in W/mm2 for evenly lit surfaces, seen through the water and its veiling light.
 
-        A surface of albedo A that receives E sends back the radiance A E / pi. Daylight comes from all around, so the
-        water scatters the same radiance E / pi into every ray; the lamp shines from the sensor's side, and only what
-        is scattered backwards returns. Up to the distance t that veil is E / pi times the scattered share of the
-        extinction, times 1 - exp(-c t) (Duntley 1963, Eq. 4, for an even light field).
+        A surface of albedo A at the irradiance E has the radiance A E / pi. Daylight is isotropic, so the water
+        scatters the radiance E / pi into every ray. The lamp is beside the camera, so only backscattered light returns.
+        Up to the distance t, the veiling light is E / pi (1 - exp(-c t)) times the scattered fraction of the extinction
+        c (Duntley 1963, Eq. 4, for an even light field).
         """
         lamp = self.sensor.lamp
         level = opaque(1e-6 / math.pi * (lamp.ambient_w_per_m2 if ambient else lamp.irradiance_w_per_m2))
@@ -373,11 +377,11 @@ class Renderer:
         return segment.weight * level * radiance
 
     def _caustic(self, p: Point3f) -> Float:
-        """Factor of the day's light on surfaces at points of the scene, focused by waves; about 1 in the mean.
+        """Return the daylight factor of focusing waves on surfaces at points of the scene; its mean is about 1.
 
-        Rays of a wavy surface of the height h are displaced by the slopes times a length L, so that the irradiance goes
-        as 1 / |det(1 - L H)|, H being h's second derivatives (Lock and Andrews, Am. J. Phys. 60, 397, 1992). Waves of
-        all directions give the trace of L H the standard deviation ``caustics``; folds are cut off.
+        A wavy surface of height h displaces rays by the length L times its slopes. The irradiance is proportional to 1
+        / |det(1 - L H)| with the second derivatives H of h (Lock and Andrews, Am. J. Phys. 60, 397, 1992). Waves of all
+        directions give the trace of L H the standard deviation ``caustics``; singularities at folds are clipped.
         """
         rng = np.random.default_rng(_DRIFTING_STREAM)
         angle, phase = rng.uniform(0, 2 * math.pi, (2, _CAUSTIC_WAVES))
@@ -389,14 +393,14 @@ class Renderer:
             xx, xy, yy = xx + x * x * bend, xy + x * y * bend, yy + y * y * bend
         size = opaque(self._caustics)
         determinant = (1 - size * xx) * (1 - size * yy) - dr.square(size * xy)
-        # Of a normal trace t the mean of 1 / (1 - t) is 1 + std^2 + 3 std^4 and so on.
+        # For a normally distributed trace t, the mean of 1 / (1 - t) is 1 + std^2 + 3 std^4 + ...
         mean = 1 + dr.square(size) + 3 * dr.square(dr.square(size))
         return 1 / (dr.clip(dr.abs(determinant), 0.15, 10.0) * mean)
 
     def _lamp_share(self, segment: RaySegment) -> Float:
-        """Share of the lamp's light where camera rays end: a round Gaussian spot about the lamp's axis.
+        """Return the fraction of lamp light at the end of camera rays: a round Gaussian spot about the lamp's axis.
 
-        Towards the slope of the view's corner away from that axis, `Flaws.uneven_lamp` of it is lost.
+        The fraction `Flaws.uneven_lamp` is lost at the corner slope's distance from that axis.
         """
         length = dr.select(segment.valid, segment.si.t, self.design.standoff_mm)
         x, y = self.view.slopes(mi.Point3f(segment.origin + segment.direction * length))
@@ -406,26 +410,26 @@ class Renderer:
 
     # --- pixels -------------------------------------------------------------------------------------------------------
 
-    def _stripe(
+    def _render_stripe(
         self, pose: SensorPose, rows: np.ndarray, columns: np.ndarray, sources: list[Light], *, spp: int
     ) -> Callable[[], np.ndarray]:
-        """Means (3, P) of `_stripe_sums` over pixels, of few samples where the light of a wide stripe is smooth.
+        """Render the stripe; return a function that fetches the means (3, P) of `_stripe_sums` over pixels.
 
-        They are fetched by the function returned: most are still being rendered.
+        Rendering is asynchronous. In a wide stripe, pixels with smooth light take few samples.
         """
 
-        def begun(where: np.ndarray, spp: int) -> Callable[[], np.ndarray]:
+        def start(where: np.ndarray, spp: int) -> Callable[[], np.ndarray]:
             found: list[Callable[[], np.ndarray]] = []
-            for part in _parts(rows[where], columns[where], spp=spp):
+            for part in _split_pixels(rows[where], columns[where], spp=spp):
                 if found:
-                    dr.sync_thread()  # the samples of one part at a time take memory
-                found.append(self._fine(self._stripe_sums, pose, *part, sources, spp=spp))
+                    dr.sync_thread()  # limits memory to the samples of one part
+                found.append(self._render_pixels(self._stripe_sums, pose, *part, sources, spp=spp))
             return lambda: np.concatenate([np.zeros((3, 0), np.float32), *(means() for means in found)], axis=1)
 
         everywhere, lines = np.arange(len(rows)), self.sensor.camera.lines()
         if len(rows) < _WIDE_PX * lines or spp < _LEAST_SPP * _FEWER_SAMPLES:
-            return begun(everywhere, spp)
-        sums = begun(everywhere, spp // _FEWER_SAMPLES)()
+            return start(everywhere, spp)
+        sums = start(everywhere, spp // _FEWER_SAMPLES)()
         image = np.zeros((self.sensor.camera.height_px, self.sensor.camera.width_px), np.float32)
         image[rows, columns] = sums[0]
         bends = np.zeros(image.shape, np.uint8)
@@ -433,13 +437,16 @@ class Renderer:
             second = cv2.Sobel(image, cv2.CV_32F, along_x, along_y, ksize=1)
             bends |= (np.abs(second) > BEND_SHARE * sums[0].max(initial=0.0)).view(np.uint8)
         again = np.flatnonzero(cv2.dilate(bends, np.ones((3, 3), np.uint8))[rows, columns])
-        sums[:, again] = begun(again, spp)()
+        sums[:, again] = start(again, spp)()
         return lambda: sums
 
     def _stripe_sums(
         self, pose: SensorPose, bundle: Rays, after_s: Float | None, sources: list[Light]
     ) -> tuple[Float, Float, Float]:
-        """Irradiance per ray of lit surfaces seen straight or in a mirror, and it times what speckle depends on."""
+        """Return irradiance per ray of surfaces seen directly or in mirrors, plain and weighted for speckle.
+
+        The weights are polarisation and roughness of the surfaces.
+        """
         total, polarised, rough = mi.Float(0.0), mi.Float(0.0), mi.Float(0.0)
         for segment in self._segments(pose, bundle, after_s):
             value = segment.weight * self._radiance(pose, segment, sources, after_s)
@@ -448,7 +455,7 @@ class Renderer:
             rough += value * self.objects.roughness_um(segment.si)
         return total, polarised, rough
 
-    def _fine(
+    def _render_pixels(
         self,
         light: Callable[..., tuple[Float, ...]],
         pose: SensorPose,
@@ -458,17 +465,17 @@ class Renderer:
         spp: int,
         shifted: bool = False,
     ) -> Callable[[], np.ndarray]:
-        """Means (K, P) over the area of pixels, the pupil and the exposure of what ``light`` finds along each ray.
+        """Render pixels; return a function that fetches the means (K, P) of ``light`` over pixel, pupil and exposure.
 
-        They are fetched by the function returned, and rendered meanwhile. ``shifted`` takes other places on the pupil
-        in neighbouring pixels, so that a blurred edge shows no steps.
+        Rendering is asynchronous. ``shifted`` uses different pupil samples in neighbouring pixels, so that a blurred
+        edge shows no steps.
         """
         index = dr.arange(mi.UInt32, len(rows) * spp)
         per_pixel = dr.opaque(mi.UInt32, spp)
         pixel = index // per_pixel
         sample = index - pixel * per_pixel
-        # Values that lie side by side are read together, which takes a fraction of the time.
-        axes = lattice(spp, 2 + 2 * self.effects.defocus + (pose.travel is not None))
+        # Adjacent values are read together, which is much faster.
+        axes = make_lattice(spp, 2 + 2 * self.effects.defocus + (pose.travel is not None))
         places = np.zeros((spp, 4))
         places[:, : 2 + 2 * self.effects.defocus] = axes[: 2 + 2 * self.effects.defocus].T
         across, down, u, v = dr.gather(mi.Vector4f, to_jit(mi.Float, places), sample)
@@ -482,34 +489,34 @@ class Renderer:
             pupil = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u, v))
         after_s = None
         if pose.travel is not None:
-            after_s = pose.travel.at(y, dr.gather(mi.Float, to_jit(mi.Float, axes[-1]), sample))
+            after_s = pose.travel.compute_times(y, dr.gather(mi.Float, to_jit(mi.Float, axes[-1]), sample))
         bundle = self.view.bundle(x + across - 0.5, y + down - 0.5, pupil)
         values = light(pose, bundle, after_s, *rest)
-        dr.eval(values)  # together: each sum on its own would trace the rays anew
+        dr.eval(values)  # together: separate sums would trace the rays again
         sums = [dr.block_sum(value, spp) for value in values]
         dr.eval(sums)
         return lambda: np.stack([each.numpy() / spp for each in sums])
 
     def _blur_px(self, marked: np.ndarray, depth_mm: np.ndarray) -> np.ndarray:
-        """Largest blur in px of what is seen at the corners of marked cells, 0 elsewhere, of depths at all nodes."""
-        row, column = places(marked)
+        """Return the largest blur in px at the corners of marked cells, 0 elsewhere, from the depths at all nodes."""
+        row, column = find_marked(marked)
         corners = np.stack([depth_mm[row + down, column + right] for down, right in np.ndindex(2, 2)])
         blur = np.zeros(marked.shape, np.float32)
         blur[row, column] = np.fmax(np.fmax.reduce(self.view.blur_radius_px(corners)), 0)
         return blur
 
-    def _repeated(self, cells: np.ndarray) -> np.ndarray:
-        """Values of grid cells given to their pixels, (H, W)."""
-        return repeated(cells, self.sensor.camera.height_px, self.sensor.camera.width_px)
+    def _expand_cells(self, cells: np.ndarray) -> np.ndarray:
+        """Expand values of grid cells to pixels (H, W)."""
+        return expand_cells(cells, self.sensor.camera.height_px, self.sensor.camera.width_px)
 
 
 def _sigmas(here: SheetLight, segment: RaySegment) -> Float:
-    """A sheet's distance across at segments' ends in standard deviations; infinity where there is no surface."""
+    """Return the distance of segment ends from a sheet in standard deviations; infinite without a surface."""
     return dr.select(segment.valid, here.distance_mm / here.sigma_mm, dr.inf)
 
 
-def _parts(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Pixels in parts of at most `SAMPLES_AT_ONCE` samples; nothing if there are none."""
+def _split_pixels(rows: np.ndarray, columns: np.ndarray, *, spp: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield pixels in parts of at most `SAMPLES_AT_ONCE` samples."""
     if len(rows):
         count = -(-len(rows) * spp // SAMPLES_AT_ONCE)
         yield from zip(np.array_split(rows, count), np.array_split(columns, count), strict=True)

@@ -1,12 +1,12 @@
-"""The laser sheet in the medium: fan rays traced through the real laser window, then a smooth ruled surface.
+"""The laser sheet in the medium: fan rays traced through the laser window, then a smooth ruled surface.
 
-Everything is in the sensor's object coordinate system (OCS), in which the nominal sheet is X = 0, Y runs along the
-stripe and Z along the laser's axis. A fan ray is the straight line Y = y0(m) + m Z, X = x0(m) + k(m) Z, with its slope
-m = dY/dZ as the parameter of the surface. A tilted window or a bow curve the surface; across it, along its normal, the
-light is a Gaussian.
+All coordinates are in the sensor's object coordinate system (OCS). The nominal sheet is X = 0, Y is along the stripe
+and Z along the laser's axis. A fan ray is the straight line Y = y0(m) + m Z, X = x0(m) + k(m) Z; its slope m = dY/dZ is
+the parameter of the surface. A tilted window or a bow curve the surface. Across it, along its normal, the irradiance is
+Gaussian.
 
-The fan's own frame has x along the sheet's normal, y along the fan and z along the laser's axis. A fan ray is named by
-the angle in rad that its projection along x makes with the axis.
+The fan's own frame has x along the sheet's normal, y along the fan and z along the laser's axis. A fan ray is
+identified by the angle in rad between the axis and its projection along x.
 """
 
 from __future__ import annotations
@@ -21,36 +21,37 @@ import numpy as np
 from numpy.polynomial import Chebyshev
 
 from twin.backend.arrays import Float, Point3f, UInt32, Vector3f, opaque, opaque_point, to_jit
-from twin.light.camera import WindowFaces, frame_about
+from twin.light.camera import WindowFaces, build_frame
 from twin.light.pose import Rays
 from uwlts.errors import DesignError
 from uwlts.model.placement import camera_from_object, laser_pose
 from uwlts.model.sensor import Laser, Medium, Sensor
 
 _RAYS = 1025
-"""Fan rays traced through the window; many more than the series have terms."""
+"""Number of fan rays traced through the window, many more than the terms of the series."""
 _NODES = 4097
-"""Nodes of the power along the fan: finer than the traced rays."""
+"""Number of nodes of the power along the fan, more than the traced rays."""
 _NEWTON_STEPS = 2
-"""Lead to the rounding of 32 bits, as the start is the ray of a fan that meets in one point behind the window."""
+"""Enough for single precision: the start is the ray of a fan with one vertex behind the window."""
 _LARGEST_DEGREE = 27
-"""Degree of the series before their ends are cut; enough for fans that fill their window."""
+"""Degree of the series before truncation, sufficient for fans that fill their window."""
 _LARGEST_MISS_MM = 1e-3
-"""By how much the series may miss a traced ray 1 m behind the window."""
+"""Largest distance between the series and a traced ray 1 m behind the window."""
 _SERIES_MM = 5e-5
+"""Largest sum of the truncated terms of a series in mm, about the rounding errors of the traced rays."""
 _SERIES_SLOPE = 1e-7
-"""Largest sum of the terms left out of a series: about the rounding errors of the traced rays."""
+"""Largest sum of the truncated terms of a series of slopes."""
 _SMALLEST_SPREAD_MM = 1e-3
-"""Rays closer to where the fan begins are taken as if so far from it."""
+"""Smallest distance from the fan's vertex; rays closer to it are treated as at this distance."""
 
 
 @dataclass(frozen=True)
 class SheetLight:
-    """The sheet's light at points: signed distance across, width, irradiance in W/mm2 across the ray, its direction.
+    """Light of the sheet at points: distance, width, irradiance in W/mm2 perpendicular to the ray, direction.
 
-    ``distance_mm`` and ``sigma_mm`` are measured along ``normal``, the unit normal of the lit surface on the side of X;
-    ``in_middle`` is the irradiance beside the point in the sheet's middle; ``exit_mm`` is the way back to the laser's
-    window.
+    The signed ``distance_mm`` and ``sigma_mm`` are measured along ``normal``, the unit normal of the lit surface
+    towards positive X. ``in_middle`` is the irradiance at the nearest point of the sheet's centre. ``exit_mm`` is the
+    path length from the laser's window.
     """
 
     distance_mm: Float
@@ -63,12 +64,12 @@ class SheetLight:
 
 
 class Sheet:
-    """The lit surface of a laser in a medium: of the sensor's own, or of ``laser``, another one of the sensor.
+    """The lit surface of a laser in a medium: of the sensor's main laser, or of ``laser``, another laser of the sensor.
 
-    ``power_w`` is the power behind the window, before the medium takes any; ``begins_at_z_mm`` the smallest Z of the
-    window's outer face in the OCS, before which there is no light. Another laser's sheet has an OCS of its own, into
-    which ``own_from_object`` (4, 4) leads from the sensor's. DesignError where a part of the fan does not pass the
-    window, or is bent too much by it.
+    ``power_w`` is the power behind the window, before absorption. ``begins_at_z_mm`` is the smallest Z of the window's
+    outer face in the OCS, before which there is no light. The sheet of another laser has its own OCS;
+    ``own_from_object`` (4, 4) transforms from the sensor's OCS to it. DesignError if part of the fan does not pass the
+    window, or the window bends the fan too unevenly.
     """
 
     def __init__(self, sensor: Sensor, medium: Medium, laser: Laser | None = None):
@@ -77,19 +78,19 @@ class Sheet:
             None if laser is None else np.linalg.inv(camera_from_object(own)) @ camera_from_object(sensor)
         )
         laser = own.laser
-        origin, angle, fan = _traced(own, medium)
+        origin, angle, fan = _trace_fan(own, medium)
         self._origin = opaque_point(origin)
         o, d = fan.origin, fan.direction
         slope, tilt = d[1] / d[2], d[0] / d[2]
-        y0, x0 = _series(slope, o[1] - slope * o[2], _SERIES_MM), _series(slope, o[0] - tilt * o[2], _SERIES_MM)
-        k, exit_z = _series(slope, tilt, _SERIES_SLOPE), _series(slope, o[2], _SERIES_MM)
+        y0, x0 = _fit_series(slope, o[1] - slope * o[2], _SERIES_MM), _fit_series(slope, o[0] - tilt * o[2], _SERIES_MM)
+        k, exit_z = _fit_series(slope, tilt, _SERIES_SLOPE), _fit_series(slope, o[2], _SERIES_MM)
         self.begins_at_z_mm = opaque(float(o[2].min()))
         far = o + 1e3 * d
         miss = np.hypot(y0(slope) + slope * far[2] - far[1], x0(slope) + k(slope) * far[2] - far[0]).max()
         if miss > _LARGEST_MISS_MM:
             raise DesignError(
-                f"the laser's window bends the {laser.fan_angle_deg:g} deg fan so unevenly that its rays are followed "
-                f"to {miss:.3f} mm only, not to {_LARGEST_MISS_MM:g} mm: make the fan narrower or tilt the window less"
+                f"the laser's window bends the {laser.fan_angle_deg:g} deg fan too unevenly: its rays are traced "
+                f"with an error of {miss:.3f} mm (limit {_LARGEST_MISS_MM:g} mm): narrow the fan or the window's tilt"
             )
         self._y0, self._x0, self._tilt, self._exit_z = map(_Series, (y0, x0, k, exit_z))
         self._dy0, self._dx0, self._dtilt = (_Series(each.deriv()) for each in (y0, x0, k))
@@ -98,34 +99,35 @@ class Sheet:
         self._start_y0, self._start_dy0 = opaque(float(straight(0.0))), opaque(float(straight.deriv()(0.0)))
         self._least, self._most = opaque(low - 0.05 * (high - low)), opaque(high + 0.05 * (high - low))
         self._offset, self._scale = opaque(offset), opaque(scale)
-        self._power, self.power_w = _power_along(laser, slope, angle, fan.weight)
+        self._power, self.power_w = _tabulate_power(laser, slope, angle, fan.weight)
         waist = laser.waist_radius_mm
         index = medium.refractive_index(laser.wavelength_nm)
         rayleigh = math.pi * waist**2 * index / (laser.beam_quality_m2 * 1e-6 * laser.wavelength_nm)
         self._waist, self._rayleigh, self._waist_at = map(opaque, (waist, rayleigh, laser.waist_distance_mm))
         self._extinction = opaque(medium.extinction_per_mm(laser.wavelength_nm))
 
-    def at(self, p: Point3f) -> SheetLight:
-        """Light of the sheet at points in the OCS.
+    def evaluate(self, p: Point3f) -> SheetLight:
+        """Return the light of the sheet at points in the OCS.
 
-        The slope of the fan ray through a point solves y0(m) + m Z = Y (Newton). Between two fan rays flows the power
-        P'(m) dm; across it spreads as a Gaussian of standard deviation w / 2 with w^2 = w0^2 (1 + ((s - s0) / zR)^2)
-        (Siegman, Lasers, Eqs. 17.5, and 17.6 for zR, with M2), s being the distance from the laser.
+        The slope m of the fan ray through a point solves y0(m) + m Z = Y (Newton). The power between two fan rays is
+        P'(m) dm. Its profile across the sheet is Gaussian with the standard deviation w / 2. The radius w at the
+        distance s from the laser follows from w^2 = w0^2 (1 + ((s - s0) / zR)^2) (Siegman, Lasers, Eqs. 17.5, and 17.6
+        for zR, with M2).
         """
         m = (p.y - self._start_y0) / (self._start_dy0 + p.z)
         for _ in range(_NEWTON_STEPS):
-            t = self._normalised(m)
+            t = self._normalise(m)
             m -= (self._y0(t) + m * p.z - p.y) / (self._dy0(t) + p.z)
             m = dr.clip(m, self._least, self._most)
-        t = self._normalised(m)
+        t = self._normalise(m)
         tilt, normal = self._tilt(t), self._normal(m, t, p.z)
         distance = (p.x - self._x0(t) - tilt * p.z) * normal.x
         stretch = dr.sqrt(1 + m * m + tilt * tilt)
         exit_mm = (p.z - self._exit_z(t)) * stretch
         away = dr.norm(p - self._origin) - self._waist_at
         sigma = 0.5 * self._waist * dr.sqrt(1 + dr.square(away / self._rayleigh))
-        # A plane Z = const is crossed by P'(m) dm / dY per length along Y, spread along X as the Gaussian is cut there.
-        density = self._power.at(m) / (self._dy0(t) + p.z) * normal.x
+        # In a plane Z = const the power per length along Y is P'(m) dm / dY; normal.x projects the profile onto it.
+        density = self._power.evaluate(m) / (self._dy0(t) + p.z) * normal.x
         in_middle = density / (sigma * math.sqrt(2 * math.pi)) * stretch * dr.exp(-self._extinction * exit_mm)
         in_middle = dr.select(exit_mm > 0, in_middle, 0.0)
         irradiance = in_middle * dr.exp(-0.5 * dr.square(distance / sigma))
@@ -133,19 +135,18 @@ class Sheet:
         return SheetLight(distance, sigma, irradiance, in_middle, direction, normal, exit_mm)
 
     def sample(self, u: Point3f) -> Rays:
-        """Rays behind the window, of weight 1 and drawn in proportion to power with three numbers from 0 to 1 each.
+        """Sample rays of weight 1 behind the window, in proportion to power, from three uniform numbers each.
 
-        ``u.x`` chooses the fan ray, ``u.y`` and ``u.z`` how far beside and how much turned against it: with the
-        standard deviations w0 / 2 at the waist and w0 / (2 zR), independent of each other, straight rays spread by
-        w(s) / 2 at every s.
+        ``u.x`` selects the fan ray, ``u.y`` its lateral offset and ``u.z`` its tilt. Their standard deviations are w0 /
+        2 at the waist and w0 / (2 zR). As both are independent, straight rays spread by w(s) / 2 at every s.
         """
         m = self._power.draw(u.x)
-        t = self._normalised(m)
+        t = self._normalise(m)
         tilt, z = self._tilt(t), self._exit_z(t)
         stretch = dr.sqrt(1 + m * m + tilt * tilt)
         along = cast(Vector3f, mi.Vector3f(tilt, m, 1.0))
         leaves = mi.Point3f(self._x0(t) + tilt * z, self._y0(t) + m * z, z)
-        # Where the ray is as far from the laser as the waist.
+        # Point of the ray at the waist's distance from the laser.
         from_laser = leaves - self._origin
         ahead = dr.dot(from_laser, along) / stretch
         to_waist = dr.safe_sqrt(ahead * ahead - dr.squared_norm(from_laser) + dr.square(self._waist_at)) - ahead
@@ -156,29 +157,29 @@ class Sheet:
         along.x += turned * stretch
         return Rays(leaves, dr.normalize(along), mi.Float(1.0))
 
-    def _normalised(self, m: Float) -> Float:
+    def _normalise(self, m: Float) -> Float:
         return dr.fma(m, self._scale, self._offset)
 
     def _normal(self, m: Float, t: Float, z: Float) -> Vector3f:
-        """Unit normal of the surface X(Y, Z): its derivatives are X_Y = (x0' + k' Z) / (y0' + Z), X_Z = k - m X_Y."""
-        # At the fan's origin, where all rays meet, both derivatives vanish.
+        """Return the unit normal of the surface X(Y, Z), from X_Y = (x0' + k' Z) / (y0' + Z) and X_Z = k - m X_Y."""
+        # Both derivatives vanish at the fan's vertex.
         spread = dr.maximum(self._dy0(t) + z, _SMALLEST_SPREAD_MM)
         by_y = (self._dx0(t) + self._dtilt(t) * z) / spread
         return dr.normalize(mi.Vector3f(1.0, -by_y, m * by_y - self._tilt(t)))
 
 
-def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, np.ndarray, Rays]:
-    """The laser's origin (3,), and angles (N,) and rays (3, N) of its fan behind the window, all in the OCS."""
+def _trace_fan(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, np.ndarray, Rays]:
+    """Trace the fan; return the laser's origin (3,), ray angles (N,) and rays (3, N) behind the window in the OCS."""
     laser, pose = sensor.laser, laser_pose(sensor)
     to_object = np.linalg.inv(camera_from_object(sensor))
-    rotation = frame_about(pose.axis, pose.normal)
+    rotation = build_frame(pose.axis, pose.normal)
     faces = WindowFaces(
         laser.window, medium, wavelength_nm=laser.wavelength_nm, origin_mm=pose.origin_mm, rotation=rotation
     )
-    # Denser towards the edges, where a series would otherwise swing.
+    # Chebyshev nodes, denser towards the edges, prevent oscillation of the series.
     angle = -math.radians(laser.fan_angle_deg / 2) * np.cos(np.linspace(0, math.pi, _RAYS))
     fan = mi.Vector3f(rotation @ _fan_directions(laser, angle))
-    path = faces.through(mi.Point3f(pose.origin_mm), fan, mode=mi.TransportMode.Importance)
+    path = faces.trace(mi.Point3f(pose.origin_mm), fan, mode=mi.TransportMode.Importance)
     if not bool(dr.all(path.weight > 0)):
         raise DesignError(
             f"part of the laser's {laser.fan_angle_deg:g} deg fan does not pass its window of "
@@ -190,33 +191,33 @@ def _traced(sensor: Sensor, medium: Medium) -> tuple[np.ndarray, np.ndarray, Ray
     return to_object[:3, :3] @ pose.origin_mm + to_object[:3, 3], angle, Rays(o, d, passed)
 
 
-def _power_along(laser: Laser, slope: np.ndarray, angle: np.ndarray, passed: np.ndarray) -> tuple[PowerTable, float]:
-    """Power behind the window per slope, and in total in W, of fan rays at slopes, angles and with shares (N,)."""
+def _tabulate_power(laser: Laser, slope: np.ndarray, angle: np.ndarray, passed: np.ndarray) -> tuple[PowerTable, float]:
+    """Return the power behind the window per slope, and the total power in W, from fan rays (N,)."""
     lit = _fan_lit_angles(laser)
     first, last = np.interp(lit[[0, -1]], angle, slope)
     nodes = np.linspace(first, last, _NODES)
-    angle_of, passes = _series(slope, angle, _SERIES_SLOPE), _series(slope, passed, 1e-6)
+    angle_of, passes = _fit_series(slope, angle, _SERIES_SLOPE), _fit_series(slope, passed, 1e-6)
     density = _power_per_angle(laser, np.clip(angle_of(nodes), lit[0], lit[-1])) * passes(nodes)
     between = np.union1d(lit, angle[(angle > lit[0]) & (angle < lit[-1])])
     total = float(np.trapezoid(_power_per_angle(laser, between) * np.interp(between, angle, passed), between))
     return PowerTable(nodes, density * angle_of.deriv()(nodes), power_w=total), total
 
 
-def _series(slope: np.ndarray, values: np.ndarray, tolerance: float) -> Chebyshev:
-    """Chebyshev series in the slope through values, without the terms at its end that sum up to less than allowed."""
+def _fit_series(slope: np.ndarray, values: np.ndarray, tolerance: float) -> Chebyshev:
+    """Fit a Chebyshev series in the slope, truncated as far as the sum of the omitted terms allows."""
     fit = Chebyshev.fit(slope, values, _LARGEST_DEGREE, domain=(slope.min(), slope.max()))
     left = np.cumsum(np.abs(fit.coef[::-1]))[::-1]
     return fit.truncate(max(1, np.count_nonzero(left > tolerance)))
 
 
 class _Series:
-    """A Chebyshev series as kernels take it: another one of the same degree needs no other kernel."""
+    """Chebyshev series with opaque coefficients: series of equal degree share a kernel."""
 
     def __init__(self, series: Chebyshev):
         self._coefficients = [opaque(float(each)) for each in series.coef]
 
     def __call__(self, t: Float) -> Float:
-        """Value at the variable brought to -1 to 1, by Clenshaw's recurrence, which keeps 32 bits exact."""
+        """Evaluate at the normalised variable (-1 to 1) by Clenshaw's recurrence, exact in single precision."""
         ahead, beyond = mi.Float(0.0), mi.Float(0.0)
         for coefficient in self._coefficients[:0:-1]:
             ahead, beyond = dr.fma(2 * t, ahead, coefficient - beyond), ahead
@@ -228,17 +229,17 @@ def _standard_normal(u: Float) -> Float:
 
 
 def _fan_lit_angles(laser: Laser) -> np.ndarray:
-    """Angles (K,) in rad between which the power per angle is smooth; outside the first and the last it is zero."""
+    """Return the angles (K,) in rad that bound the smooth parts of the power per angle, which is 0 outside them."""
     half = laser.fan_angle_deg / 2
     nodes = (-half, half) if isinstance(laser.fan_profile, str) else [angle for angle, _ in laser.fan_profile]
     return np.radians(nodes)
 
 
 def _fan_directions(laser: Laser, angle: np.ndarray) -> np.ndarray:
-    """Unit directions (3, N) of fan rays in the laser's frame.
+    """Return unit directions (3, N) of fan rays in the laser's frame.
 
-    A beam that enters line optics tilted by alpha leaves them as a cone, whose distance from a straight sheet is
-    z tan(alpha) (1 / cos(angle) - 1); the ray in the middle keeps the laser's axis.
+    A beam tilted by alpha against the line optics leaves them as a cone. Its distance from a plane sheet is z
+    tan(alpha) (1 / cos(angle) - 1); the central ray keeps the laser's axis.
     """
     bow = math.tan(math.radians(laser.bow_deg))
     along = np.stack([bow * (1 / np.cos(angle) - 1), np.tan(angle), np.ones_like(angle)])
@@ -246,7 +247,7 @@ def _fan_directions(laser: Laser, angle: np.ndarray) -> np.ndarray:
 
 
 def _power_per_angle(laser: Laser, angle: np.ndarray) -> np.ndarray:
-    """Power in W/rad at lit angles (N,), before the window. Its integral over the fan is the laser's power."""
+    """Return the power in W/rad at lit angles (N,), before the window; its integral is the laser's power."""
     half = math.radians(laser.fan_angle_deg / 2)
     match laser.fan_profile:
         case "flat":
@@ -262,10 +263,10 @@ def _power_per_angle(laser: Laser, angle: np.ndarray) -> np.ndarray:
 
 
 class PowerTable:
-    """Power per unit of a coordinate along the fan: linear between even nodes (N,), zero outside them.
+    """Power per unit of a coordinate along the fan: linear between evenly spaced nodes (N,), zero outside them.
 
-    ``density`` (N,) is the relative power per unit at the nodes, smooth or not, scaled to ``power_w`` in total. The
-    values lie in arrays, not in the kernel: every profile is looked up, and drawn from, by the same few steps.
+    ``density`` (N,) is the relative power per unit at the nodes, scaled to ``power_w`` in total. The values are stored
+    in arrays, so that all profiles use the same kernel.
     """
 
     def __init__(self, nodes: np.ndarray, density: np.ndarray, *, power_w: float):
@@ -275,18 +276,18 @@ class PowerTable:
         below = np.concatenate([[0.0], np.cumsum(0.5 * (share[1:] + share[:-1]))])
         self._share, self._below = to_jit(mi.Float, share), to_jit(mi.Float, below / below[-1])
 
-    def at(self, x: Float) -> Float:
-        """Power in W per unit of the coordinate."""
+    def evaluate(self, x: Float) -> Float:
+        """Return the power in W per unit of the coordinate."""
         place = (x - self._low) / self._step
-        # What is not a number becomes no index that clipping alone would keep within the table.
+        # The second bound catches NaN, which clipping does not.
         cell = dr.minimum(mi.UInt32(dr.clip(place, 0.0, self._cells - 1.0)), self._cells - 1)
         share = dr.lerp(*self._ends(cell), place - mi.Float(cell))
         return dr.select((place >= 0) & (place <= self._cells), self._power_per_step * share, 0.0)
 
     def draw(self, u: Float) -> Float:
-        """The coordinate below which the share ``u`` of the power lies: even ``u`` give places as dense as the power.
+        """Return the coordinate below which the fraction ``u`` of the power is emitted.
 
-        Within a cell the share a t + (b - a) t^2 / 2 of its ends' densities a and b is solved for t, 0 to 1.
+        Within a cell with the densities a and b at its ends, a t + (b - a) t^2 / 2 is solved for t, 0 to 1.
         """
         cell = dr.binary_search(0, self._cells - 1, lambda i: dr.gather(mi.Float, self._below, i + 1) <= u)
         rest = u - dr.gather(mi.Float, self._below, cell)

@@ -1,19 +1,20 @@
-"""Light that reached the camera by way of more than one scattering or reflection, by random walks from the camera.
+"""Multiply scattered and reflected light, by random walks from the camera.
 
-A walk follows a camera ray through the water: it ends on a surface or is scattered on its way, and goes on from there.
-Every place that it comes to collects three parts of the laser's light:
+A walk follows a camera ray through the water. It ends on a surface or is scattered on its path, and continues from
+there. At each vertex it collects three parts of the laser's light:
 
-- what the sheet scatters into the walk's next stretch, at one place drawn like the sheet's profile across the stretch;
-- what a lit surface sends back along that stretch, where it ends on one;
-- the same lit surfaces once more, by connecting to a point that a ray of the fan lights up.
+- light that the sheet scatters into the next segment, at one position sampled from the sheet's profile along it;
+- light that a lit surface reflects along that segment, if it ends on one;
+- light of lit surfaces again, by connecting the vertex to a point sampled from the fan.
 
-The last two count the same light; each is weighted by how probable the other one was (the balance heuristic of Veach
-1997, Eq. 9.8), which leaves no rare bright samples: a stripe close by is found by the walk itself, a distant one by
-connecting. Directions are drawn from the surface's or the water's own scattering, and in scattering water also from
-forward scattering about the direction to the laser, from which most scattered light arrives, and into the sheet nearby
-in proportion to what it scatters from there (`SheetLobe`).
+The last two estimate the same light and are combined by the balance heuristic (Veach 1997, Eq. 9.8). It prevents rare
+bright samples: nearby stripes are found by the walk, distant ones by connections.
 
-Left out: light that went by way of a mirror and was scattered or reflected by something else before or after.
+Directions are sampled from the scattering of the surface or the water. In scattering water they are also sampled from
+forward scattering about the direction to the laser, which is the source of most scattered light. A third distribution
+covers light that the nearby sheet scatters (`SheetLobe`).
+
+Light that is both reflected by a mirror and scattered or reflected elsewhere is neglected.
 """
 
 from __future__ import annotations
@@ -29,34 +30,33 @@ import numpy as np
 
 from twin.backend.arrays import PCG32, Bool, BSDFPtr, Float, Point2f, Point3f, SurfaceInteraction3f, UInt32, Vector3f
 from twin.light.illumination import Light, Passage, SheetLobe
-from twin.light.pose import Rays, SensorPose
+from twin.light.pose import CLEAR_MM, Rays, SensorPose
 from twin.light.sheet import SheetLight
-from twin.light.water import Scattering, one_minus_cosine, turned
+from twin.light.water import Scattering, one_minus_cosine, rotate_about
 from twin.options import Effects
 from twin.scene.objects import Objects
 
 _STEPS = 64
-"""No walk is longer; in the most turbid waters fewer than one in 10^4 would be."""
+"""Largest number of segments of a walk; even in the most turbid waters fewer than one walk in 10^4 would be longer."""
 _FEW = 2**16
-"""So many walks or fewer are followed to their end in one kernel, which costs less than a launch for every stretch."""
+"""Up to this number of walks, all segments are traced in one kernel, which is faster than one launch per segment."""
 _TOWARDS_LASER = 0.15
-"""Share of directions drawn about the direction to the laser."""
+"""Fraction of directions sampled about the direction to the laser."""
 _TOWARDS_SHEET = 0.3
-"""Share of directions drawn as the sheet nearby shines."""
+"""Fraction of directions sampled from the lobe of the nearby sheet."""
 _NEAR_SHEET = 0.5
-"""Share of scattered walks' distances drawn about the place where the sheet is nearest."""
+"""Fraction of scattering distances sampled about the position nearest to the sheet."""
 _SURVIVES_FROM = 0.25
-"""Walks that carry less than this share of the light they began with are ended or strengthened at random."""
-_CLEAR_MM = 1e-2
+"""Walks with less than this fraction of their initial strength undergo Russian roulette."""
 
 
 @dataclass
 class _Walks:
-    """Walks in the sensor's OCS: the ray, the light it stands for, and the pixel or cell it counts for.
+    """State of walks in the sensor's OCS: ray, strength and weight, and the pixel or cell to add light to.
 
-    ``density`` is that of the ray's direction in 1/sr where a lit surface at its end is to be counted, else 0.
-    ``away`` is True once the walk has left the camera's own ray, ``reflected`` once it has met a surface, ``scattered``
-    once the water has scattered it.
+    ``density`` is the probability density of the ray's direction in 1/sr if a lit surface at its end counts, else 0.
+    ``away`` is True once the walk has left the camera's ray, ``reflected`` after a reflection, ``scattered`` after
+    scattering by water.
     """
 
     origin: Point3f
@@ -70,14 +70,14 @@ class _Walks:
     reflected: Bool
     scattered: Bool
 
-    def of(self, kept: UInt32) -> _Walks:
-        """The walks with the given indices."""
+    def select(self, kept: UInt32) -> _Walks:
+        """Return the walks with the given indices."""
         return _Walks(*(dr.gather(type(each), each, kept) for each in vars(self).values()))
 
 
 @dataclass(frozen=True)
 class Walker:
-    """Walks before one posed scene under its direct lights; rays that meet nothing are followed over ``reach_mm``."""
+    """Tracer of walks for one scene, pose and set of direct lights; rays without a hit end after ``reach_mm``."""
 
     objects: Objects
     scattering: Scattering
@@ -88,27 +88,19 @@ class Walker:
 
     @property
     def scatters(self) -> bool:
-        """Whether walks are scattered by the water."""
+        """True if the water scatters walks."""
         return self.effects.multiple_scattering and self.scattering.coefficient > 0
 
     @property
     def finds_light(self) -> bool:
-        """Whether any light on longer ways is rendered."""
+        """True if any indirect light is rendered."""
         return self.scatters or self.effects.secondary_light
 
-    def radiance(self, bundle: Rays, cell: UInt32, cells: int, *, seed: int) -> np.ndarray:
-        """Sum (cells,) over the rays of each cell of their weight times the light that came on a longer way."""
-        total = np.zeros(cells)
-        for where, *parts in self.found(bundle, cell, seed=seed):
-            for light in parts:
-                total += np.bincount(where, light, cells)
-        return total
+    def trace(self, bundle: Rays, cell: UInt32, *, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Trace walks; yield for each group of segments the cells (N,) and two kinds of light (N,).
 
-    def found(self, bundle: Rays, cell: UInt32, *, seed: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Cells (N,) and two kinds of light (N,) that walks found for them, one part of their ways after the other.
-
-        The first kind was scattered by the water, the second only sent from surface to surface. Each is that of one ray
-        on one or more stretches, times the ray's weight.
+        The first kind was scattered by water, the second only reflected between surfaces. Both include the ray's
+        weight.
         """
         width = dr.width(cell)
         if not self.finds_light:
@@ -128,31 +120,33 @@ class Walker:
         step, stretches = 0, 1
         while True:
             number = dr.opaque(mi.UInt32, (seed * _STEPS + step) % 2**32)
-            # The camera's own rays take a kernel of their own: most of what is known of them is constant.
-            walks, found, alive = self._steps(walks, number, stretches) if step else self._step(walks, number)
+            # Camera rays have a separate kernel, as most of their state is constant.
+            walks, found, alive = (
+                self._trace_segments(walks, number, stretches) if step else self._trace_segment(walks, number)
+            )
             dr.eval(found, alive, *vars(walks).values())
-            # Dr.Jit's threads would add in any order, which rounds differently every time.
+            # Returned unsummed: parallel sums in Dr.Jit are not reproducible.
             yield walks.cell.numpy(), found.x.numpy(), found.y.numpy()
             step += stretches
             kept = cast(Any, dr.compress(alive))
             if dr.width(kept) == 0 or step >= _STEPS:
                 return
             if dr.width(kept) == 1:
-                # Arrays of one entry would take a kernel of their own: two halves do for the whole.
+                # Arrays of one entry would compile another kernel: use two halves.
                 kept = mi.UInt32([kept[0], kept[0]])
                 walks.weight *= 0.5
-            walks = walks.of(kept)
+            walks = walks.select(kept)
             stretches = 1 if dr.width(kept) > _FEW else _STEPS - step
 
-    def _steps(self, walks: _Walks, seed: UInt32, stretches: int) -> tuple[_Walks, Point2f, Bool]:
-        """As `_step`, but so many stretches of the walks in one kernel, which is the same for any number."""
+    def _trace_segments(self, walks: _Walks, seed: UInt32, stretches: int) -> tuple[_Walks, Point2f, Bool]:
+        """Trace several segments of the walks in one kernel, which does not depend on their number."""
 
         def following(walks: _Walks, found: Point2f, alive: Bool, seed: UInt32, left: UInt32):
-            walks, more, alive = self._step(walks, seed)
+            walks, more, alive = self._trace_segment(walks, seed)
             return walks, mi.Point2f(found + more), alive, seed + 1, left - 1
 
         width = dr.width(walks.cell)
-        # Without a second writing of the loop, which would find next to nothing that does not change in it.
+        # Skip the search for loop invariants, which finds almost none and traces the loop twice.
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
             walks, found, alive, _, _ = dr.while_loop(
                 (
@@ -169,8 +163,8 @@ class Walker:
             )
         return walks, found, alive
 
-    def _step(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Point2f, Bool]:
-        """The next stretch of all walks: they as they go on, both kinds of light found, and which of them go on."""
+    def _trace_segment(self, walks: _Walks, seed: UInt32) -> tuple[_Walks, Point2f, Bool]:
+        """Trace the next segment of all walks; return their new state, both kinds of light, and the live mask."""
         state, sequence = mi.sample_tea_32(seed, walks.number)
         random = cast(Any, mi.PCG32)
         rng: PCG32 = random(size=dr.width(walks.number), initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
@@ -184,23 +178,23 @@ class Walker:
         mirror = dr.select(hit, self.objects.mirror_share(si), 0.0)
 
         from_sheet, from_surfaces = mi.Float(0.0), mi.Float(0.0)
-        passages = [light.passage(o, d, length) for light in self.lights if self.scatters]
+        passages = [light.locate_sheet(o, d, length) for light in self.lights if self.scatters]
         for light, passage in zip(self.lights, passages, strict=False):
             from_sheet += self._scattered_by_sheet(light, passage, o, d, walks.away, rng.next_float32())
         for light in self.lights:
             from_surfaces += dr.exp(-c * length) * self._lit_end(light, walks, si, bsdf, end, hit)
 
-        # The walk is scattered on its way or ends on the surface, and goes on if it still promises enough.
+        # The walk is scattered or reaches the surface, and survives Russian roulette.
         in_water, distance, passed = self._free_path(passages, length, hit, rng)
         vertex = mi.Point3f(o + d * distance)
         reflected, scattered_now = cast(Bool, walks.reflected | ~in_water), cast(Bool, walks.scattered | in_water)
-        here = [light.at(vertex) for light in self.lights]
+        here = [light.evaluate(vertex) for light in self.lights]
         towards_laser = [-each.direction for each in here]
-        sheets = [SheetLobe.at(each, self.scattering.over_sine) for each in here]
+        sheets = [SheetLobe.from_light(each, self.scattering.over_sine) for each in here]
         by_water = walks.strength * (from_sheet + dr.select(walks.scattered, from_surfaces, 0.0))
         between_surfaces = walks.strength * dr.select(walks.scattered, 0.0, from_surfaces)
         strength = walks.strength * passed
-        # It may find more light than one in any direction: scattered on, it may run towards the laser.
+        # Walks directed towards the laser may find more light after scattering, and survive more often.
         promise = mi.Float(1.0)
         for towards in towards_laser if self.scatters else ():
             ahead = 4 * math.pi * self.scattering.phase(one_minus_cosine(towards, d))
@@ -213,7 +207,7 @@ class Walker:
         of_laser, of_sheet = _TOWARDS_LASER / len(self.lights), _TOWARDS_SHEET / len(self.lights)
 
         def scattered(onward: Vector3f) -> tuple[Float, Float]:
-            """Light that the vertex scatters from ``onward`` into the walk, per sr, and the density there."""
+            """Return the light scattered from ``onward`` into the walk, per sr, and the sampling density."""
             reflectance, density = bsdf.eval_pdf(context, si, si.to_local(self.pose.direction(onward)), hit & ~in_water)
             value = dr.select(in_water, self.scattering.phase(one_minus_cosine(d, onward)), reflectance[0])
             density = dr.select(in_water, value, density * (1 - mirror))
@@ -227,18 +221,18 @@ class Walker:
         may_connect = alive if self.effects.secondary_light else alive & ~reflected
         for light in self.lights:
             u = mi.Point3f(rng.next_float32(), rng.next_float32(), rng.next_float32())
-            connected = strength * self._connected(light, vertex, scattered, u, may_connect)
+            connected = strength * self._connect(light, vertex, scattered, u, may_connect)
             by_water += dr.select(scattered_now, connected, 0.0)
             between_surfaces += dr.select(scattered_now, 0.0, connected)
 
-        # A new direction: the mirror's, one about the laser's direction, or the vertex's own.
+        # New direction: mirror reflection, about the laser's direction, into the sheet, or from the vertex.
         choice, which = rng.next_float32(), rng.next_float32()
         u1, u2 = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         specular = ~in_water & (choice < mirror)
         sample, _ = bsdf.sample(context, si, u1, u2, hit & ~in_water)
         onward = self.pose.object_direction(si.to_world(sample.wo))
         if self.scatters:
-            # All tables are read at once, whichever a direction is drawn from.
+            # One look-up serves all tables.
             table, axis, share = self.scattering.angles, d, u2.x
             laser, first = dr.full(mi.Bool, False, dr.width(which)), 0.0
             by_sheet = []
@@ -247,15 +241,15 @@ class Walker:
                 first += of_laser
                 chosen = (which >= first) & (which < first + of_sheet)
                 first += of_sheet
-                table = table.or_where(about, self.scattering.narrow).or_where(chosen, sheet.angles)
+                table = table.select(about, self.scattering.narrow).select(chosen, sheet.angles)
                 axis = dr.select(about, towards, axis)
                 share = dr.select(chosen, sheet.share_below(u2.x), share)
                 laser |= about
                 by_sheet.append((sheet, chosen))
             heights = table.heights(share)
-            onward = dr.select(in_water | laser, turned(axis, heights, u2.y), onward)
+            onward = dr.select(in_water | laser, rotate_about(axis, heights, u2.y), onward)
             for sheet, chosen in by_sheet:
-                drawn, valid = sheet.at_angles(heights, u2.y)
+                drawn, valid = sheet.rotate_to_angles(heights, u2.y)
                 onward = dr.select(chosen & valid, drawn, onward)
                 strength = dr.select(chosen & ~valid & ~specular, 0.0, strength)
         onward = dr.select(specular, self.pose.object_direction(si.to_world(mi.reflect(si.wi))), onward)
@@ -266,7 +260,7 @@ class Walker:
         away = walks.away | ~specular
         following = replace(
             walks,
-            origin=mi.Point3f(vertex + onward * dr.select(in_water, 0.0, _CLEAR_MM)),
+            origin=mi.Point3f(vertex + onward * dr.select(in_water, 0.0, CLEAR_MM)),
             direction=onward,
             strength=strength,
             density=dr.select(specular | ~away, 0.0, density),
@@ -279,10 +273,10 @@ class Walker:
     def _scattered_by_sheet(
         self, light: Light, passage: Passage, o: Point3f, d: Vector3f, active: Bool, u: Float
     ) -> Float:
-        """Radiance that the sheet scatters once into rays, from one place on each."""
-        t, density = passage.pick(u)
+        """Return the radiance that the sheet scatters once into rays, estimated at one position of each."""
+        t, density = passage.sample(u)
         p = mi.Point3f(o + d * t)
-        here = light.at(p)
+        here = light.evaluate(p)
         active = active & (density > 0) & (here.irradiance > 0)
         lit = light.reaches(self.objects.scene, p, here, None, active)
         source = here.irradiance * self.scattering.phase(one_minus_cosine(-here.direction, d))
@@ -292,27 +286,30 @@ class Walker:
     def _lit_end(
         self, light: Light, walks: _Walks, si: SurfaceInteraction3f, bsdf: BSDFPtr, end: Point3f, hit: Bool
     ) -> Float:
-        """Radiance of the lit surface at the stretch's end, weighted against connecting to it."""
-        here = light.at(end)
+        """Return the radiance of the lit surface at the segment's end, with its balance-heuristic weight."""
+        here = light.evaluate(end)
         towards = si.to_local(self.pose.direction(-here.direction))
         active = hit & (walks.density > 0) & (here.irradiance > 0)
         if not self.effects.secondary_light:
             active &= ~walks.reflected
         active = light.reaches(self.objects.scene, end, here, None, active)
         radiance = bsdf.eval(mi.BSDFContext(), si, towards, active)[0] * here.irradiance
-        # Both densities per sr: per mm2, that of a walk along its own surface has no bound.
+        # Both densities are per sr: per mm2, the density of a walk along its own surface is unbounded.
         by_walk = walks.density * dr.abs(mi.Frame3f.cos_theta(si.wi))
         by_light = self._light_density(light, here, mi.Frame3f.cos_theta(towards)) * dr.square(si.t)
         return dr.select(active & (by_walk > 0), radiance * by_walk / (by_walk + by_light), 0.0)
 
     def _light_density(self, light: Light, here: SheetLight, cosine: Float) -> Float:
-        """Density per mm2 of the lit points that `_connected` draws: the share of the power that falls there."""
+        """Return the density per mm2 of the lit points sampled by `_connect`: the fraction of power per area."""
         unweakened = here.irradiance * dr.exp(self.scattering.c * here.exit_mm)
         return unweakened * dr.abs(cosine) / light.power_w
 
-    def _connected(self, light: Light, vertex: Point3f, scattered, u: Point3f, active: Bool) -> Float:
-        """Light of a lit point, drawn in proportion to the power that falls there, that the vertex scatters on."""
-        rays = light.rays(u)
+    def _connect(self, light: Light, vertex: Point3f, scattered, u: Point3f, active: Bool) -> Float:
+        """Return the light that the vertex receives from a sampled lit point and scatters into the walk.
+
+        Lit points are sampled in proportion to power.
+        """
+        rays = light.sample_rays(u)
         ray = self.pose.ray(rays.origin, rays.direction)
         si = self.objects.scene.ray_intersect(ray, active)
         lit = mi.Point3f(rays.origin + rays.direction * si.t)
@@ -323,11 +320,11 @@ class Walker:
         local = si.to_local(self.pose.direction(direction))
         sent = si.bsdf().eval(mi.BSDFContext(), si, local, active)[0]
         value, density = scattered(-direction)
-        shadow = self.pose.ray(lit + direction * _CLEAR_MM, direction)
-        shadow.maxt = distance - 2 * _CLEAR_MM
-        active &= (sent * value > 0) & (distance > 2 * _CLEAR_MM)
+        shadow = self.pose.ray(lit + direction * CLEAR_MM, direction)
+        shadow.maxt = distance - 2 * CLEAR_MM
+        active &= (sent * value > 0) & (distance > 2 * CLEAR_MM)
         active &= ~self.objects.scene.ray_test(shadow, active)
-        here = light.at(lit)
+        here = light.evaluate(lit)
         by_light = self._light_density(light, here, mi.Frame3f.cos_theta(si.wi))
         by_walk = density * dr.abs(mi.Frame3f.cos_theta(local)) / dr.square(distance)
         way = here.exit_mm + distance
@@ -335,11 +332,12 @@ class Walker:
         return dr.select(active & (by_light > 0), value * light_there * by_light / (by_light + by_walk), 0.0)
 
     def _free_path(self, passages: list[Passage], length: Float, hit: Bool, rng: PCG32) -> tuple[Bool, Float, Float]:
-        """Whether walks are scattered before the surface, how far along they then are, and the share of light left.
+        """Sample whether walks are scattered before the surface; return mask, distance and remaining strength.
 
-        Scattering is drawn as often as it promises light compared with the surface, whatever the water's clarity;
-        distances fall off by at least one reach, so that in clear water they are not drawn far behind the scene, or
-        they are drawn in inverse proportion to that from the nearest place in the sheet, whose light falls off so.
+        Scattering is selected in proportion to its expected light relative to the surface, with a probability of 0.3 to
+        0.7. Distances are exponential with a decay length of at most a quarter of ``reach_mm``: in clear water,
+        scattering must not be far behind the scene. Alternatively they are sampled in inverse proportion to the
+        distance from the position nearest to the sheet, as the light of the sheet decays.
         """
         choice, near, u = rng.next_float32(), rng.next_float32(), rng.next_float32()
         c = self.scattering.c
@@ -353,7 +351,7 @@ class Walker:
         in_water = choice < likely
         distance = -dr.log(1 - u * share) / fall
         each = _NEAR_SHEET / len(passages)
-        crossings = [passage.nearest() for passage in passages]
+        crossings = [passage.find_nearest() for passage in passages]
         spans = [(dr.log(1 + t / apart), dr.log(1 + (length - t) / apart)) for t, apart in crossings]
         for k, ((t, apart), (before, after)) in enumerate(zip(crossings, spans, strict=True)):
             place = u * (before + after) - before

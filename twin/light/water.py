@@ -1,8 +1,8 @@
-"""Scattering in the water: its phase function, evaluated and sampled.
+"""Scattering in the water: evaluation and sampling of its phase function.
 
-All phase functions have one table form, computed in float64 by NumPy. With the scattering angle t and
-h = sin^2(t / 2), 1 - cos t is 2 h; the table runs over x = log(h / (1 - h)) = 2 log tan(t / 2) in even steps, which
-resolves a peak forwards as well as one backwards.
+All phase functions are tabulated in one form, computed in double precision by NumPy. With the scattering angle t and h
+= sin^2(t / 2), 1 - cos t is 2 h. The table is evenly spaced in x = log(h / (1 - h)) = 2 log tan(t / 2), which resolves
+both a forward and a backward peak.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from twin.backend.arrays import Bool, Float, Point2f, UInt32, Vector3f, opaque, to_jit
+from twin.backend.arrays import Bool, Float, UInt32, Vector3f, opaque, to_jit
 from uwlts.model.phase_functions import Molecular, PhaseFunction, Scatterer
 from uwlts.model.sensor import Medium
 
 NODES = 4096
 FORWARD_END = 1e-10
-"""Below this 1 - cos (1.4e-5 rad) the tables are constant, so high that as much is scattered there as should be."""
+"""Below this 1 - cos (1.4e-5 rad) the tables are constant, at a height that preserves the integral."""
 BACKWARD_END = 2.0**-17
-"""Below this 1 + cos (0.22 deg) the tables are constant and continuous; 32 bits do not resolve much less of 2."""
+"""Below this 1 + cos (0.22 deg) the tables are constant and continuous, about the resolution of single precision at 2.
+"""
 FORWARD_SR = 2 * math.pi * FORWARD_END
 FIRST_PLACE = math.log(FORWARD_END / (2 - FORWARD_END))
 STEP = (math.log((2 - BACKWARD_END) / BACKWARD_END) - FIRST_PLACE) / (NODES - 1)
@@ -31,11 +32,11 @@ STEP = (math.log((2 - BACKWARD_END) / BACKWARD_END) - FIRST_PLACE) / (NODES - 1)
 
 @dataclass(frozen=True)
 class PhaseTable:
-    """A phase function on the nodes x = `FIRST_PLACE` + i `STEP`.
+    """Phase function on the nodes x = `FIRST_PLACE` + i `STEP`, normalised to 1.
 
-    ``log_density`` (NODES,) is the logarithm of the share scattered per x, pi p (1 - cos) (1 + cos) with the phase
-    function p in 1/sr, and linear between the nodes. ``cumulative`` (NODES,) is the share scattered by less than a
-    node's angle. Beyond both ends p is constant: ``cumulative[0]`` over `FORWARD_SR` forwards. All together is 1.
+    ``log_density`` (NODES,) is the logarithm of the fraction scattered per x, pi p (1 - cos) (1 + cos), with the phase
+    function p in 1/sr. It is linear between nodes. ``cumulative`` (NODES,) is the fraction scattered by less than a
+    node's angle. Beyond both ends p is constant; forwards it is ``cumulative[0]`` divided by `FORWARD_SR`.
     """
 
     log_density: np.ndarray
@@ -43,26 +44,26 @@ class PhaseTable:
 
 
 def node_angles() -> np.ndarray:
-    """Scattering angles (NODES,) in rad of the tables' nodes."""
+    """Return the scattering angles (NODES,) in rad of the tables' nodes."""
     return 2 * np.arctan(np.exp((FIRST_PLACE + STEP * np.arange(NODES)) / 2))
 
 
-def tabulated(scatterers: Sequence[Scatterer]) -> PhaseTable:
-    """The phase function of a mixture: each scatterer's, normalised, weighted by its share of the coefficient.
+def tabulate_phase_function(scatterers: Sequence[Scatterer]) -> PhaseTable:
+    """Tabulate the phase function of a mixture: normalised phase functions weighted by their scattering coefficients.
 
-    What does not scatter at all is given the function of molecules, which then weighs nothing.
+    Without scatterers, the phase function of molecules is returned; its coefficient is then 0.
     """
     if not scatterers:
-        return _table_of(Molecular())
+        return _make_table(Molecular())
     whole = sum(part.coefficient_per_mm for part in scatterers)
-    tables = [_table_of(part.phase) for part in scatterers]
+    tables = [_make_table(part.phase) for part in scatterers]
     shares = [part.coefficient_per_mm / whole for part in scatterers]
     mixed = sum(share * np.exp(table.log_density) for share, table in zip(shares, tables, strict=True))
     forward = sum(share * table.cumulative[0] for share, table in zip(shares, tables, strict=True))
-    return _normalised(np.log(mixed), forward)
+    return _normalise(np.log(mixed), forward)
 
 
-def _table_of(phase: PhaseFunction) -> PhaseTable:
+def _make_table(phase: PhaseFunction) -> PhaseTable:
     angle = node_angles()
     # p times 2 pi d(1 - cos) / dx = pi (1 - cos) (1 + cos)
     log_density = np.log(phase.per_sr(angle) * math.pi * np.sin(angle) ** 2)
@@ -70,16 +71,16 @@ def _table_of(phase: PhaseFunction) -> PhaseTable:
     if forward is None:
         # The integral of a power of the angle.
         forward = STEP * math.exp(log_density[0]) / (log_density[1] - log_density[0])
-    return _normalised(log_density, forward)
+    return _normalise(log_density, forward)
 
 
-def _normalised(log_density: np.ndarray, forward: float) -> PhaseTable:
-    """The table with its own integral, ``forward`` before the first node, brought to 1."""
+def _normalise(log_density: np.ndarray, forward: float) -> PhaseTable:
+    """Normalise a table to the integral 1; ``forward`` is the integral before the first node."""
     slope = np.diff(log_density)
     flat = np.abs(slope) < 1e-12
     mean = np.where(flat, 1.0, np.expm1(slope) / np.where(flat, 1.0, slope))
     cells = STEP * np.exp(log_density[:-1]) * mean
-    # A constant p scatters 2 pi p H into the cap of height H = 1 + cos; p is the density / (pi H (2 - H)).
+    # A constant p has the integral 2 pi p H over the cap of height H = 1 + cos; p is the density / (pi H (2 - H)).
     backward = 2 * math.exp(log_density[-1]) / (2 - BACKWARD_END)
     below = forward + np.concatenate([[0.0], np.cumsum(cells)])
     whole = below[-1] + backward
@@ -87,13 +88,12 @@ def _normalised(log_density: np.ndarray, forward: float) -> PhaseTable:
 
 
 class Scattering:
-    """Absorption and scattering of light of one wavelength in a medium: coefficients in 1/mm and the phase function.
+    """Absorption, scattering and phase function of a medium at one wavelength; coefficients in 1/mm.
 
-    ``coefficient`` is b, ``absorption`` a and ``extinction`` c = a + b; ``b`` and ``c`` are the same as kernels take
-    them. ``backward_share`` is the share of b that scatters by more than 90 deg. The phase function of all that
-    scatters lies in a table, read by the same kernels whatever the medium; ``over_sine`` is the density in proportion
-    to the phase function over the sine of the angle, ``narrow`` the mean of both. RangeError where the medium's tables
-    do not reach the wavelength.
+    ``coefficient`` is b, ``absorption`` a and ``extinction`` c = a + b; ``b`` and ``c`` are opaque copies for kernels.
+    ``backward_share`` is the fraction of b at scattering angles above 90 deg. ``angles`` tabulates the phase function,
+    ``over_sine`` the phase function divided by the sine of the angle, and ``narrow`` the mean of both densities.
+    RangeError if the wavelength is outside the medium's tables.
     """
 
     def __init__(self, medium: Medium, wavelength_nm: float):
@@ -101,36 +101,28 @@ class Scattering:
         self.coefficient = medium.scattering_per_mm(wavelength_nm)
         self.extinction = self.absorption + self.coefficient
         self.b, self.c = opaque(self.coefficient), opaque(self.extinction)
-        table = tabulated(medium.scatterers(wavelength_nm))
+        table = tabulate_phase_function(medium.scatterers(wavelength_nm))
         self.backward_share = 1 - float(np.interp(math.pi / 2, node_angles(), table.cumulative))
         sine = np.sin(node_angles())
-        over_sine = _normalised(table.log_density - np.log(sine), float(table.cumulative[0] / sine[0]))
+        over_sine = _normalise(table.log_density - np.log(sine), float(table.cumulative[0] / sine[0]))
         halves = np.log(0.5 * (np.exp(table.log_density) + np.exp(over_sine.log_density)))
-        narrow = _normalised(halves, float(table.cumulative[0] + over_sine.cumulative[0]) / 2)
-        self.angles, self.over_sine, self.narrow = AngleTable.together(table, over_sine, narrow)
+        narrow = _normalise(halves, float(table.cumulative[0] + over_sine.cumulative[0]) / 2)
+        self.angles, self.over_sine, self.narrow = AngleTable.join(table, over_sine, narrow)
 
     def phase(self, one_minus_cosine: Float) -> Float:
-        """Phase function in 1/sr at 1 - cos of the scattering angle.
+        """Return the phase function in 1/sr at 1 - cos of the scattering angle.
 
-        Compute it as |w1 - w2|^2 / 2 from the unit directions before and after: 1 minus their product loses small
-        angles to the rounding of 32 bits.
+        Compute 1 - cos as |w1 - w2|^2 / 2 from the unit directions before and after: 1 minus their scalar product loses
+        small angles in single precision.
         """
         return self.angles.density(one_minus_cosine)
-
-    def sample(self, direction: Vector3f, u: Point2f) -> tuple[Vector3f, Float]:
-        """A direction after scattering and its density in 1/sr, which is the phase function there.
-
-        The scattering angle grows with ``u.x``, the azimuth with ``u.y``.
-        """
-        turned = self.angles.turned(direction, u)
-        return turned, self.phase(0.5 * dr.squared_norm(turned - direction))
 
 
 @dataclass(frozen=True)
 class AngleTable:
-    """A `PhaseTable` as kernels read it: the density of directions about an axis, evaluated and drawn from.
+    """A `PhaseTable` for kernels: density and sampling of directions about an axis.
 
-    Several lie in the same arrays, each from its own ``start`` on: of them, one can be chosen for each direction.
+    Several tables share the same arrays, each with its own ``start``, so that each direction can use another table.
     """
 
     log_density: Float
@@ -139,8 +131,8 @@ class AngleTable:
     start: UInt32
 
     @classmethod
-    def together(cls, *tables: PhaseTable) -> list[AngleTable]:
-        """Tables that lie in the same arrays."""
+    def join(cls, *tables: PhaseTable) -> list[AngleTable]:
+        """Return tables that share the same arrays."""
         log_density = to_jit(mi.Float, np.concatenate([each.log_density for each in tables]))
         cumulative = to_jit(mi.Float, np.concatenate([each.cumulative for each in tables]))
         return [
@@ -148,13 +140,13 @@ class AngleTable:
             for k, each in enumerate(tables)
         ]
 
-    def or_where(self, mask: Bool, other: AngleTable) -> AngleTable:
-        """This table, or another one that lies in the same arrays where ``mask`` is set."""
+    def select(self, mask: Bool, other: AngleTable) -> AngleTable:
+        """Return this table, replaced by ``other``, which shares its arrays, where ``mask`` is True."""
         forward, start = (dr.select(mask, *pair) for pair in ((other.forward, self.forward), (other.start, self.start)))
         return AngleTable(self.log_density, self.cumulative, forward, start)
 
     def density(self, one_minus_cosine: Float) -> Float:
-        """Density in 1/sr at 1 - cos of the angle from the axis, the same at all azimuths."""
+        """Return the density in 1/sr at 1 - cos of the angle from the axis; it does not depend on azimuth."""
         before = dr.clip(one_minus_cosine, FORWARD_END, 2 - BACKWARD_END)
         cell, share = self._cell(before)
         low, high = self._ends(cell)
@@ -162,11 +154,11 @@ class AngleTable:
         return dr.select(one_minus_cosine < FORWARD_END, self.forward, density)
 
     def share_below(self, one_minus_cosine: Float) -> Float:
-        """Share of directions before the table's node at or below 1 - cos of an angle."""
+        """Return the cumulative fraction of directions at the table's node at or below 1 - cos of an angle."""
         return self._share(self._cell(dr.maximum(one_minus_cosine, FORWARD_END))[0])
 
     def heights(self, u: Float) -> tuple[Float, Float]:
-        """1 - cos and 1 + cos of the angle below which the share ``u`` of directions lies."""
+        """Return 1 - cos and 1 + cos of the angle below which the fraction ``u`` of directions is scattered."""
         node = mi.UInt32(0)
         step = NODES // 2
         while step:
@@ -176,41 +168,37 @@ class AngleTable:
         below, above = self._share(cell), self._share(cell + 1)
         share = dr.clip((u - below) / (above - below), 0.0, 1.0)
         low, high = self._ends(cell)
-        # The density exp(k t) over 0 < t < 1 has the inverse log(1 + share (exp(k) - 1)) / k, 0 / 0 for k = 0; to
-        # three orders of k, which is below 0.05, it is this.
+        # The density exp(k t), 0 < t < 1, has the inverse log(1 + share (exp(k) - 1)) / k, undefined at k = 0. This is
+        # its expansion to third order in k, which is below 0.05.
         k = high - low
         t = share + k * share * (1 - share) * (0.5 + k * (1 - 2 * share) / 6)
         ratio = dr.exp(FIRST_PLACE + STEP * (mi.Float(cell) + t))
         before, after = 2 * ratio / (1 + ratio), 2 / (1 + ratio)
-        # Beyond either end of the table directions are even over a cap.
+        # Beyond both ends of the table, directions are uniform over a cap.
         first, last = (self._share(mi.UInt32(end)) for end in (0, NODES - 1))
         forward, backward = u < first, u >= last
         before = dr.select(forward, FORWARD_END * u / first, before)
         after = dr.select(backward, BACKWARD_END * (1 - u) / (1 - last), after)
         return dr.select(backward, 2 - after, before), dr.select(forward, 2 - before, after)
 
-    def turned(self, axis: Vector3f, u: Point2f) -> Vector3f:
-        """Directions about an axis: the angle grows with ``u.x``, the azimuth with ``u.y``."""
-        return turned(axis, self.heights(u.x), u.y)
-
     def _cell(self, before: Float) -> tuple[UInt32, Float]:
-        """Cell of 1 - cos, which is within the table, and the place in the cell from 0 to 1."""
+        """Return the cell of 1 - cos, which is within the table, and the position in the cell from 0 to 1."""
         place = (dr.log(before / (2 - before)) - FIRST_PLACE) / STEP
         cell = dr.minimum(mi.UInt32(dr.maximum(place, 0.0)), NODES - 2)
         return cell, place - mi.Float(cell)
 
     def _ends(self, cell: UInt32) -> tuple[Float, Float]:
-        """Logarithm of the density at both ends of a cell of the table."""
+        """Return the logarithm of the density at both ends of a cell."""
         place = self.start + cell
         return dr.gather(mi.Float, self.log_density, place), dr.gather(mi.Float, self.log_density, place + 1)
 
     def _share(self, node: UInt32) -> Float:
-        """Share of directions below a node."""
+        """Return the cumulative fraction of directions at a node."""
         return dr.gather(mi.Float, self.cumulative, self.start + node)
 
 
-def turned(axis: Vector3f, heights: tuple[Float, Float], u: Float) -> Vector3f:
-    """Directions at angles from an axis of which 1 - cos and 1 + cos are given; the azimuth grows with ``u``."""
+def rotate_about(axis: Vector3f, heights: tuple[Float, Float], u: Float) -> Vector3f:
+    """Return directions at angles from an axis, given by 1 - cos and 1 + cos; the azimuth increases with ``u``."""
     before, after = heights
     sine = dr.sqrt(before * after)
     sin_azimuth, cos_azimuth = dr.sincos(2 * math.pi * u)
@@ -219,5 +207,5 @@ def turned(axis: Vector3f, heights: tuple[Float, Float], u: Float) -> Vector3f:
 
 
 def one_minus_cosine(a: Vector3f, b: Vector3f) -> Float:
-    """1 - cos of the angle between unit vectors, exact for small angles too."""
+    """Return 1 - cos of the angle between unit vectors, accurate for small angles."""
     return 0.5 * dr.squared_norm(a - b)

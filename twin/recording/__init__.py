@@ -1,1 +1,1 @@
-"""Captures with ground truth, campaigns, and the demonstration."""
+"""Recording of captures with ground truth, campaigns, and the demonstration."""

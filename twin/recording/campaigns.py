@@ -1,4 +1,4 @@
-"""Records whole campaigns: all recordings of a seed, several at a time, resumed where an earlier run was stopped."""
+"""Recording of campaigns: all recordings of a seed, several in parallel; interrupted runs are resumed."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -35,28 +35,28 @@ def record(
     variant: Variant = CPU,
     progress: ProgressListener = unheard,
 ) -> Path:
-    """Render all recordings of a campaign into a folder, with the imperfections that a seed draws.
+    """Render all recordings of a campaign into a folder, with imperfections drawn from a seed.
 
-    Run again, it resumes where it was stopped. The folder is returned.
+    An interrupted run is resumed. The folder is returned.
 
     Parameters
     ----------
     campaign
         Name (see: twin scenes) or path of the campaign's description.
     out
-        Folder for the captures and their ground truth. What is complete in it is not rendered again.
+        Folder for the captures and their ground truth. Complete recordings in it are kept.
     seed
-        Number from which imperfections and noise are drawn.
+        Seed of imperfections and noise.
     every
-        Take only every n-th profile of the scans; calibrations keep all their images.
+        Take only every n-th profile of the scans; calibrations keep all images.
     workers
-        Recordings rendered at a time; as many as there are processors unless given.
+        Number of parallel recordings (default: number of processors).
     overwrite
-        Render everything anew.
+        Render everything again.
     spp, effects, variant
         As for `simulate`.
     progress
-        Called with the number of images done, the number in all, and the name of the stage.
+        Called with the number of images done, the total number, and the name of the stage.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def record(
 
 @dataclass(frozen=True)
 class _Job:
-    """A take to render into a file, with its number of images and its files: capture, truth, unfinished capture."""
+    """A recording to render into a file. ``files`` are the capture, its truth, and the unfinished capture."""
 
     take: Take
     path: Path
@@ -108,12 +108,21 @@ def record_campaigns(
     overwrite: bool = False,
     progress: ProgressListener = unheard,
 ) -> list[Path]:
-    """Render all recordings of a campaign for each seed into ``folder/campaign-SEED``; returns these folders.
+    """Render all recordings of a campaign for each seed into ``folder/campaign-SEED``; return these folders.
 
-    Complete recordings stay as they are and interrupted ones are gone on with; ``overwrite`` removes those of the
-    seeds and renders all anew. ``progress(done, total)`` counts images. DescriptionError where the folder holds a
-    campaign that was rendered differently, or a description is wrong; DesignError where the sensor cannot measure a
-    scene; OutputError where a file cannot be written; SetupError where a process that renders was ended from outside.
+    Complete recordings are kept and interrupted ones resumed; ``overwrite`` removes those of the seeds and renders them
+    again. ``progress(done, total)`` counts images.
+
+    Raises
+    ------
+    DescriptionError
+        The folder contains a campaign with other settings, or a description is wrong.
+    DesignError
+        The sensor cannot measure a scene.
+    OutputError
+        A file cannot be written.
+    SetupError
+        A rendering process was terminated from outside.
     """
     folders = [folder / f"campaign-{seed}" for seed in seeds]
     jobs = [
@@ -151,19 +160,19 @@ def _record_all(
     overwrite: bool,
     progress: ProgressListener,
 ) -> None:
-    """Render what is not complete into a folder that keeps to a plan; ``recorded`` is the pattern of its captures."""
+    """Render incomplete recordings into a folder that follows a plan; ``recorded`` is the pattern of its captures."""
     made_folder(folder)
-    # Two at once would take each other's unfinished recordings for interrupted ones.
+    # Concurrent runs would resume each other's unfinished recordings.
     with one_writer(folder / PLAN):
         files = {file for job in jobs for file in job.files}
         keep_to_plan(folder, plan, files, recorded=recorded, called="recordings", overwrite=overwrite)
         for place in {job.path.parent for job in jobs}:
             place.mkdir(exist_ok=True)
         if overwrite:
-            # All at once and not one by one: what an interrupted run leaves must not be taken for its own.
+            # Remove all files first: after an interruption, old recordings must not pass for new ones.
             for path in (path for job in jobs for path in job.files):
                 path.unlink(missing_ok=True)
-        # The longest first, so that no process is left alone with a long one at the end.
+        # The longest first, so that the processes finish at about the same time.
         waiting = [job for job in jobs if [path.is_file() for path in job.files] != [True, True, False]]
         waiting.sort(key=lambda job: job.images, reverse=True)
         total = sum(job.images for job in jobs)
@@ -173,7 +182,7 @@ def _record_all(
 
 
 def made_folder(folder: Path) -> Path:
-    """Return the folder, made if there is none; OutputError if it cannot be."""
+    """Create a folder if it does not exist, and return it; OutputError if that fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -184,10 +193,11 @@ def made_folder(folder: Path) -> Path:
 def keep_to_plan(
     folder: Path, plan: dict[str, JsonValue], files: set[Path], *, recorded: str, called: str, overwrite: bool
 ) -> None:
-    """Write the settings of what a folder holds, or check that they are the same as before.
+    """Write the settings of a folder's contents, or check that they are unchanged.
 
-    ``files`` are those that belong to the plan, ``recorded`` is the pattern of such files and ``called`` what they are.
-    DescriptionError where the folder holds some of another plan, unless ``overwrite`` replaces all of them.
+    ``files`` belong to the plan, ``recorded`` is the glob pattern of such files, and ``called`` is their name in
+    messages. DescriptionError if the folder contains files of another plan, and ``overwrite`` does not replace all of
+    them.
     """
     path = folder / PLAN
     text = json.dumps(plan, indent=2) + "\n"
@@ -197,7 +207,7 @@ def keep_to_plan(
     except OSError as error:
         raise OutputError(f"cannot use the folder {folder}: {error.strerror}") from error
     try:
-        # No input of the command, which may replace it.
+        # The plan is an output: it must not replace an input file.
         refuse_input(path)
         note_made(path)
         known = read_json(path, called="plan") if path.is_file() else None
@@ -210,7 +220,7 @@ def keep_to_plan(
         how = f"made with {another(known, plan)}"
     if found and not overwrite:
         raise DescriptionError(
-            f"{folder} holds {called} {how}: give another folder, the same settings, or `overwrite` to start afresh"
+            f"{folder} holds {called} {how}: give another folder, the same settings, or `overwrite` to start again"
         )
     if kept := found - files:
         raise DescriptionError(
@@ -221,7 +231,7 @@ def keep_to_plan(
 
 
 def _record(job: _Job, report: Callable[[None], None]) -> None:
-    """Render a take; calls ``report`` after every image."""
+    """Render a recording; call ``report`` after every image."""
     use_variant(job.variant)
     import drjit as dr
 
@@ -237,7 +247,7 @@ def _record(job: _Job, report: Callable[[None], None]) -> None:
             as_built=take.built,
             options=job.options,
             overwrite=True,
-            # What is there of an incomplete recording is a part to go on with, or lacks its truth.
+            # An incomplete recording either has a part to resume, or lacks its truth and is rendered again.
             resume=part_path(job.path).exists(),
             progress=lambda done, total, stage="": report(None),
         )

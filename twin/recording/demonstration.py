@@ -17,7 +17,7 @@ from uwlts.runtime.workers import Lost, open_workers
 
 STAGES = ("render", "calibrate", "reconstruct", "evaluate", "report")
 AT_ONCE = 2
-"""Commands of one stage run at a time: none but the rendering keeps all processors busy."""
+"""Number of parallel commands of a stage: only rendering uses all processors by itself."""
 CAMPAIGN = "demo"
 PLACEMENTS = ("near", "standoff", "far")
 SPHERES = tuple(f"spheres-{place}" for place in PLACEMENTS)
@@ -25,7 +25,7 @@ OTHERS = ("step-scan", "pipe")
 
 
 def commands(out: Path) -> list[tuple[str, str]]:
-    """Stage and command line of everything the demo does into a folder, in order."""
+    """Return stage and command line of all steps of the demonstration, in order."""
     folder = shlex.quote(str(out))
     rows = [("render", f"twin record {CAMPAIGN} --out {folder} --overwrite")]
     steps = f"--step {' '.join(f'{folder}/step-{place}-water.h5' for place in PLACEMENTS)}"
@@ -48,11 +48,11 @@ def commands(out: Path) -> list[tuple[str, str]]:
 
 
 def demo(out: str | Path = "runs/demo") -> Path:
-    """Do the main job in a row of commands: record a virtual campaign, calibrate, reconstruct, judge, report.
+    """Demonstrate the whole process: record a virtual campaign, calibrate, reconstruct, evaluate, report.
 
-    The campaign has imperfections as a real one has, and is calibrated jointly and by the thesis's two ways. Runs
-    exactly the commands that it prints, two at a time; each could be typed by hand. The report is OUT/report.html,
-    whose path is returned.
+    The campaign has realistic imperfections. It is calibrated jointly and by both methods of the thesis. The commands
+    are printed and run two at a time; each can also be typed by hand. The path of the report, OUT/report.html, is
+    returned.
 
     Parameters
     ----------
@@ -62,9 +62,9 @@ def demo(out: str | Path = "runs/demo") -> Path:
     Raises
     ------
     CommandFailed
-        A command failed; what it printed says why.
+        A command failed; its output gives the reason.
     SetupError
-        A working process has ended unexpectedly.
+        A worker process ended unexpectedly.
     """
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
@@ -76,8 +76,8 @@ def demo(out: str | Path = "runs/demo") -> Path:
             if stage == "report":
                 (folder / "seconds.json").write_text(json.dumps(seconds, indent=2) + "\n", encoding="utf-8")
             start = time.perf_counter()
-            # Commands of one stage need nothing of each other.
-            for line, ended in workers.completed(_run, _announced([line for _, line in rows])):
+            # Commands of one stage are independent.
+            for line, ended in workers.completed(_run, _announce([line for _, line in rows])):
                 if isinstance(ended, Lost):
                     raise SetupError(f"{line}: {ended.reason}")
                 code, output, complaints = ended
@@ -92,16 +92,18 @@ def demo(out: str | Path = "runs/demo") -> Path:
     return report
 
 
-def _announced(lines: Iterable[str]) -> Iterator[str]:
-    """The commands, each printed as it begins."""
+def _announce(lines: Iterable[str]) -> Iterator[str]:
+    """Yield the commands; print each one when it starts."""
     for line in lines:
         print(f"$ {line}", flush=True)
         yield line
 
 
 def _run(line: str) -> tuple[int, str, str]:
-    """Exit code of a command and what it prints, as ``python -m`` runs it, in this process: commands share what they
-    import, which takes most of them longer than their work."""
+    """Run a command as ``python -m`` does, and return its exit code, output and error output.
+
+    It runs in this process: importing the shared modules takes most commands longer than their work.
+    """
     program, *arguments = shlex.split(line)
     output, complaints = io.StringIO(), io.StringIO()
     sys.argv = [program, *arguments]

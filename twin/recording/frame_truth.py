@@ -1,4 +1,4 @@
-"""Ground truth of a frame: the stripe's centres, the surface there, depths, and the image of points of a scene."""
+"""Ground truth of a frame: stripe centres, surface points, depths, and image positions of scene points."""
 
 from dataclasses import dataclass
 
@@ -7,27 +7,28 @@ import mitsuba as mi
 import numpy as np
 
 from twin.backend.arrays import Float, UInt32, to_jit, to_numpy
-from twin.light.image_sampling import places
+from twin.light.image_sampling import find_marked
 from twin.light.pose import SensorPose, Travel
 from twin.light.renderer import Renderer
 from uwlts.model.placement import camera_from_object
 from uwlts.storage.truth import TruthStatus
 
 _FALSE_POSITIONS = 5
-"""Within one pixel the distance bends by about 1e-2 of its change: each step gains two digits."""
+"""Number of iterations: within a pixel, the distance is linear to about 1e-2, so each step gains two digits."""
 _POINT_STEPS = 6
-"""The window bends rays so little that each step of Newton's method leaves a hundredth of the error."""
+"""Number of iterations: refraction at the window is weak, so each Newton step reduces the error to a hundredth."""
 _POINT_MM = 0.05
-"""A point is seen if its ray meets nothing so much before it: far above the rounding of 32 bits."""
+"""A point is visible if its ray ends on a surface at this distance from it, far above single-precision rounding."""
 _POINT_PX = 1e-2
-"""A point is found if the last step was no larger."""
+"""A point is found if the last Newton step was smaller."""
 _TOLERANCE_MM = 5e-4
-"""A root is where the surface truly passes the sheet's middle; across a depth edge the distance jumps instead."""
+"""Largest distance of a root from the sheet's centre; across a depth edge, the distance has a jump instead of a root.
+"""
 
 
 @dataclass(frozen=True)
 class FrameTruth:
-    """Truth of one frame, as in `uwlts.storage.truth.Truth` without the frames' axis."""
+    """Truth of one frame, as `uwlts.storage.truth.Truth` without the frame axis."""
 
     centre_px: np.ndarray
     point_mm: np.ndarray
@@ -37,7 +38,7 @@ class FrameTruth:
 
 
 def no_stripe(lines: int) -> FrameTruth:
-    """Truth of a frame without laser light."""
+    """Return the truth of a frame without laser light."""
     nothing = np.full(lines, np.nan)
     empty = np.zeros(lines, np.uint8)
     return FrameTruth(
@@ -47,11 +48,11 @@ def no_stripe(lines: int) -> FrameTruth:
 
 @dataclass(frozen=True)
 class Crossings:
-    """Where profile lines see the middle of the sheet on a surface, K of them, lit or in the shadow.
+    """Intersections of the sheet's centre with surfaces on K profile lines, lit or in shadow.
 
-    ``line`` (K,) is the line's number, ``centre_px`` (K,) the image coordinate across the stripe, ``brightness`` (K,)
-    the laser's irradiance on the image sensor in W/mm2, 0 in the shadow. ``point_mm`` and ``normal`` (K, 3) are the
-    surface there in scene coordinates, ``thing`` (K,) is the number of the object among the scene's.
+    ``line`` (K,) is the number of the line and ``centre_px`` (K,) the image coordinate across the stripe.
+    ``brightness`` (K,) is the laser's irradiance on the image sensor in W/mm2, 0 in shadow. ``point_mm`` and ``normal``
+    (K, 3) describe the surface in scene coordinates. ``thing`` (K,) is the index of the object in the scene.
     """
 
     line: np.ndarray
@@ -63,15 +64,15 @@ class Crossings:
 
 
 def true_stripe(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Travel | None = None) -> FrameTruth:
-    """True stripe of a frame: of every profile line's lit crossings of the sheet the brightest.
+    """Return the true stripe of a frame: the brightest lit crossing of every profile line.
 
-    It is what chief rays see in the middle of the exposure.
+    It applies to chief rays in the middle of the exposure.
     """
     return brightest(crossings(renderer, scene_from_object, travel=travel), renderer.sensor.camera.lines())
 
 
 def brightest(found: Crossings, lines: int) -> FrameTruth:
-    """Truth of a frame of so many profile lines by its crossings."""
+    """Return the truth of a frame with ``lines`` profile lines from its crossings."""
     truth = no_stripe(lines)
     dimmest_first = lit_dimmest_first(found)
     chosen = found.line[dimmest_first]
@@ -84,13 +85,13 @@ def brightest(found: Crossings, lines: int) -> FrameTruth:
 
 
 def lit_dimmest_first(found: Crossings) -> np.ndarray:
-    """Numbers of the lit crossings in the order of their brightness: the last of a line is its brightest."""
+    """Return indices of the lit crossings in ascending brightness, so that the brightest of a line is the last."""
     lit = np.flatnonzero(found.brightness > 0)
     return lit[np.argsort(found.brightness[lit], kind="stable")]
 
 
 def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Travel | None = None) -> Crossings:
-    """All crossings of a frame, by false position on Mitsuba's own hit points along every profile line."""
+    """Find all crossings of a frame by the false-position method along every profile line."""
     camera = renderer.sensor.camera
     pose = SensorPose(scene_from_object, travel)
     along_width = camera.stripe_along == "width"
@@ -105,19 +106,19 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
         return (at, across) if along_width else (across, at)
 
     def travelled(across: Float, at: Float) -> Float | None:
-        return None if travel is None else travel.at(position(across, at)[1], 0.5)
+        return None if travel is None else travel.compute_times(position(across, at)[1], 0.5)
 
     def distance(across: Float, at: Float) -> Float:
         bundle = renderer.view.bundle(*position(across, at))
         ray = pose.ray(bundle.origin, bundle.direction, travelled(across, at))
         hit = renderer.objects.scene.ray_intersect_preliminary(ray)
-        light = renderer.sheet.at(bundle.origin + bundle.direction * dr.select(hit.is_valid(), hit.t, 1.0))
+        light = renderer.sheet.evaluate(bundle.origin + bundle.direction * dr.select(hit.is_valid(), hit.t, 1.0))
         return dr.select(hit.is_valid() & (bundle.weight > 0), light.distance_mm, dr.nan)
 
-    # Neighbours across the stripe share an edge.
+    # Adjacent pixels across the stripe share an edge.
     marked = np.zeros((camera.lines(), (camera.height_px if along_width else camera.width_px) + 1), bool)
     marked[line, cell] = marked[line, cell + 1] = True
-    edge_line, edge = places(marked)
+    edge_line, edge = find_marked(marked)
     edges = np.empty(marked.shape, np.float32)
     edges[edge_line, edge] = distance(to_jit(mi.Float, edge - 0.5), to_jit(mi.Float, edge_line)).numpy()
     below, above = edges[line, cell], edges[line, cell + 1]
@@ -137,7 +138,7 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
         high, above = dr.select(same_side, high, centre), dr.select(same_side, above, found)
         return low, high, below, above, at, left - 1
 
-    # Written down once, as in `Walker`.
+    # Skip the search for loop invariants, as in `Walker`.
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
         low, high, below, above, at, _ = dr.while_loop(
             (low, high, below, above, at, dr.full(mi.UInt32, _FALSE_POSITIONS, len(line))),
@@ -149,7 +150,7 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
     dr.eval(centre)
     bundle = renderer.view.bundle(*position(centre, at))
     brightness, seen = renderer.laser(pose, bundle, travelled(centre, at))
-    si, offset = seen.si, dr.select(seen.valid, renderer.sheet.at(seen.end()).distance_mm, dr.nan)
+    si, offset = seen.si, dr.select(seen.valid, renderer.sheet.evaluate(seen.end()).distance_mm, dr.nan)
     thing = renderer.objects.number(si.shape, seen.valid)
     dr.eval(centre, brightness, si.p, si.n, offset, thing)
     good = np.abs(offset.numpy()) < _TOLERANCE_MM
@@ -159,12 +160,12 @@ def crossings(renderer: Renderer, scene_from_object: np.ndarray, *, travel: Trav
 
 
 def depth_map(renderer: Renderer, scene_from_object: np.ndarray) -> np.ndarray:
-    """Camera-frame z in mm (H, W), float32, of the surface that every pixel's centre sees; NaN where there is none."""
+    """Return the camera-frame z in mm (H, W), float32, of the surface at every pixel centre; NaN if there is none."""
     return seen_surfaces(renderer, scene_from_object)[0]
 
 
 def seen_surfaces(renderer: Renderer, scene_from_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What every pixel's centre sees: its depth as `depth_map`, and its object's number (H, W), -1 for nothing."""
+    """Return depth as `depth_map`, and the object number (H, W), -1 for none, at every pixel centre."""
     camera = renderer.sensor.camera
     x, y = np.meshgrid(np.arange(camera.width_px, dtype=np.float32), np.arange(camera.height_px, dtype=np.float32))
     bundle = renderer.view.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
@@ -178,9 +179,9 @@ def seen_surfaces(renderer: Renderer, scene_from_object: np.ndarray) -> tuple[np
 
 
 def image_points(renderer: Renderer, scene_from_object: np.ndarray, points_mm: np.ndarray) -> np.ndarray:
-    """Image points (N, 2) in px at which points (N, 3) of the scene are seen; NaN where one is hidden or out of view.
+    """Return the image positions (N, 2) in px of scene points (N, 3); NaN for points that are hidden or out of view.
 
-    Newton's method on the chief rays: a ray's distance from its point is brought to zero.
+    Newton's method minimises the distance of chief rays from the points.
     """
     camera, transform = renderer.sensor.camera, np.linalg.inv(scene_from_object)
     points = points_mm @ transform[:3, :3].T + transform[:3, 3]

@@ -1,4 +1,4 @@
-"""Recording of a scene into a capture, with its ground truth, and what a platform reports, in files beside it."""
+"""Recording of a scene into a capture, with ground truth and the platform's trajectory in files beside it."""
 
 import os
 from collections.abc import Sequence
@@ -39,12 +39,12 @@ def record_scene(
     resume: bool = False,
     progress: ProgressListener = unheard,
 ) -> None:
-    """Render a scene into a capture at ``path`` and its ground truth into the file beside it.
+    """Render a scene into a capture at ``path`` and its ground truth into a file beside it.
 
-    Images show ``as_built`` (the sensor itself unless given), the capture states ``sensor``. An interrupted run leaves
-    ``path.part`` with all complete frames; ``resume`` goes on from there and gives the same capture as an undisturbed
-    run. ``progress(done, total)`` is called after every frame. DesignError and DescriptionError where the sensor or the
-    scene cannot work; OutputError where a file exists already, or cannot be written.
+    Images show ``as_built`` (default: ``sensor``), the capture states ``sensor``. An interrupted run leaves
+    ``path.part`` with all complete frames. ``resume`` continues from there, with the same result as an uninterrupted
+    run. ``progress(done, total)`` is called after every frame. DesignError or DescriptionError if the sensor or the
+    scene cannot work; OutputError if a file exists, or cannot be written.
     """
     path = Path(path)
     if truth_path(path).exists() and not (overwrite or resume):
@@ -54,7 +54,7 @@ def record_scene(
     if report is not None and trajectory_path(path).exists() and not (overwrite or resume):
         raise OutputError(f"{trajectory_path(path)} exists already; give another name, or `overwrite` to replace it")
     studio = Studio(as_built or sensor, scene, options)
-    # What an operator would note: nominal values only.
+    # The header contains only what an operator knows: nominal values.
     header = CaptureHeader(
         name=path.stem,
         sensor=with_window(sensor, mounted=studio.sensor.camera.window.mounted),
@@ -77,7 +77,7 @@ def record_scene(
     shots = list(scene.motion.shots())
     truths: list[FrameTruth] = []
     dtype = np.dtype(np.uint8 if sensor.detector.bits == 8 else np.uint16)
-    # Whoever measures must not learn it, so it is not in the finished capture.
+    # The true values must not be known to the evaluation, so the finished capture does not contain the plan.
     plan: Table = {
         "scene": scene.model_dump(mode="json"),
         "as_built": studio.sensor.model_dump(mode="json"),
@@ -103,11 +103,11 @@ def record_scene(
                 taken.result()
             progress(index + 1, len(shots))
 
-        # An image is exposed and written while the light of the next one is rendered.
+        # Expose and write an image while the light of the next one is rendered.
         before: Future[None] | None = None
         for index, shot in enumerate(shots):
             dr.set_thread_count(_threads_for(shot, threads))
-            # The light first: the truth goes on from where it found the stripe.
+            # The light first: the truth uses the stripe's position that it found.
             light = studio.light(shot, index) if index >= done else None
             truths.append(studio.truth(shot))
             if index > 0:
@@ -122,16 +122,16 @@ def record_scene(
 
 
 def truth_of_recording(studio: Studio, truths: Sequence[FrameTruth], shots: Sequence[Shot]) -> Truth:
-    """The truths of a recording's frames as one, with the depth map of the first of its ``shots``."""
+    """Combine the truths of a recording's frames, with the depth map of the first shot."""
     stacked = {f.name: np.stack([getattr(truth, f.name) for truth in truths]) for f in fields(FrameTruth)}
     poses = np.stack([studio.pose(shot) for shot in shots])
     return Truth(**stacked, depth_mm=depth_map(studio.renderer, poses[0]), pose=poses)
 
 
 def _threads_for(shot: Shot, threads: int) -> int:
-    """How many of Dr.Jit's threads render a shot while another thread exposes and writes the one before.
+    """Return the number of Dr.Jit threads for a shot while another thread exposes and writes the previous one.
 
-    Between the many small kernels of a laser image they would keep that one from its processor; a lamp image has few
-    large kernels.
+    The many small kernels of a laser image would take the processor from that thread; a lamp image has few large
+    kernels.
     """
     return threads if shot.light == "lamp" else min(threads, max(1, (os.cpu_count() or 1) - 1))

@@ -1,4 +1,4 @@
-"""Renders scenes by name or description: into arrays (`render`) or into capture and truth files (`simulate`).
+"""Rendering of scenes given by name or description: into arrays (`render`) or capture and truth files (`simulate`).
 
 Mitsuba is imported when the first scene is rendered, after its variant and libLLVM are chosen.
 """
@@ -31,7 +31,7 @@ FRAME_DATA = ("stage_mm", "laser_on", "exposure_ms", "time_s")
 
 @dataclass(frozen=True, repr=False)
 class Recording(Brief):
-    """Images of a scan with what truly is to be seen in them; F images of H x W pixels.
+    """Rendered images of a scan with their ground truth; F images of H x W pixels.
 
     Attributes
     ----------
@@ -40,13 +40,13 @@ class Recording(Brief):
     stage_mm
         Recorded stage positions (F,).
     laser_on
-        Whether the laser (True) or the lamp (False) lights an image, (F,).
+        Whether the laser (True) or the lamp (False) is on, (F,).
     exposure_ms, time_s
         Exposure and time since the first image of the scan, (F,).
     truth
-        What every profile line truly shows; its depth map is that of the first image here.
+        Ground truth of every profile line; its depth map is that of the first image here.
     sensor, medium, scene
-        The sensor as rendered, the medium before it, and the scene in use.
+        The rendered sensor, the medium in front of it, and the scene.
     """
 
     images: np.ndarray
@@ -81,9 +81,9 @@ def render(
     Parameters
     ----------
     frames
-        Numbers of the scan's images to render, from 0 on; all of them unless given.
+        Numbers of the scan's images to render, from 0; default: all.
     effects
-        As for `simulate`; with camera-3d the images in which the camera would look for the stripe.
+        As for `simulate`; with camera-3d, the images are returned, not centre lines.
     scene, sensor, as_built, placement, medium, spp, seed, water, without, ideal, variant
         As for `simulate`; scene and sensors may also be descriptions, and there is one placement.
 
@@ -95,7 +95,7 @@ def render(
     described = choose_scene(scene, placement=placement, medium=medium, water=water)
     _, built = choose_sensors(sensor, as_built)
     options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
-    # The images in which a 3D camera looks for the stripe.
+    # Return images even if a 3D camera would reduce them to centre lines.
     options = replace(options, flaws=replace(options.flaws, camera_3d=0))
     shots = list(enumerate(described.motion.shots()))
     if frames is not None:
@@ -148,22 +148,22 @@ def simulate(
         Name of a scene (see: twin scenes) or path of its TOML file.
     out
         Capture to write, such as capture.h5; the truth goes to capture.truth.h5. With several placements the name
-        holds {placement}.
+        must contain {placement}.
     sensor
         Name or path of the sensor description that the capture states.
     as_built
-        Name or path of the sensor that is really rendered, if it differs from the description.
+        Name or path of the sensor to render, if it differs from the description.
     placement
-        Named place of the objects, such as near, standoff or far; several are recorded one after the other.
+        Named position of the objects, such as near, standoff or far; several are recorded in turn.
     medium
-        Name of one of the sensor's media, in place of the scene's.
+        Name of one of the sensor's media, instead of the scene's.
     spp
         Samples per lit pixel.
     seed
         Seed of all noise; the same seed gives the same capture.
     water
-        What floats in the water, in place of the medium's own: pure, clear, coastal, harbour, jerlov-I to jerlov-9C,
-        or a turbidity from 0 (pure) over 1 (clear) and 2 (coastal) to 3 (harbour).
+        Optical properties of the water, instead of the medium's: pure, clear, coastal, harbour, jerlov-I to
+        jerlov-9C, or a turbidity: 0 (pure), 1 (clear), 2 (coastal), 3 (harbour), or between.
     effects
         Effects of real images to add, NAME of typical strength or NAME=STRENGTH: glare=0.02, vignetting=0.4,
         uneven-lamp=0.6, particles=1000 and bubbles=200 (per litre), caustics=0.3, dirt=0.1, lamp-and-laser,
@@ -173,15 +173,15 @@ def simulate(
         Effects to leave out: defocus, haze, multiple-scattering, secondary-light, gloss, motion, ambient, speckle,
         fixed-pattern, noise.
     ideal
-        Leave out all of these: a pinhole's sharp image without noise.
+        Leave out all of these: the sharp image of a pinhole without noise.
     resume
-        Go on with an interrupted run.
+        Resume an interrupted run.
     overwrite
         Replace existing files.
     variant
         Mitsuba variant: llvm_ad_mono (CPU) or cuda_ad_mono (NVIDIA GPU).
     progress
-        Called with the number of images done, the number in all, and the name of the stage.
+        Called with the number of images done, the total number, and the name of the stage.
     report
         Called with a line of text for each file that is written.
 
@@ -205,7 +205,7 @@ def simulate(
     require_ending(out, CAPTURES)
     places = (placement,) if isinstance(placement, str) else tuple(placement) or (None,)
     if len(places) > 1 and "{placement}" not in out.name:
-        raise DescriptionError(f"several placements would all be written to {out}: put {{placement}} into its name")
+        raise DescriptionError(f"several placements, but one output {out}: put {{placement}} into its name")
     described = [choose_scene(scene, placement=place, medium=medium, water=water) for place in places]
     nominal, built = choose_sensors(sensor, as_built)
     options = Options.chosen(spp=spp, seed=seed, effects=effects, without=without, ideal=ideal)
@@ -215,15 +215,15 @@ def simulate(
     files, paths = {"overwrite": overwrite, "resume": resume}, []
     for each in described:
         path = out.with_name(out.name.replace("{placement}", each.placement))
-        told = partial(progress, stage=each.placement)
-        record_scene(each, nominal, path, as_built=built, options=options, progress=told, **files)
+        stage = partial(progress, stage=each.placement)
+        record_scene(each, nominal, path, as_built=built, options=options, progress=stage, **files)
         report(f"wrote {path}")
         paths.append(path)
     return paths
 
 
 def choose_scene(scene: AnyScene, *, placement: str | None, medium: str | None, water: float | str | None) -> Scene:
-    """The scene with what is given in place of its own placement, medium and water."""
+    """Return the scene, with the given placement, medium and water instead of its own."""
     if not isinstance(scene, Scene):
         return load_scene(scene, placement=placement, medium=medium, water=water)
     given = {"placement": placement, "medium": medium, "water": water}
@@ -232,7 +232,7 @@ def choose_scene(scene: AnyScene, *, placement: str | None, medium: str | None, 
 
 
 def choose_sensors(sensor: AnySensor, as_built: AnySensor | None) -> tuple[Sensor, Sensor]:
-    """The sensor as described and as built, whose images must fit each other; DescriptionError where they do not."""
+    """Return the sensor as described and as built; DescriptionError if their image formats differ."""
     nominal = sensor if isinstance(sensor, Sensor) else load_sensor(sensor)
     if as_built is None:
         return nominal, nominal
@@ -240,5 +240,5 @@ def choose_sensors(sensor: AnySensor, as_built: AnySensor | None) -> tuple[Senso
     shared = {"width_px", "height_px", "stripe_along"}
     if built.camera.model_dump(include=shared) != nominal.camera.model_dump(include=shared):
         names = [each.name if isinstance(each, Sensor) else str(each) for each in (as_built, sensor)]
-        raise DescriptionError(f"'{names[0]}' has another image size or stripe orientation than '{names[1]}'")
+        raise DescriptionError(f"'{names[0]}' and '{names[1]}' differ in image size or stripe orientation")
     return nominal, built

@@ -1,4 +1,4 @@
-"""The thesis's evaluation reproduced: campaigns are recorded, and the sensor's software evaluates them."""
+"""Reproduction of the thesis's evaluation: campaigns are recorded, then evaluated by the sensor's software."""
 
 import subprocess
 import sys
@@ -11,7 +11,7 @@ from uwlts.errors import CommandFailed, DescriptionError
 from uwlts.runtime.progress import ProgressListener, unheard
 
 _LEAST_TRIALS = 20
-"""As `uwlts thesis` demands, to refuse fewer before anything is rendered."""
+"""Smallest number of trials in `uwlts thesis`, checked before anything is rendered."""
 
 
 def reproduce(
@@ -29,43 +29,43 @@ def reproduce(
     variant: Variant = CPU,
     progress: ProgressListener = unheard,
 ) -> Path:
-    """Render the thesis's whole evaluation, evaluate it by all its methods, and set its tables beside the results.
+    """Render the campaigns of the thesis, evaluate them by all its methods, and compare the results with its tables.
 
-    Every campaign has imperfections and noise of its own. Run again, it goes on where it was stopped, and adds
-    campaigns if more are asked for. The report is OUT/report.html, whose path is returned.
+    Every campaign has its own imperfections and noise. An interrupted run is resumed, and campaigns are added if
+    the number is increased. The path of the report, OUT/report.html, is returned.
 
     Parameters
     ----------
     campaign
-        Name or path of the campaign's description; "thesis" unless given, or "joint" with ``joint``.
+        Name or path of the campaign's description; default: "thesis", or "joint" with ``joint``.
     joint
-        Compare the joint calibration with the thesis's two ways on the same images; writes OUT/report.html and
+        Compare the joint calibration with both methods of the thesis on the same images; writes OUT/report.html and
         summary.json.
     out
-        Folder for campaigns and report; runs/CAMPAIGN unless given. What is complete in it is not rendered again.
+        Folder for campaigns and report (default: runs/CAMPAIGN). Complete recordings in it are kept.
     campaigns
         Number of campaigns.
     first
         Seed of the first campaign; the others follow.
     every
-        Take only every n-th profile of the scans; calibrations keep all their images.
+        Take only every n-th profile of the scans; calibrations keep all images.
     trials
-        Trials of the Monte-Carlo propagation of every campaign, at least 20, or 0 for none.
+        Trials of the Monte Carlo propagation of every campaign: at least 20, or 0 to skip it.
     workers
-        Recordings rendered at a time; as many as there are processors unless given.
+        Number of parallel recordings (default: number of processors).
     overwrite
-        Render and evaluate everything anew.
+        Render and evaluate everything again.
     spp, variant
         As for `simulate`.
     progress
-        Called with the number of images rendered, the number in all, and the name of the stage.
+        Called with the number of images rendered, the total number, and the name of the stage.
 
     Raises
     ------
     DescriptionError, DesignError, OutputError, SetupError
         As `record_campaigns`, or an argument is out of its range.
     CommandFailed
-        The evaluation failed; it has printed why.
+        The evaluation failed; its output gives the reason.
     """
     for name, value in (("campaigns", campaigns), ("every", every), ("workers", 1 if workers is None else workers)):
         if value < 1:
@@ -88,7 +88,7 @@ def reproduce(
         overwrite=overwrite,
         progress=progress,
     )
-    # The sensor's software is a program of its own, which shares no mathematics with the twin.
+    # The sensor's software runs as a separate program, which shares no mathematics with the twin.
     command = [sys.executable, "-m", "uwlts", "thesis", str(folder), "--trials", str(trials), "--overwrite"]
     command += ["--joint"] if joint else []
     command += ["--again"] if overwrite else []

@@ -1,4 +1,4 @@
-"""A sensor before a scene, ready to take shots: poses, exposures, images with noise, and the truth of each."""
+"""Simulation of a sensor in a scene: poses, exposures, noisy images, and the ground truth of each shot."""
 
 from dataclasses import dataclass
 from itertools import product
@@ -15,7 +15,7 @@ from twin.scene.finish import shift_points
 from twin.scene.motion import Light, Shot
 from twin.scene.platforms import Platform
 from twin.sensor.detector import electrons_per_ms, fixed_pattern, grey_values
-from twin.sensor.flaws import as_built, delivered, dirt, laser_shares, veiled, vignette
+from twin.sensor.flaws import add_glare, as_built, deliver_image, dirt, laser_shares, vignette
 from twin.sensor.peak_finder import INVALID, PeakFinder
 from twin.sensor.speckle import Speckle, coherence
 from uwlts.errors import DesignError
@@ -26,19 +26,19 @@ from uwlts.model.stripe import Coordinates
 from uwlts.storage.capture import Frame, Seen
 
 ShotLight: TypeAlias = tuple[np.ndarray, LaserFrame | None]
-"""Irradiance (H, W) of lamp and day before the lens in W/mm2, and the laser's light, None where it is off."""
+"""Irradiance (H, W) of lamp and daylight before the lens in W/mm2, and the laser's light, None if it is off."""
 PROBE_SPP = 4
-"""Samples per lit pixel of the images from which the exposure follows, which need not be known to a percent."""
+"""Samples per lit pixel of the images that determine the exposure, where an error of some percent is acceptable."""
 BRIGHT_SHARE = 0.98
-"""Automatic exposure looks at the brightest pixel of every profile line and lets 2 % of the lines be brighter."""
+"""Quantile of the brightest pixel per profile line that automatic exposure uses; 2 % of the lines may be brighter."""
 STRAY_LINES = 4
-"""So many of the brightest lines may be those of single bright pixels."""
+"""Number of brightest lines that may be due to single bright pixels."""
 LIT_SHARE = 0.05
-"""A line is lit from this share of the light of the brightest line that is none of these."""
+"""A line is lit if it exceeds this fraction of the brightest line that is not one of `STRAY_LINES`."""
 
 
 def medium_of(sensor: Sensor, scene: Scene) -> Medium:
-    """The medium that a scene names, from the sensor's list, with the scene's water if it has one of its own."""
+    """Return the sensor's medium that the scene names, with the scene's water if it defines one."""
     medium = sensor.medium(scene.medium)
     if scene.water is None:
         return medium
@@ -48,12 +48,12 @@ def medium_of(sensor: Sensor, scene: Scene) -> Medium:
 
 
 def with_window(sensor: Sensor, *, mounted: bool) -> Sensor:
-    """The sensor with its camera's window in place or taken off."""
+    """Return the sensor with its camera window mounted or removed."""
     return altered(sensor, camera={"window": {"mounted": mounted}})
 
 
 def true_pose(scene: Scene, shot: Shot) -> np.ndarray:
-    """``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
+    """Return ``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
     if isinstance(scene.motion, Platform):
         assert shot.time_s is not None
         return scene.motion.course().poses(np.array([shot.time_s]))[0]
@@ -63,9 +63,12 @@ def true_pose(scene: Scene, shot: Shot) -> np.ndarray:
 
 
 def check_scene(renderer: Renderer, scene: Scene) -> None:
-    """DesignError where objects lie outside the measuring volume's depth, or no scan brings the sheet to them."""
+    """Check that a scan reaches the objects.
+
+    DesignError if the objects are outside the depth range of the measuring volume, or the sheet never meets them.
+    """
     volume, axis = renderer.sensor.volume, camera_from_object(renderer.sensor)[:3, 2]
-    # The sheet's middle line runs along Z, which the camera sees at depth standoff + Z axis_z outside the window.
+    # The sheet's centre line is along Z; outside the window, its camera depth is standoff + Z axis_z.
     nearest, farthest = ((edge - renderer.design.standoff_mm) / axis[2] for edge in (volume.near_mm, volume.far_mm))
     box = renderer.objects.scene.bbox()
     corners = np.array(list(product(*zip(box.min, box.max, strict=True))))
@@ -74,24 +77,27 @@ def check_scene(renderer: Renderer, scene: Scene) -> None:
     low, high = seen.min(axis=1), seen.max(axis=1)
     if not ((low[:, 2] <= farthest) & (high[:, 2] >= nearest)).any():
         raise DesignError(
-            f"the objects lie from Z = {low[:, 2].min():.1f} to {high[:, 2].max():.1f} mm about the stand-off, "
-            f"outside the measuring volume from {nearest:.1f} to {farthest:.1f} mm: choose another placement or volume"
+            f"the objects are at Z = {low[:, 2].min():.1f} to {high[:, 2].max():.1f} mm from the stand-off, outside "
+            f"the measuring volume from {nearest:.1f} to {farthest:.1f} mm: choose another placement or volume"
         )
     if not ((low[:, 0] <= 0) & (high[:, 0] >= 0)).any():
         raise DesignError(
-            f"the sheet never meets the objects: seen from the sensor they stay between X = {low[:, 0].min():.1f} and "
-            f"{high[:, 0].max():.1f} mm, the sheet is at X = 0: change the motion or the objects' position"
+            f"the sheet never meets the objects: in the sensor's frame they stay between X = {low[:, 0].min():.1f} and "
+            f"{high[:, 0].max():.1f} mm, but the sheet is at X = 0: change the motion or the objects' position"
         )
 
 
 @dataclass(frozen=True)
 class Exposed:
-    """A shot as taken: the image, and the mean photo-electrons of its exposure by the way that their light took.
+    """A simulated image, and the mean photo-electrons of its exposure by light path.
 
-    ``image`` (H, W) holds grey values. The others are (H, W), float32, without speckle and noise: ``direct`` is the
-    laser's light straight from the lit surfaces; ``scattered_once`` what the water scattered out of the sheet into the
-    camera's rays; ``longer_ways`` what was scattered more often or went from one surface to another; ``particles`` that
-    of grains and bubbles in the sheet; ``even`` that of lamp and day.
+    ``image`` (H, W) holds grey values. The other arrays (H, W), float32, contain neither speckle nor noise:
+
+    - ``direct``: laser light from directly lit surfaces;
+    - ``scattered_once``: light that the water scatters once from the sheet into the camera's rays;
+    - ``longer_ways``: light that is scattered several times or reflected between surfaces;
+    - ``particles``: light of particles and bubbles in the sheet;
+    - ``even``: light of lamp and day.
     """
 
     image: np.ndarray
@@ -103,15 +109,15 @@ class Exposed:
     even: np.ndarray
 
     def total(self) -> np.ndarray:
-        """All of them together (H, W)."""
+        """Return the sum of all light paths (H, W)."""
         return self.direct + self.scattered_once + self.longer_ways + self.particles + self.even
 
 
 class Studio:
-    """A sensor before a scene, ready to take shots; exposures are settled once, before the first.
+    """Simulator of a sensor in a scene; it determines the exposures when it is created.
 
-    An automatic exposure follows from the first, middle and last shot of the ``scan``, or from its ``middle`` one
-    alone, without speckle, if that shows any light.
+    An automatic exposure follows from the first, middle and last shot of the ``scan``. With "middle", it follows from
+    the middle shot alone, without speckle, if that shot shows any light.
     """
 
     def __init__(self, sensor: Sensor, scene: Scene, options: Options, *, probe: Literal["scan", "middle"] = "scan"):
@@ -131,7 +137,7 @@ class Studio:
         check_scene(self.renderer, scene)
         camera, laser = self.sensor.camera, self.sensor.laser
         self._speckle = Speckle(camera, wavelength_nm=laser.wavelength_nm, seed=options.seed)
-        # None where everything passes: each pass over an image takes a millisecond.
+        # None without losses: each multiplication of an image takes a millisecond.
         self._passed = vignette(camera, flaws.vignetting) if flaws.vignetting else None
         if flaws.dirt and mounted:
             clean = dirt(camera, flaws.dirt, seed=options.seed)
@@ -148,9 +154,9 @@ class Studio:
         self.period_s = self._period_s(max(1e-3 * longest_ms, 1 / self.sensor.detector.frame_rate_hz))
 
     def _period_s(self, shortest_s: float) -> float:
-        """Time from one shot to the next: the platform moves or settles, and the camera exposes and reads out.
+        """Return the time between shots: motion or settling of the platform, exposure and read-out of the camera.
 
-        DesignError where a platform in motion leaves the camera less time than it needs.
+        DesignError if a moving platform leaves the camera less time than it needs.
         """
         motion = self.scene.motion
         if not motion.moves():
@@ -158,32 +164,32 @@ class Studio:
         if isinstance(motion, Platform):
             assert motion.frame_rate_hz is not None
             period_s = 1 / motion.frame_rate_hz
-            way = f"at {motion.frame_rate_hz:g} images/s the next one comes"
-            advice = "take fewer images per second"
+            pace = f"at {motion.frame_rate_hz:g} images/s the next image is due"
+            advice = "reduce the frame rate"
         else:
             period_s = abs(motion.step_mm) / motion.speed_mm_per_s
-            way = f"at {motion.speed_mm_per_s:g} mm/s the next position {abs(motion.step_mm):g} mm on is reached"
-            advice = "travel more slowly, in longer steps"
+            pace = f"at {motion.speed_mm_per_s:g} mm/s the next position, {abs(motion.step_mm):g} mm on, is reached"
+            advice = "reduce the speed, increase the step"
         if motion.images() > 1 and period_s < shortest_s * (1 - 1e-9):
             raise DesignError(
-                f"{way} after {1e3 * period_s:.3g} ms, but the camera needs {1e3 * shortest_s:.3g} ms from frame to "
-                f"frame: {advice}, or with shorter exposures"
+                f"{pace} after {1e3 * period_s:.3g} ms, but the camera needs {1e3 * shortest_s:.3g} ms per frame: "
+                f"{advice} or shorten the exposures"
             )
         return period_s
 
     def pose(self, shot: Shot) -> np.ndarray:
-        """``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
+        """Return ``T_scene_object`` (4, 4) of the sensor's OCS at a shot, in the middle of its exposure."""
         return true_pose(self.scene, shot)
 
     def speed_mm_per_s(self) -> float:
-        """Speed of the stage along its positions while an image is exposed; 0 on other platforms."""
+        """Return the speed of the stage along its positions during an exposure; 0 for other platforms."""
         motion = self.scene.motion
         if isinstance(motion, Platform):
             return 0.0
         return motion.speed_mm_per_s * (1 if motion.step_mm >= 0 else -1)
 
     def travel(self, shot: Shot) -> Travel | None:
-        """Motion of the sensor during the exposure of a shot; None if it stands still."""
+        """Return the motion of the sensor during the exposure of a shot; None if it does not move."""
         exposure_ms = self.exposure_ms.get(shot.light, 0.0) * shot.exposure
         motion = self.scene.motion
         if not isinstance(motion, Platform):
@@ -194,7 +200,7 @@ class Studio:
         return self._travel(velocity, turn, exposure_ms)
 
     def travel_at(self, speed: float, *, exposure_ms: float) -> Travel | None:
-        """Movement of the sensor during an exposure at a speed of the stage in mm/s; None if it stands still."""
+        """Return the motion of the sensor during an exposure at a stage speed in mm/s; None if it does not move."""
         motion = self.scene.motion
         if speed == 0 or not self.options.effects.motion or isinstance(motion, Platform):
             return None
@@ -211,7 +217,7 @@ class Studio:
         )
 
     def electrons_per_ms(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None = None) -> np.ndarray:
-        """Mean photo-electrons per ms (H, W) of a shot."""
+        """Return the mean photo-electrons per ms (H, W) of a shot."""
         return self._electrons_per_ms(*self._light(shot, spp=spp, seed=seed, travel=travel), shot)
 
     def _light(self, shot: Shot, *, spp: int, seed: int, travel: Travel | None) -> ShotLight:
@@ -224,10 +230,10 @@ class Studio:
     def _electrons_per_ms(
         self, even: np.ndarray, laser: LaserFrame | None, shot: Shot, *, speckle: bool = True
     ) -> np.ndarray:
-        """Mean photo-electrons per ms (H, W) of what `_light` returns, with ``speckle`` if that is rendered."""
-        light = self._through_lens(even)
+        """Return the mean photo-electrons per ms (H, W) of the light from `_light`, with speckle if it is enabled."""
+        light = self._apply_lens(even)
         if laser is not None:
-            seen = self._through_lens(self._speckled(laser, shot) if speckle else laser.irradiance())
+            seen = self._apply_lens(self._add_speckle(laser, shot) if speckle else laser.irradiance())
             light = light + (seen if self._laser_shares is None else self._laser_shares * seen)
         return self._to_electrons(light)
 
@@ -236,16 +242,16 @@ class Studio:
         return electrons_per_ms(irradiance, sensor.camera, sensor.detector, wavelength_nm=sensor.laser.wavelength_nm)
 
     def shows(self, shot: Shot, light: Light) -> bool:
-        """Whether a shot is taken with the laser or the lamp on."""
+        """Return whether the laser or the lamp is on in a shot."""
         return shot.light == light or (self.options.flaws.lamp_and_laser and shot.light != "day")
 
-    def _through_lens(self, irradiance: np.ndarray) -> np.ndarray:
-        """Irradiance (H, W) behind a lens with vignetting and glare."""
+    def _apply_lens(self, irradiance: np.ndarray) -> np.ndarray:
+        """Return the irradiance (H, W) behind the lens, with vignetting and glare."""
         passed, glare = irradiance if self._passed is None else irradiance * self._passed, self.options.flaws.glare
-        return veiled(passed, glare) if glare else passed
+        return add_glare(passed, glare) if glare else passed
 
-    def _speckled(self, frame: LaserFrame, shot: Shot) -> np.ndarray:
-        """Irradiance (H, W) of the laser's light in W/mm2, with its speckle."""
+    def _add_speckle(self, frame: LaserFrame, shot: Shot) -> np.ndarray:
+        """Return the irradiance (H, W) of the laser in W/mm2, with speckle."""
         if not self.options.effects.speckle:
             return frame.irradiance()
         laser = self.sensor.laser
@@ -261,17 +267,20 @@ class Studio:
         return frame.irradiance(factors)
 
     def light(self, shot: Shot, index: int) -> ShotLight:
-        """The light of image number ``index`` before the lens."""
+        """Return the light of image number ``index`` before the lens."""
         self._shift_points(shot, index)
         seed = int(np.random.SeedSequence([self.options.seed, index]).generate_state(1)[0])
         return self._light(shot, spp=self.options.spp, seed=seed, travel=self.travel(shot))
 
     def frame(self, shot: Shot, index: int) -> Frame:
-        """Image number ``index`` of the scan with what a capture records of it."""
+        """Return image number ``index`` of the scan with its metadata in the capture."""
         return self.frame_of(self.light(shot, index), shot, index)
 
     def frame_of(self, light: ShotLight, shot: Shot, index: int) -> Frame:
-        """As `frame`, of its light. It uses no renderer, so that the next light can be rendered meanwhile."""
+        """Return the frame of light from `light`.
+
+        The renderer is not used, so it can render the next light meanwhile.
+        """
         pose = covariance = None
         if isinstance(self.scene.motion, Platform):
             course = self.scene.motion.course()
@@ -279,7 +288,7 @@ class Studio:
             pose = course.reported[number]
             covariance = None if course.covariance is None else course.covariance[number]
         return Frame(
-            self._seen(light, shot, index),
+            self._observe(light, shot, index),
             stage_mm=shot.stage_mm,
             laser_on=shot.light == "laser",
             exposure_ms=self.exposure_ms[shot.light] * shot.exposure,
@@ -289,9 +298,9 @@ class Studio:
             speed_mm_per_s=self.speed_mm_per_s(),
         )
 
-    def _seen(self, light: ShotLight, shot: Shot, index: int) -> Seen:
-        """The image of a shot, or what a 3D camera finds in it."""
-        image = self._image_of(light, shot, index)
+    def _observe(self, light: ShotLight, shot: Shot, index: int) -> Seen:
+        """Return the image of a shot, or the centre line that a 3D camera finds in it."""
+        image = self._render_image(light, shot, index)
         if self.peak_finder is None or shot.light != "laser":
             return image
         camera = self.sensor.camera
@@ -300,15 +309,15 @@ class Studio:
         return meant.stripe(self.peak_finder.numbers(image), stripe_along=camera.stripe_along, length_px=length)
 
     def image(self, shot: Shot, index: int) -> np.ndarray:
-        """Grey values (H, W) of a shot; all that is random depends on the seed, the place and the index only."""
-        return self._image_of(self.light(shot, index), shot, index)
+        """Return the grey values (H, W) of a shot; noise depends only on seed, position and index."""
+        return self._render_image(self.light(shot, index), shot, index)
 
-    def _image_of(self, light: ShotLight, shot: Shot, index: int) -> np.ndarray:
+    def _render_image(self, light: ShotLight, shot: Shot, index: int) -> np.ndarray:
         electrons_per_ms = self._electrons_per_ms(*light, shot)
-        return self._taken(electrons_per_ms, index, exposure_ms=self.exposure_ms[shot.light] * shot.exposure)
+        return self._expose(electrons_per_ms, index, exposure_ms=self.exposure_ms[shot.light] * shot.exposure)
 
     def exposed(self, shot: Shot, index: int, *, exposure: float = 1.0) -> Exposed:
-        """The image of a shot, as `image` gives it, with its light; ``exposure`` multiplies the time of exposure."""
+        """Return the image of a shot as `image` does, with its light; ``exposure`` multiplies the exposure time."""
         even, laser = self.light(shot, index)
         exposure_ms = exposure * self.exposure_ms[shot.light] * shot.exposure
         nothing = np.zeros_like(even)
@@ -316,29 +325,29 @@ class Studio:
         if laser is not None:
             parts = [laser.direct(), laser.haze, laser.scattered - laser.haze, laser.particles]
         shares = 1.0 if self._laser_shares is None else self._laser_shares
-        parts = [shares * self._through_lens(part) if part.any() else nothing for part in parts]
-        parts = [exposure_ms * self._to_electrons(part) for part in (*parts, self._through_lens(even))]
-        image = self._taken(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)
+        parts = [shares * self._apply_lens(part) if part.any() else nothing for part in parts]
+        parts = [exposure_ms * self._to_electrons(part) for part in (*parts, self._apply_lens(even))]
+        image = self._expose(self._electrons_per_ms(even, laser, shot), index, exposure_ms=exposure_ms)
         return Exposed(image, exposure_ms, *(np.maximum(part, 0, dtype=np.float32) for part in parts))
 
-    def _taken(self, electrons_per_ms: np.ndarray, index: int, *, exposure_ms: float) -> np.ndarray:
+    def _expose(self, electrons_per_ms: np.ndarray, index: int, *, exposure_ms: float) -> np.ndarray:
         noise_seed = [self.options.seed, index]
         return self.detected(exposure_ms * electrons_per_ms, exposure_ms=exposure_ms, noise_seed=noise_seed)
 
     def detected(self, electrons: np.ndarray, *, exposure_ms: float, noise_seed: list[int]) -> np.ndarray:
-        """Grey values (H, W) of mean photo-electrons (H, W), with the noise of a seed if noise is rendered."""
+        """Return grey values (H, W) for mean photo-electrons (H, W), with seeded noise if noise is enabled."""
         rng = np.random.default_rng(noise_seed) if self.options.effects.noise else None
         image = grey_values(electrons, self.sensor.detector, exposure_ms=exposure_ms, rng=rng, pattern=self._pattern)
-        return delivered(image, self.options.flaws)
+        return deliver_image(image, self.options.flaws)
 
     def truth(self, shot: Shot) -> FrameTruth:
-        """Ground truth of every profile line of a shot."""
+        """Return the ground truth of every profile line of a shot."""
         if not self.shows(shot, "laser"):
             return no_stripe(self.sensor.camera.lines())
         return true_stripe(self.renderer, self.pose(shot), travel=self.travel(shot))
 
     def _shift_points(self, shot: Shot, index: int) -> None:
-        """Move the points of a target with errors of detection to where this image shows them."""
+        """Displace the points of a target by its detection errors in this image."""
         for plate, pose in zip(self.scene.objects, self.scene.object_poses(), strict=True):
             if isinstance(plate, Printed) and plate.detection_std_px > 0:
                 seen = camera_from_object(self.sensor) @ np.linalg.inv(self.pose(shot)) @ pose
@@ -346,7 +355,7 @@ class Studio:
                 shift_points(self.renderer.objects.scene, plate, mm_per_px=mm_per_px, image=index)
 
     def _apparent_depth_mm(self, depth_mm: float) -> float:
-        """Depth at which a point on the axis seems to be: a layer of index n looks n times thinner."""
+        """Return the apparent depth of a point on the axis: a layer of index n appears n times thinner."""
         window, wavelength = self.sensor.camera.window, self.sensor.laser.wavelength_nm
         if not window.mounted:
             return depth_mm
@@ -355,7 +364,7 @@ class Studio:
         return window.distance_mm + window.thickness_mm / window.index(wavelength) + in_medium
 
     def _exposure(self, light: Light, probe: Literal["scan", "middle"]) -> float:
-        """Exposure in ms as described, or so that the brightest of the shots probed just reaches the wanted level."""
+        """Return the described exposure in ms, or that which brings the brightest shot to the wanted level."""
         wanted = self.sensor.exposure.laser_ms if light == "laser" else self.sensor.exposure.lamp_ms
         if wanted != "auto":
             return wanted
@@ -366,7 +375,7 @@ class Studio:
             if probe == "middle" and brightest > 0:
                 break
             even, laser = self._light(shot, spp=PROBE_SPP, seed=0, travel=None)
-            # Where one shot is enough, its grain need not be known either, which takes as long as all else.
+            # If one shot suffices, skip its speckle, which would double the time.
             peaks = self._electrons_per_ms(even, laser, shot, speckle=probe == "scan").max(axis=axis)
             brightest = max(brightest, lit_level(peaks))
         longest = self.sensor.exposure.longest_ms
@@ -375,7 +384,7 @@ class Studio:
 
 
 def lit_level(peaks: np.ndarray) -> float:
-    """Light that few of the lit lines exceed, of the brightest pixel of every line (L,); 0 where nothing is lit."""
+    """Return the light that few lit lines exceed, from the brightest pixel of every line (L,); 0 if no line is lit."""
     reference = np.sort(peaks)[-1 - min(STRAY_LINES, len(peaks) - 1)]
     lit = peaks[peaks > LIT_SHARE * reference]
     return float(np.quantile(lit, BRIGHT_SHARE)) if len(lit) else 0.0

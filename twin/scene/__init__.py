@@ -1,1 +1,1 @@
-"""Descriptions of scenes, objects, finishes and campaigns, and the Mitsuba scene that they become."""
+"""Descriptions of scenes, objects, finishes and campaigns, and their conversion to Mitsuba scenes."""

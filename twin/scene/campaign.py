@@ -1,4 +1,4 @@
-"""Campaigns of many recordings, with deviations of the real things from their descriptions drawn for each seed."""
+"""Campaigns of many recordings, with deviations of the real hardware drawn for each seed."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -19,16 +19,21 @@ FOLDER = "campaigns"
 
 
 class Imperfections(Description):
-    """Deviations of real things from their descriptions: standard deviations if normal, half widths if even.
+    """Deviations of the real hardware: standard deviations of normal, half widths of uniform distributions.
 
-    Of the target: ``circle_centre_std_mm`` of every printed circle or corner along x and y; ``target_bow_std_mm`` by
-    which its middle stands before or behind its corners; ``circle_detection_std_px`` of every circle or corner in every
-    image, beyond what the image's noise does; ``target_tilt_std_deg`` about X and about Y, against the stage's travel.
-    Of the stage: ``stage_position_std_mm`` of every position and ``stage_lead_std`` as a share of its travel;
-    ``stage_misalignment_std_deg`` of the travel against the sheet's normal in scans and against the laser's axis before
-    the target, about each of two axes. ``temperature_half_width_c`` is the water's, one for the calibration and another
-    for the measurements; ``window_tilt_std_deg`` the camera's window's about x and about y; ``sheet_bow_std_deg`` the
-    beam's tilt into the line optics, which bends the sheet; ``step_height_half_width_mm`` the step standard's height.
+    Target: ``circle_centre_std_mm`` of each printed circle or corner along x and y; ``target_bow_std_mm`` of the
+    centre's height over the corners; ``circle_detection_std_px`` of each circle or corner in each image, in addition to
+    image noise; ``target_tilt_std_deg`` about X and Y, relative to the stage.
+
+    Stage: ``stage_position_std_mm`` of each position; ``stage_lead_std`` relative to the travel;
+    ``stage_misalignment_std_deg`` of the travel about two axes, relative to the sheet's normal in scans and to the
+    laser's axis for targets.
+
+    Sensor: ``window_tilt_std_deg`` of the camera's window about x and y; ``sheet_bow_std_deg`` of the beam's tilt at
+    the line optics, which bends the sheet.
+
+    Others: ``temperature_half_width_c`` of the water, drawn once for calibrations and once for measurements;
+    ``step_height_half_width_mm`` of the step standard.
     """
 
     circle_centre_std_mm: NotNegative = 0.0
@@ -45,11 +50,11 @@ class Imperfections(Description):
 
 
 class CampaignRecording(Description):
-    """A scene to record in each of some media and at each of some placements.
+    """A scene to record in several media and at several placements.
 
-    ``scene`` is a name, or a path that starts at the campaign's folder if it is relative. Files are called ``name``, or
-    SCENE-PLACEMENT-MEDIUM unless a name is given. ``motion`` changes the scene's. ``stripe_along`` turns the camera.
-    ``as_described`` records with the sensor as described, free of imperfections.
+    ``scene`` is a name or a path; relative paths start at the campaign's folder. Files are called ``name`` (default:
+    SCENE-PLACEMENT-MEDIUM). ``motion`` changes the scene's motion. ``stripe_along`` rotates the camera.
+    ``as_described`` records with the sensor as described, without imperfections.
     """
 
     scene: str
@@ -62,9 +67,9 @@ class CampaignRecording(Description):
 
 
 class Campaign(Description):
-    """Recordings with one sensor. ``as_built`` is the sensor to which the imperfections are added.
+    """Recordings with one sensor. The imperfections are added to the sensor ``as_built``.
 
-    Sensors are names, or paths that start at the campaign's folder if they are relative.
+    Sensors are names or paths; relative paths start at the campaign's folder.
     """
 
     title: str
@@ -76,7 +81,7 @@ class Campaign(Description):
 
 @dataclass(frozen=True)
 class Take:
-    """One recording, ready to be rendered: the sensor as described and as built, the scene as it really is."""
+    """One recording to be rendered: the sensor as described and as built, and the actual scene."""
 
     name: str
     scene: Scene
@@ -86,7 +91,7 @@ class Take:
 
 
 def load_campaign(name_or_path: str | Path) -> Campaign:
-    """Campaign by name (``thesis``) or path; DescriptionError where it is none."""
+    """Read a campaign by name (``thesis``) or path; DescriptionError if it does not exist or is invalid."""
     path = find(name_or_path, FOLDER)
     campaign = validated(Campaign, read_table(path, FOLDER), path)
 
@@ -99,11 +104,11 @@ def load_campaign(name_or_path: str | Path) -> Campaign:
 
 
 def takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
-    """All recordings of a campaign with the imperfections of a seed; scans are thinned to every n-th profile.
+    """Return all recordings of a campaign with the imperfections of a seed; scans keep every n-th profile.
 
-    DescriptionError where a scene, placement or sensor is unknown, or two recordings have the same name.
+    DescriptionError if a scene, placement or sensor is unknown, or two recordings have the same name.
     """
-    drawn = _Drawn(campaign, seed)
+    drawn = _SampledImperfections(campaign, seed)
     found = [
         _take(recording, place, medium, drawn, every=every)
         for recording in campaign.recordings
@@ -112,11 +117,13 @@ def takes(campaign: Campaign, *, seed: int, every: int = 1) -> list[Take]:
     ]
     doubled = sorted(name for name, count in Counter(take.name for take in found).items() if count > 1)
     if doubled:
-        raise DescriptionError(f"several recordings would be called {', '.join(doubled)}: give them names")
+        raise DescriptionError(f"several recordings would be called {', '.join(doubled)}: give each its own name")
     return found
 
 
-def _take(recording: CampaignRecording, place: str | None, medium: str | None, drawn: "_Drawn", *, every: int) -> Take:
+def _take(
+    recording: CampaignRecording, place: str | None, medium: str | None, drawn: "_SampledImperfections", *, every: int
+) -> Take:
     motion = load_scene(recording.scene, placement=place, medium=medium).motion.model_dump() | recording.motion
     scene = load_scene(recording.scene, placement=place, medium=medium, motion=motion)
     name = recording.name or f"{Path(recording.scene).stem}-{scene.placement}-{scene.medium}"
@@ -125,14 +132,14 @@ def _take(recording: CampaignRecording, place: str | None, medium: str | None, d
     if recording.stripe_along is not None:
         turned = {"stripe_along": recording.stripe_along}
         sensor, built = altered(sensor, camera=turned), altered(built, camera=turned)
-    # A calibration keeps all its images, and a scan at least a few profiles.
+    # Calibrations keep all images, and scans at least five profiles.
     stage = scene.motion
     if isinstance(stage, Motion) and scene.target is None and stage.count >= 5 * every and every > 1:
         scene = _with_motion(scene, step_mm=stage.step_mm * every, count=-(-stage.count // every))
     rng = np.random.default_rng([drawn.seed, *name.encode()])
     if not recording.as_described:
-        scene = drawn.as_it_really_is(scene, rng)
-        built = drawn.with_true_water(built, calibrating=scene.target is not None or _shows_step(scene))
+        scene = drawn.apply_imperfections(scene, rng)
+        built = drawn.set_true_water(built, calibrating=scene.target is not None or _shows_step(scene))
     return Take(name, scene, sensor, built, int(rng.integers(2**31)))
 
 
@@ -141,8 +148,8 @@ def _with_motion(scene: Scene, **changes: object) -> Scene:
     return scene.model_copy(update={"motion": motion})
 
 
-class _Drawn:
-    """The imperfections of one campaign, drawn from their distributions."""
+class _SampledImperfections:
+    """Imperfections of one campaign, drawn from their distributions."""
 
     def __init__(self, campaign: Campaign, seed: int):
         self.seed, self._size = seed, campaign.imperfections
@@ -164,14 +171,14 @@ class _Drawn:
         }
         self._lower_step = size.step_height_half_width_mm * rng.uniform(-1, 1)
 
-    def with_true_water(self, sensor: Sensor, *, calibrating: bool) -> Sensor:
-        """The sensor in water of the true temperature."""
+    def set_true_water(self, sensor: Sensor, *, calibrating: bool) -> Sensor:
+        """Return the sensor in water of the true temperature."""
         warmer = self._warmer_calibrating if calibrating else self._warmer_measuring
         media = {key: each if each.kind == "air" else each.warmer_by(warmer) for key, each in sensor.media.items()}
         return altered(sensor, media=media)
 
-    def as_it_really_is(self, scene: Scene, rng: np.random.Generator) -> Scene:
-        """The scene with its target's, step's and stage's errors; ``rng`` draws those of this recording alone."""
+    def apply_imperfections(self, scene: Scene, rng: np.random.Generator) -> Scene:
+        """Return the scene with the errors of target, step and stage; ``rng`` draws the errors of this recording."""
         size, motion, objects = self._size, scene.motion, list(scene.objects)
         for number, thing in enumerate(objects):
             if isinstance(thing, Printed):
@@ -179,34 +186,37 @@ class _Drawn:
                 turned = np.array(thing.rotation_deg) + (*tilt, 0.0)
                 objects[number] = altered(thing, **self._target, rotation_deg=tuple(turned.tolist()))
         if self._lower_step != 0 and _shows_step(scene):
-            number = _lower_block(scene)
+            number = _find_lower_block(scene)
             x, y, z = objects[number].position_mm
             objects[number] = altered(objects[number], position_mm=(x, y, z + self._lower_step))
         scene = altered(scene, objects=tuple(objects))
         if isinstance(motion, Platform):
-            # Platforms know their own errors.
+            # Platforms draw their own errors.
             return _with_motion(scene, errors_seed=int(rng.integers(2**31)))
         positions = np.array([motion.start_mm + index * motion.step_mm for index in range(motion.count)])
         errors = self._lead * positions + size.stage_position_std_mm * rng.standard_normal(motion.count)
         angles = self._scan_angles
         if scene.target is not None:
-            # The sensor is mounted anew before the target.
+            # The sensor is mounted again for each target.
             angles = size.stage_misalignment_std_deg * rng.standard_normal(2)
         return _with_motion(
             scene,
-            direction=_turned_slightly(motion.unit_direction(), angles),
+            direction=_tilt_direction(motion.unit_direction(), angles),
             nominal_direction=motion.recorded_direction(),
             position_errors_mm=tuple(errors.tolist()),
         )
 
 
 def _shows_step(scene: Scene) -> bool:
-    """Whether the step standard stands before the sensor."""
+    """Return whether the scene contains the step standard."""
     return (scene.artefact or {}).get("kind") == "step"
 
 
-def _lower_block(scene: Scene) -> int:
-    """Number of the block whose face towards the sensor lies farthest away; DescriptionError where there are none."""
+def _find_lower_block(scene: Scene) -> int:
+    """Return the index of the block whose front face is farthest from the sensor.
+
+    DescriptionError if there are fewer than two blocks.
+    """
     blocks = {
         number: thing.position_mm[2] - thing.size_mm[2] / 2
         for number, thing in enumerate(scene.objects)
@@ -214,14 +224,14 @@ def _lower_block(scene: Scene) -> int:
     }
     if len(blocks) < 2:
         raise DescriptionError(
-            f"{scene.title}: a step standard of {len(blocks)} blocks has no height to change: build it of two, or set "
+            f"{scene.title}: a step standard of {len(blocks)} blocks has no step height: use two blocks, or set "
             "step_height_half_width_mm to 0"
         )
     return max(blocks, key=lambda number: blocks[number])
 
 
-def _turned_slightly(direction: np.ndarray, angles_deg: np.ndarray) -> tuple[float, float, float]:
-    """A unit direction (3,) turned by two small angles about two axes square to it."""
+def _tilt_direction(direction: np.ndarray, angles_deg: np.ndarray) -> tuple[float, float, float]:
+    """Return a unit direction (3,) rotated by two small angles about two axes perpendicular to it."""
     least = np.eye(3)[np.argmin(np.abs(direction))]
     first = np.cross(direction, least)
     first /= np.linalg.norm(first)

@@ -1,7 +1,8 @@
 """Description of a virtual scene: objects and their poses, and the motion of the sensor that scans them.
 
-Scene coordinates are the sensor's object coordinate system (OCS) at stage position 0: X normal to the sheet, the
-direction of a scan; Y along the stripe; Z along the laser's axis away from the sensor; the origin is the stand-off.
+Scene coordinates are the sensor's object coordinate system (OCS) at stage position 0. X is normal to the sheet, in the
+scan direction; Y is along the stripe; Z is along the laser's axis, away from the sensor. The origin is at the
+stand-off.
 """
 
 from abc import ABC, abstractmethod
@@ -15,9 +16,9 @@ from pydantic import BeforeValidator, Discriminator, Field, SerializeAsAny, Tag,
 from twin.scene.forms import AnyForm
 from twin.scene.guide_and_table import LinearGuide, RotaryTable
 from twin.scene.motion import Motion
-from twin.scene.placed import Flat, Placed, Pose, Reflectance
 from twin.scene.platforms import IdealPath, Platform
 from twin.scene.robot import Robot
+from twin.scene.scene_object import FlatObject, Pose, Reflectance, SceneObject
 from twin.scene.vehicle import Vehicle
 from uwlts.errors import DescriptionError
 from uwlts.model.library import find, read_table, validated
@@ -28,7 +29,7 @@ Kind = TypeVar("Kind", bound=Description)
 
 
 def altered(described: Kind, **changes: object) -> Kind:
-    """A copy with values replaced, unvalidated; a table of changes goes to the description that it is meant for."""
+    """Return a copy with replaced values, unvalidated; a table of changes applies to the nested description."""
     inner = {name: getattr(described, name) for name in changes}
     return described.model_copy(
         update={
@@ -40,14 +41,14 @@ def altered(described: Kind, **changes: object) -> Kind:
     )
 
 
-class Sphere(Placed):
-    """A sphere about its own origin."""
+class Sphere(SceneObject):
+    """A sphere centred at its own origin."""
 
     kind: Literal["sphere"]
     diameter_mm: Positive
 
 
-class Plate(Flat):
+class Plate(FlatObject):
     """A flat rectangle in its own x-y plane, facing -z (towards the sensor)."""
 
     kind: Literal["plate"]
@@ -55,36 +56,36 @@ class Plate(Flat):
     height_mm: Positive
 
 
-class Block(Flat):
-    """A box about its own origin."""
+class Block(FlatObject):
+    """A box centred at its own origin."""
 
     kind: Literal["block"]
     size_mm: tuple[Positive, Positive, Positive]
 
 
-class Pipe(Placed):
-    """The outside of a pipe; its axis is its own x axis, its middle its origin."""
+class Pipe(SceneObject):
+    """The outer surface of a pipe along its own x axis, centred at its origin."""
 
     kind: Literal["pipe"]
     diameter_mm: Positive
     length_mm: Positive
 
 
-class Mesh(Placed):
-    """Any surface from a file that trimesh reads, in mm; a relative path starts at the scene's folder."""
+class Mesh(SceneObject):
+    """A surface from a file in a format that trimesh reads, in mm; a relative path starts at the scene's folder."""
 
     kind: Literal["mesh"]
     path: str
     scale: Positive = 1.0
 
 
-class Printed(Placed, ABC):
+class Printed(SceneObject, ABC):
     """Base of calibration targets on a flat plate that faces -z; its own frame is the target's.
 
-    A real target differs from its description: every point of it (circle or corner) is off by ``centre_std_mm`` along x
-    and y, and the middle of the plate stands ``bow_mm`` before its corners. ``detection_std_px`` shifts every point in
-    every image anew, as errors of detection beyond those that the image itself leads to. ``errors_seed`` chooses these
-    errors.
+    A real target differs from its description: each point (circle or corner) has an error of ``centre_std_mm`` along x
+    and y, and the plate's centre is ``bow_mm`` in front of its corners. ``detection_std_px`` shifts each point
+    independently in each image, in addition to the detection errors that image noise causes. ``errors_seed`` is the
+    seed of these errors.
     """
 
     centre_std_mm: NotNegative = 0.0
@@ -96,28 +97,28 @@ class Printed(Placed, ABC):
 
     @abstractmethod
     def described_target(self) -> Target:
-        """The target without errors; its spacing may have the 32 bits of the renderer."""
+        """Return the target without errors; its spacing may be rounded to single precision, as in the renderer."""
 
     @abstractmethod
     def bounds_mm(self) -> np.ndarray:
-        """Corners (2, 2) of the plate in its own x-y plane: the one with the smallest x and y, and the opposite one."""
+        """Return the corners (2, 2) of the plate with the smallest and the largest x and y, in its own x-y plane."""
 
     @abstractmethod
     def ink_and_gap_reflectance(self) -> tuple[float, float]:
-        """Reflectance of the print's patches with ink and of those without."""
+        """Return the reflectance of printed patches with ink and of patches without."""
 
-    def dimmed(self, scale: float) -> Self:
-        """The same plate with every reflectance multiplied by ``scale``."""
+    def scale_reflectance(self, scale: float) -> Self:
+        """Return the plate with all reflectances multiplied by ``scale``."""
         names = [name for name in type(self).model_fields if name.endswith("reflectance")]
         return self.model_copy(update={name: scale * getattr(self, name) for name in names})
 
 
 class CirclePlate(Printed):
-    """A lattice of circles; three of them carry a dot and mark origin, X and Y.
+    """A lattice of circles; three of them have a dot and mark origin, X and Y.
 
-    The lattice has ``columns`` along x and ``rows`` along y; ``origin`` is the marked origin's column and row, and
-    ``marker_x`` and ``marker_y`` are the offsets (columns, rows) of the other two. The origin circle lies in the
-    plate's middle. ``reflectance`` is the ground's.
+    The lattice has ``columns`` along x and ``rows`` along y. ``origin`` is the column and row of the marked origin, at
+    the plate's centre; ``marker_x`` and ``marker_y`` are the offsets (columns, rows) of the other two dots.
+    ``reflectance`` is that of the background.
     """
 
     kind: Literal["circle_plate"]
@@ -141,17 +142,17 @@ class CirclePlate(Printed):
         return self
 
     def described_target(self) -> Target:
-        """The target without errors; its spacing has the 32 bits of the renderer."""
+        """Return the target without errors; its spacing is rounded to single precision, as in the renderer."""
         lattice = self.model_dump(include=set(CircleTarget.model_fields) - {"kind"})
         spacing = {key: float(np.float32(lattice[key])) for key in ("spacing_x_mm", "spacing_y_mm")}
         return parse_target({"kind": "circles"} | lattice | spacing)
 
     def bounds_mm(self) -> np.ndarray:
-        """Corners (2, 2) of the plate, whose middle is its own origin."""
+        """Return the corners (2, 2) of the plate, which is centred at its own origin."""
         return np.array([(-0.5, -0.5), (0.5, 0.5)]) * (self.width_mm, self.height_mm)
 
     def ink_and_gap_reflectance(self) -> tuple[float, float]:
-        """Reflectance of circles and of dots."""
+        """Return the reflectance of circles and of dots."""
         return self.circle_reflectance, self.marker_reflectance
 
 
@@ -162,9 +163,9 @@ def _parsed(target: Target | Mapping[str, object]) -> Target:
 class TargetPlate(Printed):
     """A calibration target of any kind.
 
-    ``target`` is a description as in a scene's ``[target]``, which is used if it is left out. ``reflectance`` is the
-    ground's, ``ink_reflectance`` that of what is printed on it: dark squares, or circles, which may be brighter than
-    the ground. The plate reaches ``rim_mm`` beyond the print on all sides.
+    ``target`` is a description as in a scene's ``[target]``, which is the default. ``reflectance`` is that of the
+    background and ``ink_reflectance`` that of the print: dark squares, or circles, which may be brighter than the
+    background. The plate extends ``rim_mm`` beyond the print on all sides.
     """
 
     kind: Literal["target_plate"]
@@ -173,16 +174,16 @@ class TargetPlate(Printed):
     rim_mm: NotNegative = 10.0
 
     def described_target(self) -> Target:
-        """The target without errors."""
+        """Return the target without errors."""
         return self.target
 
     def bounds_mm(self) -> np.ndarray:
-        """Corners (2, 2) of the plate: those of the print with the rim around it."""
+        """Return the corners (2, 2) of the plate: the bounds of the print, extended by the rim."""
         boxes = np.array([(p.x_min_mm, p.y_min_mm, p.x_max_mm, p.y_max_mm) for p in self.target.patches()])
         return np.array([boxes[:, :2].min(axis=0) - self.rim_mm, boxes[:, 2:].max(axis=0) + self.rim_mm])
 
     def ink_and_gap_reflectance(self) -> tuple[float, float]:
-        """Reflectance of the ink; without it the ground is seen."""
+        """Return the reflectance of the ink and of the background."""
         return self.ink_reflectance, self.reflectance
 
 
@@ -204,17 +205,16 @@ AnyMotion = Annotated[
     | Annotated[Vehicle, Tag("vehicle")],
     Discriminator(_kind_of_motion),
 ]
-"""A stage's steps, or a platform that ``kind`` names."""
+"""The steps of a stage, or a platform selected by ``kind``."""
 
 
 class Scene(Description):
     """A scene as read from TOML.
 
-    ``placements`` are named poses of the whole set of objects (near, standoff, far); ``placement`` is the one in use.
-    ``medium`` is one of the sensor's; ``water`` replaces what is dissolved and floats in it, by the name of a water or
-    a turbidity from 0 (pure) to 3 (harbour).
-    ``artefact`` and ``target`` are what an operator would note about the things before the sensor: calibrated values,
-    the target's description; they travel in the capture.
+    ``placements`` are named poses of the whole set of objects (near, standoff, far); ``placement`` is the current one.
+    ``medium`` is one of the sensor's media. ``water`` replaces its dissolved and suspended matter, by the name of a
+    water or a turbidity from 0 (pure) to 3 (harbour). ``artefact`` and ``target`` are what an operator would record
+    about the objects (calibrated values, the description of the target); they are stored in the capture.
     """
 
     title: str
@@ -231,7 +231,7 @@ class Scene(Description):
     @model_validator(mode="before")
     @classmethod
     def _targets_described(cls, table: object) -> object:
-        """A target_plate without a description of its own shows the scene's target."""
+        """Use the scene's target for each target_plate without a description."""
         if not isinstance(table, dict) or table.get("target") is None or not isinstance(table.get("objects"), list):
             return table
         objects = list(table["objects"])
@@ -246,11 +246,11 @@ class Scene(Description):
             raise ValueError(f"placement '{self.placement}' is not one of {', '.join(self.placements)}")
         plates = [thing for thing in self.objects if isinstance(thing, Printed)]
         if len(plates) > 1 and any(plate.detection_std_px > 0 for plate in plates):
-            raise ValueError("detection_std_px is for scenes with one target: leave it out, or the other targets")
+            raise ValueError("detection_std_px is for scenes with one target: omit it, or the other targets")
         return self
 
     def object_poses(self) -> list[np.ndarray]:
-        """Transforms (4, 4) from each object's own frame to the scene's."""
+        """Return the transforms (4, 4) from each object's own frame to the scene."""
         whole = self.placements[self.placement].matrix()
         return [whole @ thing.matrix() for thing in self.objects]
 
@@ -263,7 +263,7 @@ def load_scene(
     water: str | float | None = None,
     motion: Motion | Platform | Mapping[str, object] | None = None,
 ) -> Scene:
-    """Scene by name (``spheres``) or path, with what is given in place of its own; a motion may be a table."""
+    """Read a scene by name (``spheres``) or path; the given values replace its own. A motion may be a table."""
     path = find(name_or_path)
     table: dict[str, object] = dict(read_table(path))
     motion = motion.model_dump() if isinstance(motion, Description) else motion
@@ -279,6 +279,6 @@ def load_scene(
 
 
 def _with_paths_from(folder: Path, thing: Table) -> Table:
-    """An object's table with relative paths of mesh and texture starting at a folder."""
+    """Return an object's table with relative paths of mesh and texture resolved from a folder."""
     paths = {key: thing.get(key) for key in ("path", "texture")}
     return thing | {key: str(folder / path) for key, path in paths.items() if isinstance(path, str)}

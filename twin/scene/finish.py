@@ -1,6 +1,6 @@
-"""Finishes of surfaces under water as Mitsuba's BSDFs of all but the mirror image.
+"""Surface finishes under water as Mitsuba BSDFs, without specular mirror reflection.
 
-Patterns of calibration targets are textures that are evaluated exactly: a bitmap's texels would blur the edges.
+Patterns of calibration targets are textures that are evaluated exactly: the texels of a bitmap would blur their edges.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from twin.backend.arrays import Bool, Float, SurfaceInteraction3f, to_jit
-from twin.scene.description import AnyObject, Flat, Placed, Printed
+from twin.scene.description import AnyObject, FlatObject, Printed, SceneObject
 from uwlts.errors import DescriptionError, ImageError
 from uwlts.model.media import check_range
 from uwlts.storage.image_file import read_image
 
 _LUMINANCE = np.array([0.0722, 0.7152, 0.2126], np.float32)
-"""Of blue, green and red, linear: ITU-R BT.709-6, item 3.2."""
+"""Weights of linear blue, green and red: ITU-R BT.709-6, item 3.2."""
 _SHIFT = "point_shift_mm"
 _CELLS_PER_PATCH = 9
-"""Cells of the grid that lists the patches near a place: so many that one reaches no two of a target's circles."""
+"""Number of grid cells per patch: enough that no cell overlaps two circles of a target."""
 _PATCH_VALUES = 8
-"""Columns of the table of patches, the last two unused: values are read by fours."""
+"""Columns of the table of patches; the last two are padding, as values are read in groups of four."""
 _ROUNDING_MM = 1e-3
-"""Places on a plate of 1 m are rounded by less than this in 32 bits."""
+"""Bound of the single-precision rounding error of positions on a plate of 1 m."""
 COAT_INDEX = {"painted": 1.50, "pvc": 1.54}
-"""Relative to air: an alkyd or acrylic binder, and rigid PVC."""
+"""Refractive indices in air of an alkyd or acrylic binder, and of rigid PVC."""
 
 # Wavelength in nm, n and k of iron at room temperature: Johnson and Christy 1974, Phys. Rev. B 9:5056.
 _IRON = np.array(
@@ -52,9 +52,9 @@ _IRON = np.array(
 
 
 def iron_index(*, wavelength_nm: float) -> complex:
-    """Refractive index n + i k of iron, for steel, relative to air; linear between the table's wavelengths.
+    """Return the refractive index n + i k of iron, for steel, in air; interpolated linearly.
 
-    RangeError where the wavelength lies outside the table's visible part.
+    RangeError if the wavelength is outside the visible part of the table.
     """
     wavelength, n, k = _IRON
     source = "the table of Johnson and Christy (1974)"
@@ -62,15 +62,15 @@ def iron_index(*, wavelength_nm: float) -> complex:
     return complex(np.interp(wavelength_nm, wavelength, n), np.interp(wavelength_nm, wavelength, k))
 
 
-def finish_bsdf(thing: Placed, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> mi.BSDF:
-    """BSDF of an object in a medium, without its mirror share.
+def finish_bsdf(thing: SceneObject, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> mi.BSDF:
+    """Return the BSDF of an object in a medium, without its mirror reflection.
 
-    Without ``gloss`` everything is diffuse: a body without its coat, and a metal with the reflectance |(m - 1) /
-    (m + 1)|^2 of its smooth face at normal incidence (Fresnel). DescriptionError where the texture is missing,
-    unreadable, or its values lie outside 0 to 1; RangeError where the wavelength lies outside the table of iron.
+    Without ``gloss`` all surfaces are diffuse: a body without its coat, and a metal with the reflectance |(m - 1) / (m
+    + 1)|^2 of its smooth surface at normal incidence (Fresnel). DescriptionError if the texture is missing, unreadable,
+    or has values outside 0 to 1; RangeError if the wavelength is outside the table of iron.
     """
     if gloss and thing.finish != "diffuse":
-        return _glossy(thing, _reflectance(thing), medium_index=medium_index, wavelength_nm=wavelength_nm)
+        return _make_glossy(thing, _reflectance(thing), medium_index=medium_index, wavelength_nm=wavelength_nm)
     scale = 1.0
     if thing.finish == "metal":
         index = iron_index(wavelength_nm=wavelength_nm) / medium_index
@@ -78,8 +78,10 @@ def finish_bsdf(thing: Placed, *, medium_index: float, wavelength_nm: float, glo
     return mi.load_dict({"type": "diffuse", "reflectance": _reflectance(thing, scale)})
 
 
-def _glossy(thing: Placed, reflectance: float | mi.Texture, *, medium_index: float, wavelength_nm: float) -> mi.BSDF:
-    """A metal or coated body of a given reflectance; indices are those relative to the medium around it."""
+def _make_glossy(
+    thing: SceneObject, reflectance: float | mi.Texture, *, medium_index: float, wavelength_nm: float
+) -> mi.BSDF:
+    """Return the BSDF of a metal or coated body; indices are relative to the surrounding medium."""
     rough = {"distribution": "ggx", "alpha": thing.gloss_alpha()}
     if thing.finish == "metal":
         index = iron_index(wavelength_nm=wavelength_nm) / medium_index
@@ -89,24 +91,24 @@ def _glossy(thing: Placed, reflectance: float | mi.Texture, *, medium_index: flo
     return mi.load_dict(coat | rough | {"diffuse_reflectance": reflectance})
 
 
-def _reflectance(thing: Placed, scale: float = 1.0) -> float | mi.Texture:
-    """Reflectance of an object, a number or a texture, times ``scale``."""
+def _reflectance(thing: SceneObject, scale: float = 1.0) -> float | mi.Texture:
+    """Return the reflectance of an object, a number or a texture, multiplied by ``scale``."""
     if isinstance(thing, Printed):
-        return pattern_texture(thing.dimmed(scale))
+        return pattern_texture(thing.scale_reflectance(scale))
     if thing.texture is None:
         return scale * thing.reflectance
-    # Texture coordinates count v upwards from a picture's last row; Mitsuba counts its rows from the first.
+    # Texture coordinate v starts at the last row of the picture, but Mitsuba's rows start at the first.
     grey = scale * thing.reflectance * read_grey(thing.texture)[::-1]
     picture = mi.Bitmap(np.ascontiguousarray(grey[..., None], dtype=np.float32))
-    wrap_mode = "clamp" if isinstance(thing, Flat) else "repeat"
+    wrap_mode = "clamp" if isinstance(thing, FlatObject) else "repeat"
     return mi.load_dict({"type": "bitmap", "bitmap": picture, "raw": True, "wrap_mode": wrap_mode})
 
 
 def read_grey(path: str | Path) -> np.ndarray:
-    """Grey values (H, W) of a picture, full scale as 1, taken as they are: they are linear, not gamma-coded.
+    """Read the grey values (H, W) of a picture, relative to full scale and without gamma correction.
 
-    Colours count as their luminance (ITU-R BT.709). DescriptionError where the file is missing, damaged, or no PNG,
-    JPEG, TIFF or BMP of 8 or 16 bit without transparency.
+    Colours are converted to luminance (ITU-R BT.709). DescriptionError if the file is missing, damaged, or not a PNG,
+    JPEG, TIFF or BMP of 8 or 16 bits without transparency.
     """
     try:
         picture = read_image(Path(path))
@@ -117,11 +119,11 @@ def read_grey(path: str | Path) -> np.ndarray:
 
 
 def directional_albedo(bsdf: mi.BSDF, cosines: np.ndarray, *, samples: int = 4096) -> np.ndarray:
-    """Share (N,) of light from a direction that a surface scatters into its hemisphere, for cosines (N,) to the normal.
+    """Return the directional-hemispherical reflectance (N,) of a surface for cosines (N,) of the incidence angle.
 
-    As BSDFs are reciprocal, it is also the radiance towards that direction under a sky of radiance 1 all around. The
-    integral is the mean of Mitsuba's sample weights over a rank-1 lattice with the golden ratio's generalisation
-    (Roberts 2018), good to 1e-3.
+    As BSDFs are reciprocal, it is also the radiance towards that direction under a uniform sky of radiance 1. The
+    integral is the mean of Mitsuba's sample weights over a rank-1 lattice with the generalised golden ratio (Roberts
+    2018), accurate to 1e-3.
     """
     index = dr.arange(mi.UInt32, len(cosines) * samples)
     sample = cast(Float, mi.Float(index % samples))
@@ -135,40 +137,42 @@ def directional_albedo(bsdf: mi.BSDF, cosines: np.ndarray, *, samples: int = 409
 
 
 def albedo_parts(
-    thing: Placed, cosines: np.ndarray, *, medium_index: float, wavelength_nm: float
+    thing: SceneObject, cosines: np.ndarray, *, medium_index: float, wavelength_nm: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Directional albedo (N,) of a glossy finish over a black body, and what a unit of Mitsuba's reflectance adds.
+    """Return the directional albedo (N,) of a glossy finish over a black body, and its increase per unit reflectance.
 
-    The albedo of coated bodies and of metals is linear in ``reflectance``, so the two give it for textures too.
+    The albedo of coated bodies and of metals is linear in ``reflectance``, so the two parts apply to textures too.
     """
-    black, white = (_glossy(thing, grey, medium_index=medium_index, wavelength_nm=wavelength_nm) for grey in (0.0, 1.0))
-    # A metal does not have a diffuse reflectance; Mitsuba returns pi times its BSDF at normal incidence instead.
-    square = square_on(dr.zeros(mi.SurfaceInteraction3f))
+    black, white = (
+        _make_glossy(thing, grey, medium_index=medium_index, wavelength_nm=wavelength_nm) for grey in (0.0, 1.0)
+    )
+    # For a metal, without diffuse reflectance, Mitsuba returns pi times its BSDF at normal incidence.
+    square = view_along_normal(dr.zeros(mi.SurfaceInteraction3f))
     unit = float(cast(Float, white.eval_diffuse_reflectance(square))[0][0])
     without = directional_albedo(black, cosines)
     return without, (directional_albedo(white, cosines) - without) / unit
 
 
-def square_on(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
-    """The same places seen along their normals from outside."""
+def view_along_normal(si: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+    """Return the same surface points viewed along their normals from outside."""
     straight = mi.SurfaceInteraction3f(si)
     straight.wi = mi.Vector3f(0.0, 0.0, 1.0)
     return straight
 
 
 def pattern_texture(plate: Printed) -> mi.Texture:
-    """Reflectance of a printed plate, for a variant with `register_pattern`."""
+    """Return the texture of a printed plate; `register_pattern` must have been called for the variant."""
     return mi.load_dict({"type": "target_pattern", "plate": plate.model_dump_json()})
 
 
 def register_pattern() -> None:
-    """Make the texture ``target_pattern`` known to the selected Mitsuba variant."""
+    """Register the texture ``target_pattern`` with the selected Mitsuba variant."""
 
     class TargetPattern(mi.Texture):
-        """Reflectance of a printed plate whose uv run from 0 to 1 over its bounds.
+        """Reflectance of a printed plate whose uv coordinates run from 0 to 1 over its bounds.
 
-        At each place the print is shifted by the error of the nearest point of the target. Points are taken to lie on
-        a lattice along x and y.
+        The print is shifted locally by the error of the nearest target point. Points are assumed to be on a lattice
+        along x and y.
         """
 
         def __init__(self, props: mi.Properties):
@@ -179,7 +183,7 @@ def register_pattern() -> None:
             self.points_end = target.indices.max(axis=0).tolist()
             corner, beside = target.points_at(np.array([(0, 0), (1, 1)]))[:, :2]
             self.corner_point, self.spacing = corner.tolist(), (beside - corner).tolist()
-            self.shift_mm = to_jit(mi.Float, printed_shifts(self.plate).ravel())
+            self.shift_mm = to_jit(mi.Float, draw_print_errors(self.plate).ravel())
             patches = _patch_table(self.plate)
             lists, self.cell_mm = _patches_by_cell(patches, first, last)
             self.rows, self.columns, self.depth = lists.shape
@@ -211,7 +215,7 @@ def register_pattern() -> None:
             start = 2 * mi.UInt32((row * self.columns + column) * self.depth)
             value = mi.Float(self.plate.reflectance)
             for k in range(self.depth):
-                # Values that lie side by side are read together, which takes a quarter of the time.
+                # Adjacent values are read together, in a quarter of the time.
                 middle_x, middle_y, half_width, aspect = dr.gather(mi.Vector4f, self.patches, start + 2 * k, active)
                 is_round, reflectance, _, _ = dr.gather(mi.Vector4f, self.patches, start + 2 * k + 1, active)
                 u, v = x - middle_x, aspect * (y - middle_y)
@@ -233,7 +237,10 @@ def register_pattern() -> None:
 
 
 def _patch_table(plate: Printed) -> np.ndarray:
-    """Middle, half width, width over height, roundness and reflectance (N + 1, 8) of patches; the last is never hit."""
+    """Return centre, half width, aspect ratio, roundness and reflectance (N + 1, 8) of patches.
+
+    The last row is a patch that is never hit.
+    """
     ink, gap = plate.ink_and_gap_reflectance()
     patches = plate.described_target().patches()
     low, high = (
@@ -248,9 +255,9 @@ def _patch_table(plate: Printed) -> np.ndarray:
 
 
 def _patches_by_cell(patches: np.ndarray, first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, float]:
-    """Numbers (rows, columns, depth) of the patches that reach into each cell of a grid, and the cells' side in mm.
+    """Return indices (rows, columns, depth) of the patches that overlap each grid cell, and the cell size in mm.
 
-    They are in the order of printing; lists are filled up with the patch that is never hit.
+    They are in printing order; lists are padded with the patch that is never hit.
     """
     middle, half = patches[:-1, :2], patches[:-1, 2:3] / np.column_stack([np.ones(len(patches) - 1), patches[:-1, 3]])
     cell_mm = float(np.sqrt(np.prod(last - first) / (_CELLS_PER_PATCH * len(middle))))
@@ -268,21 +275,21 @@ def _patches_by_cell(patches: np.ndarray, first: np.ndarray, last: np.ndarray) -
     return lists.reshape(rows, columns, -1), cell_mm
 
 
-def printed_shifts(plate: Printed) -> np.ndarray:
-    """Offsets (rows, columns, 2) in mm of a target's points from where they are described, along x and y."""
+def draw_print_errors(plate: Printed) -> np.ndarray:
+    """Return the print errors (rows, columns, 2) in mm of a target's points along x and y."""
     return plate.centre_std_mm * _standard_normal(plate, 0)
 
 
 def shift_points(scene: mi.Scene, plate: Printed, *, mm_per_px: float, image: int) -> None:
-    """Move the points of a scene's only target to where they lie in one image, detection errors included."""
+    """Shift the points of a scene's only target by their print errors and their detection errors in one image."""
     noise = mm_per_px * plate.detection_std_px * _standard_normal(plate, 1, image)
     parameters = mi.traverse(scene)
     (key,) = (key for key in dict(parameters) if key.endswith(_SHIFT))
-    parameters[key] = to_jit(mi.Float, (printed_shifts(plate) + noise).ravel())
+    parameters[key] = to_jit(mi.Float, (draw_print_errors(plate) + noise).ravel())
     parameters.update()
 
 
 def _standard_normal(plate: Printed, *stream: int) -> np.ndarray:
-    """Random numbers (rows, columns, 2) for the errors of a target's points."""
+    """Return random numbers (rows, columns, 2) for the errors of a target's points."""
     columns, rows = plate.described_target().indices.max(axis=0) + 1
     return np.random.default_rng([plate.errors_seed, *stream]).standard_normal((rows, columns, 2))

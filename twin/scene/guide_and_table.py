@@ -7,19 +7,20 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
-from twin.scene.placed import Pose
-from twin.scene.platforms import SPOT_MM, Carried, Platform, Route, displaced
+from twin.scene.platforms import SPOT_MM, Platform, PlatformMotion, Route, displace_poses
+from twin.scene.scene_object import Pose
 from uwlts.model.sensor import NotNegative, Positive
 
 
 class LinearGuide(Route):
     """A linear guide from the first to the last waypoint, with the error motions of ISO 230-1:2012, 3.4.
 
-    They are ranges over the travel, in um of the carriage (the platform's origin) and in arcsec of its rotation:
-    ``positioning_um`` (EXX) along the guide, ``straightness_um`` across it (EYX) and square to both (EZX), ``roll``,
-    ``pitch`` and ``yaw`` (EAX, EBX, ECX); X is the guide's axis and Z as near the scene's Z as can be. Each is a sum of
-    waves of 1 to 4 periods over the travel, as bent rails make. ``periodic_um`` is the amplitude of what a screw of
-    ``pitch_mm`` adds to EXX. The encoder reports the nominal place.
+    Error motions are ranges over the travel, in um of the carriage (the platform's origin) and in arcsec of its
+    rotation. X is the guide's axis, and Z is as close to the scene's Z as possible. ``positioning_um`` (EXX) is along
+    the guide and ``straightness_um`` is across it (EYX) and perpendicular to both (EZX); ``roll``, ``pitch`` and
+    ``yaw`` are EAX, EBX, ECX. Each is a sum of waves of 1 to 4 periods over the travel, as bent rails cause. A screw of
+    ``pitch_mm`` adds a periodic error with the amplitude ``periodic_um`` to EXX. The encoder reports the nominal
+    position.
     """
 
     kind: Literal["linear_guide"]
@@ -35,10 +36,10 @@ class LinearGuide(Route):
     def _is_straight(self) -> "LinearGuide":
         places = np.array([waypoint.position_mm for waypoint in self.waypoints])
         if len(places) < 2 or np.linalg.norm(places[-1] - places[0]) < SPOT_MM:
-            raise ValueError("a linear guide needs two waypoints or more, the last away from the first")
+            raise ValueError("a linear guide needs two or more waypoints; the last must differ from the first")
         return self
 
-    def carried(self, rng: np.random.Generator) -> Carried:
+    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
         commanded = self.commanded()
         first, last = (self.waypoints[end].matrix()[:3, 3] for end in (0, -1))
         travel = float(np.linalg.norm(last - first))
@@ -53,19 +54,21 @@ class LinearGuide(Route):
             along = (poses[:, :3, 3] - begun) @ guide[:, 0]
             errors = np.stack([bend(along / travel) for bend in bends], axis=1)
             errors[:, 0] += 1e-3 * self.periodic_um * np.sin(2 * np.pi * along / self.pitch_mm + phase)
-            return displaced(poses, np.hstack([errors[:, :3] @ guide.T, errors[:, 3:] @ guide.T]))
+            return displace_poses(poses, np.hstack([errors[:, :3] @ guide.T, errors[:, 3:] @ guide.T]))
 
-        return Carried(true, commanded)
+        return PlatformMotion(true, commanded)
 
 
 class RotaryTable(Platform):
-    """A rotary table on which the scene's objects stand, seen from them: the sensor turns the other way round.
+    """A rotary table that carries the scene's objects, in their frame: the sensor rotates in the opposite sense.
 
-    The platform's frame lies in ``axis`` at angle 0, its z axis along the table's; ``true_axis`` is where the table
-    truly turns. Images are taken at ``count`` angles from ``start_deg`` over ``turn_deg``, at rest or at
-    ``speed_deg_per_s``. The error motions of the axis (ISO 230-7:2015) are amplitudes at one turn, with a third of
-    them at two: ``radial_um`` (EXC, EYC), ``axial_um`` (EZC) and the wobble ``tilt_arcsec`` (EAC, EBC); the scale is
-    wrong by ``angle_arcsec`` (ECC), as a graduation is that sits eccentrically. The table reports its angle.
+    The platform's frame is ``axis`` at angle 0, with z along the table's axis; ``true_axis`` is the true axis of
+    rotation. Images are taken at ``count`` angles from ``start_deg`` over ``turn_deg``, at rest or at
+    ``speed_deg_per_s``. The table reports its angle.
+
+    The error motions of the axis (ISO 230-7:2015) are amplitudes at one cycle per turn, with a third of them at two
+    cycles: ``radial_um`` (EXC, EYC), ``axial_um`` (EZC) and the wobble ``tilt_arcsec`` (EAC, EBC). The error of the
+    scale is ``angle_arcsec`` (ECC), as caused by an eccentric graduation.
     """
 
     kind: Literal["rotary_table"]
@@ -83,7 +86,7 @@ class RotaryTable(Platform):
     @model_validator(mode="before")
     @classmethod
     def _paced(cls, table: object) -> object:
-        """The rate of images follows from speed and angles."""
+        """Derive the frame rate from speed and angles."""
         if not isinstance(table, dict) or not table.get("speed_deg_per_s") or table.get("frame_rate_hz") is not None:
             return table
         steps = max(int(table.get("count", 2)) - 1, 1)
@@ -97,7 +100,7 @@ class RotaryTable(Platform):
     def places(self) -> int:
         return self.count
 
-    def carried(self, rng: np.random.Generator) -> Carried:
+    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
         nominal, true_axis = self.axis.matrix(), (self.true_axis or self.axis).matrix()
         sizes = np.array([self.radial_um, self.radial_um, self.axial_um]) * 1e-3
         tilt, scale = np.radians(self.tilt_arcsec / 3600), np.radians(self.angle_arcsec / 3600)
@@ -114,7 +117,7 @@ class RotaryTable(Platform):
             local = np.tile(np.eye(4), (len(by), 1, 1))
             local[:, :3, :3] = Rotation.from_rotvec(np.outer(-by, (0, 0, 1))).as_matrix()
             if errors is not None:
-                # The table with the objects errs in the frame in which the axis stands still.
+                # The error motion of the table with the objects, in the frame of the fixed axis.
                 table = np.tile(np.eye(4), (len(by), 1, 1))
                 table[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix()
                 table[:, :3, 3] = errors[:, :3]
@@ -126,11 +129,11 @@ class RotaryTable(Platform):
             waves = np.sin(by[:, None, None] * (1, 2) + phases) @ (1, 1 / 3)
             return turned(true_axis, by, waves * (*sizes, tilt, tilt, scale))
 
-        return Carried(true, lambda times: turned(nominal, angle(times), None))
+        return PlatformMotion(true, lambda times: turned(nominal, angle(times), None))
 
 
 def _axes(along: np.ndarray) -> np.ndarray:
-    """Axes (3, 3), in columns, of a frame with x along a direction and z as near the scene's as can be."""
+    """Return axes (3, 3), in columns, with x along a direction and z as close to the scene's Z as possible."""
     up = np.array([0.0, 0.0, 1.0]) if abs(along[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
     across = np.cross(up, along)
     across /= np.linalg.norm(across)
@@ -138,7 +141,10 @@ def _axes(along: np.ndarray) -> np.ndarray:
 
 
 def _bend(size: float, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
-    """An error motion of a range over the share of the travel from 0 to 1: waves of 1 to 4 periods, falling as 1/n."""
+    """Return an error motion over the travelled fraction, 0 to 1, with a given range.
+
+    It consists of waves of 1 to 4 periods with amplitudes that decrease as 1/n.
+    """
     orders = np.arange(1, 5)
     weights, phases = rng.standard_normal(4) / orders, rng.uniform(0, 2 * np.pi, 4)
 

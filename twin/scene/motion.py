@@ -1,4 +1,4 @@
-"""Motion of a sensor before a scene: poses, the steps of a linear stage, and the images that are taken on the way."""
+"""Motion of a sensor in a scene: steps of a linear stage, and the images taken along them."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -13,13 +13,12 @@ Light = Literal["lamp", "laser", "day"]
 
 
 class Motion(Description):
-    """Steps of a linear stage that moves the sensor: ``count`` of them from ``start_mm``, by ``step_mm``.
+    """Steps of a linear stage that moves the sensor: ``count`` positions from ``start_mm`` in steps of ``step_mm``.
 
-    ``direction`` is where the stage truly carries the sensor; the capture records ``nominal_direction``. At every
-    position the images in ``lights`` are taken in turn, those with the laser at every multiple of its exposure in
-    ``bracket``. ``position_errors_mm`` is how much farther than recorded the stage truly stands at each position, 0
-    unless given. ``speed_mm_per_s`` is how fast the stage moves along
-    ``direction`` while an image is exposed; at 0 it stands still.
+    ``direction`` is the true direction of travel; the capture records ``nominal_direction``. At every position, the
+    images in ``lights`` are taken in turn, those with the laser at every exposure factor in ``bracket``.
+    ``position_errors_mm`` is the true minus the recorded position (default: 0). ``speed_mm_per_s`` is the speed of the
+    stage along ``direction`` during an exposure, 0 if it stops.
     """
 
     start_mm: float = 0.0
@@ -48,17 +47,17 @@ class Motion(Description):
         return self
 
     def unit_direction(self) -> np.ndarray:
-        """True unit direction (3,) of the sensor's travel in the scene."""
+        """Return the true unit direction (3,) of the sensor's travel in the scene."""
         return np.array(self.direction) / np.linalg.norm(self.direction)
 
     def recorded_direction(self) -> tuple[float, float, float]:
-        """Unit direction that the capture states."""
+        """Return the unit direction that the capture records."""
         vector = np.array(self.nominal_direction or self.direction)
         x, y, z = (vector / np.linalg.norm(vector)).tolist()
         return x, y, z
 
     def shots(self) -> Iterator["Shot"]:
-        """Every image of the scan in its order."""
+        """Yield all images of the scan in order."""
         for index in range(self.count):
             stage_mm = self.start_mm + index * self.step_mm
             error = self.position_errors_mm[index] if self.position_errors_mm else 0.0
@@ -67,11 +66,11 @@ class Motion(Description):
                     yield Shot(stage_mm=stage_mm, travelled_mm=stage_mm + error, light=light, exposure=exposure)
 
     def moves(self) -> bool:
-        """Whether the sensor moves while it exposes."""
+        """Return whether the sensor moves during exposures."""
         return self.speed_mm_per_s > 0
 
     def images(self) -> int:
-        """Number of images of the scan."""
+        """Return the number of images of the scan."""
         laser = self.lights.count("laser")
         return self.count * (len(self.lights) + laser * (len(self.bracket) - 1))
 
@@ -80,8 +79,9 @@ class Motion(Description):
 class Shot:
     """One image to take.
 
-    Recorded and true position of the stage in mm, the light that is on beside the day's, and the multiple of its
-    exposure; on another platform the way of the sensor so far, and the time in s from the first image on.
+    ``stage_mm`` and ``travelled_mm`` are the recorded and the true position of the stage; on other platforms,
+    ``travelled_mm`` is the path length of the sensor and ``time_s`` the time since the first image. ``light`` is on in
+    addition to daylight; ``exposure`` multiplies the exposure time.
     """
 
     stage_mm: float

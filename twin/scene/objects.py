@@ -1,4 +1,4 @@
-"""The objects of a scene as shapes of one static Mitsuba scene; frames differ only in where the sensor stands."""
+"""The objects of a scene as shapes of one static Mitsuba scene; frames differ only in the sensor's pose."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ import trimesh
 
 from twin.backend.arrays import Bool, Float, Int32, SurfaceInteraction3f, UInt32, scalar_transform, to_jit
 from twin.scene.description import AnyObject, Block, CirclePlate, Mesh, Pipe, Plate, Scene, Sphere, TargetPlate
-from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, square_on
+from twin.scene.finish import albedo_parts, finish_bsdf, register_pattern, view_along_normal
 from twin.scene.forms.triangles import bowed_plate
-from twin.scene.placed import FreeForm
+from twin.scene.scene_object import FreeForm
 from uwlts.errors import DescriptionError
 from uwlts.files.reading import require_regular_file
 
 _MOST_MESH_BYTES = 2**28
-"""Five million triangles of a binary STL file."""
+"""Size of a binary STL file with five million triangles."""
 _FACING_SENSOR = np.diag([1.0, -1.0, -1.0, 1.0])
 _BLOCK_FACES = [np.roll(np.eye(3), shift, axis=1) @ np.diag([1, sign, sign]) for shift in range(3) for sign in (1, -1)]
-"""Right-handed axes (3, 3) of a block's faces, the third one pointing outwards."""
+"""Right-handed axes (3, 3) of a block's faces; the third one is the outward normal."""
 _CYLINDER_AXIS_TO_X = np.array([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
-# At a cosine of 0 no light is sampled; the albedo's limit there is that of a small one.
+# At a cosine of 0 no light is sampled: use the albedo at a small cosine instead.
 _ALBEDO_COSINES = np.maximum(np.linspace(0.0, 1.0, 65), 1e-3)
 
 
 @dataclass(frozen=True)
 class MirrorFace:
-    """A flat face that reflects ``share`` of the light as a mirror does.
+    """A flat face with the specular reflectance ``share``.
 
-    ``pose`` (4, 4) takes the face's frame to the scene's: origin in the face's middle, z along its outward normal, x
-    and y along its sides, of which ``half_size_mm`` (2,) are the halves.
+    ``pose`` (4, 4) transforms from the face's frame to the scene. The origin is the centre of the face, z its outward
+    normal, and x and y its sides with the half lengths ``half_size_mm`` (2,).
     """
 
     pose: np.ndarray
@@ -44,12 +44,12 @@ class MirrorFace:
 
 @dataclass(frozen=True)
 class Objects:
-    """All objects in scene coordinates, with properties of the places hit that Mitsuba's shapes do not provide.
+    """All objects in scene coordinates, with surface properties that Mitsuba's shapes do not provide.
 
-    ``scene`` holds what scatters light; ``mirrors`` are the faces that reflect beside that. Tables give a fact of each
-    shape at its number in Dr.Jit's registry, which counts through all scenes of the process. With ``coherent``, rays
-    that lie side by side are faster followed together: among facets, not among spheres and cylinders. ``glossy`` says
-    whether any object's albedo depends on the direction.
+    ``scene`` contains what scatters light and ``mirrors`` the specular faces. Tables list a property of each shape at
+    its number in Dr.Jit's registry, which is common to all scenes of the process. ``coherent`` is True if adjacent rays
+    are traced faster together, as for meshes but not for spheres and cylinders. ``glossy`` is True if the albedo of any
+    object depends on direction.
     """
 
     scene: mi.Scene
@@ -59,30 +59,30 @@ class Objects:
     _facts: dict[str, Float]
 
     def mirror_share(self, si: SurfaceInteraction3f) -> Float:
-        """Share of light that the place hit reflects as a mirror; 0 on backs and where nothing is hit."""
+        """Return the specular reflectance at surface points; 0 on back sides and without a hit."""
         return dr.select(si.wi.z > 0, self._fact("mirror", si), 0.0)
 
     def polarisation(self, si: SurfaceInteraction3f) -> Float:
-        """Degree of polarisation of laser light that the object hit scatters, 0 where nothing is hit."""
+        """Return the degree of polarisation of laser light scattered by the objects hit; 0 without a hit."""
         return self._fact("polarisation", si)
 
     def roughness_um(self, si: SurfaceInteraction3f) -> Float:
-        """Rms height of the object hit, 0 where nothing is hit."""
+        """Return the rms height of the objects hit; 0 without a hit."""
         return self._fact("roughness_um", si)
 
     def number(self, shape: mi.ShapePtr, active: Bool) -> Int32:
-        """Number of the object of a shape among the scene's objects, -1 where not ``active``."""
+        """Return the index of the objects that shapes belong to; -1 where not ``active``."""
         number = dr.gather(mi.Float, self._facts["number"], _registry_number(shape), active)
         return dr.select(active, mi.Int32(number), -1)
 
     def albedo(self, si: SurfaceInteraction3f, active: Bool = True) -> Float:
-        """Radiance towards the viewer from surfaces under a sky of radiance 1 all around, mirror images aside.
+        """Return the radiance of surfaces under a uniform sky of radiance 1, without mirror images.
 
-        It is the share of light from the viewer's direction that the surface scatters: a diffuse surface's reflectance;
-        of a gloss it depends on the direction. 0 on the back of surfaces that have only a front.
+        It equals the fraction of light from the viewer's direction that the surface scatters: the reflectance of a
+        diffuse surface; for glossy surfaces it depends on direction. It is 0 on the back of one-sided surfaces.
         """
         active = active & si.is_valid() & ((si.wi.z > 0) | (self._fact("two_sided", si) > 0))
-        reflectance = si.bsdf().eval_diffuse_reflectance(square_on(si), active)[0]
+        reflectance = si.bsdf().eval_diffuse_reflectance(view_along_normal(si), active)[0]
         if not self.glossy:
             return dr.select(active, reflectance, 0.0)
         last = len(_ALBEDO_COSINES) - 1
@@ -104,10 +104,10 @@ class Objects:
 
 
 def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gloss: bool = True) -> Objects:
-    """All objects of a scene in a medium, seen in the laser's light; without ``gloss`` diffuse and without mirrors.
+    """Build all objects of a scene in a medium for the laser's wavelength; without ``gloss`` diffuse, without mirrors.
 
-    DescriptionError where a mesh or texture file is missing, unreadable or empty; RangeError where the wavelength lies
-    outside the table of a metal.
+    DescriptionError if a mesh or texture file is missing, unreadable or empty; RangeError if the wavelength is outside
+    the table of a metal.
     """
     register_pattern()
     optics = {"medium_index": medium_index, "wavelength_nm": wavelength_nm}
@@ -129,8 +129,8 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
         "albedo_black": [black for black, _ in parts],
         "albedo_per_unit": [per_unit for _, per_unit in parts],
     }
-    # Optimised, Mitsuba would merge meshes of equal BSDF into one shape, whatever else differs between the objects.
-    # Embree's faster test lets one ray in some ten thousand slip through the seam between two facets.
+    # With optimisation, Mitsuba would merge meshes of equal BSDF into one shape. Without robust intersections, one ray
+    # in about ten thousand would pass through the edge between two facets.
     whole = {"type": "scene", "embree_use_robust_intersections": True}
     whole = mi.load_dict(whole | {f"object_{i}": shape for i, shape in enumerate(shapes)}, optimize=False)
     return Objects(
@@ -143,12 +143,12 @@ def build_objects(scene: Scene, *, medium_index: float, wavelength_nm: float, gl
 
 
 def _registry_number(shape: mi.ShapePtr) -> UInt32:
-    """Numbers of shapes in Dr.Jit's registry."""
+    """Return the numbers of shapes in Dr.Jit's registry."""
     return cast(Any, dr.reinterpret_array(mi.UInt32, shape))
 
 
 def _by_registry(shapes: list[mi.Shape], values: np.ndarray) -> Float:
-    """Values (objects,) or (objects, N) at the places of the objects' shapes in Dr.Jit's registry."""
+    """Arrange values (objects,) or (objects, N) by the shapes' numbers in Dr.Jit's registry."""
     number = [int(_registry_number(mi.ShapePtr(shape))[0]) for shape in shapes]
     table = np.zeros((max(number) + 1, *values.shape[1:]), np.float32)
     table[number] = values
@@ -158,12 +158,12 @@ def _by_registry(shapes: list[mi.Shape], values: np.ndarray) -> Float:
 
 
 def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
-    """An object at its pose (4, 4) in the scene."""
+    """Return the shape of an object at its pose (4, 4) in the scene."""
     match thing:
         case Sphere():
             matrix = pose.copy()
             if thing.texture is None:
-                matrix[:3, :3] = np.eye(3)  # Mitsuba takes a turned sphere's rounding for shear
+                matrix[:3, :3] = np.eye(3)  # Mitsuba mistakes rounding errors of a rotated sphere for shear
             matrix, kind = matrix @ _scaled(*[thing.diameter_mm / 2] * 3), "sphere"
         case Block():
             matrix, kind = pose @ _scaled(*(side / 2 for side in thing.size_mm)), "cube"
@@ -188,7 +188,7 @@ def _shape(thing: AnyObject, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Shape:
 
 
 def _mesh(thing: Mesh | FreeForm | CirclePlate | TargetPlate, pose: np.ndarray, bsdf: mi.BSDF) -> mi.Mesh:
-    """A surface of triangles with its vertices already in scene coordinates."""
+    """Return a triangle mesh with its vertices in scene coordinates."""
     vertices, faces, uv = _surface(thing)
     vertices = vertices @ pose[:3, :3].T + pose[:3, 3]
     properties = mi.Properties()
@@ -204,7 +204,7 @@ def _mesh(thing: Mesh | FreeForm | CirclePlate | TargetPlate, pose: np.ndarray, 
 
 
 def _surface(thing: Mesh | FreeForm | CirclePlate | TargetPlate) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Vertices (V, 3) in the object's own frame, faces (F, 3) and, if it has them, texture coordinates (V, 2)."""
+    """Return vertices (V, 3) in the object's own frame, faces (F, 3), and texture coordinates (V, 2) or None."""
     match thing:
         case FreeForm():
             return *thing.surface(), None
@@ -217,18 +217,18 @@ def _surface(thing: Mesh | FreeForm | CirclePlate | TargetPlate) -> tuple[np.nda
 
 
 def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """Vertices (V, 3), faces (F, 3) and, if every part has them, texture coordinates (V, 2) of all parts of a file.
+    """Read vertices (V, 3), faces (F, 3) and, if every part has them, texture coordinates (V, 2) of a mesh file.
 
-    The parts are joined here, as trimesh copies their materials to join them, which needs an imaging library.
+    Parts are concatenated here: trimesh would copy their materials, for which it needs an imaging library.
     """
     path = thing.path
     require_regular_file(path, most_bytes=_MOST_MESH_BYTES, error=DescriptionError, called="mesh")
     try:
         loaded = trimesh.load(path, force="scene")
-    # trimesh passes on whatever its readers of two dozen formats stumble over.
+    # trimesh passes on any exception of its many readers.
     except Exception as error:
         raise DescriptionError(f"trimesh cannot read {path}: {error}") from error
-    assert isinstance(loaded, trimesh.Scene)  # as it was forced to be
+    assert isinstance(loaded, trimesh.Scene)  # by force="scene"
     vertices, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0
     uv: list[np.ndarray | None] = [np.zeros((0, 2))]
     for node in loaded.graph.nodes_geometry:
@@ -242,27 +242,27 @@ def _surface_from_file(thing: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray 
             count += len(part.vertices)
     corners, triangles = np.concatenate(vertices), np.concatenate(faces)
     if len(triangles) == 0 or not np.isfinite(corners).all():
-        raise DescriptionError(f"{path} holds no usable surface: {len(triangles)} faces")
+        raise DescriptionError(f"{path} contains no usable surface: {len(triangles)} faces")
     known = [coordinates for coordinates in uv if coordinates is not None]
     everywhere = len(known) == len(uv)
     if thing.texture is not None and not everywhere:
-        raise DescriptionError(f"{path} has no texture coordinates for {thing.texture}: add them, or leave it out")
+        raise DescriptionError(f"{path} has no texture coordinates for {thing.texture}: add them, or omit the texture")
     return thing.scale * corners, triangles, np.concatenate(known) if everywhere else None
 
 
 def _require_surface(part: trimesh.Trimesh, path: str) -> None:
-    """DescriptionError where a part has no vertices (V, 3) and faces (F, 3) of them."""
+    """Check that a part has vertices (V, 3) and faces (F, 3) of existing vertices; DescriptionError if not."""
     vertices, faces = np.asarray(part.vertices), np.asarray(part.faces)
     shaped = [each.ndim == 2 and each.shape[1] == 3 for each in (vertices, faces)]
     if not all(shaped) or (faces.size and not 0 <= faces.min() <= faces.max() < len(vertices)):
         raise DescriptionError(
-            f"{path} holds no usable surface: its vertices are of the shape {vertices.shape}, its faces {faces.shape}, "
-            "expected three coordinates of each vertex and three existing vertices of each face"
+            f"{path} contains no usable surface: its vertices are of shape {vertices.shape}, its faces {faces.shape}; "
+            "expected three coordinates per vertex and three existing vertices per face"
         )
 
 
 def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:
-    """The mirrors of one object at its pose (4, 4) in the scene."""
+    """Yield the mirrors of one object at its pose (4, 4) in the scene."""
     if thing.mirror_share() == 0:
         return
     match thing:
@@ -282,5 +282,5 @@ def _mirror_faces(thing: AnyObject, pose: np.ndarray) -> Iterator[MirrorFace]:
 
 
 def _scaled(*factors: float) -> np.ndarray:
-    """The transform (4, 4) that scales by factors along x, y and z."""
+    """Return the transform (4, 4) that scales along x, y and z."""
     return np.diag([*factors, 1.0])

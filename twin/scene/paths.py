@@ -1,4 +1,4 @@
-"""Values of descriptions by their path: keys and places in lists joined by dots, as in ``objects.0.position_mm.2``."""
+"""Values in descriptions by path: keys and list indices joined by dots, as in ``objects.0.position_mm.2``."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,9 +11,10 @@ Value = float | int | str | bool
 
 
 def value_at(described: Description, path: str, source: str | Path, *, called: str = "sensor") -> Value | None:
-    """Value at a path of a description; DescriptionError where it does not exist or leads to a table or list.
+    """Return the value at a path of a description.
 
-    ``called`` is what is described, and ``source`` where the path stands, for the message.
+    ``called`` names the described thing, and ``source`` the origin of the path, for error messages. DescriptionError if
+    the path does not exist, or leads to a table or list.
     """
     found: object = described.model_dump()
     for key in path.split("."):
@@ -32,7 +33,7 @@ def value_at(described: Description, path: str, source: str | Path, *, called: s
 
 
 def with_values(table: dict[str, Any], changes: Mapping[str, Value]) -> dict[str, Any]:
-    """A copy of a description's table in which values at paths are replaced; the table stays as it is."""
+    """Return a copy of a description's table with the values at paths replaced."""
     changed = dict(table)
     for path, value in changes.items():
         *parents, last = path.split(".")

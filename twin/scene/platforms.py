@@ -1,7 +1,6 @@
-"""Platforms that carry a sensor along a path: where it truly is, what the platform reports, and the images on the way.
+"""Platforms that carry a sensor along a path: true poses, reported poses, and the images along the path.
 
-A platform's frame is carried by it; the sensor is mounted in it by ``T_platform_sensor``. Poses are given and reported
-in the scene's frame.
+The sensor is mounted on the platform with the pose ``T_platform_sensor``. Poses are given and reported in the scene.
 """
 
 from abc import ABC, abstractmethod
@@ -16,7 +15,7 @@ from scipy.interpolate import Akima1DInterpolator
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from twin.scene.motion import Light, Shot
-from twin.scene.placed import Pose
+from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import Bracket, Description, NotNegative, Positive
 from uwlts.storage.pose_files import Unit, read_trajectory
@@ -24,20 +23,20 @@ from uwlts.storage.pose_files import Unit, read_trajectory
 Poses = Callable[[np.ndarray], np.ndarray]
 """Poses (N, 4, 4) at times (N,) in s."""
 LEAD_S = 1.0
-"""A platform is on its way for so long before the first and after the last image: clocks may differ by less."""
+"""A platform moves for this time before the first and after the last image; clock offsets must be smaller."""
 
 SPOT_MM = 1e-9
-"""Places closer together are the same: the rounding of numbers of some m."""
+"""Positions closer together are identical: above the rounding error of coordinates of some metres."""
 
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """Images on the way of a platform: where the sensor truly is, and what the platform says.
+    """Images along the path of a platform, with true and reported poses.
 
-    ``poses`` gives ``T_scene_sensor``. ``reported`` (S, 4, 4) is ``T_scene_platform`` as it is stored with each of the
-    S ``shots``, ``covariance`` (S, 6, 6) that which the platform states, of the shift in mm and the rotation in rad
-    about the scene's axes, or None. ``report`` holds times of the platform's own clock (M,) with its poses and
-    covariances then; None where it stands still at every image.
+    ``poses`` returns ``T_scene_sensor``. ``reported`` (S, 4, 4) is ``T_scene_platform`` as stored with each of the S
+    shots. ``covariance`` (S, 6, 6), if the platform states it, is that of displacement in mm and rotation in rad about
+    the scene's axes. ``report`` contains times (M,) of the platform's own clock with poses and covariances; None if it
+    stops for each image.
     """
 
     shots: tuple[Shot, ...]
@@ -48,11 +47,11 @@ class Course:
 
     @cached_property
     def numbers(self) -> dict[Shot, int]:
-        """Number of each shot."""
+        """Index of each shot."""
         return {shot: number for number, shot in enumerate(self.shots)}
 
     def twist(self, shot: Shot, *, exposure_s: float) -> tuple[np.ndarray, np.ndarray]:
-        """Mean velocity (3,) in mm/s of the sensor's origin and turn (3,) in rad/s over an exposure, in the scene."""
+        """Return the mean velocity (3,) of the sensor in mm/s and its rotation rate (3,) in rad/s in an exposure."""
         assert shot.time_s is not None
         half = max(exposure_s / 2, 1e-4)
         before, after = self.poses(shot.time_s + np.array([-half, half]))
@@ -61,8 +60,8 @@ class Course:
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
-    """A platform over time: its true poses, those that it reports, and their covariances (N, 6, 6) if it knows any."""
+class PlatformMotion:
+    """Motion of a platform: true poses, reported poses, and covariances (N, 6, 6) if it states them."""
 
     true: Poses
     reported: Poses
@@ -72,12 +71,13 @@ class Carried:
 class Platform(Description, ABC):
     """Base of motions along a path.
 
-    ``mount`` is ``T_platform_sensor`` by the drawing, ``true_mount`` as built, the same unless given. At every place
-    the images in ``lights`` are taken in turn, those with the laser at every multiple of its exposure in ``bracket``;
-    a moving platform takes one image each ``1 / frame_rate_hz``, one that stops spends ``stop_s`` at every place. What
-    the platform reports scatters by ``position_std_mm`` and ``rotation_std_deg`` about each axis, independently from
-    report to report, and its clock is ahead of the camera's by ``clock_offset_s``. A moving platform reports at
-    ``report_hz``; with ``states_covariance`` it says how well it knows its pose. ``errors_seed`` chooses all errors.
+    ``mount`` is the nominal ``T_platform_sensor``, ``true_mount`` the actual one (default: the same). At every
+    position, the images in ``lights`` are taken in turn, those with the laser at every exposure factor in ``bracket``.
+    A moving platform takes one image every ``1 / frame_rate_hz``; one that stops spends ``stop_s`` at every position.
+
+    Reported poses have independent noise of ``position_std_mm`` and ``rotation_std_deg`` about each axis. The
+    platform's clock is ahead of the camera's by ``clock_offset_s``. A moving platform reports at ``report_hz``; with
+    ``states_covariance`` it also reports covariances. ``errors_seed`` is the seed of all errors.
     """
 
     mount: Pose = Pose()
@@ -94,28 +94,28 @@ class Platform(Description, ABC):
     errors_seed: Annotated[int, Field(ge=0)] = 0
 
     def moves(self) -> bool:
-        """Whether the sensor moves while it exposes."""
+        """Return whether the sensor moves during exposures."""
         return not self.stops
 
     @property
     @abstractmethod
     def stops(self) -> bool:
-        """Whether the platform stands still at every image."""
+        """True if the platform stops for each image."""
 
     @abstractmethod
     def places(self) -> int:
-        """Number of places at which images are taken."""
+        """Return the number of image positions."""
 
     @abstractmethod
-    def carried(self, rng: np.random.Generator) -> Carried:
-        """The platform over time, with errors drawn from a generator."""
+    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
+        """Return the motion of the platform, with errors drawn from a generator."""
 
     @model_validator(mode="after")
     def _takes_images(self) -> "Platform":
         if not self.lights:
             raise ValueError("lights is empty: name 'lamp', 'laser' or both")
         if self.stops and self.frame_rate_hz is not None:
-            raise ValueError(f"frame_rate_hz {self.frame_rate_hz:g} without a speed: give the speed, or leave it out")
+            raise ValueError(f"frame_rate_hz {self.frame_rate_hz:g} without a speed: give the speed, or omit the rate")
         if not self.stops and self.frame_rate_hz is None:
             raise ValueError("a moving platform needs frame_rate_hz")
         if not self.stops and self.images_per_place() > 1:
@@ -125,71 +125,71 @@ class Platform(Description, ABC):
         return self
 
     def images_per_place(self) -> int:
-        """Number of images taken at every place."""
+        """Return the number of images taken at every position."""
         laser = self.lights.count("laser")
         return len(self.lights) + laser * (len(self.bracket) - 1)
 
     def images(self) -> int:
-        """Number of images of the scan."""
+        """Return the number of images of the scan."""
         return self.places() * self.images_per_place()
 
     def shots(self) -> tuple[Shot, ...]:
-        """Every image of the scan in its order."""
+        """Return all images of the scan in order."""
         return self.course().shots
 
     def course(self) -> Course:
-        """The sensor's way, drawn with the platform's errors."""
+        """Return the path of the sensor, drawn with the platform's errors."""
         # Frozen descriptions are hashable.
         return _course(self)  # pyright: ignore[reportArgumentType]
 
-    def _drawn(self) -> Course:
+    def _draw_course(self) -> Course:
         rng = np.random.default_rng(self.errors_seed)
-        carried, mount = self.carried(rng), (self.true_mount or self.mount).matrix()
+        motion, mount = self.draw_motion(rng), (self.true_mount or self.mount).matrix()
         period_s = self.stop_s if self.frame_rate_hz is None else 1 / self.frame_rate_hz
         kinds: list[tuple[Light, float]]
         kinds = [(light, each) for light in self.lights for each in (self.bracket if light == "laser" else (1.0,))]
-        # At a stop the images are spread over the time of rest.
+        # Images at a stop are spread over its duration.
         times = period_s / len(kinds) * (np.arange(self.images()) + (0.5 if self.stops else 0.0))
 
         def sensor(at_s: np.ndarray) -> np.ndarray:
-            return carried.true(at_s) @ mount
+            return motion.true(at_s) @ mount
 
-        way = _way_mm(sensor(times))
+        way = _path_lengths_mm(sensor(times))
         shots = tuple(
             Shot(stage_mm=0.0, travelled_mm=float(way[number]), light=light, exposure=exposure, time_s=float(time))
             for number, time in enumerate(times)
             for light, exposure in [kinds[number % len(kinds)]]
         )
-        # Who takes both clocks for the same stores with an image what the platform reported at another moment.
-        reported, covariance = self._said(carried, times - self.clock_offset_s, rng)
+        # Images are stored with the pose reported at the same reading of both clocks, despite their offset.
+        reported, covariance = self._report_poses(motion, times - self.clock_offset_s, rng)
         report = None
         if not self.stops:
             own = np.arange(-LEAD_S, times[-1] + LEAD_S, 1 / self.report_hz)
-            report = (own + self.clock_offset_s, *self._said(carried, own, rng))
+            report = (own + self.clock_offset_s, *self._report_poses(motion, own, rng))
         return Course(shots, sensor, reported, covariance, report)
 
-    def _said(
-        self, carried: Carried, times: np.ndarray, rng: np.random.Generator
+    def _report_poses(
+        self, motion: PlatformMotion, times: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Poses that the platform reports at times of the camera's clock, and their covariances."""
+        """Return the poses that the platform reports at times of the camera's clock, and their covariances."""
         turn_std = np.radians(self.rotation_std_deg)
         shifts = self.position_std_mm * rng.standard_normal((len(times), 3))
         turns = turn_std * rng.standard_normal((len(times), 3))
-        poses = displaced(carried.reported(times), np.hstack([shifts, turns]))
+        poses = displace_poses(motion.reported(times), np.hstack([shifts, turns]))
         if not self.states_covariance:
             return poses, None
         white = np.diag([self.position_std_mm**2] * 3 + [turn_std**2] * 3)
-        drift = np.zeros((len(times), 6, 6)) if carried.covariance is None else carried.covariance(times)
+        drift = np.zeros((len(times), 6, 6)) if motion.covariance is None else motion.covariance(times)
         return poses, drift + white
 
 
 class Route(Platform):
-    """Base of platforms that follow a path of the sensor, as it is by the mount's drawing.
+    """Base of platforms that follow a nominal path of the sensor.
 
-    ``waypoints`` are its places one after the other, or ``trajectory`` is a file of times and poses in
-    ``trajectory_format`` and ``trajectory_unit`` (`uwlts.read`); a relative path starts at the scene's folder. Between
-    them it follows Akima's curve (rotations a spline), at a speed of about ``speed_mm_per_s`` and at most
-    ``turn_deg_per_s``. With a speed of 0 it stops at every waypoint.
+    The path is given by ``waypoints``, or by a ``trajectory`` file of times and poses in ``trajectory_format`` and
+    ``trajectory_unit`` (`uwlts.read`); a relative path starts at the scene's folder. It is interpolated by Akima's
+    method (rotations by a spline), at about ``speed_mm_per_s`` and at most ``turn_deg_per_s``. With a speed of 0 the
+    platform stops at every waypoint.
     """
 
     waypoints: tuple[Pose, ...] = ()
@@ -219,26 +219,26 @@ class Route(Platform):
 
     @property
     def _knots(self) -> tuple[np.ndarray, np.ndarray]:
-        """Times (K,), s, and ``T_scene_sensor`` (K, 4, 4) through which the path goes."""
+        """Times (K,) in s, and poses ``T_scene_sensor`` (K, 4, 4), which the path interpolates."""
         return _knots(self)  # pyright: ignore[reportArgumentType]
 
     def commanded(self) -> Poses:
-        """``T_scene_platform`` by the path and the mount's drawing."""
+        """Return the nominal poses ``T_scene_platform`` of the path."""
         times, poses = self._knots
         return _path(times, poses @ np.linalg.inv(self.mount.matrix()), stops=self.stops)
 
 
 class IdealPath(Route):
-    """A platform without errors of its own: it is where it should be."""
+    """A platform without errors: true poses equal nominal ones."""
 
     kind: Literal["path"]
 
-    def carried(self, rng: np.random.Generator) -> Carried:
+    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
         commanded = self.commanded()
-        return Carried(commanded, commanded)
+        return PlatformMotion(commanded, commanded)
 
 
-# Kept beside the descriptions, not in them: arrays in them would make the comparison of equal ones fail.
+# Cached outside the descriptions, whose comparison would fail with array fields.
 @lru_cache(maxsize=8)
 def _knots(route: Route) -> tuple[np.ndarray, np.ndarray]:
     if route.trajectory is not None:
@@ -257,17 +257,17 @@ def _knots(route: Route) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=8)
 def _course(platform: Platform) -> Course:
-    return platform._drawn()
+    return platform._draw_course()
 
 
 # --- geometry -------------------------------------------------------------------------------------------------------
 
 
 def _path(times: np.ndarray, poses: np.ndarray, *, stops: bool) -> Poses:
-    """Poses through (K, 4, 4) at times (K,): standing at each, or along splines and straight on beyond both ends."""
+    """Interpolate poses (K, 4, 4) at times (K,): stepwise at stops, else by splines with linear extrapolation."""
     if stops or len(times) == 1:
-        return lambda wanted: poses[stop_at(times, wanted)]
-    # Cubic pieces that do not swing beyond the points, as splines of two continuous derivatives do at tight turns.
+        return lambda wanted: poses[find_stop(times, wanted)]
+    # Akima interpolation does not overshoot at tight turns, as cubic splines do.
     positions = Akima1DInterpolator(times, poses[:, :3, 3], method="makima")
     velocities = positions.derivative()
     rotations = RotationSpline(times, Rotation.from_matrix(poses[:, :3, :3]))
@@ -283,25 +283,28 @@ def _path(times: np.ndarray, poses: np.ndarray, *, stops: bool) -> Poses:
     return at
 
 
-def displaced(poses: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Return poses (N, 4, 4) with errors (N, 6): a shift, then a turn in rad about the own place, by scene axes."""
+def displace_poses(poses: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Return poses (N, 4, 4) with errors (N, 6): a translation, and a rotation in rad about their position.
+
+    Both are in scene axes.
+    """
     moved = poses.copy()
     moved[:, :3, 3] += errors[:, :3]
     moved[:, :3, :3] = Rotation.from_rotvec(errors[:, 3:]).as_matrix() @ moved[:, :3, :3]
     return moved
 
 
-def interpolated(times: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Return values (N, K) between those (T, K) at times, linearly."""
+def interpolate_values(times: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return values (N, K), interpolated linearly from values (T, K) at times."""
     return np.stack([np.interp(wanted, times, column) for column in values.T], axis=1)
 
 
-def stop_at(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Number of the stop at times."""
+def find_stop(times: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return the index of the stop at times."""
     return np.clip(np.searchsorted(times, np.asarray(wanted) + 1e-9, side="right") - 1, 0, len(times) - 1)
 
 
-def _way_mm(poses: np.ndarray) -> np.ndarray:
-    """Length (N,) of the way of a sensor's origin to each pose: there the surface passes by the sheet."""
+def _path_lengths_mm(poses: np.ndarray) -> np.ndarray:
+    """Return the path length (N,) of the sensor's origin at each pose."""
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     return np.append(0.0, np.cumsum(steps))

@@ -1,4 +1,4 @@
-"""Robot arm of six joints: its kinematics, and the errors of its joints and links."""
+"""Robot arm with six joints: kinematics, and errors of joints and links."""
 
 from typing import Literal
 
@@ -7,32 +7,32 @@ from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from twin.scene.placed import Pose
-from twin.scene.platforms import LEAD_S, Carried, Route, interpolated, stop_at
+from twin.scene.platforms import LEAD_S, PlatformMotion, Route, find_stop, interpolate_values
+from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError
 from uwlts.model.sensor import NotNegative, Positive, Vector
 
 _ARC_S = 0.05
-"""Step in which the joints follow a path."""
+"""Time step of the joint trajectory along a path."""
 _STARTS = 40
-"""Random starts of the search for joint angles: an arm has up to 8 postures for a pose, and some starts find none."""
+"""Number of random starts of the search for joint angles: up to 8 postures reach a pose, and some starts find none."""
 _REACHED = 1e-6
-"""Largest misfit of a pose that is reached: share of the arm's length, and rad."""
+"""Largest residual of a reached pose, relative to the arm's length, and in rad."""
 
 
 class Robot(Route):
-    """A robot arm of six joints, whose joints and links err.
+    """A robot arm with six joints and errors of joints and links.
 
-    ``base`` is where it stands in the scene, its z axis along the first joint. ``links`` are its Denavit-Hartenberg
-    parameters (distal): d and a in mm, alpha in deg. Joints have wrong zeros by ``joint_zero_std_deg``, scatter from
-    place to place by ``joint_repeat_std_deg``, and their gears err twice per turn of the motor by
-    ``joint_gear_std_deg`` (``gear_ratio`` motor turns per turn, as strain-wave gears do); links are wrong by
-    ``link_std_mm`` in d and a. The controller reports the flange by its own lengths and angles.
+    ``base`` is its pose in the scene, with z along the first joint. ``links`` are its Denavit-Hartenberg parameters
+    (distal): d and a in mm, alpha in deg. Joints have zero errors of ``joint_zero_std_deg`` and a repeatability of
+    ``joint_repeat_std_deg`` per position. Their gear errors of ``joint_gear_std_deg`` have two periods per motor turn,
+    with ``gear_ratio`` motor turns per joint turn, as in strain-wave gears. Links have errors of ``link_std_mm`` in d
+    and a. The controller reports the flange pose from nominal lengths and angles.
     """
 
     kind: Literal["robot"]
     base: Pose = Pose(position_mm=(-600.0, 0.0, 0.0))
-    # Universal Robots UR5e, the maker's table "DH parameters for calculations of kinematics and dynamics".
+    # Universal Robots UR5e, manufacturer's table "DH parameters for calculations of kinematics and dynamics".
     links: tuple[Vector, Vector, Vector, Vector, Vector, Vector] = (
         (162.5, 0.0, 90.0),
         (0.0, -425.0, 0.0),
@@ -47,7 +47,7 @@ class Robot(Route):
     gear_ratio: Positive = 101.0
     link_std_mm: NotNegative = 0.0
 
-    def carried(self, rng: np.random.Generator) -> Carried:
+    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
         times = self._knots[0]
         if not self.stops:
             times = np.linspace(-LEAD_S, times[-1] + LEAD_S, 2 + int((times[-1] + 2 * LEAD_S) / _ARC_S))
@@ -63,8 +63,8 @@ class Robot(Route):
 
         def over_time(at: np.ndarray, values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
             if self.stops:
-                return values[stop_at(at, wanted)]
-            return interpolated(at, values, wanted)
+                return values[find_stop(at, wanted)]
+            return interpolate_values(at, values, wanted)
 
         smooth = None if self.stops else CubicSpline(times, angles)
 
@@ -76,11 +76,14 @@ class Robot(Route):
             errors = zero + over_time(self._knots[0], repeat, wanted) + gear * np.sin(2 * self.gear_ratio * at + phases)
             return base @ _flange(at + errors, wrong)
 
-        return Carried(true, lambda wanted: base @ _flange(joints(wanted), links))
+        return PlatformMotion(true, lambda wanted: base @ _flange(joints(wanted), links))
 
 
 def _flange(angles: np.ndarray, links: np.ndarray) -> np.ndarray:
-    """Pose (N, 4, 4) of the flange in the robot's base at joint angles (N, 6) in rad (Denavit, Hartenberg 1955)."""
+    """Return the pose (N, 4, 4) of the flange in the robot's base for joint angles (N, 6) in rad.
+
+    Denavit and Hartenberg 1955.
+    """
     pose = np.tile(np.eye(4), (len(angles), 1, 1))
     for joint, (d, a, alpha) in zip(angles.T, links, strict=True):
         c, s, ca, sa = np.cos(joint), np.sin(joint), np.cos(np.radians(alpha)), np.sin(np.radians(alpha))
@@ -94,9 +97,9 @@ def _flange(angles: np.ndarray, links: np.ndarray) -> np.ndarray:
 
 
 def _joint_angles(poses: np.ndarray, links: np.ndarray) -> np.ndarray:
-    """Joint angles (N, 6) in rad that bring the flange to poses (N, 4, 4) of the base, each near the one before.
+    """Return joint angles (N, 6) in rad that move the flange to poses (N, 4, 4) of the base.
 
-    DescriptionError where the arm does not reach a pose.
+    The angles of each pose are close to the previous ones. DescriptionError if the arm does not reach a pose.
     """
     length = float(np.abs(links[:, :2]).sum())
 
@@ -115,8 +118,8 @@ def _joint_angles(poses: np.ndarray, links: np.ndarray) -> np.ndarray:
         else:
             place = ", ".join(f"{x:.0f}" for x in wanted[:3, 3])
             raise DescriptionError(
-                f"the robot does not reach place {number + 1}, its flange at ({place}) mm of its base: move the base, "
-                "or give longer links"
+                f"the robot does not reach place {number + 1}, with its flange at ({place}) mm from its base: move the "
+                "base, or use longer links"
             )
         start = solution.x
         found.append(start)

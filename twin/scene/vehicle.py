@@ -1,7 +1,7 @@
-"""Underwater vehicle: the sea that moves it, and the drift of its navigation.
+"""Underwater vehicle: motion by waves and vibration, and drift of its navigation.
 
-Formulas follow T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control (Wiley, 2011; "Fossen"), and
-J. A. Farrell, Aided Navigation (McGraw-Hill, 2008; "Farrell").
+Formulas follow T. I. Fossen, Handbook of Marine Craft Hydrodynamics and Motion Control (Wiley, 2011; "Fossen"), and J.
+A. Farrell, Aided Navigation (McGraw-Hill, 2008; "Farrell").
 """
 
 from collections.abc import Callable
@@ -11,20 +11,21 @@ from typing import Literal
 import numpy as np
 from pydantic import model_validator
 
-from twin.scene.platforms import LEAD_S, Carried, Route, displaced, interpolated
+from twin.scene.platforms import LEAD_S, PlatformMotion, Route, displace_poses, interpolate_values
 from uwlts.model.sensor import Description, NotNegative, Positive
 
 _GRAVITY = 9.81
 _COMPONENTS = 24
 _STEP_S = 0.05
-"""Step of the navigation's errors: far below the time in which any of them changes."""
+"""Time step of the navigation errors, far below all their time constants."""
 
 
 class Sea(Description):
-    """Waves above a vehicle, by their significant height at the surface, and what of them moves the vehicle.
+    """Waves above a vehicle, given by their significant height at the surface, and the vehicle's response.
 
-    At ``depth_mm`` the water moves on circles, along ``towards_deg`` (from X to Y of the scene) and up and down. The
-    vehicle follows with ``share`` of it, as its control leaves it, and rolls and pitches by ``tilt_deg`` (rms).
+    At ``depth_mm`` the water moves in circles, horizontally along ``towards_deg`` (from X to Y of the scene) and
+    vertically. The vehicle follows the fraction ``share`` of this motion that its control leaves, and rolls and pitches
+    by ``tilt_deg`` (rms).
     """
 
     significant_height_mm: NotNegative = 0.0
@@ -34,13 +35,12 @@ class Sea(Description):
     tilt_deg: NotNegative = 0.0
 
 
-def waves_of(sea: Sea, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
-    """Function of times (N,) in s for shifts, mm, and turns, rad, (N, 6) in the scene.
+def sample_waves(sea: Sea, rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function from times (N,) in s to displacements in mm and rotations in rad, (N, 6) in the scene.
 
-    Pierson and Moskowitz's spectrum by the significant height H (Fossen, section 8.2.1), with the peak at
-    w0 = 0.4 sqrt(g / H): S(w) = 5/16 H^2 w0^4 w^-5 exp(-1.25 (w0 / w)^4). Waves of deep water decay with the depth by
-    exp(-w^2 depth / g). Each of the components is a sinusoid of random phase; their frequencies lie at random within
-    bands, so that the motion does not repeat.
+    Pierson-Moskowitz spectrum for the significant height H (Fossen, section 8.2.1), with the peak at w0 = 0.4 sqrt(g /
+    H): S(w) = 5/16 H^2 w0^4 w^-5 exp(-1.25 (w0 / w)^4). Deep-water waves decay with depth by exp(-w^2 depth / g). Each
+    component is a sinusoid of random phase. Frequencies are random within bands, so that the motion is not periodic.
     """
     still = sea.significant_height_mm == 0 and sea.tilt_deg == 0
     height = max(sea.significant_height_mm, 100.0) * 1e-3
@@ -72,13 +72,14 @@ def waves_of(sea: Sea, rng: np.random.Generator) -> Callable[[np.ndarray], np.nd
 
 
 class Navigation(Description):
-    """Errors of an inertial navigation aided by a Doppler log, a depth sensor and inclinometers.
+    """Errors of an inertial navigation aided by a Doppler velocity log, a depth sensor and inclinometers.
 
-    Velocity has white noise of ``velocity_mm_per_sqrt_s`` (mm/s per root Hz: after t s the position has walked by that
-    times the root of t) and a bias of ``velocity_bias_mm_per_s`` that changes within ``bias_time_s``. The heading walks
-    by ``heading_deg_per_sqrt_s`` and drifts by a gyro's bias of ``gyro_bias_deg_per_s``; a wrong heading turns the way
-    travelled. Roll and pitch (``tilt_std_deg``) and depth (``depth_std_mm``) are measured, so that their errors stay
-    bounded; they change within ``aided_time_s``. The navigation states the covariance of exactly these errors.
+    Velocity has white noise of ``velocity_mm_per_sqrt_s`` (mm/s per root Hz): after t s, the random walk of the
+    position is this value times sqrt(t). Velocity also has a bias of ``velocity_bias_mm_per_s`` with the time constant
+    ``bias_time_s``. The heading has a random walk of ``heading_deg_per_sqrt_s`` and a gyro bias of
+    ``gyro_bias_deg_per_s``; heading errors rotate the travelled path. Roll and pitch (``tilt_std_deg``) and depth
+    (``depth_std_mm``) are measured, so their errors are bounded, with the time constant ``aided_time_s``. The
+    navigation states the covariance of exactly these errors.
     """
 
     velocity_mm_per_sqrt_s: NotNegative = 0.0
@@ -93,23 +94,23 @@ class Navigation(Description):
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """Errors of the reported pose at times: shift in mm, rotation in rad about the scene's axes."""
+    """Errors of the reported pose at times: displacement in mm and rotation in rad about the scene's axes."""
 
     times_s: np.ndarray
     values: np.ndarray
     covariances: np.ndarray
 
     def errors(self, times_s: np.ndarray) -> np.ndarray:
-        """Errors (N, 6), between the steps linear."""
-        return interpolated(self.times_s, self.values, times_s)
+        """Return linearly interpolated errors (N, 6)."""
+        return interpolate_values(self.times_s, self.values, times_s)
 
     def covariance(self, times_s: np.ndarray) -> np.ndarray:
-        """Covariances (N, 6, 6) that the navigation states."""
+        """Return the covariances (N, 6, 6) stated by the navigation."""
         flat = self.covariances.reshape(len(self.times_s), -1)
-        return interpolated(self.times_s, flat, times_s).reshape(-1, 6, 6)
+        return interpolate_values(self.times_s, flat, times_s).reshape(-1, 6, 6)
 
 
-def drift_of(
+def simulate_drift(
     navigation: Navigation,
     poses: Callable[[np.ndarray], np.ndarray],
     *,
@@ -117,11 +118,11 @@ def drift_of(
     lasting_s: float,
     rng: np.random.Generator,
 ) -> Drift:
-    """Errors of the navigation of a vehicle with true poses, from 0 at ``lead_s`` before the time 0 on.
+    """Simulate the navigation errors of a vehicle with true poses, starting from 0 at ``lead_s`` before time 0.
 
-    The state holds errors of position (3), roll and pitch (2), heading, bias of velocity (2), of the gyro, and is
-    propagated with its covariance: x' = F x + w, P' = F P F^T + Q (Farrell, sections 4.6 and 4.9). Depth, roll and
-    pitch are Gauss-Markov processes of first order in their stationary state.
+    The state contains errors of position (3), roll and pitch (2) and heading, and biases of velocity (2) and gyro. It
+    is propagated with its covariance: x' = F x + w, P' = F P F^T + Q (Farrell, sections 4.6 and 4.9). Depth, roll and
+    pitch are stationary first-order Gauss-Markov processes.
     """
     n = navigation
     times = np.arange(-lead_s, lasting_s + lead_s + _STEP_S, _STEP_S)
@@ -143,7 +144,7 @@ def drift_of(
     values, covariances = np.empty((len(times), 9)), np.empty((len(times), 9, 9))
     for number, (x, y, _) in enumerate(velocity):
         values[number], covariances[number] = state, spread
-        # A heading that is wrong by e turns the velocity v: the position errs by e z x v.
+        # A heading error e rotates the velocity v: the position error changes by e z x v.
         step[0, 5], step[1, 5] = -y * _STEP_S, x * _STEP_S
         state = step @ state + drawn[number]
         spread = step @ spread @ step.T + np.diag(noise)
@@ -151,10 +152,10 @@ def drift_of(
 
 
 class Vehicle(Route):
-    """An underwater vehicle that waves move and thrusters shake, and that navigates by INS and DVL.
+    """An underwater vehicle moved by waves and vibrations, navigated by INS and DVL.
 
-    The scene's Z points down. `Sea` moves it, and its `Navigation` drifts. The sensor vibrates along each axis by
-    ``vibration_mm`` and turns by ``vibration_deg`` at ``vibration_hz`` (amplitudes).
+    The scene's Z points down. `Sea` moves the vehicle, and its `Navigation` drifts. The sensor vibrates at
+    ``vibration_hz`` with the amplitudes ``vibration_mm`` along and ``vibration_deg`` about each axis.
     """
 
     kind: Literal["vehicle"]
@@ -170,18 +171,18 @@ class Vehicle(Route):
             raise ValueError("a vehicle does not stop: give speed_mm_per_s, or a trajectory")
         return self
 
-    def carried(self, rng: np.random.Generator) -> Carried:
+    def draw_motion(self, rng: np.random.Generator) -> PlatformMotion:
         commanded = self.commanded()
-        waves, phases = waves_of(self.sea, rng), rng.uniform(0, 2 * np.pi, 6)
+        waves, phases = sample_waves(self.sea, rng), rng.uniform(0, 2 * np.pi, 6)
         sizes = np.append(np.full(3, self.vibration_mm), np.full(3, np.radians(self.vibration_deg)))
 
         def true(times: np.ndarray) -> np.ndarray:
             vibrations = sizes * np.sin(2 * np.pi * self.vibration_hz * times[:, None] + phases)
-            return displaced(commanded(times), waves(times) + vibrations)
+            return displace_poses(commanded(times), waves(times) + vibrations)
 
-        drift = drift_of(self.navigation, true, lead_s=2 * LEAD_S, lasting_s=float(self._knots[0][-1]), rng=rng)
+        drift = simulate_drift(self.navigation, true, lead_s=2 * LEAD_S, lasting_s=float(self._knots[0][-1]), rng=rng)
 
         def reported(times: np.ndarray) -> np.ndarray:
-            return displaced(true(times), drift.errors(times))
+            return displace_poses(true(times), drift.errors(times))
 
-        return Carried(true, reported, drift.covariance)
+        return PlatformMotion(true, reported, drift.covariance)

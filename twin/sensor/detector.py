@@ -1,7 +1,7 @@
-"""From light to grey values, after EMVA 1288: photons, electrons, noise, full well, gain, quantisation.
+"""Image sensor model after EMVA 1288: photons, electrons, noise, full well, gain, quantisation.
 
-A camera's pixels differ from each other, the same way in every image (`fixed_pattern`); charge that a full pixel cannot
-hold spills along its column (`spilled`); shot and read noise come from `twin.sensor.random_numbers`.
+Pixels of a camera differ from each other in the same way in every image (`fixed_pattern`). Charge above the full well
+of a pixel spills along its column (`spread_blooming`). Shot and read noise come from `twin.sensor.random_numbers`.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ PLANCK_TIMES_LIGHT = 6.62607015e-34 * 299792458.0
 """h c in J m (SI, exact)."""
 
 MOST_ELECTRONS = 1e15
-"""No pixel comes near it; beyond, Poisson numbers no longer fit into 64 bits."""
+"""Upper limit, far above any real pixel; larger Poisson numbers would not fit into 64 bits."""
 
 _BANDS = 8
-"""Bands of rows with random numbers of their own: at most so many are made at a time."""
+"""Number of bands of rows with independent random numbers, and of parallel tasks."""
 _STREAM = 1288
-"""Keeps the pattern's random numbers apart from those of the images, whatever their seeds."""
+"""Random number stream of the pattern, separate from those of the images."""
 
 
 def electrons_per_ms(irradiance: np.ndarray, camera: Camera, detector: Detector, *, wavelength_nm: float) -> np.ndarray:
-    """Mean photo-electrons per ms and pixel for an irradiance in W/mm2 (EMVA 1288 release 4, Eq. 4)."""
+    """Return the mean photo-electrons per ms and pixel for an irradiance in W/mm2 (EMVA 1288 release 4, Eq. 4)."""
     area_mm2 = (1e-3 * camera.pixel_size_um) ** 2 / camera.pixel_aspect
     photons_per_joule = 1e-9 * wavelength_nm / PLANCK_TIMES_LIGHT
     return irradiance * np.float32(1e-3 * area_mm2 * photons_per_joule * detector.quantum_efficiency)
@@ -44,13 +44,13 @@ def grey_values(
     rng: np.random.Generator | None,
     pattern: FixedPattern | None = None,
 ) -> np.ndarray:
-    """Image (H, W), uint8 or uint16, of mean photo-electrons (H, W).
+    """Return the image (H, W), uint8 or uint16, for mean photo-electrons (H, W).
 
-    ``rng`` None leaves out all noise that changes from image to image, ``pattern`` None what differs from pixel to
-    pixel. Shot noise of signal and dark current is Poisson's; blooming and the full well act before the readout, which
-    adds its offset pattern and noise. Rounding is the only quantisation. Bands of rows have random numbers of their
-    own, so that the image does not depend on how many of them are made at a time. ImageError where ``electrons`` is not
-    a two-dimensional image of finite numbers from 0 to 1e15, or ``pattern`` has another size.
+    With ``rng`` None there is no temporal noise, with ``pattern`` None no fixed-pattern noise. Signal and dark current
+    have Poisson shot noise. Blooming and full well are applied before the read-out, which adds offset pattern and
+    noise; the only quantisation is the final rounding. Bands of rows have independent random numbers, so that the image
+    does not depend on the number of parallel tasks. ImageError if ``electrons`` is not a two-dimensional image of
+    finite numbers from 0 to 1e15, or ``pattern`` has another size.
     """
     electrons = np.asarray(electrons, np.float32)
     if electrons.ndim != 2 or electrons.size == 0:
@@ -62,33 +62,35 @@ def grey_values(
         )
     if pattern is not None and pattern.gain.shape != electrons.shape:
         raise ImageError(
-            f"the fixed pattern is of {pattern.gain.shape} pixels, the image of {electrons.shape}: make the pattern "
-            "with the image's height and width"
+            f"the fixed pattern is of {pattern.gain.shape} pixels, the image of {electrons.shape}: create the pattern "
+            "with the height and width of the image"
         )
     count = min(_BANDS, len(electrons))
     detectors, exposures = [detector] * count, [exposure_ms] * count
     patterns = [None] * count if pattern is None else pattern.bands(count)
     rngs: list[np.random.Generator | None] = [None] * count
     if rng is not None:
-        # They continue the given generator's seed; SFC64 is NumPy's fastest.
+        # Seeds derive from the given generator; SFC64 is NumPy's fastest bit generator.
         seeds = cast(np.random.SeedSequence, rng.bit_generator.seed_seq).spawn(count)
         rngs = [np.random.Generator(np.random.SFC64(seed)) for seed in seeds]
     with ThreadPoolExecutor() as pool:
-        charges = list(pool.map(_collected, np.array_split(electrons, count), detectors, exposures, patterns, rngs))
+        charges = list(pool.map(_collect, np.array_split(electrons, count), detectors, exposures, patterns, rngs))
         if detector.blooming > 0:
-            bloomed = spilled(np.concatenate(charges), full_well_e=detector.full_well_e, share=detector.blooming)
+            bloomed = spread_blooming(
+                np.concatenate(charges), full_well_e=detector.full_well_e, share=detector.blooming
+            )
             charges = np.array_split(bloomed, count)
-        return np.concatenate(list(pool.map(_digitised, charges, detectors, patterns, rngs)))
+        return np.concatenate(list(pool.map(_digitise, charges, detectors, patterns, rngs)))
 
 
-def _collected(
+def _collect(
     electrons: np.ndarray,
     detector: Detector,
     exposure_ms: float,
     pattern: FixedPattern | None,
     rng: np.random.Generator | None,
 ) -> np.ndarray:
-    """Electrons of light and dark current that an exposure collects, before any are lost."""
+    """Return the electrons of light and dark current collected in an exposure, without saturation."""
     exposure_s = 1e-3 * exposure_ms
     dark = np.float32(exposure_s * detector.dark_current_e_per_s * detector.dark_current_growth())
     if pattern is None:
@@ -104,16 +106,16 @@ def _collected(
 def _mean_electrons(
     light: np.ndarray, gain: np.ndarray, hot_e_per_s: np.ndarray, exposure_s: float, dark: float, mean: np.ndarray
 ) -> None:
-    """Mean electrons (N,) of pixels with a gain and a dark current (N,) of their own beyond that of all."""
+    """Write the mean electrons (N,) of pixels with individual gain and dark current (N,) to ``mean``."""
     seconds, everywhere = np.float32(exposure_s), np.float32(dark)
     for i in range(len(light)):
         mean[i] = light[i] * gain[i] + hot_e_per_s[i] * seconds + everywhere
 
 
-def _digitised(
+def _digitise(
     charge: np.ndarray, detector: Detector, pattern: FixedPattern | None, rng: np.random.Generator | None
 ) -> np.ndarray:
-    """Grey values of collected electrons, which are overwritten."""
+    """Return the grey values of collected electrons, which are overwritten."""
     signal = np.minimum(charge, np.float32(detector.full_well_e), out=charge)
     if pattern is not None:
         signal += pattern.offset_e
@@ -121,13 +123,13 @@ def _digitised(
         add_normal_numbers(signal, detector.read_noise_e, rng)
     image = np.empty(signal.shape, np.uint8 if detector.bits == 8 else np.uint16)
     scale, offset = np.float32(detector.gain_dn_per_e()), np.float32(detector.black_level_dn)
-    _rounded(signal.ravel(), scale, offset, np.float32(detector.full_scale_dn()), image.ravel())
+    _round(signal.ravel(), scale, offset, np.float32(detector.full_scale_dn()), image.ravel())
     return image
 
 
 @compiled
-def _rounded(signal: np.ndarray, scale: np.float32, offset: np.float32, most: np.float32, image: np.ndarray) -> None:
-    """Signals (N,), float32, scaled, with an offset, rounded to integers from 0 to ``most`` into the image (N,)."""
+def _round(signal: np.ndarray, scale: np.float32, offset: np.float32, most: np.float32, image: np.ndarray) -> None:
+    """Scale, offset and round signals (N,), float32, to integers from 0 to ``most`` in the image (N,)."""
     nothing = np.float32(0)
     for i in range(len(signal)):
         image[i] = min(max(np.rint(signal[i] * scale + offset), nothing), most)
@@ -138,23 +140,23 @@ class FixedPattern:
     """Non-uniformity of one camera's pixels; every array is (H, W), float32."""
 
     gain: np.ndarray
-    """Factor of the photo-electrons, 1 in the mean."""
+    """Factor of the photo-electrons, with mean 1."""
     offset_e: np.ndarray
-    """Offset of the readout in electrons, 0 in the mean."""
+    """Read-out offset in electrons, with mean 0."""
     hot_e_per_s: np.ndarray
-    """Dark current of the hot pixels beyond that of the others, at the image sensor's temperature."""
+    """Excess dark current of hot pixels, at the image sensor's temperature."""
 
     def bands(self, count: int) -> list[FixedPattern]:
-        """The pattern of ``count`` bands of rows, as `numpy.array_split` cuts them."""
+        """Return the pattern of ``count`` bands of rows, as divided by `numpy.array_split`."""
         parts = (np.array_split(array, count) for array in (self.gain, self.offset_e, self.hot_e_per_s))
         return [FixedPattern(*band) for band in zip(*parts, strict=True)]
 
 
 def fixed_pattern(detector: Detector, *, height: int, width: int) -> FixedPattern | None:
-    """The pattern of the camera with the detector's ``pattern_seed``; None if its pixels are all alike.
+    """Return the pattern of a camera from the detector's ``pattern_seed``; None if all pixels are equal.
 
-    Gain and offset are normal, the hot pixels' dark currents exponentially distributed, all independent from pixel to
-    pixel. Each has random numbers of its own: changing one value leaves the others' pattern as it is.
+    Gain and offset are normally, dark currents of hot pixels exponentially distributed, and independent between pixels.
+    Each has its own random numbers: changing one value leaves the patterns of the others unchanged.
     """
     spreads = (detector.prnu, detector.dsnu_e, detector.dsnu_row_e, detector.dsnu_column_e)
     if not any(spreads) and detector.hot_pixels_per_million == 0:
@@ -174,26 +176,26 @@ def fixed_pattern(detector: Detector, *, height: int, width: int) -> FixedPatter
     return FixedPattern(1 + gain, pixels + rows + columns, hot.reshape(height, width))
 
 
-def spilled(charge: np.ndarray, *, full_well_e: float, share: float) -> np.ndarray:
-    """Charge (H, W) in electrons after blooming; the given array itself if no pixel is over its full well.
+def spread_blooming(charge: np.ndarray, *, full_well_e: float, share: float) -> np.ndarray:
+    """Return the charge (H, W) in electrons after blooming; the given array itself if no pixel exceeds its full well.
 
-    Half of what a pixel holds above the full well goes up its column and half goes down. It fills the pixels it meets
-    and keeps its direction over those that are full, until it fits or leaves the image. At each step from a full pixel
-    to the next, ``share`` of it arrives and the rest is drained; a share of 1 loses none.
+    Half of the excess charge of a pixel moves up its column and half down. It fills pixels on its path and passes full
+    ones, until it fits or leaves the image. At each step from a full pixel to the next, the fraction ``share`` is
+    transferred and the rest is drained.
     """
     columns = np.flatnonzero((charge > full_well_e).any(axis=0))
     if columns.size == 0:
         return charge
     before = np.take(charge, columns, axis=1).astype(float)
-    down_first, up_first = (_swept(image, full_well_e, share) for image in (before, before[::-1]))
+    down_first, up_first = (_sweep(image, full_well_e, share) for image in (before, before[::-1]))
     after = charge.copy()
-    # Where the charge of two pixels meets, whichever comes first takes the room: the mean of both orders favours none.
+    # If charge of two pixels meets, the result depends on the order: average both orders.
     after[:, columns] = (down_first + up_first[::-1]) / 2
     return after
 
 
-def _swept(charge: np.ndarray, full_well_e: float, share: float) -> np.ndarray:
-    """Columns after the spilt charge has run down them, then up."""
+def _sweep(charge: np.ndarray, full_well_e: float, share: float) -> np.ndarray:
+    """Return the columns after the excess charge has moved down, then up."""
     kept = np.minimum(charge, full_well_e)
     spilt_each_way = share / 2 * (charge - kept)
     for rows in (range(len(kept)), reversed(range(len(kept)))):

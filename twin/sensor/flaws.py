@@ -1,7 +1,7 @@
-"""Flaws of real recordings, which an ordinary rendering does not have; see `twin.options.Flaws`.
+"""Flaws of real recordings that standard rendering does not include; see `twin.options.Flaws`.
 
-Some are built into the sensor (`as_built`), some change the light on the image sensor (`vignette`, `veiled`,
-`laser_shares`), and some what the camera makes of its grey values (`delivered`).
+Some are properties of the sensor (`as_built`). Others change the light on the image sensor (`vignette`, `add_glare`,
+`laser_shares`) or the grey values that the camera delivers (`deliver_image`).
 """
 
 import math
@@ -17,26 +17,29 @@ from uwlts.model.library import merged, validated
 from uwlts.model.sensor import Camera, Sensor
 
 GLARE_REACH = 0.15
-"""Distance over which glare falls to 1 / e, as a share of the image's width: assumed, as wide as a veil looks."""
+"""Decay length of glare (1 / e) as a fraction of the image width (assumed from its visual appearance)."""
 _SPOT_MM = 0.2, 3.0
-"""Diameters of spots on the window: silt and films that begin to foul, up to drops and fingerprints."""
+"""Range of the diameters of spots on the window, from silt and fouling films to drops and fingerprints."""
 _CELLS_PER_SPOT = 4
 _DIRT_STREAM = 41
-"""Keeps the spots' random numbers apart from others of the same seed."""
+"""Random number stream of the spots, separate from others of the same seed."""
 _CELLS_PER_REACH = 16
-"""The veil is as smooth as its kernel: cells of a sixteenth of its reach show it to some 1e-3 of itself."""
+"""Number of cells per decay length; the smooth veiling glare is then accurate to about 1e-3."""
 LASER_SHARES = {"red": 1.0, "green": 0.083, "blue": 0.008}
-"""Laser light at 635 nm that pixels behind filters see against a red one: 0.041 and 0.004 against 0.496 of the Nikon
-D5100 (Darrodi et al. 2015, J. Opt. Soc. Am. A 32, 381). Filters of machine vision cameras may separate less."""
+"""Response to laser light at 635 nm behind colour filters, relative to red.
+
+0.041 and 0.004 divided by 0.496 for the Nikon D5100 (Darrodi et al. 2015, J. Opt. Soc. Am. A 32, 381). Filters of
+machine vision cameras may separate colours less.
+"""
 _RGGB = (("red", "green"), ("green", "blue"))
 
 
 def as_built(sensor: Sensor, flaws: Flaws) -> Sensor:
-    """The sensor with the flaws of its pixels, its lens and its shutter; DescriptionError where it cannot have them."""
+    """Return the sensor with the flaws of its pixels, lens and shutter; DescriptionError if they are incompatible."""
     if flaws.jpeg and sensor.detector.bits != 8:
         raise DescriptionError(
             f"jpeg holds 8-bit images, the sensor '{sensor.name}' gives {sensor.detector.bits} bits: take a sensor "
-            "with detector.bits = 8, or leave jpeg out"
+            "with detector.bits = 8, or omit jpeg"
         )
     camera = sensor.camera
     built = {"pixel_aspect": camera.pixel_aspect * flaws.pixel_aspect}
@@ -47,9 +50,9 @@ def as_built(sensor: Sensor, flaws: Flaws) -> Sensor:
 
 
 def vignette(camera: Camera, loss: float) -> np.ndarray:
-    """Shares (H, W), float32, of the light that passes the lens's mounts: 1 - loss (r / R)^2.
+    """Return the transmission (H, W), float32, of the lens with vignetting: 1 - loss (r / R)^2.
 
-    r is the distance from the principal point, R that of the farthest corner.
+    r is the distance from the principal point, and R that of the farthest corner.
     """
     cx, cy = camera.principal_point()
     y, x = np.ogrid[: camera.height_px, : camera.width_px]
@@ -58,11 +61,11 @@ def vignette(camera: Camera, loss: float) -> np.ndarray:
 
 
 def dirt(camera: Camera, share: float, *, seed: int) -> np.ndarray:
-    """Shares (H, W), float32, of the light that passes dirt on the window.
+    """Return the transmission (H, W), float32, of a dirty window.
 
-    Opaque spots of 0.2 to 3 mm, as many of each size as cover the same area, cover a ``share`` of the window at random.
-    A pixel looks through a disc of the window, the pupil shrunk by the way to the focused plane, and loses the part of
-    it that is covered: 1 - share in the mean.
+    Opaque spots of 0.2 to 3 mm at random positions cover the fraction ``share`` of the window; each logarithmic
+    interval of sizes covers the same area. A pixel sees a disc of the window, the pupil reduced by the distance to the
+    focused plane, and loses the covered fraction of it: 1 - share in the mean.
     """
     inner = camera.window.distance_mm
     px_per_mm = camera.focal_length_px() / inner
@@ -71,7 +74,7 @@ def dirt(camera: Camera, share: float, *, seed: int) -> np.ndarray:
     blur_px = 0.5 * camera.focal_length_mm / working * (1 - inner / focus) * px_per_mm
     largest_px = 0.5 * _SPOT_MM[1] * px_per_mm
     margin = math.ceil(blur_px + largest_px)
-    # Cells of which the smallest spot's radius has at least `_CELLS_PER_SPOT`.
+    # The radius of the smallest spot spans at least `_CELLS_PER_SPOT` cells.
     fine = max(1, math.ceil(_CELLS_PER_SPOT / (0.5 * _SPOT_MM[0] * px_per_mm)))
     height, width = (side + 2 * margin for side in (camera.height_px, camera.width_px))
     rng = np.random.default_rng([seed, _DIRT_STREAM])
@@ -81,13 +84,14 @@ def dirt(camera: Camera, share: float, *, seed: int) -> np.ndarray:
     while left > 0:
         radius = 0.5 * math.exp(rng.uniform(*np.log(_SPOT_MM))) * px_per_mm * fine
         area = math.pi * radius**2
-        # Each logarithmic interval of sizes covers the same area; of the last spot so much as is left, in the mean.
+        # Each logarithmic interval of sizes covers the same area. The last spot is added with the probability that
+        # preserves the mean area.
         for _ in range(rng.poisson((largest_px * fine / radius) ** 2)):
             if left < rng.random() * area:
                 left = 0.0
                 break
             centre = [round(16 * rng.uniform(-radius, side + radius)) for side in free.shape[::-1]]
-            # OpenCV fills the cells that a circle touches, half a cell beyond it.
+            # OpenCV fills all cells touched by a circle, half a cell beyond its radius.
             cv2.circle(free, centre, max(1, round(16 * (radius - 0.5))), 0.0, -1, shift=4)
             left -= area * free.size / math.prod(side + 2 * radius for side in free.shape)
     free = cv2.resize(free, (width, height), interpolation=cv2.INTER_AREA)
@@ -97,10 +101,11 @@ def dirt(camera: Camera, share: float, *, seed: int) -> np.ndarray:
     return np.clip(free[margin : margin + camera.height_px, margin : margin + camera.width_px], 0, 1)
 
 
-def veiled(light: np.ndarray, share: float) -> np.ndarray:
-    """Light (H, W), a share of which is spread by exp(-r / w) / (2 pi w^2) with w = `GLARE_REACH` image widths.
+def add_glare(light: np.ndarray, share: float) -> np.ndarray:
+    """Return light (H, W), the fraction ``share`` of which is spread as veiling glare.
 
-    No light is lost but what falls beyond the image's borders.
+    The kernel is exp(-r / w) / (2 pi w^2) with w = `GLARE_REACH` image widths. Light is lost only beyond the image
+    borders.
     """
     height, width = light.shape
     cell = max(1, int(GLARE_REACH * width / _CELLS_PER_REACH))
@@ -116,16 +121,16 @@ def veiled(light: np.ndarray, share: float) -> np.ndarray:
 
 
 def laser_shares(height: int, width: int) -> np.ndarray:
-    """Shares (H, W), float32, of laser light at 635 nm behind the filters of a colour image sensor (RGGB)."""
+    """Return the response (H, W), float32, to laser light at 635 nm behind the filters of a colour sensor (RGGB)."""
     cell = np.array([[LASER_SHARES[colour] for colour in row] for row in _RGGB], np.float32)
     return np.tile(cell, (-(-height // 2), -(-width // 2)))[:height, :width]
 
 
-def delivered(image: np.ndarray, flaws: Flaws) -> np.ndarray:
-    """Grey values (H, W) as the camera gives them: of a colour camera the red channel, compressed or not.
+def deliver_image(image: np.ndarray, flaws: Flaws) -> np.ndarray:
+    """Return the grey values (H, W) that the camera delivers.
 
-    Colours between the pixels of a filter are interpolated linearly. A compressed colour image keeps brightness at
-    every pixel and colours at every second one only (4:2:0), so that light of one colour is blurred.
+    A colour camera delivers its red channel, with missing colours interpolated linearly. JPEG stores brightness at
+    every pixel but colour at every second one only (4:2:0), which blurs monochromatic light.
     """
     if flaws.colour_filter:
         image = cv2.cvtColor(image, cv2.COLOR_BayerRGGB2BGR)

@@ -1,4 +1,4 @@
-"""The peak finder inside a 3D camera: centre of gravity above a threshold, one number of 16 bits per profile line."""
+"""Peak finder of a 3D camera: centre of gravity above a threshold, one 16-bit number per profile line."""
 
 from dataclasses import dataclass
 
@@ -9,20 +9,20 @@ from uwlts.model.sensor import Camera
 INVALID = 0
 """Number of a line without a stripe."""
 THRESHOLD = 0.06
-"""Share of the full scale above which pixels count: above the noise, as such cameras are set up."""
+"""Fraction of the full scale above which pixels count: above the noise, as usual for such cameras."""
 _FEWEST_PX = 2
-"""Narrower things are hot pixels."""
+"""Smallest width of a stripe; narrower peaks are hot pixels."""
 _REACH_PX = 64
-"""Things that reach farther from their brightest pixel are no stripe."""
+"""Largest distance of a stripe's edge from its brightest pixel."""
 
 
 @dataclass(frozen=True)
 class PeakFinder:
-    """Finds places across profile lines in steps of 1 / ``steps`` px.
+    """Finder of peak positions across profile lines in steps of 1 / ``steps`` px.
 
-    The brightest pixel of a line and the pixels about it above the threshold count, with what is above it as weight, as
-    in the cameras' firmware (Fisher and Naidu, "A comparison of algorithms for subpixel peak detection", 1996, centre
-    of mass). ``full_scale_dn`` is the largest grey value.
+    It uses the brightest pixel of a line and the contiguous pixels above the threshold, weighted by their excess, as
+    the firmware of cameras does (Fisher and Naidu, "A comparison of algorithms for subpixel peak detection", 1996,
+    centre of mass). ``full_scale_dn`` is the largest grey value.
     """
 
     camera: Camera
@@ -30,18 +30,21 @@ class PeakFinder:
     steps: int
 
     def scale_px(self) -> float:
-        """Pixels of one step, the scale of the numbers."""
+        """Return the size of one step in pixels."""
         return 1 / self.steps
 
     def numbers(self, image: np.ndarray) -> np.ndarray:
-        """Places (L,), uint16, on the profile lines of an image (H, W), in steps; `INVALID` without a stripe."""
+        """Return positions (L,), uint16, in steps on the profile lines of an image (H, W).
+
+        Lines without a stripe get `INVALID`.
+        """
         across = image if self.camera.stripe_along == "width" else image.T
         lines, brightest = np.arange(across.shape[1]), across.argmax(axis=0)
         place = brightest + np.arange(-_REACH_PX, _REACH_PX + 1)[:, None]
         inside = (place >= 0) & (place < len(across))
         seen = across[np.clip(place, 0, len(across) - 1), lines].astype(np.float32)
         above = np.where(inside, np.maximum(seen - np.float32(THRESHOLD * self.full_scale_dn), 0), 0)
-        # All pixels between the brightest one and the first dark one on either side.
+        # Pixels from the brightest one to the first dark one on either side.
         run = np.minimum.accumulate(above[_REACH_PX:] > 0, axis=0)
         before = np.minimum.accumulate(above[_REACH_PX::-1] > 0, axis=0)[::-1]
         together = np.concatenate([before[:-1], run])

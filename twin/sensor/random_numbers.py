@@ -1,6 +1,6 @@
-"""Random numbers for every pixel of an image: Poisson's, each of its own mean, and normal ones.
+"""Random numbers for every pixel of an image: Poisson numbers with individual means, and normal ones.
 
-They take a few nanoseconds each, several times less than NumPy's, whose generators are called once for each number.
+Each takes a few nanoseconds, several times less than NumPy's, whose generators are called once per number.
 """
 
 from __future__ import annotations
@@ -14,36 +14,37 @@ from scipy import special
 from uwlts.runtime.compiled import compiled, compiled_part
 
 POISSON_STEP = 0.125
-"""Step of the means for which `poisson_numbers` has a table; smaller ones make a larger table and fewer events."""
+"""Step of the means tabulated by `poisson_numbers`; smaller steps need a larger table and fewer events."""
 LARGEST_MEAN = 32.0
-"""Means from here on are left to NumPy."""
+"""NumPy generates numbers with means from here on."""
 _LEVELS = int(LARGEST_MEAN / POISSON_STEP)
 _CELLS = 4096
-"""Cells of the unit interval in a table: twelve bits of a random number choose one."""
+"""Cells of the unit interval in a table; twelve bits of a random number select one."""
 _COUNTS = 120
-"""Counts with a probability above 1e-17 for every mean in the table."""
+"""Number of tabulated counts: those with a probability above 1e-17 for some mean in the table."""
 _SEVERAL = 255
-"""Marks a cell that does not belong to a single count."""
+"""Marks a cell that belongs to several counts."""
 
 _LAYERS = 256
 _LAST_EDGE = 3.6541528853610088
-"""Of layers under exp(-x^2 / 2), where the last one begins its tail (Marsaglia and Tsang 2000)."""
+"""Start of the tail, the outer edge of the last layer under exp(-x^2 / 2) (Marsaglia and Tsang 2000)."""
 _LAYER_AREA = 4.92867323399e-3
-"""Area of each of them."""
+"""Area of each layer."""
 _MANTISSA = 2**24
-"""Numbers that a layer is divided into: as many as 32 bits tell apart."""
+"""Number of positions within a layer, the resolution of single precision."""
 
 
 def poisson_numbers(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Poisson random numbers, float32, of the shape of their means (float32, finite, not negative).
+    """Return Poisson random numbers, float32, for means (float32, finite, not negative) of any shape.
 
-    Most pixels of a laser image are nearly dark, for which this is many times faster than NumPy. A mean is split,
-    m = m_j + r, with m_j on a grid of steps h and 0 <= r < h. The part of m_j is found by inversion in a table: one of
-    4096 equal cells of the unit interval holds the uniform number, and nearly all cells belong to a single count; the
-    others, and with them the tail, are settled by a further uniform number and the distribution function. The part of r
-    is a Poisson process of density h over all pixels of which each event is kept with probability r / h (L. Devroye,
-    Non-Uniform Random Variate Generation, 1986, sections III.2.4 and VI.1.3). Sums of Poisson numbers are Poisson's, so
-    the result is exact to the resolution of a double.
+    Most pixels of a laser image are nearly dark; for these, this is many times faster than NumPy. A mean is split into
+    m = m_j + r, with m_j on a grid of step h and 0 <= r < h. The number for m_j is found by table inversion. A uniform
+    number selects one of 4096 equal cells of the unit interval, and nearly all cells belong to a single count. In the
+    other cells, which include the tail, another uniform number and the distribution function determine the count.
+
+    The number for r is a Poisson process of density h over all pixels, from which each event is kept with the
+    probability r / h (L. Devroye, Non-Uniform Random Variate Generation, 1986, sections III.2.4 and VI.1.3). A sum of
+    Poisson numbers is a Poisson number, so the result is exact to double precision.
     """
     flat = np.ascontiguousarray(mean).ravel()
     numbers = np.empty(flat.shape, np.float32)
@@ -54,34 +55,35 @@ def poisson_numbers(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def add_normal_numbers(values: np.ndarray, deviation: float, rng: np.random.Generator) -> None:
-    """Add normal random numbers of mean 0 and a standard deviation to a contiguous array, float32, in place.
+    """Add normal random numbers with mean 0 and a standard deviation to a contiguous array, float32, in place.
 
-    They come from layers of the density, most of which is a pile of rectangles (Marsaglia and Tsang, "The ziggurat
-    method for generating random variables", J. Statist. Software 5, 2000), exact to the resolution of 32 bits.
+    The ziggurat method is used, which divides the density into layers, mostly rectangles (Marsaglia and Tsang, "The
+    ziggurat method for generating random variables", J. Statist. Software 5, 2000). It is exact to the resolution of 32
+    bits.
     """
     _add_normal_numbers(values.ravel(), deviation, *_layers(), _start(rng))
 
 
 def _start(rng: np.random.Generator) -> np.uint64:
-    """A state from which `_next` goes on, another one at every call."""
+    """Return an initial state for `_next`, different at every call."""
     return rng.integers(0, 2**64, dtype=np.uint64)
 
 
 @compiled_part
 def _next(state: np.uint64) -> np.uint64:
-    """The next state; its bits are made random by `_mixed` (SplitMix64: Steele, Lea and Flood 2014, Fig. 17)."""
-    return _later(state, 1)
+    """Return the next state of SplitMix64 (Steele, Lea and Flood 2014, Fig. 17); `_mix` turns it into random bits."""
+    return _advance(state, 1)
 
 
 @compiled_part
-def _later(state: np.uint64, steps: int) -> np.uint64:
-    """The state after so many steps."""
+def _advance(state: np.uint64, steps: int) -> np.uint64:
+    """Return the state after a number of steps."""
     return state + np.uint64(steps) * np.uint64(0x9E3779B97F4A7C15)
 
 
 @compiled_part
-def _mixed(state: np.uint64) -> np.uint64:
-    """Random 64 bits of a state."""
+def _mix(state: np.uint64) -> np.uint64:
+    """Return 64 random bits from a state."""
     z = (state ^ (state >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return z ^ (z >> np.uint64(31))
@@ -89,8 +91,8 @@ def _mixed(state: np.uint64) -> np.uint64:
 
 @compiled_part
 def _uniform(state: np.uint64) -> float:
-    """A uniform number from 0 to 1, without 1, of a state."""
-    return np.float64(_mixed(state) >> np.uint64(11)) * 2.0**-53
+    """Return a uniform number in [0, 1) from a state."""
+    return np.float64(_mix(state) >> np.uint64(11)) * 2.0**-53
 
 
 @compiled
@@ -102,9 +104,10 @@ def _small_poisson_numbers(
     events: int,
     numbers: np.ndarray,
 ) -> None:
-    """Poisson random numbers (N,) of means (N,) below LARGEST_MEAN; others are left 0. ``events`` are drawn in all.
+    """Write Poisson random numbers (N,) for means (N,) below LARGEST_MEAN to ``numbers``, and 0 for others.
 
-    Each number has states of its own, so that rounding of one mean, as on another processor, changes no other number.
+    ``events`` is the number of events of the process for the remainders. Each number has its own states: a rounding
+    difference in one mean, as on another processor, does not change other numbers.
     """
     step = np.float32(POISSON_STEP)
     for i in range(len(mean)):
@@ -112,8 +115,8 @@ def _small_poisson_numbers(
             numbers[i] = 0
             continue
         level = np.int64(mean[i] / step)
-        own = _later(state, 2 * i)
-        cell = np.int64(_mixed(own) >> np.uint64(52))
+        own = _advance(state, 2 * i)
+        cell = np.int64(_mix(own) >> np.uint64(52))
         count = np.int64(count_of_cell[level, cell])
         if count == _SEVERAL:
             uniform = (cell + _uniform(_next(own))) / _CELLS
@@ -121,7 +124,7 @@ def _small_poisson_numbers(
             while distribution[level, count] <= uniform:
                 count += 1
         numbers[i] = count
-    state = _later(state, 2 * len(mean))
+    state = _advance(state, 2 * len(mean))
     for _ in range(events):
         state = _next(state)
         i = np.int64(_uniform(state) * len(mean))
@@ -132,9 +135,9 @@ def _small_poisson_numbers(
 
 @cache
 def _poisson_tables() -> tuple[np.ndarray, np.ndarray]:
-    """The count of every cell of every level (levels, cells), and the distribution functions (levels, counts)."""
+    """Return the count of every cell (levels, cells), and the distribution functions (levels, counts)."""
     distribution = special.pdtr(np.arange(_COUNTS), POISSON_STEP * np.arange(_LEVELS)[:, None])
-    distribution[:, -1] = 1.0  # in rounding it may stay below the largest uniform number
+    distribution[:, -1] = 1.0  # rounding may leave it below the largest uniform number
     edges = np.arange(_CELLS + 1) / _CELLS
     lowest = np.array([np.searchsorted(row, edges[:-1], side="right") for row in distribution])
     highest = np.array([np.searchsorted(row, edges[1:], side="left") for row in distribution])
@@ -145,11 +148,11 @@ def _poisson_tables() -> tuple[np.ndarray, np.ndarray]:
 def _add_normal_numbers(
     values: np.ndarray, deviation: float, edges: np.ndarray, heights: np.ndarray, inner: np.ndarray, state: np.uint64
 ) -> None:
-    """As `add_normal_numbers`, with the layers' ``edges``, ``heights`` and ``inner`` parts of `_layers`."""
+    """Add normal numbers as `add_normal_numbers`; ``edges``, ``heights`` and ``inner`` come from `_layers`."""
     for i in range(len(values)):
         while True:
             state = _next(state)
-            bits = _mixed(state)
+            bits = _mix(state)
             layer = np.int64(bits & np.uint64(_LAYERS - 1))
             place = np.int64(bits >> np.uint64(40))
             x = place * edges[layer]
@@ -157,7 +160,7 @@ def _add_normal_numbers(
                 break
             state = _next(state)
             if layer == 0:
-                # The tail beyond the last edge r: of x = r - log(u) / r the share exp(-(x - r)^2 / 2) is accepted
+                # Tail beyond the last edge r: accept x = r - log(u) / r with the probability exp(-(x - r)^2 / 2)
                 # (Marsaglia 1964).
                 beyond = -math.log(1 - _uniform(state)) / _LAST_EDGE
                 state = _next(state)
@@ -174,10 +177,10 @@ def _add_normal_numbers(
 
 @cache
 def _layers() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of layers from below: outer edges over `_MANTISSA` (L,), heights of their floors (L + 1,), inner parts (L,).
+    """Return outer edges divided by `_MANTISSA` (L,), floor heights (L + 1,) and inner parts (L,) of the layers.
 
-    The lowest one holds the tail, and is as wide as a rectangle of its area would be. Of the numbers up to
-    `_MANTISSA`, those below the inner part lie under the density at all of the layer's heights.
+    Layers are numbered from below. The lowest one contains the tail; its width is that of a rectangle with its area. Of
+    the positions up to `_MANTISSA`, those below the inner part are under the density at all heights of the layer.
     """
     edges = [_LAYER_AREA / math.exp(-0.5 * _LAST_EDGE**2), _LAST_EDGE]
     while len(edges) < _LAYERS:

@@ -1,14 +1,16 @@
-"""Subjective speckle of a laser-lit surface: the noise that the surface's roughness puts on the image of the stripe.
+"""Subjective speckle of a laser-lit surface: the noise in the image of the stripe due to surface roughness.
 
-A rough surface in coherent light forms on the image sensor a circular complex Gaussian field whose spatial frequencies
-end at the lens's aperture. Its intensity is summed over the pixels and over what does not interfere: the polarisations
-and, for a laser of some line width, its colours. What is left is a factor of mean 1 for every pixel of the image.
+On the image sensor, a rough surface in coherent light forms a circular complex Gaussian field. The lens aperture limits
+its spatial frequencies. The intensity is integrated over pixels, and over what does not interfere: polarisations and,
+for a laser of finite line width, wavelengths. The result is a factor of mean 1 for every pixel.
 
-Such a sum is one of independent exponential variables with weights l_i of sum 1: the eigenvalues of the coherence over
-the pixel, times those of the colours, times the shares of the polarisations (Goodman, Speckle Phenomena in Optics,
-Sec. 4.7). Its variance is sum l_i^2 and its third cumulant 2 sum l_i^3; both sums are products of those of the three
-causes. One exponential pattern is computed, with the correlation that sums over pixels have, and brought to a
-distribution with these cumulants: drawing every variable takes a hundred times as long where a pixel holds many grains.
+This integral is a sum of independent exponential variables with weights l_i of sum 1. They are the eigenvalues of the
+coherence over the pixel, times those of the wavelengths, times the fractions of the polarisations (Goodman, Speckle
+Phenomena in Optics, Sec. 4.7). Its variance is sum l_i^2 and its third cumulant 2 sum l_i^3; both sums are products
+over the three causes.
+
+One exponential pattern is computed with the correlation of pixel integrals, and transformed to a distribution with
+these cumulants. Sampling every variable would take a hundred times as long if a pixel contains many grains.
 """
 
 from __future__ import annotations
@@ -26,25 +28,25 @@ from twin.sensor.random_numbers import add_normal_numbers
 from uwlts.errors import DesignError, ImageError, RangeError
 from uwlts.model.sensor import Camera
 
-# The pattern repeats across the stripe after this many pixels, more than a stripe is wide, and this many grains.
+# Period of the pattern across the stripe: at least this many pixels, wider than a stripe, and this many grains.
 _TILE_PX = 64
 _TILE_GRAINS = 16
 
 # Widest grain in pixels.
 _WIDEST_PX = 64.0
-# Up to this grain, in pixels, a field has the correlation of sums over pixels (to 0.01).
+# Up to this grain in pixels, the field gets the correlation of pixel integrals (accuracy 0.01).
 _FINE_PX = 1.25
-# Wider grains are those of a lens whose grain squared is larger by so many pixels squared (to 0.025 at first, to 0.005
-# from 4 pixels on).
+# For wider grains, this is added to the square of the grain (pixels squared); the correlation is then accurate to
+# 0.025, and to 0.005 from 4 pixels on.
 _WIDENED_PX2 = 0.75
-# Finest grain, in pixels, whose sums' correlation is computed: that of neighbours is 0.02, and less for finer ones.
+# Finest grain in pixels for the correlation of pixel integrals; neighbours are then correlated by 0.02.
 _UNCORRELATED_PX = 0.1
-# Finest grain, in pixels, whose sums' third cumulant is computed: what it exceeds that of equal variables by comes from
-# the pixel's border, and so goes with the grain.
+# Finest grain in pixels for the third cumulant of pixel integrals; its excess over that of equal variables comes from
+# the pixel's border and is proportional to the grain.
 _BORDER_PX = 0.3
 
-# Renewal length by the resolution cell: the field's correlation then falls to one half where that of a moved Airy
-# pattern does (see `renewal_correlation`).
+# Renewal length in resolution cells: the field's correlation then falls to one half at the same displacement as that of
+# an Airy pattern (see `renewal_correlation`).
 _RENEWAL_CELLS = 0.9
 _RENEWAL_GROUPS = 8
 
@@ -53,33 +55,32 @@ _LEAST_CONTRAST = 1e-4
 # Nodes of the table of distributions, along half the skewness and along the cube root of an exponential variable.
 _SKEWS = 65
 _ROOTS = 513
-_LARGEST_ROOT = 3.0  # of an exponential variable of 27: one in 5e11 is larger
+_LARGEST_ROOT = 3.0  # cube root of 27, which one exponential variable in 5e11 exceeds
 
 
 class Speckle:
-    """Speckle pattern of a camera in the light of a laser, for any position along the travel of the stage.
+    """Speckle pattern of a camera in laser light, for any position along the travel of the stage.
 
-    A pattern depends on the seed, the travel and the pixel only: frames can be asked for in any order, and any part of
-    a frame alone. From ``2 renewal_mm`` of travel on it is a new one. ``wavelength_nm`` is that in air, the space
-    between lens and image sensor; other seeds, which are not negative, give independent patterns. DesignError where the
-    lens is focused within its focal length, or stopped down so far that grains are wider than 64 pixels; RangeError
-    where the wavelength is not finite, or below 1 nm.
+    A pattern depends only on seed, travel and pixel: frames, or parts of a frame, can be computed in any order. After
+    ``2 renewal_mm`` of travel it is independent. ``wavelength_nm`` is that in air, between lens and image sensor.
+    Different non-negative seeds give independent patterns. DesignError if the lens is focused within its focal length,
+    or grains are wider than 64 pixels; RangeError if the wavelength is not finite, or below 1 nm.
     """
 
     def __init__(self, camera: Camera, *, wavelength_nm: float, seed: int) -> None:
         focal, focus = camera.focal_length_mm, camera.focus_distance_mm
         if focus <= focal:
             raise DesignError(
-                f"focus_distance_mm {focus:g} is not beyond focal_length_mm {focal:g}: such a lens forms no image"
+                f"focus_distance_mm {focus:g} is not larger than focal_length_mm {focal:g}: the lens forms no image"
             )
         magnification = focal / (focus - focal)  # of the focused plane
-        wavelength_mm = 1e-6 * float(_within("the wavelength in nm", wavelength_nm, 1.0, math.inf))
+        wavelength_mm = 1e-6 * float(_require_range("the wavelength in nm", wavelength_nm, 1.0, math.inf))
         grain_mm = wavelength_mm * camera.f_number * (1 + magnification)
         grain_px = grain_mm / (1e-3 * camera.pixel_size_um)
         if grain_px > _WIDEST_PX:
             raise DesignError(
-                f"at f/{camera.f_number:g} speckle grains are {grain_px:.0f} pixels wide, which is more than the "
-                f"{_WIDEST_PX:g} this model allows: check f_number and pixel_size_um"
+                f"at f/{camera.f_number:g} speckle grains are {grain_px:.0f} pixels wide, more than the {_WIDEST_PX:g} "
+                "of this model: check f_number and pixel_size_um"
             )
         self.camera = camera
         self.renewal_mm = _RENEWAL_CELLS * grain_mm / magnification
@@ -97,39 +98,56 @@ class Speckle:
         polarisation: ArrayLike,
         coherence: ArrayLike = 1.0,
     ) -> np.ndarray:
-        """Factors (P,), float32, not negative and of mean 1, for the laser's light in pixels (P,) in any order.
+        """Return factors (P,), float32, not negative and of mean 1, of the laser's light in pixels (P,).
 
-        The patterns of two orthogonal polarisations add in intensity, I = (1 + P) / 2 I_1 + (1 - P) / 2 I_2, which
-        gives the contrast sqrt((1 + P^2) / 2) (Goodman, Speckle Phenomena in Optics, Ch. 3) for the degree of
-        polarisation P of the scattered light, (P,) or one for all, 0 to 1: 1 for bare metal, about 0 for paint and
-        plastics, in which light is scattered many times. ``coherence``, (P,) or one for all, is the contrast of the
-        unintegrated pattern of one polarisation, 0 to 1 (see the function `coherence`), below 1e-4 taken for that; it
-        multiplies the contrast, as averaging over the pixel's area does (`pixel_contrast`). All have the same grains:
-        where many patterns add up, the correlation from pixel to pixel is smaller than that of one by at most a fifth
-        of itself. For how the pattern changes with the travel see `renewal_correlation`. ImageError where a pixel lies
-        outside the image, RangeError where travel, polarisation or coherence is not finite or outside its range.
+        Parameters
+        ----------
+        rows, columns
+            Pixels (P,) in any order.
+        travel_mm
+            Travel of the stage. See `renewal_correlation` for its effect.
+        polarisation
+            Degree of polarisation P of the scattered light, (P,) or a scalar, 0 to 1: 1 for bare metal, about 0 for
+            paint and plastics, where light is scattered many times. The patterns of two orthogonal polarisations add in
+            intensity, I = (1 + P) / 2 I_1 + (1 - P) / 2 I_2, with the contrast sqrt((1 + P^2) / 2) (Goodman, Speckle
+            Phenomena in Optics, Ch. 3).
+        coherence
+            Contrast of the unintegrated pattern of one polarisation, (P,) or a scalar, 1e-4 to 1 (smaller values are
+            raised); see the function `coherence`. It multiplies the contrast, as averaging over the pixel area does
+            (`pixel_contrast`).
+
+        Raises
+        ------
+        ImageError
+            A pixel is outside the image.
+        RangeError
+            Travel, polarisation or coherence is not finite or outside its range.
+
+        Notes
+        -----
+        All factors have the same grains. If many patterns add up, the true correlation between pixels is smaller by
+        up to a fifth.
         """
-        # Small integers would overflow where a pixel's place in the tile is counted.
+        # Small integer types would overflow in the index of a pixel in the tile.
         rows, columns = (np.asarray(values).astype(np.intp, casting="same_kind") for values in (rows, columns))
         height, width = self.camera.height_px, self.camera.width_px
         inside = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width)
         if not inside.all():
             worst = np.argmin(inside)
             raise ImageError(
-                f"row {rows[worst]}, column {columns[worst]} lies outside the image of {height} rows and {width} "
-                "columns: ask for pixels of the image only"
+                f"row {rows[worst]}, column {columns[worst]} is outside the image of {height} rows and {width} columns"
             )
-        position = float(_within("the travel in mm", travel_mm, -math.inf, math.inf)) / self.renewal_mm
-        polarised = np.square(_within("the degree of polarisation", polarisation, 0.0, 1.0))
-        coherent = np.square(np.maximum(_within("the coherence", coherence, 0.0, 1.0), _LEAST_CONTRAST))
+        position = float(_require_range("the travel in mm", travel_mm, -math.inf, math.inf)) / self.renewal_mm
+        polarised = np.square(_require_range("the degree of polarisation", polarisation, 0.0, 1.0))
+        coherent = np.square(np.maximum(_require_range("the coherence", coherence, 0.0, 1.0), _LEAST_CONTRAST))
         squares, cubes = self._pixel
-        # Of the colours of a Gaussian line (`coherence`), whose weights go as r^k, C^2 = (1 - r) / (1 + r).
+        # A Gaussian line (`coherence`) has weights proportional to r^k, with C^2 = (1 - r) / (1 + r).
         variance = squares * coherent * (1 + polarised) / 2
         cubes = cubes * 4 * np.square(coherent) / (3 + np.square(coherent)) * (1 + 3 * polarised) / 4
         along, across = (columns, rows) if self._along_width else (rows, columns)
         pattern = self._tile.intensity(_amplitudes(self._tile.size, self._seed, position))
         intensity = pattern[across % self._tile.across_px, along]
-        factors = 1 + np.sqrt(variance) * _shaped(intensity, cubes / variance**1.5)
+        factors = 1 + np.sqrt(variance) * _skew_exponential(intensity, cubes / variance**1.5)
         return np.maximum(factors, 0.0).astype(np.float32)
 
 
@@ -141,33 +159,45 @@ def coherence(
     index: float = 1.0,
     cosines: tuple[float, float] = (1.0, 1.0),
 ) -> np.ndarray:
-    """Contrast, above 0 up to 1, of the speckle of a surface in the light of a laser with a spectral width.
+    """Return the speckle contrast, above 0 up to 1, of a rough surface in laser light of a spectral width.
 
-    A height h delays the light by n (cos i + cos o) h = g h. With normal heights of standard deviation s, patterns of
-    wavenumbers that differ by q are correlated by exp(-(q g s)^2 / 2) in amplitude, exp(-(q g s)^2) in intensity. Over
-    a Gaussian line of standard deviation d, q has the variance 2 d^2, and the mean of the intensity's correlation is
-    C^2 = (1 + 4 (d g s)^2)^(-1/2) (Parry in Dainty, Laser Speckle and Related Phenomena, 1975; Goodman, Speckle
-    Phenomena in Optics, Ch. 5). Light that enters the material travels farther than its roughness says: for
-    ``roughness_um`` put half the standard deviation of its optical path then, with the index 1.
+    A height h delays the light by n (cos i + cos o) h = g h. For normally distributed heights with the standard
+    deviation s, patterns of wavenumbers that differ by q have an amplitude correlation of exp(-(q g s)^2 / 2), and an
+    intensity correlation of exp(-(q g s)^2). Over a Gaussian line of standard deviation d, q has the variance 2 d^2.
+    The mean intensity correlation is C^2 = (1 + 4 (d g s)^2)^(-1/2) (Parry in Dainty, Laser Speckle and Related
+    Phenomena, 1975; Goodman, Speckle Phenomena in Optics, Ch. 5).
 
-    ``roughness_um`` is the standard deviation of the surface's heights within a resolution cell, of any shape;
-    ``linewidth_nm`` the full width at half maximum of the laser's spectrum during an exposure, 0 for a coherent laser;
-    ``wavelength_nm`` the mean wavelength in air; ``index`` the medium's refractive index n relative to air; ``cosines``
-    those of the angles i and o between the surface's normal and the light that arrives and leaves. RangeError where a
-    value is not finite, or negative.
+    Parameters
+    ----------
+    roughness_um
+        Standard deviation of the surface's heights within a resolution cell, of any shape. If light enters the
+        material, give half the standard deviation of its optical path instead, with the index 1.
+    linewidth_nm
+        Full width at half maximum of the laser's spectrum during an exposure, 0 for a coherent laser.
+    wavelength_nm
+        Mean wavelength in air.
+    index
+        Refractive index n of the medium relative to air.
+    cosines
+        Cosines of the angles i and o of incident and scattered light with the surface normal.
+
+    Raises
+    ------
+    RangeError
+        A value is not finite, or negative.
     """
-    roughness = _within("the roughness in um", roughness_um, 0.0, math.inf)
-    width = _within("the line width in nm", linewidth_nm, 0.0, math.inf)
-    wavelength = _within("the wavelength in nm", wavelength_nm, 1.0, math.inf)
+    roughness = _require_range("the roughness in um", roughness_um, 0.0, math.inf)
+    width = _require_range("the line width in nm", linewidth_nm, 0.0, math.inf)
+    wavelength = _require_range("the wavelength in nm", wavelength_nm, 1.0, math.inf)
     spread_per_um = 1e3 * 2 * math.pi / wavelength**2 * width / math.sqrt(8 * math.log(2))
     return (1 + 4 * (spread_per_um * index * sum(cosines) * roughness) ** 2) ** -0.25
 
 
 def pixel_contrast(grain_px: float) -> float:
-    """Contrast of a coherent, polarised pattern of grain lambda N (1 + m), in pixels, averaged over square pixels.
+    """Return the contrast of a coherent, polarised pattern averaged over square pixels.
 
-    C^2 is the mean of the intensity's correlation, |2 J1(z) / z|^2 with z = pi r / grain, over all pairs of points of
-    the pixel (Goodman, Speckle Phenomena in Optics, Ch. 4).
+    ``grain_px`` is lambda N (1 + m) in pixels. C^2 is the mean intensity correlation, |2 J1(z) / z|^2 with z = pi r /
+    grain, over all pairs of points of the pixel (Goodman, Speckle Phenomena in Optics, Ch. 4).
     """
     nodes, weights = np.polynomial.legendre.leggauss(32 + math.ceil(8 / grain_px))
     lag, weights = (1 + nodes) / 2, weights * (1 - nodes) / 2
@@ -176,22 +206,23 @@ def pixel_contrast(grain_px: float) -> float:
 
 
 def renewal_correlation(lag: ArrayLike) -> np.ndarray:
-    """Correlation of the complex fields at two positions that lie ``lag`` renewal lengths apart.
+    """Return the correlation of the complex fields at two positions that are ``lag`` renewal lengths apart.
 
-    The moved surface carries its speckle along, so a pixel sees a new pattern when the image has moved by a grain. Here
-    patterns fade into new ones instead of moving: 1 at no lag, 1 - (pi lag)^2 / 8 near it, one half at 0.79, none from
-    2 on. The renewal length is 0.9 lambda N (1 + m) / m of travel. Intensities are correlated by the square.
+    Real speckle moves with the surface, so a pixel sees a new pattern when the image has moved by a grain. Here,
+    patterns fade into new ones instead: the correlation is 1 at lag 0, about 1 - (pi lag)^2 / 8 near it, one half at
+    0.79, and 0 from 2 on. The renewal length is 0.9 lambda N (1 + m) / m of travel. The intensity correlation is the
+    square.
     """
     lag = np.minimum(np.abs(lag), 2.0)
     return (1 - lag / 2) * np.cos(math.pi * lag / 2) + np.sin(math.pi * lag / 2) / math.pi
 
 
 class _Tile:
-    """Periodic piece of the pattern, as long as the stripe, from amplitudes of spatial frequencies."""
+    """Periodic tile of the pattern, as long as the stripe, from amplitudes of spatial frequencies."""
 
     def __init__(self, along_px: int, grain_px: float) -> None:
         least = math.ceil(_TILE_GRAINS * grain_px)
-        apart = math.ceil(2 * grain_px)  # the ends of the stripe are neighbours in the tile
+        apart = math.ceil(2 * grain_px)  # keeps the ends of the stripe uncorrelated, as the tile is periodic
         self.across_px = cast(int, fft.next_fast_len(max(_TILE_PX, least)))
         along_px = cast(int, fft.next_fast_len(max(along_px + apart, least)))
         if grain_px <= _FINE_PX:
@@ -206,7 +237,7 @@ class _Tile:
         self.size = self._bins.size
 
     def intensity(self, amplitudes: np.ndarray) -> np.ndarray:
-        """Intensity (across, along), exponential, whose mean is the mean square of the amplitudes (size,)."""
+        """Return the exponential intensity (across, along), whose mean is the mean square of the amplitudes (size,)."""
         spectrum = np.zeros(self._shape, np.complex64)
         spectrum.ravel()[self._bins] = amplitudes * self._amplitude
         field = np.asarray(fft.ifft2(spectrum, norm="forward", overwrite_x=True))
@@ -214,17 +245,17 @@ class _Tile:
 
 
 def _power_of_sums(across_px: int, along_px: int, grain_px: float) -> np.ndarray:
-    """Relative power (across, along) of a field whose intensities are correlated as fine grains' sums over pixels.
+    """Return the relative power (across, along) of a field whose intensity has the correlation of pixel integrals.
 
-    The correlation of fields is the root of that of their intensities. The intensities are still to be reshaped, which
-    takes a share of their correlation: it is made up for, for light of one colour and polarisation.
+    The field correlation is the square root of the intensity correlation. The later transformation of the intensities
+    reduces their correlation; this is compensated for monochromatic, polarised light.
     """
     correlation = _correlation_of_sums(grain_px)
     wanted = correlation / correlation[0, 0]
-    # By Mehler's formula for exponential variables, whose polynomials are Laguerre's, the n-th term of what they are
-    # reshaped to is correlated by the n-th power.
+    # By Mehler's formula for exponential variables (Laguerre polynomials), the n-th term of their transform is
+    # correlated by the n-th power of their correlation.
     nodes, weights = np.polynomial.laguerre.laggauss(48)
-    shaped = _shaped(nodes, _third_of_pixel(grain_px) / pixel_contrast(grain_px) ** 3)
+    shaped = _skew_exponential(nodes, _third_of_pixel(grain_px) / pixel_contrast(grain_px) ** 3)
     terms = np.square((weights * shaped) @ np.polynomial.laguerre.lagvander(nodes, 12))[1:]
     drawn = np.linspace(0, 1, 1001)
     reshaped = np.polynomial.polynomial.polyval(drawn, np.concatenate([[0.0], terms / terms.sum()]))
@@ -238,7 +269,7 @@ def _power_of_sums(across_px: int, along_px: int, grain_px: float) -> np.ndarray
 
 
 def _correlation_of_sums(grain_px: float) -> np.ndarray:
-    """Covariance (L, L) of intensities summed over two pixels that lie so many rows and columns apart.
+    """Return the covariance (L, L) of intensities integrated over two pixels at each row and column distance.
 
     It is the mean of |2 J1(z) / z|^2, as in `pixel_contrast`, over pairs of points of both pixels.
     """
@@ -248,7 +279,7 @@ def _correlation_of_sums(grain_px: float) -> np.ndarray:
     part, weights = (1 + nodes) / 2, weights / 2
     count = len(part)
     places = (np.arange(-1, reach + 1)[:, None] + part).ravel()
-    # Points so far apart are found within two pixels more often, then less often, the farther they are apart.
+    # The density of distances between points of two pixels is triangular.
     pairs = np.zeros((reach + 1, places.size))
     for lag, row in enumerate(pairs):
         row[lag * count : (lag + 2) * count] = np.concatenate([weights * part, weights * (1 - part)])
@@ -257,9 +288,10 @@ def _correlation_of_sums(grain_px: float) -> np.ndarray:
 
 @cache
 def _third_of_pixel(grain_px: float) -> float:
-    """Half the third cumulant of a coherent, polarised pattern averaged over square pixels; see `pixel_contrast`.
+    """Return half the third cumulant of a coherent, polarised pattern averaged over square pixels.
 
-    It is the mean of 2 J1(z) / z over the three pairs of triples of points of the pixel, times each other.
+    It is the mean, over triples of points of the pixel, of the product of 2 J1(z) / z for their three pairs; see
+    `pixel_contrast`.
     """
     grain = max(grain_px, _BORDER_PX)
     nodes, weights = np.polynomial.legendre.leggauss(max(7, math.ceil(5 / grain)))
@@ -272,13 +304,16 @@ def _third_of_pixel(grain_px: float) -> float:
 
 
 def _airy(grains: np.ndarray) -> np.ndarray:
-    """Correlation 2 J1(z) / z of the field at distances in grains."""
+    """Return the correlation 2 J1(z) / z of the field at distances in grains."""
     z = math.pi * np.maximum(grains, 1e-9)
     return 2 * j1(z) / z
 
 
-def _shaped(exponential: np.ndarray, skew: ArrayLike) -> np.ndarray:
-    """Numbers (P,) of mean 0, variance 1 and of half the skewness ``skew``, 0 to 1, that grow with exponential ones."""
+def _skew_exponential(exponential: np.ndarray, skew: ArrayLike) -> np.ndarray:
+    """Transform exponential numbers monotonically to numbers (P,) of mean 0 and variance 1.
+
+    Their half skewness is ``skew``, 0 to 1.
+    """
     places = np.empty((2, len(exponential)))
     places[0], places[1] = np.multiply(skew, _SKEWS - 1), np.cbrt(exponential) * ((_ROOTS - 1) / _LARGEST_ROOT)
     return ndimage.map_coordinates(_shapes(), places, order=1, mode="nearest")
@@ -286,12 +321,12 @@ def _shaped(exponential: np.ndarray, skew: ArrayLike) -> np.ndarray:
 
 @cache
 def _shapes() -> np.ndarray:
-    """Quantiles (skews, roots) of distributions of mean 0 and variance 1 at those of an exponential variable.
+    """Return quantiles (skews, roots) of distributions of mean 0 and variance 1 at those of an exponential variable.
 
-    ``skews`` are halves of the skewness from 0 to 1, ``roots`` cube roots of the exponential variable. The
-    distributions are Pearson's of type III, shifted gamma distributions, which stand for sums of exponential variables
-    with the same three cumulants (Buckley and Eagleson, Austral. J. Statist. 30A, 150, 1988). They are exact for equal
-    variables, and never reach below what sums can.
+    ``skews`` are half skewnesses from 0 to 1, ``roots`` cube roots of the exponential variable. The distributions are
+    of Pearson type III (shifted gamma), which approximate sums of exponential variables with the same three cumulants
+    (Buckley and Eagleson, Austral. J. Statist. 30A, 150, 1988). They are exact for equal variables, and their lower
+    limit is never below that of the sums.
     """
     roots = np.linspace(0, _LARGEST_ROOT, _ROOTS)
     above = np.exp(-(roots**3))
@@ -302,10 +337,10 @@ def _shapes() -> np.ndarray:
 
 
 def _amplitudes(size: int, seed: int, position: float) -> np.ndarray:
-    """Circular complex Gaussian amplitudes (size,), complex64, of mean square 1 at a position in renewal lengths.
+    """Return circular complex Gaussian amplitudes (size,), complex64, of mean square 1.
 
-    Independent draws belong to the nodes of a lattice; between two nodes their cosine and sine weighted sum is taken.
-    Groups of frequencies have lattices shifted against each other, so that no position is special.
+    ``position`` is in renewal lengths. Independent draws belong to the nodes of a lattice; between two nodes, they are
+    combined with cosine and sine weights. Groups of frequencies have shifted lattices, so that no position is special.
     """
     result = np.empty(size, np.complex64)
     for group in range(_RENEWAL_GROUPS):
@@ -319,7 +354,7 @@ def _amplitudes(size: int, seed: int, position: float) -> np.ndarray:
 
 
 def _draw(size: int, seed: int, group: int, node: int) -> np.ndarray:
-    """Circular complex Gaussian numbers (size,) of mean square 1 that belong to a lattice node of either sign."""
+    """Return circular complex Gaussian numbers (size,) of mean square 1 for a lattice node of either sign."""
     key = (group, 2 * node if node >= 0 else -2 * node - 1)
     rng = np.random.Generator(np.random.SFC64(np.random.SeedSequence(seed, spawn_key=key)))
     parts = np.zeros(2 * size, np.float32)
@@ -327,8 +362,8 @@ def _draw(size: int, seed: int, group: int, node: int) -> np.ndarray:
     return parts.view(np.complex64)
 
 
-def _within(name: str, value: ArrayLike, least: float, most: float) -> np.ndarray:
-    """The value as float64, refused if not finite or outside the range."""
+def _require_range(name: str, value: ArrayLike, least: float, most: float) -> np.ndarray:
+    """Return the value as float64; RangeError if it is not finite or outside the range."""
     value = np.asarray(value, float)
     bad = ~(np.isfinite(value) & (value >= least) & (value <= most))
     if bad.any():

@@ -1,4 +1,4 @@
-"""Page of a camera's calibration from photographs: the lens models, the images used, and pictures of those left out."""
+"""Page of a camera calibration from photographs: lens models, images used, and pictures of rejected images."""
 
 from pathlib import Path
 
@@ -25,11 +25,11 @@ from uwlts.storage.image_file import read_image
 
 _THUMBNAIL_PX = 420
 _MOST_PICTURES = 12
-_ARROWS_PX = 0.02  # length of the usual arrow, as a share of the image's width
+_ARROWS_PX = 0.02  # length of the rms arrow, relative to the image width
 
 
 def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool = False) -> None:
-    """Write the page of a camera's calibration; OutputError if that fails."""
+    """Write the page of a camera calibration; OutputError if that fails."""
     lens = camera.lens
     left_out = [each for each in camera.photographs if each.reason is not None]
     used = sorted(_used(camera), key=Photograph.rms_px, reverse=True)
@@ -60,7 +60,7 @@ def write_camera(path: str | Path, camera: CameraCalibration, *, overwrite: bool
 
 
 def camera_lines(camera: CameraCalibration) -> list[str]:
-    """The result, as text."""
+    """Return the result as lines of text."""
     taken = camera.lens.options
     models = [
         f"  {each.name:32} {each.rms_px:8.4f} px" + ("   taken" if each.options == taken else "")
@@ -72,7 +72,7 @@ def camera_lines(camera: CameraCalibration) -> list[str]:
 
 
 def _summary(camera: CameraCalibration) -> list[str]:
-    """Images used, misses, and the parameters with their standard uncertainties."""
+    """Return images used, residuals, and the parameters with their standard uncertainties, as lines of text."""
     lens = camera.lens
     lines = [
         f"{len(lens.used)} of {len(camera.photographs)} images used, {lens.solution.rms_px():.3f} px rms",
@@ -94,7 +94,7 @@ def _used(camera: CameraCalibration) -> list[Photograph]:
 
 
 def _misses(camera: CameraCalibration) -> Markup:
-    """Misses of all points over the image, enlarged, and of each image."""
+    """Plot the residuals of all points over the image, magnified, and the rms of each image."""
     model = camera.lens.solution.model
     used = _used(camera)
     places = np.vstack([each.pixels for each in used])
@@ -114,7 +114,7 @@ def _misses(camera: CameraCalibration) -> Markup:
 
 
 def _thumbnail(camera: CameraCalibration, photograph: Photograph) -> str | None:
-    """The image, brightened, with the points found; None where it cannot be read."""
+    """Return the image, brightened, with the points found; None if it cannot be read."""
     try:
         image = read_image(camera.folder / photograph.name)
     except Error:

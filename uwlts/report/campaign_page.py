@@ -1,4 +1,4 @@
-"""The report of a campaign: one HTML page that contains everything it shows and loads nothing from the network."""
+"""Report of a campaign: one self-contained HTML page without network access."""
 
 import json
 import platform
@@ -51,7 +51,7 @@ _CAPTIONS = {
 
 @dataclass(frozen=True, repr=False)
 class Report(Brief):
-    """Report of a campaign: its page and summary, what it shows, and the published values beside the measured ones."""
+    """Report of a campaign: page and summary file, the campaign shown, and the published values for comparison."""
 
     page: Path
     summary: Path
@@ -59,7 +59,7 @@ class Report(Brief):
     reference: Reference | None
 
     def rows(self) -> list[Row]:
-        """The summary table."""
+        """Return the summary table."""
         return summary_table(self.campaign, self.reference)
 
 
@@ -73,7 +73,7 @@ def write_campaign(
     workers: int = 1,
     overwrite: bool = False,
 ) -> Report:
-    """Gather a campaign's files into one page with pictures, and a summary in numbers beside it.
+    """Report a campaign's files as one page with pictures, and write a numerical summary beside it.
 
     Parameters
     ----------
@@ -81,13 +81,13 @@ def write_campaign(
         Folder with captures NAME.h5, coloured clouds NAME.ply (or .h5), evaluations NAME.evaluation.json and
         calibrations.
     reference : str or Path, optional
-        Published values to set beside the measured ones: name (thesis) or path of a TOML file.
+        Published values to compare with: name (thesis) or path of a TOML file.
     out : str or Path, optional
-        Page to write; FOLDER/report.html unless given. The summary goes beside it, to summary.json.
+        Page to write (default: FOLDER/report.html). The summary is written beside it, to summary.json.
     pictures : str or Path, optional
-        Folder for the stripe and the cloud of every measurement as PNG files; not written unless given.
+        Folder for PNG files of the stripe and the cloud of every measurement (default: not written).
     workers : int
-        Number of processes that draw; with more than one, a script needs Python's ``if __name__ == "__main__"``.
+        Number of drawing processes; with more than one, a script needs Python's ``if __name__ == "__main__"``.
     overwrite : bool
         Replace an existing report, summary and pictures.
 
@@ -118,7 +118,7 @@ def write_campaign(
         try:
             Path(pictures).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OutputError(f"cannot make the folder {pictures}: {error.strerror}") from error
+            raise OutputError(f"cannot create the folder {pictures}: {error.strerror}") from error
         write_pictures(pictures, drawn, overwrite=overwrite)
     return report
 
@@ -129,7 +129,7 @@ def report_page(
     *,
     pictures: Sequence[MeasurementPictures] | None = None,
 ) -> str:
-    """The page as text; ``pictures`` are those of `draw_pictures`, drawn unless given."""
+    """Return the page as text; ``pictures`` are those of `draw_pictures` (default: drawn here)."""
     collected, rows = FigureCollector(), summary_table(campaign, reference)
     drawn = zip(campaign.measurements, pictures or draw_pictures(campaign), strict=True)
     return render_page(
@@ -139,7 +139,7 @@ def report_page(
         title=campaign.folder.resolve().name,
         introduction=introduction(campaign),
         key_figures=headline_tiles(campaign, reference),
-        groups=_grouped(rows),
+        groups=_group_rows(rows),
         published=None if reference is None else reference.title,
         explanations=explanations(rows, reference),
         measurements=[_measurement(measurement, each, collected) for measurement, each in drawn],
@@ -154,7 +154,7 @@ def report_page(
 def _measurement(
     measurement: GatheredMeasurement, pictures: MeasurementPictures, collected: FigureCollector
 ) -> dict[str, Any]:
-    """Parts of a measurement's section; what it lacks is None."""
+    """Return the parts of a measurement's section; missing ones are None."""
     cloud, judged = measurement.cloud, measurement.judged
     evaluation, truth = (None, None) if judged is None else (judged.evaluation, judged.truth)
     shown = figures = None
@@ -209,7 +209,7 @@ def _facts(measurement: GatheredMeasurement) -> list[tuple[str, str]]:
 
 
 def _truth_table(compared: TruthComparisons) -> ComparisonTable:
-    """Distances to the true surface as measured, and after the best fit if there is one."""
+    """Return the distances to the true surface as measured and, if available, after the best fit."""
     columns = {"as measured": compared, "after best fit": compared.after_best_fit}
     shown = {heading: truth for heading, truth in columns.items() if truth is not None}
     texts = [
@@ -236,7 +236,7 @@ def _truth_table(compared: TruthComparisons) -> ComparisonTable:
 
 
 def _calibrations(campaign: GatheredCampaign) -> dict[str, Any]:
-    """Parts of the section about all calibrations."""
+    """Return the parts of the section about all calibrations."""
     by_name = {found.name: found.calibration for found in campaign.calibrations}
     warnings, groups = [], []
     for name, calibration in by_name.items():
@@ -258,8 +258,8 @@ def _calibrations(campaign: GatheredCampaign) -> dict[str, Any]:
     }
 
 
-def _grouped(rows: list[Row]) -> list[tuple[str, list[tuple[str, ...]]]]:
-    """Rows as text under their measurement; the uncertainty stands beside the calibrated value."""
+def _group_rows(rows: list[Row]) -> list[tuple[str, list[tuple[str, ...]]]]:
+    """Group rows as text by measurement; the uncertainty follows the calibrated value."""
     groups: dict[str, list[tuple[str, ...]]] = {}
     for row in rows:
         name, quantity, true, *others = row.texts()
@@ -303,29 +303,29 @@ def _value(value: Any) -> str:
 _EXPLANATIONS = {
     "sphere spacing": "Distance between the centres of spheres fitted to the points, each with its radius free "
     "(VDI/VDE 2634: SSE is its error).",
-    "probing error PE": "Range of the points' distances from the fitted sphere without outliers, of which "
-    "VDI/VDE 2634 allows 0.3 %; of several spheres the worst.",
+    "probing error PE": "Range of the points' distances from the fitted sphere without outliers (VDI/VDE 2634 allows "
+    "0.3 % of outliers); the largest of several spheres.",
     "range error RE": "Range of the points' distances from the fitted plane.",
-    "deviations STD": "Standard deviation of the points' distances from the fitted surface; of several the largest.",
-    "deviations range": "Largest less smallest distance of the points from the fitted surface.",
+    "deviations STD": "Standard deviation of the points' distances from the fitted surface; the largest of several.",
+    "deviations range": "Largest minus smallest distance of the points from the fitted surface.",
     "step height": "Mean distance of one face's points from the plane fitted to the other face.",
     "pipe diameter": "Diameter of the fitted cylinder.",
-    "within": "Share of the points whose distance to the true surface, along its normal, is at most this.",
-    "rms distance": "Root mean square of those distances. Only rendered captures have a true surface. A best fit turns "
-    "and shifts the whole cloud, as aligning it with a drawing would.",
-    "window distance": "From the camera's entrance pupil to the window's inner face, found from the images in "
-    "water; true is what was set in the twin.",
-    "interface distance": "With one refraction a single interface stands for the whole window; its distance has no "
-    "true value.",
+    "within": "Fraction of the points whose distance to the true surface, along its normal, is at most this.",
+    "rms distance": "Root mean square of those distances. Only rendered captures have a true surface. A best fit "
+    "rotates and translates the whole cloud, like alignment with a drawing.",
+    "window distance": "From the camera's entrance pupil to the window's inner face, estimated from the images in "
+    "water; the true value is that of the twin.",
+    "interface distance": "With one refraction, a single interface represents the whole window; no true value of its "
+    "distance exists.",
 }
 _PUBLISHED = (
-    "Published values in mm for the same kind of measurement: errors where there is a calibrated value, else the "
-    "quantity itself; several values are several positions."
+    "Published values in mm for the same kind of measurement: errors if a calibrated value exists, else the quantity "
+    "itself; several values are for several positions."
 )
 
 
 def headline_tiles(campaign: GatheredCampaign, reference: Reference | None) -> list[Tile]:
-    """The key figures that the campaign has."""
+    """Return the key figures available in the campaign."""
     content = summary(campaign, reference)
     published, truth, window = content.published, content.truth, content.window_distance_mm
     tiles = []
@@ -346,7 +346,7 @@ def headline_tiles(campaign: GatheredCampaign, reference: Reference | None) -> l
         note = f"mean absolute value of {count} measurements" if count > 1 else "one measurement"
         add(name, small_length(found.mean_abs), note, theirs)
     if truth.share_within_tolerance is not None:
-        # After the best-fit motion if there is one: the datum is the calibration's own choice.
+        # After the best-fit motion if there is one: the coordinate system depends on the calibration.
         fitted = truth.after_best_fit.share_within_tolerance
         note = f"rms distance {small_length(truth.rms_mm)}"
         if fitted is not None:
@@ -364,7 +364,7 @@ def headline_tiles(campaign: GatheredCampaign, reference: Reference | None) -> l
 
 
 def introduction(campaign: GatheredCampaign) -> list[tuple[str, str]]:
-    """Sensor, medium, calibration and origin of the images, each in a sentence."""
+    """Return sensor, medium, calibration and origin of the images, one sentence each."""
     recorded = [m.capture for m in campaign.measurements if m.capture is not None] or list(campaign.captures)
     judged = [m.judged for m in campaign.measurements if m.judged is not None]
     indices = [text for m in campaign.measurements if (text := _index(m)) is not None]
@@ -388,7 +388,7 @@ def introduction(campaign: GatheredCampaign) -> list[tuple[str, str]]:
 
 
 def explanations(rows: list[Row], reference: Reference | None) -> list[tuple[str, str]]:
-    """Explanations of a table's quantities."""
+    """Return explanations of the quantities in a table."""
     found = [
         (start, text) for start, text in _EXPLANATIONS.items() if any(row.quantity.startswith(start) for row in rows)
     ]
@@ -413,7 +413,7 @@ def _medium(capture: GatheredCapture) -> str:
 
 
 def _index(measurement: GatheredMeasurement) -> str | None:
-    """The index that the points were calculated with, which need not be the description's."""
+    """Return the index used for the points, which may differ from that of the description."""
     recorded = {} if measurement.cloud is None else measurement.cloud.metadata
     index = measurement.judged.medium_index if measurement.judged is not None else recorded.get("medium_index")
     return f"points calculated with n = {index:.5f} relative to air" if is_number(index) else None

@@ -26,11 +26,11 @@ _WIDTH = 110
 
 @dataclass(frozen=True)
 class Row:
-    """One quantity, in mm or as a share.
+    """One quantity, in mm or as a fraction.
 
-    ``true`` is the calibrated (or, for a twin, set) value with its ``uncertainty``, ``stated`` the expanded uncertainty
-    (k = 2) of the measured one; ``published`` are errors for quantities that have a true value of their own, else
-    values of the quantity itself.
+    ``true`` is the calibrated value (for a twin: the set value) with its ``uncertainty``. ``stated`` is the expanded
+    uncertainty (k = 2) of the measured value. ``published`` are errors of quantities with a true value, else values of
+    the quantity itself.
     """
 
     measurement: str
@@ -44,12 +44,12 @@ class Row:
     unit: Literal["mm", "share"] = "mm"
 
     def texts(self) -> tuple[str, str, str, str, str, str, str]:
-        """The row as text: measurement, quantity, true, measured, error, stated, published."""
+        """Return the row as text: measurement, quantity, true, measured, error, stated, published."""
         if self.unit == "share":
             measured = MISSING if self.measured is None else f"{fixed(100 * self.measured, 2)} %"
         else:
             measured = fixed(self.measured)
-        # Two decimals below a millimetre where more were not printed: 0.10 is not the same claim as 0.1.
+        # Published values below 1 mm keep two decimals: 0.10 states more than 0.1.
         published = [fixed(v, 2) if abs(v) < 1 and round(v, 2) == v else f"{v:g}" for v in self.published]
         error, stated = fixed(self.error, signed=True), fixed(self.stated)
         known = fixed(self.true), measured, error, stated
@@ -57,13 +57,13 @@ class Row:
 
 
 def summary_table(campaign: GatheredCampaign, reference: Reference | None = None) -> list[Row]:
-    """Rows of all measurements, then the window's distance of every calibration."""
+    """Return rows for all measurements, then for the window distance of every calibration."""
     rows = [row for measurement in campaign.measurements for row in _measurement_rows(measurement, reference)]
     return rows + _window_rows(campaign, reference)
 
 
 def print_table(rows: list[Row], *, published: str = "thesis", console: Console | None = None) -> None:
-    """Print rows on a terminal of any kind, a dumb one included, or to a file; ``published`` heads the last column."""
+    """Print rows on a terminal of any kind or to a file; ``published`` is the heading of the last column."""
     if console is None:
         usual = Console()
         console = usual if usual.is_terminal and not usual.is_dumb_terminal else Console(width=_WIDTH)
@@ -75,7 +75,7 @@ def print_table(rows: list[Row], *, published: str = "thesis", console: Console 
         name, *others = row.texts()
         if last not in (None, name):
             table.add_section()
-        # Text, so that names from files are never taken for markup.
+        # Text, so that names from files are not interpreted as markup.
         table.add_row(*(Text(text) for text in ("" if name == last else name, *others)))
         last = name
     console.print(table)
@@ -116,7 +116,7 @@ def _window_rows(campaign: GatheredCampaign, reference: Reference | None) -> lis
         window = found.calibration.window
         if window is None:
             continue
-        # A single interface stands for the whole window: its distance has no true value.
+        # A single interface represents the whole window: no true value of its distance exists.
         pane = window.refractions == 2
         true = campaign.true_window_mm if pane else None
         published = reference.values((CALIBRATION,), "window_distance_mm") if reference is not None and pane else ()
@@ -127,20 +127,20 @@ def _window_rows(campaign: GatheredCampaign, reference: Reference | None) -> lis
 
 
 def parameter_table(campaign: GatheredCampaign) -> ComparisonTable:
-    """All parameters with their units and, where known, standard deviations; a last column of a twin's true values."""
+    """Return all parameters with units and known standard deviations; the last column shows a twin's true values."""
     columns = [(found.name, _parameters(found.calibration)) for found in campaign.calibrations]
     if campaign.true_sensor is not None:
         columns.append(("true", _parameters(nominal_calibration(campaign.true_sensor))))
-    return _side_by_side(columns)
+    return _combine_columns(columns)
 
 
 def residual_table(calibrations: tuple[GatheredCalibration, ...]) -> ComparisonTable:
-    """Every single figure that the residuals of the calibrations hold, by its name."""
-    return _side_by_side([(found.name, dict(_figures(found.calibration))) for found in calibrations])
+    """Return all scalar residual figures of the calibrations by name."""
+    return _combine_columns([(found.name, dict(_figures(found.calibration))) for found in calibrations])
 
 
-def _side_by_side(columns: list[tuple[str, dict[tuple[str, str], str]]]) -> ComparisonTable:
-    """Columns by their headings, each of texts by words and unit."""
+def _combine_columns(columns: list[tuple[str, dict[tuple[str, str], str]]]) -> ComparisonTable:
+    """Combine columns given by heading, each a table of texts by words and unit."""
     rows = dict.fromkeys(row for _, table in columns for row in table)
     return ComparisonTable(
         tuple(heading for heading, _ in columns),
@@ -149,7 +149,7 @@ def _side_by_side(columns: list[tuple[str, dict[tuple[str, str], str]]]) -> Comp
 
 
 def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
-    """Texts of the parameters, with their standard uncertainties where known, and of what follows from them."""
+    """Return texts of the parameters, with known standard uncertainties, and of derived quantities."""
     table = {}
     for row in parameter_rows(calibration):
         value, std = row.texts()
@@ -166,11 +166,11 @@ def _parameters(calibration: Calibration) -> dict[tuple[str, str], str]:
 
 
 def _figures(calibration: Calibration) -> Iterator[tuple[tuple[str, str], str]]:
-    """Name with unit, and text, of every single figure among the residuals."""
+    """Yield name with unit, and text, of every scalar residual figure."""
     for group, name, value in entries_of(calibration.residuals_in_file()):
         words = f"{group}: {words_of(name)}" if group else words_of(name)
         if group == "camera std":
-            # Standard deviations of the camera stand beside its parameters.
+            # Standard deviations of the camera are shown with its parameters.
             continue
         if is_number(value):
             yield (words, unit_of(name)), plain(value)

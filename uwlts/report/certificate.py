@@ -1,4 +1,4 @@
-"""The certificate of a calibration: its content as typed objects, and the seal over it."""
+"""Calibration certificate: its content as typed objects, and its seal."""
 
 import hashlib
 import json
@@ -23,30 +23,36 @@ from uwlts.model.parameter_keys import ParameterKey, WindowParameter, parameter_
 from uwlts.model.sensor import Medium
 from uwlts.pages.numbers import as_fine_as, numbers_in
 from uwlts.pages.toolkit import MISSING
-from uwlts.report.certificate_volume import InUse, LengthUncertainty, in_use, index_key, length_uncertainties
+from uwlts.report.certificate_volume import (
+    CalibrationInUse,
+    LengthUncertainty,
+    index_key,
+    length_uncertainties,
+    prepare_use,
+)
 
 FORMAT = "uwlts-certificate"
 VERSION = 1
 _SEAL = "sha256"
-# Shots that are listed besides the best one of each kind.
+# Number of best shots listed, in addition to the best one of each kind.
 _BEST_SHOTS = 3
 NOT_JOINT = "the calibration was not estimated jointly: the uncertainty of lengths measured by it is not known"
 
 
-def canonical(content: Mapping[str, JsonValue]) -> bytes:
-    """The content but its seal as bytes that depend on nothing else: sorted keys, no spaces, UTF-8."""
+def to_canonical_json(content: Mapping[str, JsonValue]) -> bytes:
+    """Return the content without its seal as canonical JSON bytes: sorted keys, no spaces, UTF-8."""
     bare = {key: value for key, value in content.items() if key != _SEAL}
     text = json.dumps(bare, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return text.encode("utf-8")
 
 
-def seal_of(content: Mapping[str, JsonValue]) -> str:
-    """The seal of a content: SHA-256 of its canonical bytes."""
-    return hashlib.sha256(canonical(content)).hexdigest()
+def compute_seal(content: Mapping[str, JsonValue]) -> str:
+    """Return the seal of a content: SHA-256 of its canonical bytes."""
+    return hashlib.sha256(to_canonical_json(content)).hexdigest()
 
 
 def read_certificate(path: str | Path) -> dict[str, JsonValue]:
-    """A certificate's JSON as it stands in the file, all of it sealed; CaptureError if it is missing or foreign."""
+    """Read the sealed JSON of a certificate; CaptureError if the file is missing or not a certificate."""
     content = read_json(path, called="certificate")
     if content.get("format") != FORMAT:
         raise CaptureError(f'{path} is JSON but not a certificate: expected "format": "{FORMAT}"')
@@ -56,31 +62,31 @@ def read_certificate(path: str | Path) -> dict[str, JsonValue]:
 
 
 def check_certificate(path: str | Path, calibration: str | Path) -> list[str]:
-    """Return objections to a certificate and to its belonging to a calibration's file; none if both are as issued.
+    """Check a certificate's seal and that it belongs to a calibration file; return the problems found.
 
     Parameters
     ----------
     path : str or Path
         Certificate (JSON) to verify.
     calibration : str or Path
-        The calibration file that it is about.
+        The certified calibration file.
 
     Raises
     ------
     CaptureError
-        A file cannot be read, or is no certificate.
+        A file cannot be read, or is not a certificate.
     """
     content, found = read_certificate(path), sha256_of(calibration)
     against = []
-    if content.get(_SEAL) != seal_of(content):
-        against.append(f"{path} was changed after it was issued: its seal does not fit its content")
+    if content.get(_SEAL) != compute_seal(content):
+        against.append(f"{path} was changed after it was issued: its seal does not match its content")
     certified = content.get("calibration")
     if not isinstance(certified, dict):
         raise CaptureError(f"{path} is damaged: it does not name its calibration")
     if found != (stated := certified.get("sha256")):
         against.append(
-            f"{calibration} is not the calibration that {path} is about, or was changed since: its SHA-256 is {found}, "
-            f"the certificate's {stated}"
+            f"{calibration} is not the calibration certified by {path}, or was changed since: its SHA-256 is {found}, "
+            f"the certificate states {stated}"
         )
     return against
 
@@ -90,13 +96,13 @@ _Medium = Annotated[Medium, PlainSerializer(lambda medium: medium.model_dump(mod
 
 
 class _Stored(BaseModel):
-    """Base of what a certificate's file holds."""
+    """Base of the content of a certificate's file."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class CertifiedFile(_Stored):
-    """The calibration's file: name, SHA-256, the digest by which clouds name it, when and by what it was made."""
+    """The calibration file: name, SHA-256, the digest stored in clouds, date, and software."""
 
     file: str
     sha256: str
@@ -106,7 +112,7 @@ class CertifiedFile(_Stored):
 
 
 class ParameterRow(_Stored):
-    """A parameter in words with its unit, value, and standard uncertainties after and before; None for unknown."""
+    """A parameter: words, unit, value, and standard uncertainties after and before calibration (None: unknown)."""
 
     name: str
     words: str
@@ -116,7 +122,7 @@ class ParameterRow(_Stored):
     std_before: float | None
 
     def texts(self) -> tuple[str, str]:
-        """The value with as many decimals as two digits of its standard uncertainty have, and that."""
+        """Return value and standard uncertainty as text, rounded to two digits of the uncertainty."""
         if self.std is None or not self.std > 0:
             return f"{self.value:.6g}", MISSING
         return as_fine_as(self.value, self.std, digits=2), as_fine_as(self.std, self.std, digits=2)
@@ -130,7 +136,7 @@ class CalibratedMedium(_Stored):
 
 
 class Validity(_Stored):
-    """A region that the evidence covers, in which medium, and how well its index is known."""
+    """A region covered by the evidence: its medium, refractive index and extent."""
 
     name: str
     medium: _Medium
@@ -145,7 +151,7 @@ class Validity(_Stored):
 
 
 class NextShot(_Stored):
-    """A further shot: what it is, the standard uncertainty of lengths before and after, and the advice to take it."""
+    """A recommended shot: description, standard uncertainty of lengths before and after, and advice."""
 
     words: str
     before_mm: float
@@ -154,7 +160,7 @@ class NextShot(_Stored):
 
 
 class Certificate(_Stored):
-    """Content of every certificate. Fields that are not given are left out of the file."""
+    """Common content of all certificates. Fields that are not set are omitted from the file."""
 
     format: str
     version: int
@@ -168,12 +174,12 @@ class Certificate(_Stored):
     uncertainty_known: bool
 
     def in_file(self) -> dict[str, JsonValue]:
-        """The content as plain JSON with the keys of files."""
+        """Return the content as plain JSON with the keys of files."""
         return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
 
 class JointCertificate(Certificate):
-    """Certificate of a joint calibration; without a covered area (see ``remark``) no lengths are known."""
+    """Certificate of a joint calibration; without a covered area (see ``remark``), lengths are not certified."""
 
     validity: tuple[Validity, ...]
     scatter_px: dict[str, float]
@@ -191,7 +197,7 @@ class JointCertificate(Certificate):
 
 
 class SequentialCertificate(Certificate):
-    """Certificate of a calibration in steps, which gives no uncertainty of lengths."""
+    """Certificate of a sequential calibration, which does not provide the uncertainty of lengths."""
 
     remark: str
     use: str
@@ -204,9 +210,9 @@ AnyCertificate = JointCertificate | SequentialCertificate
 
 
 def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -> AnyCertificate:
-    """Sealed content of a certificate of the calibration in a file, issued at a time in ISO 8601.
+    """Return the sealed content of the certificate of a calibration file, issued at a time in ISO 8601.
 
-    Raises CalibrationError: its joint estimate is damaged.
+    CalibrationError if the joint estimate is damaged.
     """
     base = Certificate(
         format=FORMAT,
@@ -226,12 +232,12 @@ def certificate_of(calibration: Calibration, path: str | Path, *, issued: str) -
         parameters=parameter_rows(calibration),
         uncertainty_known=calibration.joint is not None,
     )
-    content = (_sequential if calibration.joint is None else _joint)(base, calibration)
-    return content.model_copy(update={_SEAL: seal_of(content.in_file())})
+    content = (_complete_sequential if calibration.joint is None else _complete_joint)(base, calibration)
+    return content.model_copy(update={_SEAL: compute_seal(content.in_file())})
 
 
 def certificate_lines(content: AnyCertificate) -> list[str]:
-    """The main statements of a certificate for the terminal."""
+    """Return the main statements of a certificate for the terminal."""
     if content.remark is not None:
         return [content.remark]
     assert isinstance(content, JointCertificate)
@@ -249,7 +255,7 @@ def certificate_lines(content: AnyCertificate) -> list[str]:
 
 
 def parameter_rows(calibration: Calibration) -> tuple[ParameterRow, ...]:
-    """Every parameter that was estimated."""
+    """Return all estimated parameters."""
     if (joint := calibration.joint) is not None:
         rows = zip(joint.parameters, joint.values, joint.std, joint.std_before, strict=True)
         return tuple(_row(*row) for row in rows)
@@ -281,7 +287,7 @@ def _row(key: ParameterKey, value: float, std: float | None = None, before: floa
     )
 
 
-def _sequential(base: Certificate, calibration: Calibration) -> SequentialCertificate:
+def _complete_sequential(base: Certificate, calibration: Calibration) -> SequentialCertificate:
     window = calibration.window
     rms = {}
     for step in calibration.residuals:
@@ -297,11 +303,11 @@ def _sequential(base: Certificate, calibration: Calibration) -> SequentialCertif
     )
 
 
-def _joint(base: Certificate, calibration: Calibration) -> JointCertificate:
+def _complete_joint(base: Certificate, calibration: Calibration) -> JointCertificate:
     joint, found = require_joint(calibration), regions(calibration)
     content = JointCertificate(
         **dict(base),
-        validity=tuple(_validity(in_use(calibration, region)) for region in found),
+        validity=tuple(_validity(prepare_use(calibration, region)) for region in found),
         scatter_px=joint.scatter_px,
         shared_variance=joint.shared_variance,
         residuals=joint.residual_count,
@@ -312,7 +318,7 @@ def _joint(base: Certificate, calibration: Calibration) -> JointCertificate:
         no_area = "the stripes of the evidence cover no area: the uncertainty of lengths is not known"
         none = "the calibration does not state which volume its evidence covers: calibrate again"
         return content.model_copy(update={"remark": no_area if found else none})
-    use = in_use(calibration, found[0])
+    use = prepare_use(calibration, found[0])
     lengths, known = lengths_over(use.known, found[0]), use.known
     weak = weaknesses(lengths, known.parameters.keys, known.covariance)
     return content.model_copy(
@@ -327,7 +333,7 @@ def _joint(base: Certificate, calibration: Calibration) -> JointCertificate:
 
 
 def _shots(outlooks: Sequence[Outlook]) -> tuple[NextShot, ...]:
-    """The best shots, and the best of each kind, in their order."""
+    """Return the best shots, and the best of each kind, in order."""
     kinds = [outlook.words.split(",")[0] for outlook in outlooks]
     return tuple(
         NextShot(words=o.words.rstrip(","), before_mm=o.before_mm, after_mm=o.after_mm, advice=o.advice())
@@ -336,7 +342,7 @@ def _shots(outlooks: Sequence[Outlook]) -> tuple[NextShot, ...]:
     )
 
 
-def _validity(use: InUse) -> Validity:
+def _validity(use: CalibrationInUse) -> Validity:
     region, known, index = use.region, use.known, index_key(use.known)
     low, high = region.outline_mm.min(axis=0), region.outline_mm.max(axis=0)
     return Validity(

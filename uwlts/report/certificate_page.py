@@ -1,4 +1,4 @@
-"""The certificate as a page to read and to print, its pictures, and its files."""
+"""Certificate page for reading and printing, with its charts, and the certificate's files."""
 
 import json
 import math
@@ -32,8 +32,8 @@ from uwlts.pages.toolkit import (
 from uwlts.report.certificate import AnyCertificate, JointCertificate, ParameterRow, certificate_of, parameter_rows
 from uwlts.report.certificate_volume import (
     LengthUncertainty,
-    change_from,
-    in_use,
+    compare_calibrations,
+    prepare_use,
     require_same_sensor,
     uncertainty_maps,
 )
@@ -47,16 +47,16 @@ _WORST_IMAGES = 5
 def write_certificate(
     calibration: str | Path, *, out: str | Path | None = None, before: str | Path | None = None, overwrite: bool = False
 ) -> tuple[Path, AnyCertificate]:
-    """Write the certificate of a calibration: a page to read and print, and the same beside it as sealed JSON.
+    """Write the certificate of a calibration: a page to read and print, and its content as sealed JSON.
 
     Parameters
     ----------
     calibration : str or Path
-        Calibration file; only a joint one has uncertainties.
+        Calibration file; only a joint calibration has uncertainties.
     out : str or Path, optional
-        Page to write; CALIBRATION.certificate.html unless given. The JSON goes beside it.
+        Page to write (default: CALIBRATION.certificate.html). The JSON is written beside it.
     before : str or Path, optional
-        Another calibration of the same sensor to set beside it.
+        Another calibration of the same sensor to compare with.
     overwrite : bool
         Replace existing files.
 
@@ -89,9 +89,9 @@ def write_certificate(
 def certificate_page(
     content: AnyCertificate, calibration: Calibration, *, before: tuple[str, Calibration] | None = None
 ) -> str:
-    """The page as text; ``before`` is another calibration of the sensor with its name, set beside this one.
+    """Return the page as text; ``before`` is the name and content of another calibration of the sensor to compare with.
 
-    Raises CalibrationError: the joint estimate is damaged, or the other calibration is of another sensor.
+    CalibrationError if the joint estimate is damaged, or the other calibration is of another sensor.
     """
     if before is not None:
         require_same_sensor(calibration, before[1])
@@ -112,7 +112,10 @@ def certificate_page(
 def _pictures(
     content: JointCertificate, calibration: Calibration, before: tuple[str, Calibration] | None
 ) -> dict[str, Any]:
-    """Pictures of the page by name; ``worst`` are the images whose residuals lie farthest above their kind."""
+    """Return the charts of the page by name.
+
+    ``worst`` are the images with the largest residuals relative to their kind.
+    """
     joint = require_joint(calibration)
     fits = [image for image in content.images if image.rms_px is not None]
     fits.sort(key=lambda image: -(image.rms_px or 0.0) / content.scatter_px[image.kind])
@@ -124,11 +127,11 @@ def _pictures(
     if not content.lengths:
         return drawn
     region = regions(calibration)[0]
-    mesh, maps = uncertainty_maps(in_use(calibration, region))
+    mesh, maps = uncertainty_maps(prepare_use(calibration, region))
     drawn["lengths"] = length_chart(content.lengths)
     drawn["maps"] = [heat_map(title, mesh, 1e3 * values) for title, values in maps.items()]
     if before is not None:
-        change = change_from(calibration, before[1], region)
+        change = compare_calibrations(calibration, before[1], region)
         drawn["largest_change_um"] = 1e3 * change.largest_mm
         drawn["changes"] = [
             heat_map(f"change in {axis}", change.at_mm, 1e3 * change.moved_mm[..., "XYZ".index(axis)], signed=True)
@@ -138,7 +141,7 @@ def _pictures(
 
 
 def _parameters(rows: Sequence[ParameterRow], before: tuple[str, Calibration] | None) -> list[tuple[str, ...]]:
-    """Words, unit, value, standard uncertainty, that before; value and uncertainty by the other calibration."""
+    """Return words, unit, value, standard and prior uncertainty, then both values of the other calibration."""
     other = {} if before is None else {row.name: row for row in parameter_rows(before[1])}
     shown = []
     for row in rows:
@@ -149,7 +152,7 @@ def _parameters(rows: Sequence[ParameterRow], before: tuple[str, Calibration] | 
 
 
 def _length_rows(lengths: Sequence[LengthUncertainty]) -> list[tuple[float, list[tuple[str, str]]]]:
-    """Length, and for X, Y and Z its expanded uncertainties in µm; a dash where it does not fit."""
+    """Return lengths with expanded uncertainties in µm along X, Y and Z; a dash if the length does not fit."""
     table = {(r.length_mm, r.axis): (fixed(1e3 * r.calibration_mm, 1), fixed(1e3 * r.point_mm, 1)) for r in lengths}
     return [
         (length, [table.get((length, axis), (MISSING, MISSING)) for axis in "XYZ"])
@@ -158,7 +161,10 @@ def _length_rows(lengths: Sequence[LengthUncertainty]) -> list[tuple[float, list
 
 
 def heat_map(title: str, at_mm: np.ndarray, values: np.ndarray, *, signed: bool = False) -> Markup:
-    """Values (R, C) in µm over a mesh (R, C, 2) of Y and Z, the sensor being above; signed ones from blue to red."""
+    """Draw values (R, C) in µm over a mesh (R, C, 2) of Y and Z, with the sensor on top.
+
+    Signed values are drawn from blue to red.
+    """
     size = np.ptp(at_mm.reshape(-1, 2), axis=0)
     figure, (ax,) = new_figure(3.7, float(np.clip(2.4 * size[1] / size[0], 1.5, 4.0)) + 0.8)
     limit = max(float(np.abs(values).max()), 1e-9)
@@ -173,12 +179,12 @@ def heat_map(title: str, at_mm: np.ndarray, values: np.ndarray, *, signed: bool 
 
 
 def correlation_picture(keys: Sequence[ParameterKey], covariance: np.ndarray) -> Markup:
-    """The correlation matrix of parameters, coloured, with their names at the left and numbers above."""
+    """Draw the correlation matrix of parameters, with names on the left and numbers on top."""
     std = np.sqrt(np.diag(covariance))
     std = np.where(std > 0, std, 1.0)
     correlation = covariance / np.outer(std, std)
     count = len(keys)
-    # A row of 0.24 inches holds its name in 8 points; names need some 3 inches at the left.
+    # A row of 0.24 inches holds an 8-point name; names need about 3 inches on the left.
     figure, (ax,) = new_figure(3.0 + 0.24 * count, 0.5 + 0.24 * count)
     ax.imshow(correlation, cmap=DEVIATIONS, vmin=-1, vmax=1)
     for row, column in np.argwhere(np.abs(correlation) >= 0.5):
@@ -199,7 +205,7 @@ def correlation_picture(keys: Sequence[ParameterKey], covariance: np.ndarray) ->
 
 
 def image_residuals(images: Sequence[ImageFit]) -> Markup:
-    """Root mean square residual of every image, a panel for each kind and two of them in a row."""
+    """Draw the rms residual of every image, one panel per kind and two panels per row."""
     kinds = list(dict.fromkeys(image.kind for image in images))
     rows = math.ceil(len(kinds) / 2)
     figure, panels = new_figure(9.0, 2.7 * rows, rows=rows, columns=min(2, len(kinds)))
@@ -215,7 +221,7 @@ def image_residuals(images: Sequence[ImageFit]) -> Markup:
 
 
 def length_chart(lengths: Sequence[LengthUncertainty]) -> Markup:
-    """Expanded uncertainty over length, for each axis."""
+    """Draw the expanded uncertainty over length, for each axis."""
     figure, panels = new_figure(9.0, 3.2, columns=2)
     shown = {"surfaces: the calibration alone": "calibration_mm", "single points": "point_mm"}
     for ax, (title, name) in zip(panels, shown.items(), strict=True):

@@ -1,4 +1,4 @@
-"""Uncertainty of lengths and points over the volume that a joint calibration covers, and its change by another one."""
+"""Uncertainty of lengths and points over the calibrated volume, and differences between two calibrations."""
 
 from dataclasses import dataclass
 
@@ -22,22 +22,22 @@ from uwlts.model.sensor import Uncertainty
 from uwlts.optics.triangulation import points_on_sheet
 
 LENGTHS_MM = (10.0, 20.0, 50.0, 100.0, 150.0, 200.0, 300.0, 500.0)
-# Places tried along each axis for the largest uncertainty, which changes slowly over the volume.
+# Number of positions along each axis searched for the largest uncertainty, which varies slowly over the volume.
 _PLACES = 9
 # Rows of the maps' mesh, along Z; finer meshes look the same.
 _ROWS = 17
 # Columns of the maps' mesh, along Y.
 _COLUMNS = 21
 _SHORT_SHARE = 0.25
-"""Of the volume's depth and width: a length whose uncertainty is shown where it is measured."""
+"""Largest short length of the maps, relative to the smaller of the volume's depth and width."""
 
 
 @dataclass(frozen=True)
 class LengthUncertainty:
-    """Expanded uncertainties (k = 2) in mm of one length along X, Y or Z, the largest over the volume.
+    """Expanded uncertainties (k = 2) in mm of a length along X, Y or Z, the largest in the volume.
 
-    ``calibration_mm`` is by the calibration alone, as for points averaged over surfaces; along X by the stage alone.
-    ``point_mm`` includes the noise of a single stripe centre at each end.
+    ``calibration_mm`` is the contribution of the calibration alone, as for points averaged over surfaces; along X, that
+    of the stage. ``point_mm`` includes the noise of a single stripe centre at each end.
     """
 
     axis: str
@@ -47,11 +47,11 @@ class LengthUncertainty:
 
 
 @dataclass(frozen=True, eq=False)
-class InUse:
-    """A joint estimate as it holds for measurements, in the region that it covers.
+class CalibrationInUse:
+    """A joint estimate as used for measurements, in the region that it covers.
 
-    ``covariance`` (P, P) is that of the estimate with the drift of the medium's index since; ``noise_px`` the standard
-    deviation of a stripe's centre.
+    ``covariance`` (P, P) includes the drift of the medium's index since calibration. ``noise_px`` is the standard
+    deviation of a stripe centre.
     """
 
     calibration: Calibration
@@ -62,8 +62,8 @@ class InUse:
     noise_px: float
 
 
-def in_use(calibration: Calibration, region: SheetRegion) -> InUse:
-    """A joint calibration in one of its regions; CalibrationError where it is damaged."""
+def prepare_use(calibration: Calibration, region: SheetRegion) -> CalibrationInUse:
+    """Return a joint calibration for measurements in one of its regions; CalibrationError if it is damaged."""
     known = estimate_in(calibration, region)
     uncertainty = calibration.origin().known_before
     covariance, keys = known.covariance.copy(), known.parameters.keys
@@ -72,38 +72,40 @@ def in_use(calibration: Calibration, region: SheetRegion) -> InUse:
         covariance[keys.index(index), keys.index(index)] += drift**2
     scatter = require_joint(calibration).scatter_px
     noise = next((scatter[kind] for kind in (STRIPE, STEP, *SCANNED) if kind in scatter), 0.0)
-    return InUse(calibration, region, known, covariance, uncertainty, noise)
+    return CalibrationInUse(calibration, region, known, covariance, uncertainty, noise)
 
 
 def index_key(known: StoredEstimate) -> MediumIndex | None:
-    """The index of what the camera looks into; None in air."""
+    """Return the parameter key of the index of the camera's medium; None in air."""
     return None if known.view.medium is None else known.parameters.index_key(known.view.medium)
 
 
-def length_uncertainties(use: InUse) -> list[LengthUncertainty]:
-    """Every length that fits into the volume, along X, Y and Z."""
+def length_uncertainties(use: CalibrationInUse) -> list[LengthUncertainty]:
+    """Return the uncertainty of every length that fits into the volume, along X, Y and Z."""
     found = []
     for axis in "YZ":
         for length in LENGTHS_MM:
-            ends = ends_over(use.region, axis, length)
+            ends = find_ends(use.region, axis, length)
             if len(ends):
-                std = [lengths_of(use, ends).std_mm(use.covariance, noise_px=noise) for noise in (0.0, use.noise_px)]
+                std = [
+                    compute_lengths(use, ends).std_mm(use.covariance, noise_px=noise) for noise in (0.0, use.noise_px)
+                ]
                 found.append(LengthUncertainty(axis, length, *(2 * float(each.max()) for each in std)))
-    # Along the stage's motion the same place of the sheet sees both ends, so that only the stage counts.
+    # Along the stage's motion, the same point of the sheet measures both ends, so only the stage contributes.
     position, scale = np.sqrt(2.0) * use.uncertainty.stage_position_mm, use.uncertainty.stage_scale
     along_x = {length: 2 * float(np.hypot(position, scale * length)) for length in sorted({e.length_mm for e in found})}
     return [LengthUncertainty("X", length, stage, stage) for length, stage in along_x.items()] + found
 
 
-def lengths_of(use: InUse, ends: np.ndarray) -> Lengths:
-    """Lengths between Y and Z (M, 2, 2)."""
+def compute_lengths(use: CalibrationInUse, ends: np.ndarray) -> Lengths:
+    """Return lengths between points given by Y and Z (M, 2, 2)."""
     points = points_at(use.known, ends.reshape(-1, 2))
     first = 2 * np.arange(len(ends))
     return lengths_between(points, first, first + 1)
 
 
-def ends_over(region: SheetRegion, axis: str, length_mm: float) -> np.ndarray:
-    """Ends (M, 2, 2) of lengths along an axis all over a region; none where it does not fit."""
+def find_ends(region: SheetRegion, axis: str, length_mm: float) -> np.ndarray:
+    """Return end points (M, 2, 2) of lengths along an axis throughout a region; empty if the length does not fit."""
     depths = region.mesh(_PLACES, 2)[:, 0, 1]
     found = []
     if axis == "Y":
@@ -119,17 +121,17 @@ def ends_over(region: SheetRegion, axis: str, length_mm: float) -> np.ndarray:
     return np.array(found).reshape(-1, 2, 2)
 
 
-def uncertainty_maps(use: InUse) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Y and Z (R, C, 2) of a mesh of the sheet, and maps of standard uncertainties (R, C) over it, mm, by their titles.
+def uncertainty_maps(use: CalibrationInUse) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return Y and Z (R, C, 2) of a mesh of the sheet, and maps of standard uncertainties (R, C) in mm by title.
 
-    For points they are those of the coordinates of the form, without a rigid motion of the whole volume: by the
-    calibration alone, and with the stripe's noise. For a length that fits well into the volume they are those by the
-    calibration, about each point as far as the volume reaches.
+    For points, they are uncertainties of the coordinates without rigid motion of the whole volume: from the calibration
+    alone, and with stripe noise. For a short length about each point, they are from the calibration; its centre is
+    moved inwards if the length would exceed the volume.
     """
     mesh = use.region.mesh(_ROWS, _COLUMNS)
     at = mesh.reshape(-1, 2)
     points = points_at(use.known, at)
-    moved = without_rigid_motion(at, (points.by_parameters @ covariance_root(use.covariance)).transpose(2, 0, 1))
+    moved = remove_rigid_motion(at, (points.by_parameters @ covariance_root(use.covariance)).transpose(2, 0, 1))
     calibration = np.sqrt(np.sum(moved**2, axis=0))
     shown = {"calibration": calibration, "single point": np.hypot(calibration, points.by_px * use.noise_px)}
     maps = {
@@ -141,12 +143,12 @@ def uncertainty_maps(use: InUse) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     power = 10.0 ** np.floor(np.log10(longest))
     short = float(max(step * power for step in (1, 2, 5) if step * power <= longest))
     for axis, length in (("Y", (short, 0.0)), ("Z", (0.0, short))):
-        maps[f"u of {short:g} mm along {axis}"] = _of_length(use, mesh, np.array(length))
+        maps[f"u of {short:g} mm along {axis}"] = _map_length(use, mesh, np.array(length))
     return mesh, maps
 
 
-def without_rigid_motion(at_mm: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """Displacements (R, N, 3) of points at Y and Z (N, 2) less the rigid motions that fit them best."""
+def remove_rigid_motion(at_mm: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Return displacements (R, N, 3) of points at Y and Z (N, 2) after subtracting the best-fit rigid motions."""
     points = np.column_stack([np.zeros(len(at_mm)), at_mm - at_mm.mean(axis=0)])
     turns = np.cross(np.eye(3)[:, None], points[None])
     shifts = np.broadcast_to(np.eye(3)[:, None], turns.shape)
@@ -155,8 +157,8 @@ def without_rigid_motion(at_mm: np.ndarray, moved: np.ndarray) -> np.ndarray:
     return (flat - (flat @ basis) @ basis.T).reshape(moved.shape)
 
 
-def _of_length(use: InUse, mesh: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Standard uncertainty (R, C) of a length (2,) whose middle is at each point of the mesh, or as near as it fits."""
+def _map_length(use: CalibrationInUse, mesh: np.ndarray, length: np.ndarray) -> np.ndarray:
+    """Return the standard uncertainty (R, C) of a length vector (2,) centred at, or near, each mesh point."""
     middle = mesh.reshape(-1, 2).copy()
     low, high = use.region.outline_mm[:, 1].min(), use.region.outline_mm[:, 1].max()
     half = length / 2
@@ -166,15 +168,15 @@ def _of_length(use: InUse, mesh: np.ndarray, length: np.ndarray) -> np.ndarray:
         left, right = max(a for a, _ in ranges) + half[0], min(b for _, b in ranges) - half[0]
         at[0] = np.clip(at[0], left, right) if left < right else (left + right) / 2
     ends = np.stack([middle - half, middle + half], axis=1)
-    return lengths_of(use, ends).std_mm(use.covariance).reshape(mesh.shape[:2])
+    return compute_lengths(use, ends).std_mm(use.covariance).reshape(mesh.shape[:2])
 
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Displacement in mm of points of the same pixels by a calibration against another one.
+    """Displacement in mm of points of the same pixels between two calibrations.
 
-    ``moved_mm`` (R, C, 3) is that in X, Y and Z of the OCS at Y and Z ``at_mm`` (R, C, 2), with a rigid motion of all
-    taken out; ``largest_mm`` is the largest distance before that.
+    ``moved_mm`` (R, C, 3) is the displacement in X, Y and Z of the OCS at Y and Z ``at_mm`` (R, C, 2). A rigid motion
+    of all points is subtracted; ``largest_mm`` is the largest distance before that.
     """
 
     at_mm: np.ndarray
@@ -183,7 +185,7 @@ class Change:
 
 
 def require_same_sensor(calibration: Calibration, other: Calibration) -> None:
-    """CalibrationError where two calibrations cannot be of one sensor."""
+    """Check that two calibrations can be of the same sensor; CalibrationError if not."""
     sizes = [f"{c.camera.width_px} x {c.camera.height_px} px" for c in (calibration, other)]
     for name, (one, two) in {
         "image size": sizes,
@@ -195,10 +197,10 @@ def require_same_sensor(calibration: Calibration, other: Calibration) -> None:
             )
 
 
-def change_from(calibration: Calibration, other: Calibration, region: SheetRegion) -> Change:
-    """Change of a calibration against another one, in its region.
+def compare_calibrations(calibration: Calibration, other: Calibration, region: SheetRegion) -> Change:
+    """Return the displacements between a calibration and another one, in its region.
 
-    Raises CalibrationError: the other one is of another sensor, or sees no sheet somewhere in the region.
+    CalibrationError if the other calibration is of another sensor, or does not see the sheet in part of the region.
     """
     require_same_sensor(calibration, other)
     mesh = region.mesh(_ROWS, _COLUMNS)
@@ -208,8 +210,10 @@ def change_from(calibration: Calibration, other: Calibration, region: SheetRegio
         through = each if region.view.window else each.model_copy(update={"window": None})
         found = points_on_sheet(through, pixels, medium_index=each.index_of(region.medium)).points_mm
         if not np.isfinite(found).all():
-            raise CalibrationError("one of the calibrations sees no sheet somewhere in the volume: they do not compare")
+            raise CalibrationError(
+                "one of the calibrations does not see the sheet in part of the volume: they cannot be compared"
+            )
         points.append(found)
     moved = (points[0] - points[1]) @ calibration.object_transform()[:3, :3]
-    form = without_rigid_motion(mesh.reshape(-1, 2), moved[None])[0]
+    form = remove_rigid_motion(mesh.reshape(-1, 2), moved[None])[0]
     return Change(mesh, form.reshape(*mesh.shape[:2], 3), float(np.linalg.norm(moved, axis=1).max()))

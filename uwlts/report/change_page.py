@@ -1,4 +1,4 @@
-"""Page of a surface's change: a map of the distances, their histogram and the figures; and the places as a cloud."""
+"""Page of a surface change: map and histogram of the distances, and figures; the points as a coloured cloud."""
 
 from pathlib import Path
 
@@ -17,11 +17,11 @@ from uwlts.storage.cloud_files import PLY_COLOURS, write_ply_points
 from uwlts.storage.las_file import las_content
 
 PLACES_FORMATS = (".ply", ".laz", ".las")
-"""Endings of the files of places."""
+"""Supported endings of the coloured cloud."""
 _COLOURS = colormaps["RdBu"]
 _NOT_SIGNIFICANT = "#cccccc"
 _INK = 60_000
-"""Area of all dots together, square points: they nearly touch."""
+"""Total area of all dots (square points), such that they nearly touch."""
 _COLUMNS = (
     "region",
     "centre / mm",
@@ -33,7 +33,7 @@ _COLUMNS = (
     "volume / mm³",
 )
 _MOST_ROWS = 20
-"""Regions that the page lists and numbers; the file beside it has all."""
+"""Number of regions listed and numbered on the page; the JSON file lists all."""
 
 
 def write_change(
@@ -44,11 +44,11 @@ def write_change(
     coloured: str | Path | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write the page of a change, its figures as JSON beside it, and its places as a cloud (``coloured``).
+    """Write the page of a change, its figures as JSON beside it, and its points as a cloud (``coloured``).
 
-    The cloud is PLY, LAZ or LAS by its ending. Its points have x, y, z (mm in PLY, else m), the colours of the map,
-    nx, ny, nz, distance, level (mm; NaN where not compared) and significant (0, 1).
-    OutputError if a file exists and ``overwrite`` is not given, or cannot be written.
+    The cloud is PLY, LAZ or LAS, depending on its ending. Its fields are x, y, z (mm in PLY, else m), the colours of
+    the map, nx, ny, nz, distance, level (mm; NaN if not compared) and significant (0, 1). OutputError if a file exists
+    and ``overwrite`` is not given, or cannot be written.
     """
     text = render_page(
         "uwlts.report",
@@ -85,7 +85,7 @@ def _write_places(path: Path, change: SurfaceChange, *, overwrite: bool) -> None
 
 
 def _colours(change: SurfaceChange) -> np.ndarray:
-    """Red, green and blue (P, 3) uint8 of the places, as on the map; `UNKNOWN` where not compared."""
+    """Return red, green and blue (P, 3) uint8 of the points, as on the map; `UNKNOWN` if not compared."""
     limit = surface_limit_mm(change.distance_mm[change.compared])
     colours = _COLOURS((np.nan_to_num(change.distance_mm) / limit + 1) / 2, bytes=True)[:, :3]
     for where, colour in ((~change.significant, _NOT_SIGNIFICANT), (~change.compared, UNKNOWN)):
@@ -110,7 +110,7 @@ def _rows(change: SurfaceChange) -> list[tuple[str, ...]]:
 
 
 def _map(change: SurfaceChange) -> str:
-    """The places from above, across the two longest of their extents, coloured where the change is significant."""
+    """Plot the points along their two longest extents, coloured if the change is significant."""
     first, second = np.sort(np.argsort(np.ptp(change.points_mm, axis=0), kind="stable")[1:])
     shown, changed = change.compared, change.significant
     limit = surface_limit_mm(change.distance_mm[shown])
@@ -144,6 +144,6 @@ def _histogram(change: SurfaceChange) -> Markup:
     for side in (-1, 1):
         label = "level of detection (median)" if side > 0 else None
         axes.axvline(side * float(np.median(level)), color=RED, linewidth=1, label=label)
-    axes.set(xlabel="distance / mm", ylabel="places")
+    axes.set(xlabel="distance / mm", ylabel="points")
     axes.legend(frameon=False)
     return svg_of(figure)

@@ -1,4 +1,4 @@
-"""Report of an inspection for the owner of the object: findings first, then pictures, uncertainty and traceability."""
+"""Inspection report for the owner of the object: findings, pictures, uncertainty and traceability."""
 
 from __future__ import annotations
 
@@ -50,22 +50,22 @@ from uwlts.storage.cloud_files import read_cloud
 
 _BLEMISHES = (FeatureKind.PIT, FeatureKind.DENT, FeatureKind.PROTRUSION)
 _FIRST = ("depth", "height", "remaining wall")
-"""Values that stand first in the table of findings."""
+"""Quantities in the first columns of the table of findings."""
 _SMALLEST = 1e-6
-"""An uncertainty below it is written as 0."""
+"""Smaller uncertainties are shown as 0."""
 _SMALLEST_MM = 0.002
-"""Figures without uncertainty are written to a tenth of it."""
+"""Precision that determines the decimals of figures without uncertainty."""
 _MOST_PICTURES = 40
 FINDINGS = "findings"
-"""Kind of the page, in the name of the JSON beside it."""
+"""Kind of the page, in the name of its JSON file."""
 _MOST_DRAWN = 60_000
 _AROUND = 1.2
-"""Times a finding's size: how much is drawn around it."""
+"""Size of the area shown around a finding, relative to the finding."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A file that the findings rest on, with its SHA-256 digest, and what is to be said of it."""
+    """A file on which the findings are based: role, name, SHA-256 digest, and a note."""
 
     role: str
     name: str
@@ -75,7 +75,7 @@ class Source:
 
 @dataclass(frozen=True)
 class _CheckedFigure:
-    """A figure of an artefact, mm, with its expanded uncertainty (k = 2), and the calibrated size whose error it is."""
+    """A figure of an artefact in mm, with its expanded uncertainty (k = 2) and the calibrated size, if any."""
 
     name: str
     calibrated_mm: float | None
@@ -98,33 +98,33 @@ def write_findings(
     overwrite: bool = False,
     **options: Any,
 ) -> Inspection:
-    """Inspect a cloud and write the report for the object's owner: a page, the same as JSON, and as PDF.
+    """Inspect a cloud and write the report for the object's owner: a page, its content as JSON, and optionally a PDF.
 
     Parameters
     ----------
     cloud
         File of the object's cloud.
     kind
-        What the cloud shows.
+        Kind of the object.
     out
-        Page to write; the JSON goes beside it, for pipe.html to pipe.findings.json.
+        Page to write; the JSON is written beside it, for pipe.html to pipe.findings.json.
     pdf
-        Also print the page to a PDF beside it, with the Chromium or Chrome that is installed.
+        Also print the page to a PDF beside it, with an installed Chromium or Chrome.
     title
-        Title of the report; the kind and the cloud's name unless given.
+        Title of the report (default: "Inspection of" and the cloud's name).
     captures
-        Captures that the cloud was reconstructed from, for the traceability.
+        Captures from which the cloud was reconstructed, for traceability.
     calibration
-        Calibration of the sensor; it has to be the one that the cloud names.
+        Calibration of the sensor; it must be the one named by the cloud.
     certificate
-        Its certificate (JSON), whose seal is checked.
+        Certificate (JSON) of the calibration, whose seal is checked.
     verification
-        Evaluations (JSON of uwlts evaluate) of artefacts that were measured by the same calibration; their figures
-        stand in the report.
+        Evaluations (JSON of uwlts evaluate) of artefacts measured with the same calibration; their figures are
+        reported.
     overwrite
         Replace existing files.
     options
-        Those of the kind's inspection: `uwlts.inspect_pipe`, `uwlts.inspect_weld`, `uwlts.inspect_flange`.
+        Options of the inspection: `uwlts.inspect_pipe`, `uwlts.inspect_weld`, `uwlts.inspect_flange`.
 
     Raises
     ------
@@ -133,9 +133,9 @@ def write_findings(
     CaptureError, CalibrationError
         A file cannot be read.
     EvaluationError
-        The cloud does not show such an object, or the calibration, certificate or verification belongs to another one.
+        The cloud does not show such an object, or does not belong to the calibration, certificate or verification.
     SetupError
-        A PDF is asked for and there is no browser.
+        A PDF is requested, but no browser is installed.
     """
     page, path = Path(out), Path(cloud)
     refuse_unsuitable_page(page, kind=FINDINGS, overwrite=overwrite)
@@ -191,22 +191,22 @@ def _sources(
         sources.append(Source("calibration", Path(calibration).name, sha256_of(calibration), note))
     if certificate is not None:
         if calibration is None:
-            raise EvaluationError("a certificate is that of a calibration: give that, too")
+            raise EvaluationError("a certificate belongs to a calibration: give that, too")
         if problems := check_certificate(certificate, calibration):
-            raise EvaluationError(f"the certificate {certificate} does not hold: {'; '.join(problems)}")
+            raise EvaluationError(f"the certificate {certificate} is not valid: {'; '.join(problems)}")
         sources.append(Source("certificate", Path(certificate).name, sha256_of(certificate), "its seal is intact"))
     return sources
 
 
 def _artefact_check(path: str | Path, cloud: PointCloud) -> tuple[str, list[_CheckedFigure]]:
-    """Name and figures of an artefact that was measured by the calibration that the cloud names."""
+    """Return name and figures of an artefact that was measured with the calibration named by the cloud."""
     record, named = read_evaluation(path), cloud.metadata.get("calibration")
     if record.artefact is None or record.evaluation is None:
-        raise EvaluationError(f"{path} is the evaluation of no artefact: give those of spheres, a step or a plane")
+        raise EvaluationError(f"{path} is not an evaluation of an artefact: give that of spheres, a step or a plane")
     if named is None or record.calibration != named:
         raise EvaluationError(
-            f"{path} is of a cloud by another calibration than this one: it names {str(record.calibration)[:12]}, the "
-            f"cloud {str(named)[:12]}; measure the artefact by the calibration in use"
+            f"{path} is of a cloud made by another calibration: it names {str(record.calibration)[:12]}, the cloud "
+            f"{str(named)[:12]}; measure the artefact with the calibration in use"
         )
     figures, keys = record.evaluation.figures_mm, record.figure_keys()
     rows = []
@@ -270,13 +270,13 @@ def _page(
     )
 
 
-def _with_interval(value: FeatureValue) -> str:
+def _format_interval(value: FeatureValue) -> str:
     half = COVERAGE_FACTOR * value.uncertainty
     if half <= _SMALLEST:
         return f"{value.value:.4g}"
     shown = as_fine_as(value.value, half, digits=2)
     if value.low > value.value - 0.9 * half:
-        # Not symmetric: a value that cannot be negative.
+        # The interval of a non-negative value is asymmetric.
         return f"{shown} ({as_fine_as(value.low, half, digits=2)} to {as_fine_as(value.high, half, digits=2)})"
     return f"{shown} ± {as_fine_as(half, half, digits=2)}"
 
@@ -286,11 +286,11 @@ def _value_row(value: FeatureValue) -> tuple[str, ...]:
     fine = [
         MISSING if part is None else as_fine_as(part, part, digits=2) if part > _SMALLEST else "0" for part in parts
     ]
-    return value.name, value.unit, _with_interval(value), *fine
+    return value.name, value.unit, _format_interval(value), *fine
 
 
 def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str, ...]]] | None:
-    """Headings and rows of features with values of the same names; None where there are none."""
+    """Return headings and rows of features; None without features."""
     if not features:
         return None
     units = {value.name: value.unit for each in features for value in each.values}
@@ -298,7 +298,7 @@ def _rows(features: Sequence[Feature]) -> tuple[tuple[str, ...], list[tuple[str,
     rows = []
     for each in features:
         place = " ".join(f"{number:.1f}" for number in each.place_mm)
-        rows.append((each.name, place, *(_with_interval(each[name]) if name in each else MISSING for name in units)))
+        rows.append((each.name, place, *(_format_interval(each[name]) if name in each else MISSING for name in units)))
     return ("finding", "place / mm", *(f"{name} / {unit}" for name, unit in units.items())), rows
 
 
@@ -309,30 +309,30 @@ def _tiles(whole: list[Feature], parts: list[Feature]) -> list[Tile]:
             worst = max(own, key=lambda each: each.values[0].value)
             value = worst.values[0]
             plural = f"{kind}s" if len(own) > 1 else str(kind)
-            note = f"largest {value.name} {_with_interval(value)} {value.unit} ({worst.name})"
+            note = f"largest {value.name} {_format_interval(value)} {value.unit} ({worst.name})"
             tiles.append(Tile(plural, str(len(own)), note, accent=True))
     walls = [each["remaining wall"] for each in parts if "remaining wall" in each]
     if walls:
         least = min(walls, key=lambda value: value.value)
-        tiles.append(Tile("least remaining wall", f"{_with_interval(least)} {least.unit}", accent=True))
+        tiles.append(Tile("least remaining wall", f"{_format_interval(least)} {least.unit}", accent=True))
     if whole and whole[0].kind == FeatureKind.PIPE and not parts:
         tiles.append(Tile("pits, dents, protrusions", "none found", accent=True))
     for each in whole[:1]:
         for value in each.values[:5]:
             if not value.name.startswith("axis"):
-                tiles.append(Tile(f"{each.name}: {value.name}", f"{_with_interval(value)} {value.unit}"))
+                tiles.append(Tile(f"{each.name}: {value.name}", f"{_format_interval(value)} {value.unit}"))
     return tiles
 
 
 def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:
-    """All points by their deviation: of a pipe unrolled along its axis, else across the two longest extents."""
+    """Plot all points by their deviation: a pipe unrolled along its axis, other objects in X and Y."""
     seen = np.flatnonzero(np.isfinite(found.deviation_mm))
     seen = seen[:: max(1, len(seen) // _MOST_DRAWN)]
     whole = found.features[0] if found.features else None
     pipe = whole if whole is not None and whole.kind == FeatureKind.PIPE else None
     middle = cloud.points_mm[seen].mean(axis=0)
-    u, v = _flat(cloud.points_mm[seen], pipe, middle)
-    # As wide as the surface asks for at a height of 5 inches, with the bar of colours beside it.
+    u, v = _map_coordinates(cloud.points_mm[seen], pipe, middle)
+    # Width for equal scales at a height of 5 inches, including the colour bar.
     width = 1.8 + 4.5 * float(np.ptp(u)) / max(float(np.ptp(v)), 1e-9)
     figure, (axes,) = new_figure(float(np.clip(width, 4.0, 9.0)), 5.0)
     limit = surface_limit_mm(found.deviation_mm)
@@ -340,7 +340,7 @@ def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:
     colours = axes.scatter(u, v, c=found.deviation_mm[seen], rasterized=True, **style)
     figure.colorbar(colours, ax=axes, label="above the undamaged surface / mm")
     for each in parts:
-        x, y = _flat(each.place_mm[None], pipe, middle)
+        x, y = _map_coordinates(each.place_mm[None], pipe, middle)
         axes.annotate(each.name, (x[0], y[0]), xytext=(8, 8), textcoords="offset points", fontsize=8, color=INK)
         axes.plot(x, y, "o", markersize=14, markerfacecolor="none", markeredgecolor=RED)
     labels = ("along the axis / mm", "around the circumference / mm") if pipe else ("first extent / mm", "second / mm")
@@ -348,8 +348,8 @@ def _map(found: Inspection, cloud: PointCloud, parts: list[Feature]) -> str:
     return png_data_uri(figure, dpi=130)
 
 
-def _flat(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Coordinates (N,) of points on a map: along and around a pipe from the side of ``middle`` (3,), else X and Y."""
+def _map_coordinates(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return map coordinates (N,) of points: along and around a pipe, centred at ``middle`` (3,), else X and Y."""
     if pipe is None:
         return points[:, 0], points[:, 1]
     away = (points - pipe.place_mm) @ pipe.axes.T
@@ -359,11 +359,11 @@ def _flat(points: np.ndarray, pipe: Feature | None, middle: np.ndarray) -> tuple
 
 
 def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
-    """A finding from above, and cut along its length through its deepest place."""
+    """Plot a finding from above, and in a section along its length through the deepest point."""
     local = (cloud.points_mm - feature.place_mm) @ feature.axes.T
     half = np.maximum(_AROUND * feature.extent_mm[:2], 2.0)
     near = np.isfinite(found.deviation_mm) & (np.abs(local[:, :2]) < half).all(axis=1)
-    # The other side of a pipe lies below.
+    # Exclude the opposite side of a pipe.
     near &= np.abs(local[:, 2]) < max(2 * float(half.max()), 5.0)
     local, deviation = local[near], found.deviation_mm[near]
     figure, (above, cut) = new_figure(9.0, 3.4, columns=2)
@@ -379,7 +379,9 @@ def _picture(feature: Feature, found: Inspection, cloud: PointCloud) -> str:
     cut.axhline(0, color=INK, linewidth=0.8)
     value = feature.values[0]
     sign = 1 if feature.kind == FeatureKind.PROTRUSION else -1
-    cut.axhline(sign * value.value, color=RED, linewidth=1, label=f"{value.name} {_with_interval(value)} {value.unit}")
+    cut.axhline(
+        sign * value.value, color=RED, linewidth=1, label=f"{value.name} {_format_interval(value)} {value.unit}"
+    )
     cut.set(xlabel="along its length / mm", ylabel="deviation / mm")
     cut.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, 1.22), ncols=2, frameon=False)
     return png_data_uri(figure, dpi=110)

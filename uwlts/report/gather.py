@@ -1,4 +1,4 @@
-"""Reads what the commands have left in a campaign's folder, and published values to set beside it."""
+"""Reading of a campaign's folder, and of published values to compare with."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ from uwlts.storage.truth import read_truth
 _EVALUATION, _TRUTH = ".evaluation.json", ".truth.h5"
 
 CALIBRATION = "calibration"
-"""Name under which a reference lists values of calibrations."""
+"""Name of the calibrations' values in a reference."""
 
 _Number = Annotated[FiniteFloat, Strict()]
 _SECONDS = TypeAdapter(dict[str, Annotated[_Number, Field(ge=0)]])
@@ -34,7 +34,7 @@ _SECONDS = TypeAdapter(dict[str, Annotated[_Number, Field(ge=0)]])
 
 @dataclass(frozen=True, eq=False)
 class GatheredCapture:
-    """A capture of the campaign: its header, number of images and indices of those with the laser on."""
+    """A capture of the campaign: header, number of images, and indices of those with the laser on."""
 
     path: Path
     header: CaptureHeader
@@ -49,7 +49,7 @@ class GatheredCapture:
 
 @dataclass(frozen=True, eq=False)
 class GatheredCalibration:
-    """A calibration of the campaign, with the digest by which clouds name it."""
+    """A calibration of the campaign, with the digest stored in clouds."""
 
     name: str
     calibration: Calibration
@@ -58,7 +58,7 @@ class GatheredCalibration:
 
 @dataclass(frozen=True, eq=False)
 class GatheredMeasurement:
-    """A cloud with everything that belongs to it; what the folder lacks is None, never all of it."""
+    """A cloud with its evaluation, capture and calibration; missing parts are None, but never all of them."""
 
     name: str
     cloud: PointCloud | None
@@ -68,7 +68,7 @@ class GatheredMeasurement:
 
     @property
     def digest(self) -> str | None:
-        """Digest of the calibration with which the cloud was made, whether that calibration is at hand or not."""
+        """Digest of the cloud's calibration, even if that calibration is not in the folder."""
         if self.judged is not None and self.judged.calibration is not None:
             return self.judged.calibration
         found = None if self.cloud is None else self.cloud.metadata.get("calibration")
@@ -76,13 +76,13 @@ class GatheredMeasurement:
 
     @property
     def known_as(self) -> tuple[str, ...]:
-        """Names under which published values may stand: the measurement's own, then its capture's."""
+        """Names to look up published values: that of the measurement, then that of its capture."""
         return (self.name,) if self.capture is None else (self.name, self.capture.name)
 
 
 @dataclass(frozen=True, eq=False)
 class GatheredCampaign:
-    """All files of a folder. ``true_sensors`` are those of the truth files, ``seconds`` the time of each stage."""
+    """All files of a folder. ``true_sensors`` come from the truth files; ``seconds`` is the time of each stage."""
 
     folder: Path
     measurements: tuple[GatheredMeasurement, ...]
@@ -93,13 +93,13 @@ class GatheredCampaign:
 
     @property
     def main_digest(self) -> str | None:
-        """Digest of the calibration that most clouds were made with; of equally many the first calibration's."""
+        """Digest of the calibration used by most clouds; if several are equally frequent, the first calibration's."""
         used = Counter(m.digest for m in self.measurements if m.digest is not None)
         return max([*(c.digest for c in self.calibrations), *used], key=used.__getitem__, default=None)
 
     @property
     def main_calibration(self) -> GatheredCalibration | None:
-        """The calibration of `main_digest`; None where its file is not in the folder."""
+        """The calibration of `main_digest`; None if its file is not in the folder."""
         return next((c for c in self.calibrations if c.digest == self.main_digest), None)
 
     @property
@@ -109,29 +109,28 @@ class GatheredCampaign:
 
     @property
     def true_sensor(self) -> Sensor | None:
-        """The sensor behind its windows as it truly was; None without truth files, or where they disagree."""
+        """The true sensor with its windows; None without truth files, or if they disagree."""
         mounted = [sensor for sensor in self.true_sensors if sensor.camera.window.mounted]
         same = all((s.camera, s.laser) == (mounted[0].camera, mounted[0].laser) for s in mounted)
         return mounted[0] if mounted and same else None
 
     @property
     def true_window_mm(self) -> float | None:
-        """Distance of the camera's window as set in the twin; None as `true_sensor`."""
+        """Distance of the camera's window in the twin; None if `true_sensor` is None."""
         return None if self.true_sensor is None else self.true_sensor.camera.window.distance_mm
 
 
 def gather_campaign(folder: str | Path) -> GatheredCampaign:
     """Read a campaign's folder.
 
-    Captures are ``NAME.h5`` with their truth ``NAME.truth.h5``, clouds ``NAME.ply`` or ``.h5``, evaluations
-    ``NAME.evaluation.json``, calibrations ``calibration*.json``, times ``seconds.json``. A cloud names its capture in
-    its metadata; otherwise the capture of the same name is taken.
-
-    Raises CaptureError: the folder is missing or holds nothing to report, or a file (named in the message) is damaged.
+    It contains captures ``NAME.h5``, their truth ``NAME.truth.h5``, clouds ``NAME.ply`` or ``.h5``, evaluations
+    ``NAME.evaluation.json``, calibrations ``calibration*.json``, and times ``seconds.json``. The metadata of a cloud
+    name its capture; otherwise the capture of the same name is used. CaptureError if the folder is missing or contains
+    nothing to report, or a file (named in the message) is damaged.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise CaptureError(f"there is no folder {folder}; give the folder that holds the campaign's files")
+        raise CaptureError(f"there is no folder {folder}; give the folder of the campaign's files")
     in_hdf5 = list(_files(folder, "*.h5", but=_TRUTH))
     captures = {path.name: _capture(path) for path in in_hdf5 if not is_cloud(path)}
     read = {path.stem: read_calibration(path) for path in _files(folder, "calibration*.json", but=_EVALUATION)}
@@ -146,7 +145,7 @@ def gather_campaign(folder: str | Path) -> GatheredCampaign:
         )
     by_digest = {calibration.digest: calibration for calibration in calibrations}
     measurements = []
-    for name, cloud in sorted(_paired(clouds, judged).items()):
+    for name, cloud in sorted(_pair_clouds(clouds, judged).items()):
         recorded = None if cloud is None else cloud.metadata.get("capture")
         capture = captures.get(recorded) if isinstance(recorded, str) else None
         found = GatheredMeasurement(name, cloud, judged.get(name), capture or captures.get(f"{name}.h5"), None)
@@ -163,7 +162,7 @@ def gather_campaign(folder: str | Path) -> GatheredCampaign:
 
 def _files(folder: Path, pattern: str, *, but: str | None = None) -> Iterator[Path]:
     for path in sorted(folder.glob(pattern)):
-        # A hidden file is one that is still being written.
+        # Hidden files are still being written.
         if is_regular_file(path) and not path.name.startswith(".") and not (but and path.name.endswith(but)):
             yield path
 
@@ -174,11 +173,11 @@ def _capture(path: Path) -> GatheredCapture:
         return GatheredCapture(path, capture.header, len(capture), laser)
 
 
-def _paired(clouds: dict[str, PointCloud], judged: dict[str, EvaluationRecord]) -> dict[str, PointCloud | None]:
-    """Cloud of every measurement by its name: an evaluation and its cloud, or a cloud without any evaluation.
+def _pair_clouds(clouds: dict[str, PointCloud], judged: dict[str, EvaluationRecord]) -> dict[str, PointCloud | None]:
+    """Pair clouds with evaluations by name; clouds without evaluation are included.
 
-    The cloud has the evaluation's name, or the one it gives. Where it holds no deviations, a copy of it that does, as
-    the evaluation writes it, takes its place.
+    An evaluation belongs to the cloud of its own name, or else to the cloud that it names. If that cloud has no
+    deviations, it is replaced by its coloured copy, which the evaluation wrote.
     """
     pairs: dict[str, PointCloud | None] = {}
     taken = set()
@@ -210,20 +209,20 @@ def _several(value: object) -> tuple[object, ...]:
 
 
 class Reference(Description):
-    """Published values in mm: by measurement, then by figure; several where several were published."""
+    """Published values in mm by measurement and figure, one or several each."""
 
     title: str
     figures: dict[str, dict[str, Annotated[tuple[_Number, ...], BeforeValidator(_several)]]]
 
     def values(self, measurements: tuple[str, ...], figure: str) -> tuple[float, ...]:
-        """Values of a figure under the first of these names that has any; none are an empty tuple."""
+        """Return values of a figure for the first of the measurement names that has any; empty if none has."""
         return next((v for name in measurements if (v := self.figures.get(name, {}).get(figure))), ())
 
 
 def load_reference(name_or_path: str | Path) -> Reference:
-    """Published values by name (``thesis``) or path of a TOML file.
+    """Read published values by name (``thesis``) or path of a TOML file.
 
-    Raises DescriptionError: nothing has this name, or the file holds anything but numbers by measurement and figure.
+    DescriptionError if the name is unknown, or the file contains anything but numbers by measurement and figure.
     """
     path = find(name_or_path, "references")
     table = read_table(path, "references")

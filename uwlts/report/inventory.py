@@ -1,4 +1,4 @@
-"""Files and sensors described for the terminal: what a file holds."""
+"""Descriptions of files and sensors for the terminal."""
 
 import math
 from collections.abc import Mapping
@@ -42,7 +42,7 @@ def describe(path: str | Path) -> str:
     Raises
     ------
     CaptureError, DescriptionError
-        The file is missing, foreign or damaged.
+        The file is missing, damaged, or of another kind.
     """
     name, path = str(path), Path(path)
     match [s for s in path.suffixes if s != ".part"]:
@@ -74,12 +74,12 @@ def _json_lines(path: Path) -> list[str]:
         if found == MOUNT_FORMAT:
             return mount_lines(read_mount(path))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise CaptureError(f"{path} is damaged: something in it is missing or no number ({error})") from error
+        raise CaptureError(f"{path} is damaged: a value is missing or not a number ({error})") from error
     raise CaptureError(f"{path} is neither a calibration, a mount nor an evaluation: format is {found!r}")
 
 
 def capture_lines(capture: Capture) -> list[str]:
-    """Content of a capture."""
+    """Describe the content of a capture."""
     header, camera = capture.header, capture.header.sensor.camera
     laser = int(capture.laser_on.sum())
     lines = [
@@ -103,7 +103,7 @@ def capture_lines(capture: Capture) -> list[str]:
 
 
 def truth_lines(header: TruthHeader, truth: Truth) -> list[str]:
-    """Content of a ground-truth file."""
+    """Describe the content of a ground-truth file."""
     frames, lines = truth.status.shape
     visible = int(np.count_nonzero(truth.status == TruthStatus.VISIBLE))
     return [
@@ -113,7 +113,7 @@ def truth_lines(header: TruthHeader, truth: Truth) -> list[str]:
 
 
 def cloud_lines(cloud: PointCloud) -> list[str]:
-    """Content of a cloud."""
+    """Describe the content of a cloud."""
     if len(cloud) == 0:
         return ["cloud without points", *(f"{key}: {value}" for key, value in cloud.metadata.items())]
     low, high = cloud.points_mm.min(axis=0), cloud.points_mm.max(axis=0)
@@ -128,7 +128,7 @@ _MEDIA = {"air": "air", "fresh": "fresh water", "sea": "sea water", "custom": "t
 
 
 def calibration_lines(calibration: Calibration) -> list[str]:
-    """Parameters and residuals of a calibration."""
+    """Describe parameters and residuals of a calibration."""
     camera, window, sheet = calibration.camera, calibration.window, calibration.sheet
     lines = [
         f"calibration of the sensor '{calibration.sensor_name}' "
@@ -166,7 +166,7 @@ def calibration_lines(calibration: Calibration) -> list[str]:
 
 
 def _image_lines(camera: Mapping[str, JsonValue], sheet: Mapping[str, JsonValue]) -> list[str]:
-    """The lens model, and what each image of the target gave; none where a calibration does not hold that."""
+    """Describe the lens model and the result of each target image; empty if the calibration does not contain them."""
     table = camera.get("image_table")
     if not isinstance(table, list):
         return []
@@ -193,7 +193,7 @@ def _image_lines(camera: Mapping[str, JsonValue], sheet: Mapping[str, JsonValue]
 
 
 def _figure_lines(calibration: Calibration | PolynomialCalibration, **shown: tuple[str, str]) -> list[str]:
-    """Figures by their steps, each with its name and its text; ValueError if one is no number."""
+    """Format figures of calibration steps, each given by name and text; ValueError if one is not a number."""
     lines = []
     for step, (name, text) in shown.items():
         value = calibration.figures(step).get(name)
@@ -205,7 +205,7 @@ def _figure_lines(calibration: Calibration | PolynomialCalibration, **shown: tup
 
 
 def mount_lines(mount: Mount) -> list[str]:
-    """The transform with its 95 % intervals, the artefact, the scatter found, poses left out and the next pose."""
+    """Describe the transform with 95 % intervals, the artefact, the scatter, rejected poses and the next pose."""
 
     def within(std: float | None) -> str:
         return "given" if std is None else f"+-{mount.coverage_factor * std:.3f}"
@@ -264,7 +264,7 @@ def _vector(values: tuple[float, float, float]) -> str:
 
 
 def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:
-    """Range and residuals of a calibration by polynomials."""
+    """Describe range and residuals of a polynomial calibration."""
     last = calibration.first_line + len(calibration.domains_px) - 1
     reached = sum(domain is not None for domain in calibration.domains_px)
     low, high = calibration.depth_range_mm
@@ -283,7 +283,7 @@ def polynomial_lines(calibration: PolynomialCalibration) -> list[str]:
 
 
 def evaluation_lines(record: EvaluationRecord) -> list[str]:
-    """Figures of an evaluation."""
+    """Describe the figures of an evaluation."""
     lines = [f"evaluation of {record.cloud}"]
     if evaluation := record.evaluation:
         for name, value in evaluation.figures_mm.items():
@@ -306,7 +306,7 @@ def evaluation_lines(record: EvaluationRecord) -> list[str]:
 
 
 def _shift_texts(truth: TruthComparisons) -> list[str]:
-    """Mean errors of all points along X, Y and Z, with what is stated for them; nothing where the file has none."""
+    """Return the mean errors of all points along X, Y and Z with uncertainty, as text; empty if not in the file."""
     shift = truth.shift_mm or ()
     stated = truth.shift_expanded_mm or (None,) * len(shift)
     return [
@@ -316,7 +316,7 @@ def _shift_texts(truth: TruthComparisons) -> list[str]:
 
 
 def sensor_lines(sensor: Sensor) -> list[str]:
-    """Views of a sensor in each of its media; the line length for both ways to turn the camera."""
+    """Describe the views of a sensor in each of its media, and the line length for both camera orientations."""
     laser = sensor.laser
     lines = [f"sensor '{sensor.name}': {sensor.notes}", f"image {sensor.camera.width_px} x {sensor.camera.height_px}"]
     if laser.baseline_mm is not None:

@@ -1,4 +1,4 @@
-"""Results of a model comparison: figures as a file, lines for a terminal, and a page to read."""
+"""Results of a model comparison: a file of figures, lines for a terminal, and a page."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -40,14 +40,17 @@ class _Content(BaseModel):
 
 @dataclass(frozen=True)
 class HeldOutScore(Score):
-    """A score, and what the model misses besides the best, in quadrature, with its standard error; None if as good."""
+    """A score, with the model's additional error relative to the best, in quadrature, and its standard error.
+
+    Both are None if the model is as good as the best.
+    """
 
     adds_mm: float | None
     adds_std_mm: float | None
 
 
 class ModelRow(_Content):
-    """A model's scores, or the reason why it cannot be calibrated."""
+    """The scores of a model, or the reason why it cannot be calibrated."""
 
     model: str
     parameters: int | None
@@ -57,12 +60,12 @@ class ModelRow(_Content):
     as_good: bool | None = None
 
     def score(self, where: str) -> HeldOutScore | None:
-        """Score for one way of holding out."""
+        """Return the score for images held out inside or outside the volume."""
         return self.inside if where == INSIDE else self.outside
 
 
 class ModelComparisonContent(_Content):
-    """All figures of a comparison as its file holds them, lengths in mm."""
+    """All figures of a comparison as stored in its file, lengths in mm."""
 
     format: Literal["uwlts-models"]
     version: Literal[1]
@@ -80,13 +83,14 @@ class ModelComparisonContent(_Content):
 
 
 def content_of(comparison: Comparison) -> ModelComparisonContent:
-    """All figures of a comparison."""
+    """Return all figures of a comparison."""
     choice, score, polynomials = comparison.choice, comparison.polynomials, comparison.why_none
     if score is not None:
         polynomials = (
-            f"polynomials, fitted to the target in {score.medium} alone, miss stripes in {score.images} images inside "
-            f"the calibrated volume by {small_length(score.all_mm)} ± {small_length(score.std_mm)}, the simplest model "
-            f"by {small_length(score.model_mm)} ± {small_length(score.model_std_mm)}; outside they do not measure"
+            f"polynomials, fitted to the target in {score.medium} alone, have an error of {small_length(score.all_mm)} "
+            f"± {small_length(score.std_mm)} for stripes in {score.images} images inside the calibrated volume, the "
+            f"simplest model {small_length(score.model_mm)} ± {small_length(score.model_std_mm)}; outside they do not "
+            "measure"
         )
     return ModelComparisonContent(
         format="uwlts-models",
@@ -117,7 +121,7 @@ def _row(choice: Choice, judged: JudgedModel) -> ModelRow:
 
 
 def lines_of(content: ModelComparisonContent) -> list[str]:
-    """The table and the verdicts, as text."""
+    """Return the table and the verdicts as lines of text."""
     width = max(len(row.model) for row in content.models)
     heads = [f"{where} the volume, {content.held_out[where]} images held out" for where in _WAYS]
     columns = f"{'points':>8}{'stripes':>9}{'all':>15}{'adds':>14}"
@@ -154,12 +158,12 @@ def write_models(path: str | Path, comparison: Comparison, *, overwrite: bool = 
 
 
 def models_page(content: ModelComparisonContent) -> str:
-    """The page as text."""
+    """Return the page as text."""
     return render_page("uwlts.report", "models.html.j2", c=content, ways=_WAYS, picture=_picture(content))
 
 
 def _picture(content: ModelComparisonContent) -> Markup | None:
-    """The share that each model adds, by its number in the table; None where no model adds anything."""
+    """Plot the additional error of each model by its number in the table; None if there are none."""
     shown = {}
     for where in _WAYS:
         scores = [(number, row.score(where)) for number, row in enumerate(content.models, start=1)]
@@ -169,8 +173,8 @@ def _picture(content: ModelComparisonContent) -> Markup | None:
     if not shown:
         return None
     figure, panels = new_figure(5.6 * len(shown), 3.4, columns=len(shown))
-    label = "adds to the misses of the best, with standard error"
-    # Both pictures number all models, including those that add nothing.
+    label = "additional error relative to the best, with standard error"
+    # Both charts number all models, including those without additional error.
     count = len(content.models)
     for axes, (where, adding) in zip(panels, shown.items(), strict=True):
         number, adds_um, error_um = zip(*adding, strict=True)
@@ -190,15 +194,15 @@ _PARTS = {
 
 
 _OF_THE_WINDOW = {"refractions", "window_tilt"}
-"""Effects that bend rays in a medium and hardly in air: only images in a medium can show that one is not needed."""
+"""Effects on rays in a medium that are negligible in air: only images in a medium show whether they are needed."""
 
 
 def adds(
     choice: Choice, candidate: Candidate, other: Candidate, where: str, *, wet: bool = False
 ) -> tuple[float, float] | None:
-    """Additional misses of a model against another, in quadrature, mm with standard error; None where it is as good.
+    """Return the additional error of a model relative to another, in quadrature, in mm, with its standard error.
 
-    They are those in all images held out, or only those in a medium.
+    It is None if the model is as good. All images held out are used, or with ``wet`` only those in a medium.
     """
     tally = (choice.wet_tallies if wet else choice.tallies)[where]
     if choice.no_worse(candidate, other, where, wet=wet):
@@ -209,7 +213,7 @@ def adds(
 
 
 def verdicts(choice: Choice) -> list[str]:
-    """Sentences on what is needed of everything that was modelled in several ways, and on the model to take."""
+    """Return sentences on which modelled effects are needed, and which model to use."""
     usual, said = Candidate(), []
     known = {each.candidate: each for each in choice.judged}
     for name, (part, lacking) in _PARTS.items():
@@ -217,21 +221,23 @@ def verdicts(choice: Choice) -> list[str]:
         if without is None:
             continue
         by_window = name in _OF_THE_WINDOW
-        loss = f"there is no calibration, {without.reason}" if without.reason else _costs(choice, without, usual)
+        loss = (
+            f"there is no calibration, {without.reason}" if without.reason else _describe_costs(choice, without, usual)
+        )
         if not loss and by_window and not choice.wet_tallies:
             said.append(
                 f"whether {part} is needed is not shown: of the images held out {min(choice.wet.values())} are in "
                 f"water, at least {FEWEST_HELD} inside and outside the calibrated volume are needed"
             )
             continue
-        loss = loss or (_costs(choice, without, usual, wet=True) if by_window else "")
+        loss = loss or (_describe_costs(choice, without, usual, wet=True) if by_window else "")
         seen = f"{sum(choice.wet.values())} images held out in water" if by_window else "images held out"
         found = f"needed: {lacking} {loss}" if loss else f"not needed: {lacking} {seen} are predicted as well"
         said.append(f"{part} is {found}")
-    return [*said, _of_distortion(choice, list(known)), *_chosen(choice)]
+    return [*said, _describe_distortion(choice, list(known)), *_describe_choice(choice)]
 
 
-def _of_distortion(choice: Choice, candidates: Sequence[Candidate]) -> str:
+def _describe_distortion(choice: Choice, candidates: Sequence[Candidate]) -> str:
     usual = Candidate()
     levels = [c.distortion for c in candidates if replace(c, distortion=usual.distortion) == usual]
     enough = choice.level("distortion", levels)
@@ -240,12 +246,12 @@ def _of_distortion(choice: Choice, candidates: Sequence[Candidate]) -> str:
     fewer = max((level for level in levels if len(level) < len(enough)), key=len, default=None)
     if fewer is not None:
         judged = next(each for each in choice.judged if each.candidate == replace(usual, distortion=fewer))
-        said += f": with {distortion_words(fewer)} {judged.reason or _costs(choice, judged, least)}"
+        said += f": with {distortion_words(fewer)} {judged.reason or _describe_costs(choice, judged, least)}"
     return said
 
 
-def _costs(choice: Choice, without: JudgedModel, usual: Candidate, *, wet: bool = False) -> str:
-    """Ways of holding out in which a model is worse, and by how much; empty where it is as good."""
+def _describe_costs(choice: Choice, without: JudgedModel, usual: Candidate, *, wet: bool = False) -> str:
+    """Describe where a model is worse, and by how much; empty if it is as good."""
     found = {where: adds(choice, without.candidate, usual, where, wet=wet) for where in without.scores}
     parts = [
         f"{small_length(cost[0])} ± {small_length(cost[1])} {'inside' if where == INSIDE else 'outside'}"
@@ -253,15 +259,15 @@ def _costs(choice: Choice, without: JudgedModel, usual: Candidate, *, wet: bool 
         if cost is not None
     ]
     where = " in water" if wet else ""
-    return f"points{where} are missed by a further {' and '.join(parts)} the calibrated volume" if parts else ""
+    return f"points{where} have an additional error of {' and '.join(parts)} the calibrated volume" if parts else ""
 
 
-def _chosen(choice: Choice) -> list[str]:
+def _describe_choice(choice: Choice) -> list[str]:
     best, simplest, good = choice.best(), choice.simplest(), choice.as_good()
     others = [candidate.words() for candidate in good if candidate not in (best, simplest)]
-    said = f"best predicts: {best.words()}"
+    said = f"best prediction: {best.words()}"
     if simplest != best:
-        said += f"; the simplest that is as good within the standard errors: {simplest.words()}"
+        said += f"; simplest model that is as good within the standard errors: {simplest.words()}"
     elif others:
-        said += ", which is also the simplest of those as good"
-    return [said + (f"; as good are also: {'; '.join(others)}" if others else "")]
+        said += ", which is also the simplest of the equally good models"
+    return [said + (f"; equally good: {'; '.join(others)}" if others else "")]

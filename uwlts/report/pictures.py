@@ -1,4 +1,4 @@
-"""Pictures of a campaign's measurements: the stripe in one image and the cloud as PNG, the deviations as SVG."""
+"""Pictures of a campaign's measurements: stripe and cloud as PNG, deviations as SVG."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,13 +23,13 @@ from uwlts.stripe import Stripe, stripe_in
 _WIDTH_IN = 11.2
 # Largest height of a picture, inches.
 _TALLEST_IN = 4.4
-# An image with fewer stripe centres than this shows no stripe to speak of.
+# An image with fewer stripe centres than this is regarded as having no stripe.
 _LEAST_LINES = 8
 
 
 @dataclass(frozen=True, eq=False)
 class StripeView:
-    """A laser image (H, W) of a capture, dark for a centre line, its number, and the stripe found in it."""
+    """A laser image (H, W) of a capture (black if only centre lines exist), its number, and its stripe."""
 
     frame: int
     image: np.ndarray
@@ -37,7 +37,7 @@ class StripeView:
 
 
 def stripe_view(capture: Capture) -> StripeView | None:
-    """The laser image nearest to the middle of a capture that shows a stripe; None where none does."""
+    """Return the laser image nearest to the middle of a capture that shows a stripe; None if no image does."""
     header = capture.header
     laser = np.flatnonzero(capture.laser_on)
     for place in np.argsort(np.abs(np.arange(len(laser)) - (len(laser) - 1) / 2), kind="stable"):
@@ -50,10 +50,10 @@ def stripe_view(capture: Capture) -> StripeView | None:
 
 
 def stripe_picture(view: StripeView) -> Figure:
-    """Above the stripe with its centres, below the brightest part of it pixel by pixel."""
+    """Draw the stripe with its centres on top, and the brightest part of it pixel by pixel below."""
     shape = view.image.shape if view.stripe.stripe_along == "width" else view.image.T.shape
     windows = [plot.stripe_window(view.stripe, shape, enlarged=enlarged) for enlarged in (False, True)]
-    # Pixels are square; the axes' labels and titles need some 0.8 inches more.
+    # Pixels are square; axis labels and titles need about 0.8 inches.
     heights = [
         0.8 + min(_TALLEST_IN, _WIDTH_IN * (bottom - top + 1) / (right - left + 1))
         for left, right, top, bottom in windows
@@ -66,14 +66,16 @@ def stripe_picture(view: StripeView) -> Figure:
     upper.add_patch(part)
     centres = f"{len(view.stripe.lines)} stripe centres (orange)"
     upper.set_title(f"image {view.frame}: {centres}; square root of grey values", fontsize=9)
-    lower.set_title("the marked part, pixel by pixel, with the centre found on each line", fontsize=9)
+    lower.set_title("marked part, magnified, with the centre found on each line", fontsize=9)
     return figure
 
 
 @dataclass(frozen=True)
 class MeasurementPictures:
-    """A measurement's stripe and cloud as PNG, and its deviations as SVG, their histogram and along the stripe; None
-    without a capture that shows a stripe, without a cloud, or where the cloud has no deviations."""
+    """A measurement's stripe and cloud as PNG, and its deviations (histogram, along the stripe) as SVG.
+
+    A picture is None without a capture that shows a stripe, without a cloud, or without deviations.
+    """
 
     name: str
     stripe: bytes | None
@@ -83,12 +85,14 @@ class MeasurementPictures:
 
 
 def draw_pictures(campaign: GatheredCampaign, *, workers: int = 1) -> list[MeasurementPictures]:
-    """Pictures of a campaign's measurements, in order, drawn in so many processes; CaptureError where an image of a
-    capture is damaged."""
-    return work_through(_drawn, campaign.measurements, workers=workers)
+    """Draw the pictures of a campaign's measurements, in order, in ``workers`` processes.
+
+    CaptureError if an image of a capture is damaged.
+    """
+    return work_through(_draw_measurement, campaign.measurements, workers=workers)
 
 
-def _drawn(measurement: GatheredMeasurement, send: Send) -> MeasurementPictures:
+def _draw_measurement(measurement: GatheredMeasurement, send: Send) -> MeasurementPictures:
     view, cloud = None, measurement.cloud
     if measurement.capture is not None:
         with Capture(measurement.capture.path) as capture:
@@ -103,7 +107,7 @@ def _drawn(measurement: GatheredMeasurement, send: Send) -> MeasurementPictures:
 
 
 def svg_if_any(draw: Callable[..., Axes], shown: object, **options: Any) -> Markup | None:
-    """A plot as SVG; None if there is nothing to draw."""
+    """Return a plot as SVG; None if there is nothing to draw."""
     try:
         return svg_of(draw(shown, **options))
     except plot.NothingToDrawError:
@@ -113,9 +117,9 @@ def svg_if_any(draw: Callable[..., Axes], shown: object, **options: Any) -> Mark
 def write_pictures(
     folder: str | Path, pictures: Sequence[MeasurementPictures], *, overwrite: bool = False
 ) -> list[Path]:
-    """Write ``stripe-NAME.png`` and ``cloud-NAME.png`` of every measurement that has them; returns what was written.
+    """Write ``stripe-NAME.png`` and ``cloud-NAME.png`` of every measurement, if available; return the paths.
 
-    Raises OutputError: the folder is missing, or a picture exists and ``overwrite`` is not given.
+    OutputError if the folder is missing, or a picture exists and ``overwrite`` is not given.
     """
     written = []
     for each in pictures:

@@ -1,7 +1,7 @@
-"""Static plots of clouds, stripes and calibrations: matplotlib axes in, axes out.
+"""Static plots of clouds, stripes and calibrations, with matplotlib axes as input and output.
 
-Every function draws into ``ax``, or into a new figure in the style of the pages if none is given, and returns the axes;
-``ax.figure.savefig(...)`` stores them. `page_toolkit.svg_of` turns a figure into a part of a page.
+Every function draws into ``ax``, or into a new figure in the style of the pages, and returns the axes;
+``ax.figure.savefig(...)`` saves them. `uwlts.pages.toolkit.svg_of` converts a figure for a page.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ STOPS = (
     (0.75, (236, 139, 96)),
     (1.0, (170, 21, 40)),
 )
-"""Colours of deviations: place between -1 and +1 limit (0 to 1), and red-green-blue."""
+"""Colour scale of deviations: position between -1 and +1 limit (0 to 1), and red, green, blue."""
 
 DEVIATIONS = LinearSegmentedColormap.from_list(
     "deviations", [(place, (red / 255, green / 255, blue / 255)) for place, (red, green, blue) in STOPS]
@@ -53,7 +53,7 @@ PALE = "#9dbad6"
 """Colour of bars."""
 
 LIMIT_STD = 2.0
-"""The colours of deviations end at this many standard deviations, as in the thesis."""
+"""Range of the deviation colours in standard deviations, as in the thesis."""
 
 AZIMUTH_DEG = 28.0
 """Viewing direction of clouds: angle from +X towards +Y, deg."""
@@ -61,10 +61,10 @@ ELEVATION_DEG = 38.0
 """Viewing direction of clouds: angle downwards (towards +Z), deg."""
 
 MOST_POINTS = 15_000
-"""An interactive cloud shows at most this many points, with which it still turns smoothly."""
+"""Largest number of points in an interactive cloud that still rotates smoothly."""
 
 SHORT_LIST = 3
-"""Lists of residuals up to this length are written out in tables; longer ones are drawn."""
+"""Lists of residuals up to this length are written into tables; longer ones are drawn."""
 
 # Bins of a histogram.
 _BINS = 81
@@ -74,9 +74,9 @@ _SHOWN_STD = 4.0
 _INTERVALS = 120
 # Fewest points for the mean and scatter of an interval.
 _LEAST_IN_INTERVAL = 5
-# Residuals that differ by less than this share are drawn as dots: bars must start at zero, where all would look alike.
+# Residuals within this ratio are drawn as dots: bars, which start at zero, would all look the same.
 _FLAT = 1.2
-# Share of a surface's places within the range of its colours.
+# Fraction of a surface's points within the colour range.
 _SHOWN_SHARE = 0.995
 # Margin shown on either side of a stripe, px.
 _AROUND_PX = 24
@@ -87,7 +87,7 @@ _AROUND_ENLARGED_PX = 7
 
 
 class NothingToDrawError(ValueError):
-    """A cloud or calibration does not hold what a plot shows."""
+    """A cloud or calibration does not contain the data of a plot."""
 
 
 def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviation") -> Axes3D:
@@ -100,11 +100,12 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviati
     ax
         Three-dimensional axes.
     colour
-        What the points' colours show: the deviation from the fitted or true surface, which ends at two standard
-        deviations, the depth Z, the brightness of the stripe, or the standard uncertainty of the position.
+        Quantity shown by colour: "deviation" from the fitted or true surface, limited to two standard deviations;
+        "depth" Z; "intensity", the brightness of the stripe; or "uncertainty", the standard uncertainty of the
+        position.
     """
     if ax is None:
-        # The axes are square: as wide as the room beside the colour bar, and higher than the figure, which cuts them.
+        # The axes are square, as wide as the space beside the colour bar, and clipped by the figure vertically.
         figure, side, room = figure_of(11.2, 6.0, layout=None), 0.86, (0.84, 0.84 * 6.0 / (0.86 * 11.2))
         height = side * 11.2 / 6.0
         ax = Axes3D(figure, (0.02, 0.5 - height / 2, side, height))
@@ -119,9 +120,9 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviati
         ax.text2D(0.5, 0.5, "the cloud has no points", transform=ax.transAxes, ha="center")
         return ax
     low, high = cloud_limits(cloud.points_mm)
-    # The farthest points come first, so that the nearest stay visible.
+    # The farthest points are drawn first, so that the nearest remain visible.
     points = cloud.points_mm[order := np.argsort(-(cloud.points_mm @ view_direction()), kind="stable")]
-    values, label, scale = _coloured_by(cloud, colour)
+    values, label, scale = _select_values(cloud, colour)
     size = float(np.clip(1e5 / len(cloud), 1.0, 16.0))
     style: dict[str, Any] = {"s": size, "linewidths": 0, "depthshade": False, "rasterized": True}
     if values is None:
@@ -150,8 +151,8 @@ def cloud(cloud: PointCloud, ax: Axes3D | None = None, colour: Colour = "deviati
     return ax
 
 
-def _coloured_by(cloud: PointCloud, colour: Colour) -> tuple[np.ndarray | None, str, dict[str, Any]]:
-    """Values (N,) with their label and style; None where the cloud does not have them."""
+def _select_values(cloud: PointCloud, colour: Colour) -> tuple[np.ndarray | None, str, dict[str, Any]]:
+    """Return values (N,) with label and style; None if the cloud does not have them."""
     match colour:
         case "deviation":
             if cloud.deviation_mm is None or not np.isfinite(cloud.deviation_mm).any():
@@ -175,40 +176,39 @@ def _coloured_by(cloud: PointCloud, colour: Colour) -> tuple[np.ndarray | None, 
 
 
 def deviation_colours(deviation_mm: np.ndarray, limit_mm: float) -> np.ndarray:
-    """Red, green and blue (N, 3) uint8 of deviations (N,) as pictures show them: those of `DEVIATIONS` up to the limit,
-    `UNKNOWN` where one is NaN."""
+    """Return red, green and blue (N, 3) uint8 of deviations (N,): `DEVIATIONS` up to the limit, `UNKNOWN` for NaN."""
     shown = DEVIATIONS.with_extremes(bad=UNKNOWN)
     return shown(np.ma.masked_invalid((deviation_mm / limit_mm + 1) / 2), bytes=True)[:, :3]
 
 
 def view_direction() -> np.ndarray:
-    """Unit vector (3,) in the OCS along which clouds are looked at."""
+    """Return the viewing direction of clouds, a unit vector (3,) in the OCS."""
     azimuth, elevation = np.radians((AZIMUTH_DEG, ELEVATION_DEG))
     across = np.cos(elevation)
     return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
 
 
 def cloud_limits(points_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper ends (3,) of axes that just hold the points, none of them without a length."""
+    """Return lower and upper limits (3,) of axes that contain the points, each of non-zero length."""
     low, high = (points_mm.min(axis=0), points_mm.max(axis=0)) if len(points_mm) else (np.zeros(3), np.ones(3))
     half = np.maximum(0.52 * (high - low), 0.02 * max(1e-6, float((high - low).max())))
     return (low + high) / 2 - half, (low + high) / 2 + half
 
 
 def colour_limit_mm(deviation_mm: np.ndarray) -> float:
-    """Deviation at which the colours end: `LIMIT_STD` standard deviations, never quite zero."""
+    """Return the limit of the deviation colours: `LIMIT_STD` standard deviations, above zero."""
     finite = deviation_mm[np.isfinite(deviation_mm)].astype(np.float64)
     return max(LIMIT_STD * float(finite.std()), 1e-9) if len(finite) else 1e-9
 
 
 def surface_limit_mm(distance_mm: np.ndarray) -> float:
-    """Distance at which the colours of a surface end, so that all but a few of its places differ; never zero."""
+    """Return the limit of a surface's distance colours: the 99.5 % quantile of absolute distances, above zero."""
     known = distance_mm[np.isfinite(distance_mm)]
     return (float(np.quantile(np.abs(known), _SHOWN_SHARE)) if len(known) else 0.0) or 1e-3
 
 
 def interactive_cloud(cloud: PointCloud) -> tuple[go.Figure, str]:
-    """Points in the OCS with equal scales, seen from the sensor's side, to turn by hand; and what it shows."""
+    """Return an interactive plot of points in the OCS with equal scales, seen from the sensor, and its caption."""
     import plotly.graph_objects as go
 
     chosen = np.arange(len(cloud))
@@ -272,29 +272,29 @@ def interactive_cloud(cloud: PointCloud) -> tuple[go.Figure, str]:
 
 
 def _xyz(points: np.ndarray) -> dict[str, Any]:
-    """Columns of points (N, 3), or the numbers of a vector (3,), by axis."""
+    """Return columns of points (N, 3), or components of a vector (3,), by axis."""
     return dict(zip("xyz", points.T if points.ndim == 2 else points.tolist(), strict=True))
 
 
 def stripe(
     image: np.ndarray | Frame, stripe: Stripe | None = None, ax: Axes | None = None, *, enlarged: bool = False
 ) -> Axes:
-    """Draw a laser image, with a stripe the part of it around the stripe and the centres found.
+    """Draw a laser image; with a stripe, draw the part around it and the centres found.
 
-    The stripe always lies: an image in which it runs along the height is shown with rows and columns exchanged. Whole
-    numbers on the axes are pixel centres.
+    The stripe is horizontal: images with the stripe along the height are transposed. Integers on the axes are pixel
+    centres.
 
     Parameters
     ----------
     image
-        Image (H, W), or a frame of a capture. Its grey values are shown by their square roots, in which the faint ends
-        of a stripe are visible.
+        Image (H, W), or a frame of a capture. Square roots of its grey values are shown, which makes faint ends of a
+        stripe visible.
     stripe
         The stripe found in the image.
     ax
         Axes to draw into.
     enlarged
-        Show the brightest part of the stripe, with linear grey values and the centres joined.
+        Show the brightest part of the stripe, with linear grey values and connected centres.
     """
     grey = image.image if isinstance(image, Frame) else image
     ax = _axes(ax, 11.2, 4.0)
@@ -319,7 +319,7 @@ def stripe(
     if not enlarged:
         ax.plot(lines, centres, ".", color=ORANGE, markersize=1.5, label=f"{len(lines)} stripe centres")
         return ax
-    # A gap between image lines stays a gap.
+    # Keep gaps between image lines.
     gaps = np.flatnonzero(np.diff(lines) > 1) + 1
     x, y = (np.insert(values.astype(float), gaps, np.nan) for values in (lines, centres))
     ax.plot(x, y, ".-", color=ORANGE, linewidth=1, markersize=7, label="centre found on each line")
@@ -328,7 +328,7 @@ def stripe(
 
 
 def stripe_window(stripe: Stripe, shape: Sequence[int], *, enlarged: bool = False) -> tuple[int, int, int, int]:
-    """First and last line, first and last pixel that `stripe` shows of an image of a shape (pixels, lines)."""
+    """Return first and last line, first and last pixel of the part shown by `stripe`; ``shape`` is (pixels, lines)."""
     lines, margin = _shown_lines(stripe, enlarged=enlarged), _AROUND_ENLARGED_PX if enlarged else _AROUND_PX
     centres = stripe.centre_px[lines]
     return (
@@ -340,11 +340,11 @@ def stripe_window(stripe: Stripe, shape: Sequence[int], *, enlarged: bool = Fals
 
 
 def _shown_lines(stripe: Stripe, *, enlarged: bool) -> np.ndarray:
-    """Image lines that are shown: all of the stripe, or enlarged the neighbouring ones with the most light in it."""
+    """Return the image lines shown: all of the stripe, or in the enlarged view adjacent ones with the most light."""
     if not enlarged:
         return stripe.lines
     count = min(_LINES_ENLARGED, len(stripe.lines))
-    # A 3D camera may not give amplitudes; then the place with the most lines is shown.
+    # Without amplitudes of a 3D camera, show the part with the most lines.
     amplitude = (
         stripe.amplitude if np.isfinite(stripe.amplitude).any() else np.where(np.isfinite(stripe.centre_px), 1, 0)
     )
@@ -353,7 +353,7 @@ def _shown_lines(stripe: Stripe, *, enlarged: bool) -> np.ndarray:
 
 
 def deviation_histogram(cloud: PointCloud, ax: Axes | None = None) -> Axes:
-    """Draw the distribution of a cloud's deviations beside the normal one of the same mean and standard deviation.
+    """Draw the distribution of a cloud's deviations, and the normal distribution with its mean and deviation.
 
     Raises
     ------
@@ -370,7 +370,7 @@ def deviation_histogram(cloud: PointCloud, ax: Axes | None = None) -> Axes:
     counts, edges = np.histogram(finite, bins=_BINS, range=(mean - reach, mean + reach))
     middles, width = (edges[1:] + edges[:-1]) / 2, 2 * reach / _BINS
     beyond = len(finite) - int(counts.sum())
-    label = f"points; {beyond:,} of {len(finite):,} lie farther out" if beyond else "points"
+    label = f"points; {beyond:,} of {len(finite):,} outside" if beyond else "points"
     ax.bar(factor * middles, counts, width=factor * width, color=PALE, label=label)
     if std > 0:
         normal = len(finite) * width / (std * np.sqrt(2 * np.pi)) * np.exp(-0.5 * ((middles - mean) / std) ** 2)
@@ -398,7 +398,7 @@ def along_stripe(cloud: PointCloud, ax: Axes | None = None) -> Axes:
     place = np.clip(np.searchsorted(edges, y, side="right") - 1, 0, _INTERVALS - 1)
     count = np.bincount(place, minlength=_INTERVALS)
     enough = count >= _LEAST_IN_INTERVAL
-    # Points of one Y have no profile.
+    # Points with the same Y do not form a profile.
     if edges[0] == edges[-1] or not enough.any():
         raise NothingToDrawError("too few points of the cloud have a deviation: evaluate it first")
     ax = _axes(ax)
@@ -406,7 +406,7 @@ def along_stripe(cloud: PointCloud, ax: Axes | None = None) -> Axes:
     square = np.bincount(place, deviation**2, _INTERVALS)[enough] / count[enough]
     std = np.sqrt(np.maximum(square - mean**2, 0))
     unit, factor = unit_for(float(deviation.std()))
-    # A gap in the stripe stays a gap in the curve.
+    # Keep gaps of the stripe in the curve.
     middles, curves = (edges[1:] + edges[:-1]) / 2, np.full((2, _INTERVALS), np.nan)
     curves[:, enough] = factor * np.array([mean, std])
     low, high = curves[0] - curves[1], curves[0] + curves[1]
@@ -419,7 +419,7 @@ def along_stripe(cloud: PointCloud, ax: Axes | None = None) -> Axes:
 
 
 def _evaluated(cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) that have a deviation, and their deviations (N,)."""
+    """Return points (N, 3) with a deviation, and their deviations (N,)."""
     deviation = np.full(len(cloud), np.nan) if cloud.deviation_mm is None else cloud.deviation_mm.astype(np.float64)
     known = np.isfinite(deviation)
     return cloud.points_mm[known], deviation[known]
@@ -427,7 +427,7 @@ def _evaluated(cloud: PointCloud) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class ResidualList:
-    """A list of numbers among a calibration's residuals, None where there is none, and the images it belongs to."""
+    """A list of residuals of a calibration (None if missing), and the images to which they belong."""
 
     group: str
     name: str
@@ -436,7 +436,7 @@ class ResidualList:
 
 
 def residual_lists(calibration: Calibration) -> list[ResidualList]:
-    """All lists of residuals that are long enough to be drawn; matrices are left out."""
+    """Return all lists of residuals long enough to be drawn, without matrices."""
     found = []
     for group, name, value in entries_of(calibration.residuals_in_file()):
         values = number_list(value) or ()
@@ -448,12 +448,12 @@ def residual_lists(calibration: Calibration) -> list[ResidualList]:
 
 
 def residuals(calibration: Calibration, ax: Axes | None = None, *, which: ResidualList | None = None) -> Axes:
-    """Draw one list of a calibration's residuals by image, of `residual_lists` the first one unless ``which`` is given.
+    """Draw one list of a calibration's residuals by image: ``which``, or the first one of `residual_lists`.
 
     Raises
     ------
     NothingToDrawError
-        The calibration has no list of residuals.
+        The calibration does not contain a list of residuals.
     """
     which = which or next(iter(residual_lists(calibration)), None)
     if which is None:
@@ -480,14 +480,14 @@ def residuals(calibration: Calibration, ax: Axes | None = None, *, which: Residu
 def window_curves(
     calibrations: Mapping[str, Calibration], ax: Axes | None = None, *, true_mm: float | None = None
 ) -> Axes:
-    """Draw the step height error over the tried window distance, of all calibrations (by name) that store it.
+    """Draw the step height error over the tried window distance, for all calibrations (by name) that contain it.
 
-    A diamond marks each estimate, a dashed line the true distance if it is given.
+    A diamond marks each estimate, and a dashed line the true distance, if given.
 
     Raises
     ------
     NothingToDrawError
-        None of the calibrations stores it.
+        None of the calibrations contains it.
     """
     curves = {name: _window_curve(calibration) for name, calibration in calibrations.items()}
     if all(curve is None for curve in curves.values()):
@@ -500,7 +500,7 @@ def window_curves(
         errors = number_list(calibrations[name].figures("window").get("errors_mm"))
         rms = float(np.sqrt(np.mean(np.square(np.array(errors or [None], dtype=float)))))
         if window is not None and np.isfinite(rms):
-            # The tried distances are too coarse to meet the bottom of the valley.
+            # The tried distances are too coarse to include the minimum.
             curve = np.vstack([curve, (window.distance_mm, rms)])
             curve = curve[np.argsort(curve[:, 0])]
             ax.plot(*curve.T, color=colour, label=f"{label}: {window.distance_mm:.3f} mm, error {rms:.4f} mm")
@@ -515,7 +515,7 @@ def window_curves(
 
 
 def _window_curve(calibration: Calibration) -> np.ndarray | None:
-    """Tried distances and errors (C, 2), NaN for missing ones; None if the calibration does not store them."""
+    """Return tried distances and errors (C, 2), NaN for missing ones; None if the calibration does not contain them."""
     stored = calibration.figures("window").get("curve_mm")
     rows = [number_list(row) for row in stored] if isinstance(stored, list) else []
     if not rows or any(row is None or len(row) != 2 for row in rows):
@@ -524,7 +524,7 @@ def _window_curve(calibration: Calibration) -> np.ndarray | None:
 
 
 def seconds(seconds: Mapping[str, float], ax: Axes | None = None) -> Axes:
-    """Draw the time in s of each stage by its name."""
+    """Draw the time in s of each stage."""
     ax = _axes(ax, 8.0, 0.8 + 0.3 * len(seconds))
     bars = ax.barh([plain_text(name) for name in seconds], list(seconds.values()), color="#7fa6cc")
     ax.bar_label(bars, [f"{value:.3g} s" for value in seconds.values()], padding=4)

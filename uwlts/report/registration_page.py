@@ -1,4 +1,4 @@
-"""Page of a registration: the scans, their overlaps, the distances in each of them, and what is not determined."""
+"""Page of a registration: scans, overlaps with their distances, and undetermined movements."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,12 +14,12 @@ from uwlts.registration.register import RegisteredScans
 from uwlts.report.plot import surface_limit_mm
 
 _SHOWN = 30_000
-"""Points of all scans in a picture: more cover each other."""
+"""Number of points shown per picture for all scans together; more would overlap."""
 _VIEWS = ((0, 1), (0, 2), (1, 2))
 
 
 REGISTRATION = "registration"
-"""Kind of the page, in the name of the JSON beside it."""
+"""Kind of the page, in the name of its JSON file."""
 
 
 def write_registration(
@@ -60,7 +60,7 @@ def _scans(registered: RegisteredScans) -> str:
         if (first, second) == _VIEWS[-1]:
             axes.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
-    return _seen(draw)
+    return _draw_views(draw)
 
 
 def _overlaps(registered: RegisteredScans) -> str:
@@ -75,11 +75,11 @@ def _overlaps(registered: RegisteredScans) -> str:
         known: dict[str, Any] = {"c": distance, "cmap": "RdBu", "vmin": -limit, "vmax": limit, "linewidths": 0}
         return axes.scatter(places[:, first], places[:, second], s=4, **known)
 
-    return _seen(draw, label="distance / mm")
+    return _draw_views(draw, label="distance / mm")
 
 
-def _seen(draw: Callable[[Any, int, int], Any], *, label: str | None = None) -> str:
-    """Three views along the axes, side by side."""
+def _draw_views(draw: Callable[[Any, int, int], Any], *, label: str | None = None) -> str:
+    """Draw three views along the axes, side by side."""
     figure, axes = new_figure(11.0, 3.8, columns=3)
     drawn = None
     for (first, second), ax in zip(_VIEWS, axes, strict=True):

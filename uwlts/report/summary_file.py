@@ -1,4 +1,4 @@
-"""The key figures of a campaign, and their file summary.json."""
+"""Key figures of a campaign, and their file summary.json."""
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,17 +20,17 @@ KEY_FIGURES = {
     "pipe_diameter_error_mm": ("Pipe diameter error", "pipe", Quantity.DIAMETER_ERROR),
     "plane_range_error_mm": ("Plane range error", "plane", Quantity.RANGE_ERROR),
 }
-"""Key figures by name: heading, kind of the artefact (None: any) and quantity; details are left out."""
+"""Key figures by name: heading, kind of artefact (None: any) and quantity; details are excluded."""
 
 
 class _Stored(BaseModel):
-    """Base of what the summary holds; what was not measured is None or empty."""
+    """Base of the summary's content; values that were not measured are None or empty."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class KeyFigure(_Stored):
-    """An error of every measurement, its largest or the published ones, and the mean of their absolute values."""
+    """The largest error or the published errors of every measurement, and the mean of their absolute values."""
 
     mean_abs: float | None
     by_measurement: Mapping[str, float | tuple[float, ...]]
@@ -47,12 +47,12 @@ class _KeyFigures(_Stored):
     plane_range_error_mm: KeyFigure
 
     def figure(self, key: str) -> KeyFigure:
-        """The figure of a key of `KEY_FIGURES`."""
+        """Return the figure of a key of `KEY_FIGURES`."""
         return getattr(self, key)
 
 
 class PooledTruth(_Stored):
-    """Share within the tolerance and rms distance over all points; None without any, or if the tolerances differ."""
+    """Fraction within the tolerance and rms distance over all points; None without points or if tolerances differ."""
 
     tolerance_mm: float | None = None
     share_within_tolerance: float | None = None
@@ -60,7 +60,7 @@ class PooledTruth(_Stored):
 
 
 class TruthSummary(PooledTruth):
-    """Comparison with truth over the points of all measurements, after the best fit of each, and of each."""
+    """Comparison with truth over the points of all measurements, also after best fits, and for each measurement."""
 
     after_best_fit: PooledTruth
     by_measurement: dict[str, TruthComparisons]
@@ -74,7 +74,7 @@ class WindowDistance(_Stored):
 
 
 class PointCount(_Stored):
-    """Points of an evaluation."""
+    """Numbers of points of an evaluation."""
 
     total: int
     used: int
@@ -82,7 +82,7 @@ class PointCount(_Stored):
 
 
 class CalibrationSummary(_KeyFigures):
-    """Key figures of the measurements made with another calibration than the main one."""
+    """Key figures of the measurements made with a calibration other than the main one."""
 
     truth: TruthSummary
 
@@ -92,7 +92,7 @@ class _Title(_Stored):
 
 
 class PublishedSummary(_KeyFigures, _Title):
-    """Published key figures of the measurements made, by the names that the reference gives them."""
+    """Published key figures of the measurements, by the names used in the reference."""
 
     window_distance_mm: tuple[float, ...]
 
@@ -105,8 +105,8 @@ class _Names(_Stored):
 class Summary(_KeyFigures, _Names):
     """Key figures of a campaign.
 
-    The figures at the top are those of the measurements made with the campaign's main ``calibration``; others are
-    under ``other_calibrations``. ``seconds`` is the time of each stage.
+    Top-level figures are for measurements made with the campaign's main ``calibration``; others are in
+    ``other_calibrations``. ``seconds`` is the time of each stage.
     """
 
     window_distance_mm: WindowDistance
@@ -118,7 +118,7 @@ class Summary(_KeyFigures, _Names):
 
 
 def summary(campaign: GatheredCampaign, reference: Reference | None = None) -> Summary:
-    """Key figures of a campaign, with published ones if a reference is given."""
+    """Return the key figures of a campaign, with published ones if a reference is given."""
     main = campaign.main_measurements
     others: dict[str, list[GatheredMeasurement]] = {}
     for measurement in campaign.measurements:
@@ -148,7 +148,7 @@ def summary(campaign: GatheredCampaign, reference: Reference | None = None) -> S
 def write_summary(
     path: str | Path, campaign: GatheredCampaign, reference: Reference | None = None, *, overwrite: bool = False
 ) -> None:
-    """Write the summary as indented JSON, whole or not at all; OutputError where that fails."""
+    """Write the summary as indented JSON, completely or not at all; OutputError if that fails."""
     text = json.dumps(summary(campaign, reference).model_dump(), indent=2, allow_nan=False)
     with written_aside(path, overwrite=overwrite) as aside:
         aside.write_text(text + "\n", encoding="utf-8")
@@ -186,13 +186,13 @@ def _truth(measurements: Iterable[GatheredMeasurement]) -> TruthSummary:
     compared = {m.name: m.judged.truth for m in measurements if m.judged is not None and m.judged.truth is not None}
     fitted = [truth.after_best_fit for truth in compared.values() if truth.after_best_fit is not None]
     return TruthSummary(
-        **_pooled(list(compared.values())).model_dump(),
-        after_best_fit=_pooled(fitted if len(fitted) == len(compared) else []),
+        **_pool(list(compared.values())).model_dump(),
+        after_best_fit=_pool(fitted if len(fitted) == len(compared) else []),
         by_measurement=compared,
     )
 
 
-def _pooled(compared: Sequence[TruthFigures]) -> PooledTruth:
+def _pool(compared: Sequence[TruthFigures]) -> PooledTruth:
     weights = [truth.matched for truth in compared]
     if not sum(weights) or len({truth.tolerance_mm for truth in compared}) > 1:
         return PooledTruth()

@@ -1,7 +1,7 @@
-"""The choice of a libLLVM for Dr.Jit: what is refused, what is reported, and that a kernel runs with what is chosen.
+"""Selection of a libLLVM for Dr.Jit: refusals, reports, and a kernel with the selected library.
 
-Real shared libraries stand in for broken ones: a copy of a small library from Mitsuba's wheel, in which the name of a
-library it needs is overwritten with one of the same length that no system has.
+Broken libraries are simulated by real ones: copies of a small library from Mitsuba's wheel. The name of a library that
+it needs is overwritten with a name of the same length that exists on no system.
 """
 
 import importlib.util
@@ -47,7 +47,7 @@ def overwrite_name(source, target):
 
 
 def run_child(script, **environment):
-    """Run a script in a fresh interpreter, in which neither drjit nor mitsuba is imported."""
+    """Run a script in a new interpreter that has not imported drjit or mitsuba."""
     root = Path(__file__).parents[3]
     variables = {key: value for key, value in os.environ.items() if key != "DRJIT_LIBLLVM_PATH"} | environment
     return subprocess.run(

@@ -1,4 +1,4 @@
-"""How much light the twin shows, in absolute units: windows, sheet, water, camera and lamp against closed forms."""
+"""Absolute irradiance of the twin: windows, sheet, water, camera and lamp against closed forms."""
 
 import math
 from dataclasses import replace
@@ -57,7 +57,7 @@ def test_a_window_passes_what_the_fields_continuity_allows(mode, glass, absorpti
     angle = np.radians(np.linspace(0, 75, 151))
     direction = mi.Vector3f(to_jit(mi.Float, np.sin(angle)), 0.0, to_jit(mi.Float, np.cos(angle)))
     transport = {"camera": mi.TransportMode.Radiance, "laser": mi.TransportMode.Importance}[mode]
-    path = faces.through(mi.Point3f(0.0, 0.0, 0.0), direction, mode=transport)
+    path = faces.trace(mi.Point3f(0.0, 0.0, 0.0), direction, mode=transport)
     assert (path.weight.numpy() > 0).all()
     # The twin's own coefficient: given, or 14.5 / m for Rubin's clear soda lime at 635 nm, or none.
     absorption = 1e-3 * {1.52: 0.0, 1.9: 40.0, "soda-lime": 14.5}[glass]
@@ -85,7 +85,7 @@ def profile(
     x = np.linspace(-3.0, 3.0, 301)
     grid_x, grid_y = np.meshgrid(x, y, indexing="ij")
     p = mi.Point3f(to_jit(mi.Float, grid_x), to_jit(mi.Float, grid_y), mi.Float(z))
-    light = sheet.at(p)
+    light = sheet.evaluate(p)
     power = light.irradiance * light.direction.z
     dr.eval(power)
     return power.numpy().astype(float).reshape(grid_x.shape), x, y, weights
@@ -110,8 +110,8 @@ def test_the_sheet_carries_the_lasers_power(thesis, name):
         expected = weights @ (fan.power_per_angle(angle) * np.exp(-fan.extinction * way))
         power, x, _, along = profile(sheet, sensor, medium, z)
         total = power.sum(axis=0) @ along * (x[1] - x[0])
-        # The trapezoidal rule is exact for a Gaussian seven nodes wide and more, Gauss's for the smooth profile along.
-        # What is left is the twin's polynomial of the profile along the fan.
+        # The trapezoidal rule is exact for a Gaussian sampled by seven or more nodes, Gauss's rule for the smooth
+        # profile along the fan. The remaining error is that of the twin's polynomial along the fan.
         assert total == pytest.approx(expected, rel=1e-4)
     assert 0.5 < expected / fan.power_w < 0.98
 
@@ -155,7 +155,7 @@ def camera_factor(sensor: Sensor, medium: Medium, points: np.ndarray) -> np.ndar
 
 
 def pixels_per_mm(sensor: Sensor, medium: Medium, points: np.ndarray) -> np.ndarray:
-    """How a stripe of unit width across X widens in an image column: area in px2 per mm2, per px/mm along Y."""
+    """Return the image area in px2 per mm2 of a stripe of unit width along X in an image column, per px/mm along Y."""
     step = 0.01
     x, y = (
         (image_of(sensor, medium, points + step * axis) - image_of(sensor, medium, points - step * axis)) / (2 * step)
@@ -198,7 +198,7 @@ def test_the_stripes_irradiance_is_what_power_reflectance_and_lens_make_of_it(th
 @pytest.mark.parametrize(("absorption", "scattering"), [(2.0, 0.0), (5.0, 1.5)])
 def test_water_dims_the_stripe_over_the_laser_s_and_the_cameras_way(thesis, absorption, scattering):
     sensor = cropped(thesis, 33, 512)
-    # The phase function of forward scattering leaves hardly any haze in the stripe: below 1e-5 of it.
+    # With the forward-scattering phase function, haze in the stripe is below 1e-5 of it.
     media = clear(), clear(absorption, scattering, phase="henyey-greenstein", asymmetry=0.95)
     renderers = [Renderer(sensor, medium, scene_of(plate()), effects=NONE) for medium in media]
     for z in (-40.0, 0.0, 50.0):
@@ -224,7 +224,7 @@ def test_a_plate_under_the_lamp_shows_reflectance_times_irradiance_over_pi(thesi
     inside = (uv >= 0).all(axis=1) & (uv[:, 0] < 1280) & (uv[:, 1] < 1024)
     assert inside.sum() > 80
     expected = 0.45 * 3e-6 / math.pi * camera_factor(sensor, medium, points)[inside]
-    # Half a pixel of rounding is 0.1 mm or 2e-4 rad, by which cos^4 changes by less than 4 * 2e-4 * tan 18 deg.
+    # Rounding by half a pixel is 0.1 mm or 2e-4 rad; cos^4 then changes by less than 4 * 2e-4 * tan 18 deg.
     np.testing.assert_allclose(image[uv[inside, 1], uv[inside, 0]], expected, rtol=3e-4)
 
 

@@ -34,9 +34,12 @@ SMALLEST_P = 1e-4
 """Agreement is refused where chance alone would part two equal images further only once in 10^4 times."""
 LARGEST_Z = -stats.norm.ppf(SMALLEST_P / 2)
 SECOND_ORDER = math.radians(SIGMA_DEG) ** 2
-"""The twin's light runs along the fan wherever it is in the sheet's width, stock's spreads from a point: cosines, ways
-and phase functions change with the square of the angle between the two, 8e-5. What changes with the angle itself has
-another sign on the sheet's other side; surfaces tilted across the sheet would show that."""
+"""Relative error due to the different light directions across the sheet.
+
+In the twin light runs along the fan, in the stock renderer it comes from a point. Cosines, path lengths and phase
+functions change with the square of the angle between the two, 8e-5. First-order changes have opposite signs on both
+sides of the sheet; surfaces tilted across the sheet would show them.
+"""
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +57,7 @@ def turbid(asymmetry: float) -> Medium:
 def twin_irradiance(
     sensor: Sensor, medium: Medium, scene: Scene, *without: str, spp: int, runs: int, pixel_px: int = BLOCK_PX
 ) -> np.ndarray:
-    """Block means (runs, H, W) of the twin's image without defocus, which stock's pinhole has not, in W/mm2."""
+    """Return block means (runs, H, W) of the twin's image in W/mm2, without defocus like the stock pinhole."""
     renderer = Renderer(sensor, medium, scene, effects=ALL.without("defocus", *without))
     images = (renderer.irradiance("laser", sensor_at(), spp=spp, seed=run) for run in range(runs))
     return np.stack([blocks(image, pixel_px) for image in images])
@@ -73,16 +76,16 @@ class Comparison:
     resolved: float
 
     def p_of_blocks(self) -> float:
-        """How often blocks of equal images would differ by more."""
+        """Return the probability that blocks of equal images differ by more."""
         return float(stats.chi2.sf(np.sum(self.z**2), len(self.z)))
 
     def agrees(self) -> bool:
-        """Whether chance explains the differences of the blocks, and that of their sum."""
+        """Return whether the differences of the blocks, and of their sum, are explained by chance."""
         off = max(abs(self.ratio - 1) - SECOND_ORDER, 0.0)
         return self.p_of_blocks() > SMALLEST_P and off < LARGEST_Z * self.resolved
 
     def differs_clearly(self) -> bool:
-        """Whether the sums differ by more than ten standard errors."""
+        """Return whether the sums differ by more than ten standard errors."""
         return abs(self.ratio - 1) > 10 * self.resolved
 
 
@@ -114,9 +117,9 @@ def in_stripe(direct: np.ndarray) -> np.ndarray:
 
 
 def off_stripe(direct: np.ndarray) -> np.ndarray:
-    """Blocks (H, W) that no light of the stripe comes to, and their neighbours neither.
+    """Return the mask of blocks (H, W) that, like their neighbours, receive no light of the stripe.
 
-    The twin renders the stripe to 4.5 standard deviations; stock goes on, with 4e-5 of the peak.
+    The twin renders the stripe up to 4.5 standard deviations; the stock renderer has no limit: 4e-5 of the peak remain.
     """
     lit = direct > 1e-9 * direct.max()
     lit[1:] |= lit[:-1].copy()
@@ -125,9 +128,9 @@ def off_stripe(direct: np.ndarray) -> np.ndarray:
 
 
 def interpolated(stock: np.ndarray, direct: np.ndarray) -> np.ndarray:
-    """Blocks of runs (K, H, W) as the twin shows light on longer ways off the stripe: linear between its cells.
+    """Return blocks of runs (K, H, W) as the twin shows indirect light off the stripe: interpolated between its cells.
 
-    The mean over a cell of what is linear from middle to middle of the cells is 1/8, 6/8 and 1/8 of three cells'.
+    The cell mean of a function that is linear between cell centres is 1/8, 6/8 and 1/8 of three cells.
     """
     weights = np.array([0.125, 0.75, 0.125])
     longer = [cv2.sepFilter2D(run - direct, -1, weights, weights, borderType=cv2.BORDER_REPLICATE) for run in stock]
@@ -205,12 +208,13 @@ def test_light_scattered_once_is_stocks(broad, medium):
     ids=["even", "forward", "far forward"],
 )
 def test_light_scattered_any_number_of_times_is_stocks(broad, asymmetry, names):
-    """Stripe and haze on their own, as the haze is a few per cent of the stripe and would hide in it; row by row.
+    """Compare stripe and haze separately, row by row, as the haze is only a few per cent of the stripe.
 
-    Stock finds the sheet by chance, its bright part near the laser most seldom: the haze of most runs is a little too
-    dark, that of a few far too bright, the more so the more the fog scatters forwards. Where a test's time gives no
-    mean the haze is left out: at an asymmetry of 0.5 before the plate, at 0.9 on both sides of the stripe. With so many
-    samples the twin's walks are hardly smoothed; what smoothing does to few of them `test_smoothing` bounds.
+    The stock renderer finds the sheet by chance, and most rarely its bright part near the laser. The haze of most runs
+    is slightly too dark and that of a few far too bright, more so for stronger forward scattering. The haze is
+    therefore omitted where the test's time does not suffice for a mean: at an asymmetry of 0.5 before the plate, at 0.9
+    on both sides of the stripe. With this number of samples, smoothing of the twin's walks is negligible;
+    `test_smoothing` tests it with few walks.
     """
     scene, medium = scene_of(plate(side=800.0)), turbid(asymmetry)
     stock = stock_irradiance(

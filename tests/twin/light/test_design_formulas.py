@@ -25,7 +25,7 @@ from uwlts.storage.truth import TruthStatus
 PIXEL = 1e-3
 """Of one line: a coordinate of 1000 px is rounded to 6e-5 px, and 1e-4 mm of a ray in 32 bits are 5e-4 px."""
 MEAN_PIXEL = 2.5e-4
-"""Of the mean over all lines, on which only what they share of that remains: allowed is half of it."""
+"""Tolerance in px of the mean over all lines: half of the systematic error that the lines have in common."""
 COSINE = math.cos(math.radians(35))
 STANDOFF = 265 / math.tan(math.radians(35))
 
@@ -67,11 +67,11 @@ def test_the_stripe_on_a_plate_is_where_the_formulas_say(thesis, medium_name, al
         # A stripe's end is a point on a line: it is known to a pixel's error along the line and one across it.
         end_mm = 2 * PIXEL * line_length_mm(setup, depth, side_px=1.0)
         assert np.abs(np.abs(position_along_mm(setup, u, v)) - np.abs(y)).max() < end_mm
-        # The middles of the outermost lines lie one line less apart than the side is long.
+        # The distance between the centres of the outermost lines is one line less than the side.
         assert abs(np.ptp(y) - line_length_mm(setup, depth, side_px=camera.lines() - 1)) < 2 * end_mm
 
         # Two plates 2 mm apart. The quotient departs from the slope by h^2 / Z^2 of it, h = 1 mm and Z at least 337 mm:
-        # 1e-5. The errors of two centres in the 5.8 px or more that lie between them give 4e-4, of their means 1e-4.
+        # 1e-5. The errors of two centres at least 5.8 px from each other give 4e-4, those of their means 1e-4.
         ahead, behind = stripe(z + 1.0)[0], stripe(z - 1.0)[0]
         assert np.abs(ahead - behind).min() > 5.8
         excess = 2 * COSINE / (ahead - behind) / per_pixel - 1

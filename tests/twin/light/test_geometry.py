@@ -1,8 +1,8 @@
-"""Where the twin's rays run: lens, windows and sheet against OpenCV's lens and Fermat's principle, in float64.
+"""Paths of the twin's rays: lens, windows and sheet against OpenCV's lens and Fermat's principle, in double precision.
 
-The twin computes in 32 bits. A coordinate of 400 mm is known to 3e-5 mm and a direction to 6e-8, which over 500 mm is
-3e-5 mm again; some ten such roundings on a ray's way through lens, window and frames add up, as independent errors
-do, to 1e-4 mm. ``RAY_MM`` allows three times that for the largest of all errors.
+The twin computes in single precision. A coordinate of 400 mm has an error of 3e-5 mm and a direction of 6e-8, which is
+3e-5 mm again over 500 mm. About ten such independent errors on a ray's path through lens, window and frames add up to
+1e-4 mm. ``RAY_MM`` allows three times that for the largest error.
 """
 
 import math
@@ -26,7 +26,7 @@ from tests.virtual_sensors import (
     sensor_at,
 )
 from twin.backend.arrays import to_jit, to_numpy
-from twin.light.camera import LensRays, WindowFaces, frame_about
+from twin.light.camera import LensRays, WindowFaces, build_frame
 from twin.light.pose import SensorPose
 from twin.light.renderer import Renderer
 from twin.light.sheet import Sheet
@@ -87,7 +87,7 @@ def opencv_pixels(camera: Camera, rays: np.ndarray) -> np.ndarray:
 
 
 def hits(renderer: Renderer, pixels: np.ndarray, z: float) -> np.ndarray:
-    """Where image points see the plate at ``z``, (N, 3) in the OCS, by Mitsuba."""
+    """Return the points (N, 3) in the OCS where image points see the plate at ``z``, by Mitsuba."""
     pose = SensorPose(sensor_at(-z))
     bundle = renderer.view.bundle(to_jit(mi.Float, pixels[:, 0]), to_jit(mi.Float, pixels[:, 1]))
     si = renderer.objects.scene.ray_intersect(pose.ray(bundle.origin, bundle.direction))
@@ -181,7 +181,7 @@ def sent_through(window: Window, medium: Medium, angles: np.ndarray) -> tuple[np
     """Rays at angles to the axis in the x-z plane: origins, directions (N, 3) behind the window, and which passed."""
     faces = WindowFaces(window, medium, wavelength_nm=635.0, origin_mm=np.zeros(3), rotation=np.eye(3))
     x, z = to_jit(mi.Float, np.sin(angles)), to_jit(mi.Float, np.cos(angles))
-    path = faces.through(mi.Point3f(0.0, 0.0, 0.0), mi.Vector3f(x, 0.0, z), mode=mi.TransportMode.Radiance)
+    path = faces.trace(mi.Point3f(0.0, 0.0, 0.0), mi.Vector3f(x, 0.0, z), mode=mi.TransportMode.Radiance)
     return to_numpy(path.origin), to_numpy(path.direction), path.weight.numpy() > 0
 
 
@@ -214,7 +214,7 @@ def test_frames_are_right_handed_and_follow_their_axis():
     random = np.random.default_rng(0)
     for _ in range(50):
         axis, across = random.normal(size=(2, 3))
-        frame = frame_about(axis, across)
+        frame = build_frame(axis, across)
         np.testing.assert_allclose(frame.T @ frame, np.eye(3), atol=1e-14)
         assert np.linalg.det(frame) > 0
         assert frame[:, 2] @ axis == pytest.approx(np.linalg.norm(axis))
@@ -232,8 +232,8 @@ def sheet_points(sensor: Sensor, medium: Medium, angle: np.ndarray, z: float) ->
 
 
 def light_at(sheet: Sheet, points: np.ndarray) -> dict[str, np.ndarray]:
-    """What the sheet says of points (N, 3), as NumPy arrays."""
-    light = sheet.at(mi.Point3f(*[to_jit(mi.Float, column) for column in points.T]))
+    """Return the light of the sheet at points (N, 3) as NumPy arrays."""
+    light = sheet.evaluate(mi.Point3f(*[to_jit(mi.Float, column) for column in points.T]))
     dr.eval(light)
     values = {
         name: getattr(light, name).numpy().astype(float)
@@ -304,5 +304,5 @@ def test_roll_turns_the_sheet_about_the_lasers_axis(thesis, along):
     sheet = Sheet(rolled, medium)
     lit, beside = ((p + origin) @ to_object[:3, :3].T + to_object[:3, 3] for p in (turned, flat))
     np.testing.assert_allclose(light_at(sheet, lit)["distance_mm"], 0.0, atol=1e-4)
-    # Points of the unrolled sheet lie y sin 10 deg beside the rolled one.
+    # Points of the unrolled sheet are displaced by y sin 10 deg from the rolled one.
     np.testing.assert_allclose(light_at(sheet, beside)["distance_mm"], spread * math.sin(math.radians(10)), atol=1e-4)

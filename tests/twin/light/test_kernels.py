@@ -1,6 +1,6 @@
-"""Frames after the first reuse its kernels, wherever the sensor stands and however many pixels are lit.
+"""Frames after the first reuse its kernels, for any sensor pose and number of lit pixels.
 
-Another sensor's do, too, and in other water: a design study compiles no kernel anew from design to design.
+Other sensors and waters do too: a design study does not recompile kernels for each design.
 """
 
 import drjit as dr
@@ -96,7 +96,7 @@ OTHER = {
         "waist_radius_mm": 0.081,
     },
 }
-"""Numbers by which designs differ; what one has and another lacks, such as distortion, takes kernels of its own."""
+"""Values that differ between designs; features that only one design has, such as distortion, need separate kernels."""
 
 
 def test_another_sensor_in_other_water_compiles_nothing(thesis, new_kernels):
@@ -111,7 +111,7 @@ def test_another_sensor_in_other_water_compiles_nothing(thesis, new_kernels):
     launched, new = new_kernels()
     assert launched >= 10
     assert new == 0
-    # An effect that is absent does compile anew: the count can tell.
+    # Without an effect, other kernels are compiled: the count detects it.
     frames(altered(thesis, SMALL), clear(0.3), sphere(), spp=4)
     assert new_kernels()[1] > 0
 

@@ -33,10 +33,10 @@ def variance(image: np.ndarray) -> np.ndarray:
 
 
 def blur_diameter_px(sensor: Sensor, distance_mm: float) -> float:
-    """Diameter of the blur disc of a thin lens for a point at a distance in air.
+    """Return the diameter of the blur disc of a thin lens for a point at a distance in air.
 
     By similar triangles behind the lens: D c |1 / z - 1 / F| with the image distance c and the focused distance F. The
-    diameter D follows from the f-number N = f / D by the working f-number c / D = N (1 + m) at m = f / (F - f).
+    diameter D follows from the working f-number c / D = N (1 + m), with N = f / D and m = f / (F - f).
     """
     camera = sensor.camera
     magnification = camera.focal_length_mm / (camera.focus_distance_mm - camera.focal_length_mm)
@@ -96,7 +96,7 @@ def test_in_water_the_sharp_depth_is_where_it_appears_at_the_focused_distance(th
 def test_defocus_keeps_the_light(thesis, z):
     sensor = cropped(thesis, 64, 1024)
     sharp, blurred = (columns(sensor, clear(0.3), z, effects).sum() for effects in (NONE, BLURRED))
-    # What leaves the 64 columns at one side comes in at the other; the weight cos^4 is the chief ray's in both.
+    # Light that leaves the 64 columns on one side enters on the other; both have the cos^4 weight of the chief ray.
     assert blurred == pytest.approx(sharp, rel=2e-3)
 
 

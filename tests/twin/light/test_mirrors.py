@@ -19,7 +19,7 @@ SHARE, MIRROR_Z, TILT = 0.8, 40.0, math.radians(10.0)
 PLATE_Z = 10.0
 EFFECTS = replace(NONE, secondary_light=True, gloss=True)
 BLOCK = block((30.0, 60.0, 20.0), (0.0, 0.0, 10.0), reflectance=0.6)
-"""Its upper face lies at Z = 0, its lower one 20 mm above the mirror."""
+"""Its upper face is at Z = 0, its lower one 20 mm above the mirror."""
 
 
 def mirror(share: float, **rest: object) -> dict[str, object]:

@@ -42,10 +42,10 @@ def test_travel_during_the_exposure_blurs_the_stripe_evenly(renderer, exposure_m
     assert (np.abs(px_per_mm) > 1).all()
     still = renderer.irradiance("laser", sensor_at(), spp=512).astype(float)
     blurred = renderer.irradiance("laser", sensor_at(), spp=512, travel=travel(exposure_mm)).astype(float)
-    (at_rest, narrow), (moving, wide) = moments(still), moments(blurred)
+    (to_rest_frame, narrow), (moving, wide) = moments(still), moments(blurred)
     # An even motion over L px has the variance L^2 / 12; the plate runs away from the camera by 0.3 % per mm.
     np.testing.assert_allclose(wide - narrow, (exposure_mm * px_per_mm) ** 2 / 12, rtol=0.01 * exposure_mm)
-    np.testing.assert_allclose(moving, at_rest, atol=0.005 * exposure_mm**2)
+    np.testing.assert_allclose(moving, to_rest_frame, atol=0.005 * exposure_mm**2)
     assert blurred.sum() == pytest.approx(still.sum(), rel=0.01)
 
 

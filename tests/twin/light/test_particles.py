@@ -48,7 +48,8 @@ def test_many_bodies_scatter_as_a_haze_of_the_same_cross_section(small, body):
     # In the middle the camera looks along its axis at light that runs along Z; in 20 deg of field it changes little.
     cosine = -camera_from_object(small)[2, 2]
     per_sr = 1e-6 * count * mean_square_radius * SHARES[body](np.array([cosine]))[0]
-    # Isotropic haze of 1 per m scatters 1e-3 / 4 pi per mm and sr. Spots fall over the middle's border, both ways.
+    # Isotropic haze of 1 per m scatters 1e-3 / 4 pi per mm and sr. Spots cross the border of the centre inwards and
+    # outwards.
     expected = haze[middle].mean() * per_sr / (1e-3 / (4 * math.pi))
     values = np.array([frame[middle].mean() for frame in frames])
     assert np.count_nonzero(values) > 20
@@ -81,10 +82,10 @@ def test_equal_seeds_give_equal_bodies_and_a_flat_disc_keeps_its_light(small):
     assert not np.array_equal(first, other)
     for radius in (0.0, 0.7, 4.0, 11.3):
         one = Spots(*(np.array([each]) for each in (40.3, 30.8, 2.0, radius)))
-        image = one.drawn(64, 80)
+        image = one.draw(64, 80)
         assert image.sum() == pytest.approx(2.0, rel=0.01)
         y, x = np.nonzero(image)
         assert np.hypot(y - 30.8, x - 40.3).max() <= radius + 0.5
-    cut = Spots(*(np.array([each]) for each in (40.0, 0.0, 2.0, 9.0))).drawn(64, 80)
+    cut = Spots(*(np.array([each]) for each in (40.0, 0.0, 2.0, 9.0))).draw(64, 80)
     # Half of it and the row through its middle.
     assert cut.sum() == pytest.approx(1.0 + 18 / (math.pi * 81), rel=0.03)

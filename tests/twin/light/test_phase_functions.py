@@ -9,8 +9,8 @@ from hypothesis import given, settings, strategies as st
 from scipy.special import chdtrc
 
 from tests.virtual_sensors import clear, gauss_legendre
-from twin.backend.arrays import to_jit, to_numpy
-from twin.light.water import NODES, Scattering, node_angles, tabulated
+from twin.backend.arrays import Float, Point2f, Vector3f, to_jit, to_numpy
+from twin.light.water import NODES, Scattering, node_angles, rotate_about, tabulate_phase_function
 from uwlts.model.phase_functions import (
     FournierForand,
     HenyeyGreenstein,
@@ -56,13 +56,13 @@ def shares(medium: Medium, edges: np.ndarray) -> np.ndarray:
 
 def within(table_of: PhaseFunction, degrees: float) -> float:
     """Share scattered by less than an angle."""
-    table = tabulated((Scatterer(1.0, table_of),))
+    table = tabulate_phase_function((Scatterer(1.0, table_of),))
     return float(np.interp(math.log(math.radians(degrees)), np.log(node_angles()), table.cumulative))
 
 
 def mean_cosine(phase: PhaseFunction) -> float:
-    """1 less the integral of (1 - cos), to which small angles add nothing."""
-    table = tabulated((Scatterer(1.0, phase),))
+    """Return the mean cosine, 1 minus the integral of (1 - cos); small angles do not contribute."""
+    table = tabulate_phase_function((Scatterer(1.0, phase),))
     return 1 - float(np.diff(table.cumulative) @ (1 - np.cos(np.sqrt(node_angles()[1:] * node_angles()[:-1]))))
 
 
@@ -80,7 +80,7 @@ def test_henyey_and_greenstein_is_its_series(asymmetry):
 
 
 def test_molecules_scatter_by_their_depolarisation_and_as_much_back_as_forth():
-    # Across, light polarised both ways is left: (1 - d) / (1 + d) less than forwards, with d = 0.039.
+    # With the depolarisation d = 0.039, forward / across - 1 is (1 - d) / (1 + d).
     forward, across, backward = Molecular().per_sr(np.radians([1e-6, 90.0, 180.0]))
     assert forward / across - 1 == pytest.approx((1 - 0.039) / (1 + 0.039), abs=1e-4)
     assert forward == pytest.approx(backward)
@@ -110,8 +110,8 @@ MOBLEY = [
 
 def test_petzolds_average_is_mobleys():
     found = [within(PetzoldAverage(), degrees) for degrees, _ in MOBLEY]
-    # The integral depends on how one passes between the angles: taken as powers of the angle, as here, or as straight
-    # lines, it differs by 0.4 % of what lies between 5 and 15 deg, where the angles are farthest apart.
+    # The integral depends on the interpolation between the angles: power laws, as here, and straight lines differ by
+    # 0.4 % of the part between 5 and 15 deg, where the spacing of the angles is largest.
     assert found == pytest.approx([share for _, share in MOBLEY], abs=0.003)
     shares_found = [within(PetzoldAverage(), degrees) for degrees in (0.1, 1.0, 5.0, 10.0)]
     assert [round(100 * share) for share in shares_found] == [5, 23, 52, 67]
@@ -120,7 +120,7 @@ def test_petzolds_average_is_mobleys():
 
 
 def test_petzolds_average_has_the_values_of_the_table_and_its_forward_slope():
-    table = tabulated((Scatterer(1.0, PetzoldAverage()),))
+    table = tabulate_phase_function((Scatterer(1.0, PetzoldAverage()),))
     per_solid_angle = np.exp(table.log_density) / (math.pi * np.sin(node_angles()) ** 2)
     found = np.exp(
         np.interp(np.log(np.radians([0.1, 1.0, 10.0, 90.0])), np.log(node_angles()), np.log(per_solid_angle))
@@ -193,7 +193,7 @@ def test_what_is_evaluated_integrates_to_one(name):
     edges = places(400)
     total = shares(medium, edges).sum()
     ends = one_minus_cosine(edges[[0, -1]])
-    table = tabulated(medium.scatterers(635.0))
+    table = tabulate_phase_function(medium.scatterers(635.0))
     outside = np.interp(math.log(ends[0]), np.log(1 - np.cos(node_angles())), table.cumulative)
     outside += 2 * math.pi * (2 - ends[1]) * scattering.phase(mi.Float(2.0)).numpy()[0]
     # 32 bits leave 1e-6 of the logarithm, and the pole's share is read between nodes.
@@ -255,13 +255,19 @@ def test_a_medium_that_does_not_scatter_has_no_coefficient():
 # --- what is drawn ----------------------------------------------------------------------------------------------------
 
 
+def directions_after(scattering: Scattering, direction: Vector3f, u: Point2f) -> tuple[Vector3f, Float]:
+    """Return directions after scattering, sampled as in random walks, and their densities in 1/sr."""
+    after = rotate_about(direction, scattering.angles.heights(u.x), u.y)
+    return after, scattering.phase(0.5 * dr.squared_norm(after - direction))
+
+
 def drawn(medium: Medium, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Direction (3,) before, directions (count, 3) after scattering and their densities (count,) in 1/sr."""
     rng = np.random.default_rng(20)
     before = rng.normal(size=3)
     before = np.float32(before / np.linalg.norm(before))
     u = mi.Point2f(*(to_jit(mi.Float, rng.random(count)) for _ in range(2)))
-    after, density = Scattering(medium, 635.0).sample(mi.Vector3f(*map(float, before)), u)
+    after, density = directions_after(Scattering(medium, 635.0), mi.Vector3f(*map(float, before)), u)
     return before.astype(float), to_numpy(after).astype(float), density.numpy()
 
 
@@ -310,7 +316,7 @@ def test_directions_are_even_about_the_axis(name):
 def test_angles_grow_with_the_number_from_which_they_are_drawn(name):
     u = np.linspace(0, 1 - 2**-24, 200_001)
     numbers = mi.Point2f(to_jit(mi.Float, u), 0.3)
-    after, density = Scattering(MEDIA[name], 635.0).sample(mi.Vector3f(0.0, 0.0, 1.0), numbers)
+    after, density = directions_after(Scattering(MEDIA[name], 635.0), mi.Vector3f(0.0, 0.0, 1.0), numbers)
     directions = to_numpy(after).astype(float)
     assert np.isfinite(directions).all()
     assert (density.numpy() > 0).all()
@@ -324,7 +330,7 @@ def test_another_water_needs_no_new_kernel():
     def use(medium: Medium) -> None:
         scattering = Scattering(medium, 635.0)
         u = mi.Point2f(to_jit(mi.Float, np.linspace(0, 0.99, 1234)), to_jit(mi.Float, np.linspace(0, 0.99, 1234)))
-        after, density = scattering.sample(mi.Vector3f(0.0, 0.6, 0.8), u)
+        after, density = directions_after(scattering, mi.Vector3f(0.0, 0.6, 0.8), u)
         dr.eval(after, density, scattering.phase(u.x))
 
     use(MEDIA["petzold"])

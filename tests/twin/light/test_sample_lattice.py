@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from tests.virtual_sensors import altered, clear, plate, scene_of, sensor_at
-from twin.light.image_sampling import lattice, pupil_shifts
+from twin.light.image_sampling import make_lattice, pupil_shifts
 from twin.light.renderer import Renderer
 from twin.options import NONE
 
@@ -17,7 +17,7 @@ BLURRED = replace(NONE, defocus=True)
 @settings(deadline=None, max_examples=60)
 @given(count=st.integers(1, 400), axes=st.integers(1, 6))
 def test_samples_are_even_along_every_axis_and_their_own_mirror_image(count: int, axes: int):
-    points = lattice(count, axes)
+    points = make_lattice(count, axes)
     assert points.shape == (axes, count)
     # Coordinates are odd multiples of half a strip; rounding leaves some 1e-13 of a strip.
     numbers = np.rint(2 * count * points).astype(int)
@@ -29,7 +29,7 @@ def test_samples_are_even_along_every_axis_and_their_own_mirror_image(count: int
 @pytest.mark.parametrize("count", [3, 16, 17, 64])
 def test_samples_have_no_first_moment(count: int):
     """Neither along the pixel nor along the pupil, nor any odd one of pixel and pupil together."""
-    points = lattice(count, 5) - 0.5
+    points = make_lattice(count, 5) - 0.5
     for factors in ([0], [1], [2], [3], [4], [0, 1, 2], [0, 2, 3], [1, 1, 3]):
         assert abs(np.prod(points[factors], axis=0).mean()) < 1e-12, factors
 
@@ -44,7 +44,7 @@ def test_the_pupils_shifts_are_spread_over_a_block_of_pixels():
     block = pupil_shifts(*np.mgrid[0:4, 0:4].reshape(2, -1))
     apart = block[:, :, None] - block[:, None]
     distance = np.hypot(*(apart - np.rint(apart)))[~np.eye(16, dtype=bool)]
-    # In a square grid, 16 points lie 1/4 apart on the torus that the square is; two thirds of it are well spread.
+    # In a square grid on the torus, 16 points have a spacing of 1/4; two thirds of that is well spread.
     assert distance.min() > 2 / 3 / 4
     mirrored = np.abs(block[:, :, None] + block[:, None] - 1).max(axis=0).min(axis=1)
     assert mirrored.max() < 1e-12

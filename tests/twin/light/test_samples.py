@@ -33,7 +33,7 @@ def stripe(reference):
 
 
 def worst(renderer: Renderer, reference: np.ndarray, stripe: np.ndarray, spp: int) -> float:
-    """Largest error of a stripe's pixel, as a share of the brightest."""
+    """Return the largest error of a stripe's pixel, relative to the brightest pixel."""
     image = renderer.irradiance("laser", sensor_at(), spp=spp).astype(float)
     return np.abs(image - reference)[stripe].max() / reference.max()
 
@@ -88,14 +88,14 @@ def test_wide_stripes_take_fewer_samples_where_they_are_smooth(thesis, monkeypat
     scene = scene_of(plate(), block((40.0, 6.0, 12.0), (0.0, 0.0, -6.0), reflectance=0.5))
     renderer = Renderer(sensor, clear(0.3), scene, effects=replace(NONE, defocus=True))
     rendered = 0
-    whole = Renderer._fine
+    whole = Renderer._render_pixels
 
     def counted(self: Renderer, *arguments: Any, spp: int, **kwargs: Any) -> np.ndarray:
         nonlocal rendered
         rendered += len(arguments[2]) * spp
         return whole(self, *arguments, spp=spp, **kwargs)
 
-    monkeypatch.setattr(Renderer, "_fine", counted)
+    monkeypatch.setattr(Renderer, "_render_pixels", counted)
     image = renderer.irradiance("laser", sensor_at(), spp=16)
     few, rendered = rendered, 0
     monkeypatch.setattr("twin.light.renderer._WIDE_PX", math.inf)

@@ -27,7 +27,10 @@ def objects_of(thing: dict) -> Objects:
 
 
 def hits(objects: Objects, start: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where rays from points (N, 3) in one direction (3,) meet the objects: places, normals (N, 3); whether (N,)."""
+    """Intersect rays from points (N, 3) in one direction (3,) with the objects.
+
+    Return positions and normals (N, 3), and the hit mask (N,).
+    """
     o, d = mi.Point3f(*(to_jit(mi.Float, c) for c in start.T)), mi.Vector3f(*(float(c) for c in direction))
     si = objects.scene.ray_intersect(mi.Ray3f(o, d))
     dr.eval(si.t, si.p, si.n)
@@ -42,8 +45,8 @@ def weld_function(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return -weld_height(Weld(**WELD), x, y)
 
 
-# What facets of step h deviate from a surface of radius r, h^2 / 8 r: at the tip of the head's nose 0.0073 mm and on
-# most of it less than half of that, of the weld 0.004 mm; rays in 32 bits add 1e-4 mm.
+# Deviation h^2 / 8 r of facets with step h from a surface of radius r: 0.0073 mm at the tip of the head's nose, less
+# than half of that on most of it, 0.004 mm for the weld; single precision adds 1e-4 mm.
 @pytest.mark.parametrize(
     ("thing", "function", "half", "most", "usual"),
     [(HEAD, head_function, (44.0, 78.0), 0.008, 0.004), (WELD, weld_function, (39.9, 59.9), 0.0045, 0.003)],
@@ -69,7 +72,7 @@ def test_rays_hit_where_the_smooth_surface_lies(thing, function, half, most, usu
 
 
 def test_no_ray_slips_through_the_seams_of_a_mesh():
-    """Rays towards the beads all meet the open sheet that they lie on; Embree's fast test loses some in 10^5."""
+    """All rays towards the beads meet the open sheet below them; Embree's fast test would lose some in 10^5."""
     x, y = np.random.default_rng(3).uniform(-1, 1, (2, 2_000_000)) * [[27.0], [22.0]]
     direction = np.array([0.5, 0.0, np.sqrt(0.75)])
     target = np.stack([x, y, np.zeros_like(x)], axis=1)
@@ -100,8 +103,8 @@ def test_the_nose_hides_the_stripe_on_the_cameras_far_side_only(thesis, x):
         assert not gaps
         return
     # A line is lost where the nose's edge comes within a pixel (0.15 mm) of the stripe, and facets shift that edge by
-    # their 0.01 mm: what is hidden lies between that of sheets 0.2 mm to either side, but for the oracle's steps of
-    # 0.2 mm and lines 0.13 mm apart.
+    # their 0.01 mm. The hidden part is between those of sheets 0.2 mm to either side, apart from the oracle's steps of
+    # 0.2 mm and the line spacing of 0.13 mm.
     (low, high), ranges = gaps[0], [hidden_places(thesis, medium, x + dx)[[0, -1]] for dx in (-0.2, 0.0, 0.2)]
     assert len(gaps) == 1
     assert ranges[1][1] - ranges[1][0] > 10

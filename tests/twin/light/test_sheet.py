@@ -65,8 +65,8 @@ def fan_rays(laser: Laser, angle: np.ndarray) -> np.ndarray:
 
 
 def light_at(sheet: Sheet, points: np.ndarray) -> dict[str, np.ndarray]:
-    """What the sheet says of points (N, 3), in float64."""
-    light = sheet.at(mi.Point3f(*[to_jit(mi.Float, column) for column in points.T]))
+    """Return the light of the sheet at points (N, 3), in double precision."""
+    light = sheet.evaluate(mi.Point3f(*[to_jit(mi.Float, column) for column in points.T]))
     dr.eval(light)
     names = ("distance_mm", "sigma_mm", "irradiance", "exit_mm")
     values = {name: getattr(light, name).numpy().astype(float) for name in names}
@@ -94,7 +94,7 @@ def power_per_mm(sheet: Sheet, y: np.ndarray, z: float) -> np.ndarray:
 
 
 def fan_edges(sheet: Sheet, z: float) -> np.ndarray:
-    """The two Y between which there is light, sought on ever finer grids."""
+    """Return the two Y that bound the light, searched on successively finer grids."""
     edges = np.array([-600.0, 600.0])
     spacing = np.ptp(edges)
     for _ in range(3):
@@ -162,7 +162,7 @@ def test_a_bent_sheet_lies_on_paths_of_least_time(thesis, name):
         ray = farther / np.linalg.norm(farther, axis=1, keepdims=True)
         np.testing.assert_allclose(light["direction"], ray, rtol=0, atol=2e-6)
         along = np.gradient(points, axis=0)
-        # Central differences over 2 deg miss the tangent by a share of (2 deg)^2 of how it turns, below 1e-4.
+        # Central differences over 2 deg have a relative error of (2 deg)^2 of the change of the tangent, below 1e-4.
         slant = np.einsum("ni,ni->n", light["normal"], along / np.linalg.norm(along, axis=1, keepdims=True))
         assert np.abs(slant[1:-1]).max() < 1e-4
         assert np.abs(np.einsum("ni,ni->n", light["normal"], ray)).max() < 2e-6
@@ -200,7 +200,7 @@ def test_in_air_the_bow_is_a_cone(thesis, bow, fan):
 def test_a_fan_bent_too_unevenly_is_refused(thesis):
     window = {"tilt_x_deg": 24.0, "tilt_y_deg": 30.0, "aperture_diameter_mm": 2000.0}
     sensor = altered(thesis, {"laser": {"fan_angle_deg": 119.0, "window": window}})
-    with pytest.raises(DesignError, match=r"119 deg fan so unevenly .* to \d+\.\d+ mm only, not to 0\.001 mm"):
+    with pytest.raises(DesignError, match=r"119 deg fan too unevenly: .* error of \d+\.\d+ mm \(limit 0\.001 mm\)"):
         Sheet(sensor, WATER)
 
 
@@ -216,7 +216,7 @@ def test_power_behind_the_window_is_what_its_faces_pass_and_is_kept(thesis, name
     cosine = fan_rays(laser, angle) @ oracle_window(laser.window, WATER)[0][0].normal
     passed = window_transmittance(cosine, laser.window, 1.3312, absorption_per_mm=laser.window.absorption_per_mm())
     expected = 1e-3 * laser.power_mw * (passed * shape_of(laser, angle)).mean()
-    # The midpoint rule misses up to a share of 1e-4 / 2 where the profile jumps; roundings in 32 bits stay below 1e-6.
+    # The midpoint rule has a relative error of up to 1e-4 / 2 at jumps of the profile; single precision adds 1e-6.
     assert sheet.power_w == pytest.approx(expected, rel=5e-5 if name in ("corners", "twisted") else 2e-6)
     assert 0.85 < sheet.power_w / (1e-3 * laser.power_mw) < 0.97
     for z in DEPTHS:
@@ -269,7 +269,7 @@ def test_a_table_is_drawn_from_by_the_inverse_of_its_integral():
     assert not ((x > 1) & (x < 2)).any(), "nothing where there is no power"
     grid = np.linspace(-3, 5, 801)
     expected = 0.02 * np.interp(grid, nodes, density, left=0.0, right=0.0) / before[-1]
-    np.testing.assert_allclose(table.at(to_jit(mi.Float, grid)).numpy(), expected, rtol=0, atol=2e-8)
+    np.testing.assert_allclose(table.evaluate(to_jit(mi.Float, grid)).numpy(), expected, rtol=0, atol=2e-8)
 
 
 def drawn(sheet: Sheet, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -285,7 +285,7 @@ FOCUSED = {"waist_radius_mm": 0.06, "waist_distance_mm": 430.0}
 
 @pytest.mark.parametrize("name", ["gaussian", "corners", "tilted", "twisted", "hollow"])
 def test_rays_are_spread_as_the_irradiance_says(thesis, name):
-    """A million rays, counted in 60 strips along Y by 12 equal shares of the Gaussian, in three planes."""
+    """Count a million rays in 60 strips along Y and 12 intervals of equal probability across, in three planes."""
     sensor = altered(thesis, {"laser": LASERS[name] | FOCUSED})
     sheet = Sheet(sensor, WATER)
     origin, direction = drawn(sheet, 1_000_000, 1)
@@ -308,7 +308,7 @@ def test_rays_are_spread_as_the_irradiance_says(thesis, name):
         part = np.minimum(stats.norm.cdf(across) * 12, 11).astype(int)
         counts = np.bincount(strip * 12 + part, minlength=720)
         expected = np.repeat(share / share.sum(), 12) / 12 * len(points)
-        assert counts[expected < 1].sum() <= 5, "no rays where there is no light, strips cut by a corner aside"
+        assert counts[expected < 1].sum() <= 5, "rays in the dark, apart from strips cut by a corner"
         filled = expected > 20
         assert filled.sum() > 500
         chi2 = ((counts[filled] - expected[filled]) ** 2 / expected[filled]).sum()
@@ -343,7 +343,7 @@ def test_the_numbers_0_and_almost_1_give_rays(thesis):
 
 
 def test_a_waist_at_the_origin_of_a_bare_fan_gives_rays(thesis):
-    # There the rays of the fan meet, and the surface has no normal of its own.
+    # All rays of the fan meet there, and the normal of the surface is undefined.
     sensor = altered(thesis, {"laser": {"waist_distance_mm": 1e-6, "window": {"mounted": False}}})
     u = mi.Point3f(*(to_jit(mi.Float, np.linspace(0.01, 0.99, 50)) for _ in range(3)))
     rays = Sheet(sensor, Medium(kind="air")).sample(u)

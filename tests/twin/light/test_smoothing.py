@@ -10,7 +10,7 @@ from scipy import stats
 
 from tests.bench.light import in_named_water
 from twin.light.renderer import Renderer
-from twin.light.smoothing import FoundLight, blurred, estimated, interpolated
+from twin.light.smoothing import FoundLight, blur_cells, estimate_light, interpolate_cells
 from twin.options import Options
 from twin.scene.description import load_scene
 
@@ -27,7 +27,7 @@ def halo() -> np.ndarray:
 
 def features() -> np.ndarray:
     line = (np.abs(ROWS - 20 - 0.1 * COLUMNS) < 0.5).astype(np.float32)
-    return np.stack([np.ones(SHAPE, np.float32), *(blurred(line, width) for width in (0.7, 2.1, 6.3, 19.0))])
+    return np.stack([np.ones(SHAPE, np.float32), *(blur_cells(line, width) for width in (0.7, 2.1, 6.3, 19.0))])
 
 
 def walks_of(light: np.ndarray, walks: int, *, rng: np.random.Generator) -> FoundLight:
@@ -44,7 +44,7 @@ def test_rare_bright_walks_leave_no_spots_and_all_light_is_kept():
     light, walks = halo(), 8
     findings = walks_of(light, walks, rng=rng)
     raw = findings.total() / walks
-    found = estimated(findings, np.full(SHAPE, walks), features(), tolerance=0.05, noise_share=0.05).cells
+    found = estimate_light(findings, np.full(SHAPE, walks), features(), tolerance=0.05, noise_share=0.05).cells
     # The variance of a walk is exp(1.5^2) - 1 = 8.5 times its squared mean, so that 8 of them scatter by 103 % and the
     # brightest of 3,072 cells by 8 times that or more.
     before, after = raw / light - 1, found / light - 1
@@ -61,7 +61,7 @@ def test_what_enough_walks_found_is_kept_whatever_the_features_say():
     walks = 4000
     findings = walks_of(light, walks, rng=rng)
     raw = findings.total() / walks
-    found = estimated(findings, np.full(SHAPE, walks), features(), tolerance=0.05, noise_share=0.2).cells
+    found = estimate_light(findings, np.full(SHAPE, walks), features(), tolerance=0.05, noise_share=0.2).cells
     inside = light > 4.9
     assert np.abs(found[inside] / raw[inside] - 1).mean() < 0.02
     assert (found / light - 1).std() < 0.06
@@ -76,14 +76,14 @@ def test_more_walks_in_some_cells_are_weighed():
         cells = np.flatnonzero((COLUMNS < 32) == left)
         each = light.ravel()[cells][:, None] * rng.exponential(1.0, (len(cells), count))
         findings.add(np.repeat(cells, count), each.astype(np.float32).ravel())
-    found = estimated(findings, walks, features(), tolerance=0.05, noise_share=0.05).cells
+    found = estimate_light(findings, walks, features(), tolerance=0.05, noise_share=0.05).cells
     for side in (COLUMNS < 32, COLUMNS >= 32):
         # 6,144 exponential walks on the poorer side scatter by 1.3 % of the mean light, twice that with its weights.
         assert found[side].mean() == pytest.approx(light[side].mean(), rel=0.08)
 
 
 def test_no_walks_and_dark_features_are_no_light():
-    nothing = estimated(
+    nothing = estimate_light(
         FoundLight(*SHAPE), np.ones(SHAPE), np.zeros((2, *SHAPE), np.float32), tolerance=0.0, noise_share=0.05
     )
     assert (nothing.cells == 0).all()
@@ -92,21 +92,21 @@ def test_no_walks_and_dark_features_are_no_light():
     # The inverse of the second one's sum is more than single precision holds.
     none, hardly = np.zeros(SHAPE, np.float32), np.full(SHAPE, 1e-43, np.float32)
     dark = np.stack([none, hardly, np.ones(SHAPE, np.float32)])
-    spread = estimated(findings, np.ones(SHAPE), dark, tolerance=1e-3, noise_share=0.05).cells
+    spread = estimate_light(findings, np.ones(SHAPE), dark, tolerance=1e-3, noise_share=0.05).cells
     assert spread.sum(dtype=float) == pytest.approx(1.0, rel=1e-4)
     assert spread.max() < 0.01
 
 
 def test_small_places_take_the_light_of_the_cells_about_them():
     rng = np.random.default_rng(1)
-    # Where the light has been described, a place within the cells shows it as steep as its own features are.
+    # Within the cells, described light is as steep as its features.
     light, walks = features()[1] * 40 + 0.5, 64
     findings = walks_of(light, walks, rng=rng)
-    estimate = estimated(findings, np.full(SHAPE, walks), features(), tolerance=0.05, noise_share=0.05)
+    estimate = estimate_light(findings, np.full(SHAPE, walks), features(), tolerance=0.05, noise_share=0.05)
     rows, columns = np.array([20.25, 23.0, 30.5]), np.array([10.0, 30.5, 50.25])
-    own = np.stack([interpolated(feature, rows, columns) for feature in features()])
-    found = estimate.at(rows, columns, own, FoundLight(1, 3), 1)
-    assert found == pytest.approx(interpolated(light, rows, columns), rel=0.25)
+    own = np.stack([interpolate_cells(feature, rows, columns) for feature in features()])
+    found = estimate.evaluate(rows, columns, own, FoundLight(1, 3), 1)
+    assert found == pytest.approx(interpolate_cells(light, rows, columns), rel=0.25)
 
 
 # --- rendered frames --------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Light on longer ways: integrating sphere, corner and thin water against closed forms and quadrature; its noise."""
+"""Indirect light: integrating sphere, corner and thin water against closed forms and quadrature, and its noise."""
 
 import math
 from dataclasses import replace
@@ -34,7 +34,7 @@ from uwlts.model.sensor import Medium, Sensor
 BOUNCED = replace(NONE, secondary_light=True)
 SCATTERED = replace(NONE, multiple_scattering=True)
 BATCHES = 32
-"""Walks of a point are added up in so many parts, whose scatter tells the error of their mean."""
+"""Number of batches of a point's walks; their scatter gives the standard error of the mean."""
 SURE = 4.5
 """Standard errors: one in 10^5 is larger, taking into account that 32 batches estimate it to 13 %."""
 
@@ -46,7 +46,7 @@ def coarse(thesis) -> Sensor:
 
 
 def walked(renderer: Renderer, pixels: np.ndarray, walks: int, *, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Irradiance (N,) of light on longer ways at image points (N, 2), and its standard error."""
+    """Return the irradiance (N,) of indirect light at image points (N, 2), and its standard error."""
     pose = SensorPose(np.eye(4))
     direct, _ = lights([renderer._sheets[0]], pose)
     walker = Walker(renderer.objects, renderer.scattering, renderer.effects, pose, direct, 2000.0)
@@ -54,8 +54,11 @@ def walked(renderer: Renderer, pixels: np.ndarray, walks: int, *, seed: int = 0)
     cell = np.repeat(np.arange(len(pixels) * BATCHES), each)
     x, y = pixels[cell // BATCHES].T
     bundle = renderer.view.bundle(to_jit(mi.Float, x), to_jit(mi.Float, y))
-    sums = walker.radiance(bundle, to_jit(mi.UInt32, cell), len(pixels) * BATCHES, seed=seed)
-    batches = sums.astype(float).reshape(len(pixels), BATCHES) / each
+    sums = np.zeros(len(pixels) * BATCHES)
+    for where, *parts in walker.trace(bundle, to_jit(mi.UInt32, cell), seed=seed):
+        for light in parts:
+            sums += np.bincount(where, light, len(sums))
+    batches = sums.reshape(len(pixels), BATCHES) / each
     return batches.mean(axis=1), batches.std(axis=1, ddof=1) / math.sqrt(BATCHES)
 
 
@@ -66,7 +69,7 @@ def seen(sensor: Sensor, medium: Medium, points: np.ndarray) -> tuple[np.ndarray
 
 
 def assert_agrees(found: np.ndarray, error: np.ndarray, expected: np.ndarray, *, within: float, noise: float) -> None:
-    """Means agree within their standard errors and the reference's own accuracy ``within``; they tell something."""
+    """Check that means agree within their standard errors and the accuracy ``within``, and are conclusive."""
     print("relative deviation", np.round(found / expected - 1, 4), "standard error", np.round(error / expected, 4))
     assert (error < noise * expected).all(), "the test could not fail"
     np.testing.assert_array_less(np.abs(found - expected), SURE * error + within * expected)

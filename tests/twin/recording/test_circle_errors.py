@@ -1,4 +1,4 @@
-"""What is wrong with a real target and its stage: circles printed off, found off, a bowed plate, positions off."""
+"""Errors of a real target and its stage: print errors of circles, detection errors, a bowed plate, position errors."""
 
 import math
 from pathlib import Path
@@ -14,7 +14,7 @@ from twin.recording.frame_truth import depth_map
 from twin.recording.record_scene import record_scene
 from twin.recording.studio import Studio, with_window
 from twin.scene.description import CirclePlate, Scene
-from twin.scene.finish import printed_shifts
+from twin.scene.finish import draw_print_errors
 from twin.scene.motion import Motion, Shot
 from uwlts.model.sensor import Sensor
 from uwlts.storage.capture import Capture
@@ -63,7 +63,7 @@ def lamp_scene(medium: str = "air", **changes: Any) -> Scene:
 
 
 def lattice_mm(scene: Scene) -> np.ndarray:
-    """Where the circles (rows, columns, 3) of a scene are meant to lie in it."""
+    """Return the nominal positions (rows, columns, 3) of the circles in a scene."""
     plate = scene.objects[0]
     column, row = np.meshgrid(np.arange(COLUMNS) - ORIGIN[0], np.arange(ROWS) - ORIGIN[1])
     flat = np.stack([column * plate.spacing_x_mm, row * plate.spacing_y_mm, np.zeros(column.shape)], axis=-1)
@@ -103,7 +103,7 @@ def rendered_px(sensor: Sensor, scene: Scene) -> np.ndarray:
 def test_printed_shifts_move_the_circles(bare, bow_mm):
     """On a flat plate and on the mesh that a bowed one is, which have uv of their own."""
     perfect, printed = (lamp_scene(centre_std_mm=std, bow_mm=bow_mm, errors_seed=5) for std in (0.0, 0.3))
-    shifts = printed_shifts(printed.objects[0])
+    shifts = draw_print_errors(printed.objects[0])
     moved = rendered_px(bare, printed) - rendered_px(bare, perfect)
     points = lattice_mm(perfect)
     expected = expected_px(bare, points + np.concatenate([shifts, np.zeros((ROWS, COLUMNS, 1))], axis=-1))
@@ -115,15 +115,15 @@ def test_printed_shifts_move_the_circles(bare, bow_mm):
 
 def test_printed_shifts_have_their_size():
     plate = CirclePlate.model_validate(PLATE | {"columns": 40, "rows": 60, "centre_std_mm": 0.002, "errors_seed": 1})
-    shifts = printed_shifts(plate)
+    shifts = draw_print_errors(plate)
     assert shifts.shape == (60, 40, 2)
     # The standard deviation of 2400 draws is uncertain by 1 / sqrt(4800).
     np.testing.assert_allclose(shifts.std(axis=(0, 1)), 0.002, rtol=4.5 / math.sqrt(4800))
     assert abs(np.corrcoef(shifts[..., 0].ravel(), shifts[..., 1].ravel())[0, 1]) < 4.5 / math.sqrt(2400)
-    np.testing.assert_array_equal(shifts, printed_shifts(plate))
+    np.testing.assert_array_equal(shifts, draw_print_errors(plate))
     other = plate.model_copy(update={"errors_seed": 2})
-    assert abs(np.corrcoef(shifts.ravel(), printed_shifts(other).ravel())[0, 1]) < 4.5 / math.sqrt(4800)
-    assert not printed_shifts(plate.model_copy(update={"centre_std_mm": 0.0})).any()
+    assert abs(np.corrcoef(shifts.ravel(), draw_print_errors(other).ravel())[0, 1]) < 4.5 / math.sqrt(4800)
+    assert not draw_print_errors(plate.model_copy(update={"centre_std_mm": 0.0})).any()
 
 
 # --- circles found off their places
@@ -175,7 +175,7 @@ def test_detection_errors_come_on_top_of_printed_ones(small):
         scene = lamp_scene(detection_std_px=0.6, errors_seed=5, centre_std_mm=printed)
         expected = expected_px(with_window(small, mounted=False), lattice_mm(scene))
         positions.append(found_px(studio_of(small, scene).image(LAMP, 2), expected))
-    shifts = printed_shifts(scene.objects[0])
+    shifts = draw_print_errors(scene.objects[0])
     moved = positions[1] - positions[0]
     points = lattice_mm(scene)
     bare = with_window(small, mounted=False)
@@ -214,7 +214,7 @@ def test_a_bowed_plate_is_a_piece_of_a_sphere(thesis, bow_mm):
     corner = math.hypot(width, height) / 2
     radius = (corner**2 + bow_mm**2) / (2 * bow_mm)
     sphere = radius - math.copysign(1, bow_mm) * np.sqrt(radius**2 - x**2 - y**2)
-    assert sphere[np.hypot(x, y).argmax()] == pytest.approx(bow_mm, rel=0.1), "the corners lie behind the middle"
+    assert sphere[np.hypot(x, y).argmax()] == pytest.approx(bow_mm, rel=0.1), "the corners are behind the centre"
     # Facets of 1.9 mm x 1.4 mm cut 0.0007 mm off a radius of 940 mm; the paraboloid that stands for the sphere leaves
     # it by corner^4 / 32 radius^3 = 0.0012 mm; depths in 32 bits add 1e-4 mm.
     np.testing.assert_allclose(z, sphere, atol=0.005 if abs(bow_mm) > 0.5 else 5e-4)

@@ -194,7 +194,7 @@ def test_the_uneven_lamp_lights_places_and_not_pixels(sensor):
     slopes = (points @ axes.T + standoff)[:, :2] / (points @ axes.T + standoff)[:, 2:]
     corner = np.hypot(160, 128) / 2 / camera.focal_length_px()
     expected = (1 - loss) ** (((slopes / corner - (0.25, 0.0)) ** 2).sum(axis=1))
-    # The nearest pixel lies up to half a pixel off, 1/200 of the diagonal, and the spot falls by up to 3 over that.
+    # The nearest pixel is up to half a pixel away, 1/200 of the diagonal, and the spot falls by up to 3 over that.
     np.testing.assert_allclose(ratio[row[inside], column[inside]], expected[inside], rtol=0.02)
     assert np.ptp(expected[inside]) > 0.3
     by_pixel = (1 - loss) ** ((((rays[:, :2] / rays[:, 2:]) / corner - (0.25, 0.0)) ** 2).sum(axis=1))

@@ -88,7 +88,7 @@ def distance_to_sphere(points: np.ndarray, centre: np.ndarray, diameter: float) 
 
 
 def true_points(renderer: Renderer, pose: np.ndarray, at_least: int) -> FrameTruth:
-    """The visible lines of a frame's truth; every point must lie in the plane of the sheet."""
+    """Return the points of a frame's visible lines; every point must be in the plane of the sheet."""
     truth = true_stripe(renderer, pose)
     visible = truth.status == TruthStatus.VISIBLE
     assert visible.sum() >= at_least
@@ -172,8 +172,8 @@ def test_the_depth_map_is_the_camera_frame_z_of_what_pixels_see(thesis):
     axes, standoff = camera_axes(sensor)
     z = (points @ axes.T + standoff)[:, 2]
     column, row = np.rint(uv).astype(int).T
-    # A pixel's centre lies up to half a pixel from the point; the plate's depth runs along the image evenly enough to
-    # go there with the neighbours' slope: its change over half a pixel, 0.1 mm, bends by 1e-3 of that.
+    # A pixel's centre is up to half a pixel from the point. The plate's depth is extrapolated with the slope between
+    # its neighbours: its change over half a pixel, 0.1 mm, is nonlinear by 1e-3 only.
     slope_v, slope_u = np.gradient(depth)
     there = depth[row, column] + slope_u[row, column] * (uv[:, 0] - column) + slope_v[row, column] * (uv[:, 1] - row)
     inner = np.isfinite(there)
@@ -215,7 +215,7 @@ def test_pixels_know_the_object_that_they_see(thesis):
 
 
 def intervals_overlap(start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Signed length (N,) of the parts of segments (N, 3) inside a box, as a share of them: negative if they pass by."""
+    """Return the signed fraction (N,) of segments (N, 3) inside a box; negative if they miss it."""
     with np.errstate(divide="ignore", invalid="ignore"):
         first, second = (low - start) / (end - start), (high - start) / (end - start)
     enter = np.nanmax(np.concatenate([np.minimum(first, second), np.zeros((len(start), 1))], axis=1), axis=1)
@@ -260,7 +260,7 @@ def test_lines_whose_stripe_is_shaded_or_hidden_have_none(thesis, name):
     assert not bright[inner == 3].any()
     assert bright[inner == 0].all()
     assert truth.crossings[lines.astype(int)].max() == 1
-    # What lies in the shadow is still seen, what is hidden is not.
+    # Points in the shadow are visible, hidden ones are not.
     found = crossings(renderer, sensor_at())
     on_the_plate = found.line[np.abs(found.point_mm[:, 2] - z) < 0.1]
     seen = np.isin(lines, on_the_plate)
@@ -268,8 +268,8 @@ def test_lines_whose_stripe_is_shaded_or_hidden_have_none(thesis, name):
 
 
 def test_of_two_crossings_on_a_line_the_brighter_is_given(thesis):
-    # A thin block stands before another. As the laser stands aside, some of the camera's columns see past
-    # the near block's edge and show both stripes.
+    # A thin block is in front of another. As the laser is beside the camera, some image columns see past the edge of
+    # the near block and show both stripes.
     laser = {
         "baseline_mm": None,
         "triangulation_angle_deg": None,

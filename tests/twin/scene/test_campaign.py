@@ -1,4 +1,4 @@
-"""Campaigns: what is drawn for each seed, how far real things lie from their descriptions, and what is refused."""
+"""Campaigns: what is drawn for each seed, deviations of real hardware from descriptions, and refusals."""
 
 import math
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.virtual_sensors import scene_of
-from twin.scene.campaign import Campaign, Imperfections, Take, _Drawn, load_campaign, takes
+from twin.scene.campaign import Campaign, Imperfections, Take, _SampledImperfections, load_campaign, takes
 from twin.scene.description import load_scene
 from uwlts.errors import DescriptionError
 from uwlts.model.library import load_sensor, names
@@ -63,7 +63,7 @@ def over_seeds(name: str, wanted: list[int]) -> list[dict[str, Take]]:
 
 
 def differing(one: Any, other: Any, *, at: str = "") -> set[str]:
-    """Where two dumps of descriptions differ: keys joined by dots, numbers of lists left out."""
+    """Return the differences between two dumps of descriptions: keys joined by dots, without list indices."""
     if isinstance(one, dict) and isinstance(other, dict) and one.keys() == other.keys():
         return set().union(*(differing(one[key], other[key], at=f"{at}.{key}") for key in one))
     if isinstance(one, list | tuple) and isinstance(other, list | tuple) and len(one) == len(other):
@@ -166,7 +166,7 @@ def test_an_imperfection_alone_changes_what_it_is_about_and_nothing_else(name: s
 def test_any_printed_target_has_a_targets_imperfections():
     board = {"kind": "chessboard", "columns": 7, "rows": 6, "square_mm": 10.0}
     scene = scene_of({"kind": "target_plate"}, target=board)
-    found = _Drawn(campaign(**SIZES), 1).as_it_really_is(scene, np.random.default_rng(1)).objects[0]
+    found = _SampledImperfections(campaign(**SIZES), 1).apply_imperfections(scene, np.random.default_rng(1)).objects[0]
     assert (found.centre_std_mm, found.detection_std_px, found.errors_seed) == (0.002, 0.03, 1)
     assert found.bow_mm != 0
     assert np.count_nonzero(found.rotation_deg) == 2
@@ -184,7 +184,7 @@ def test_without_imperfections_everything_is_as_built():
             placement=take.scene.placement,
             medium=take.scene.medium,
         )
-        # Errors of size 0 are none, whatever their seed.
+        # Errors of size 0 vanish for any seed.
         changed = differing(scene.model_dump(), take.scene.model_dump())
         stage = {f"motion.{key}" for key in ("count", "nominal_direction", "position_errors_mm")}
         assert changed <= stage | {"objects.errors_seed"}
@@ -242,7 +242,7 @@ def test_size_of_the_waters_temperature():
     }
     for name in ("target", "plane-near-water"):
         assert_spread(warmer[name], 5.0 / math.sqrt(3))
-        # The largest of 200 evenly spread draws lies within 5 % of the end but once in 30000 times.
+        # The largest of 200 uniform draws is within 5 % of the end, except once in 30000 times.
         assert 4.75 < np.abs(warmer[name]).max() <= 5.0
     assert warmer["target"] == warmer["target-water"] == warmer[STEP]
     assert all(warmer[name] == warmer["plane-near-water"] for name in PLANES)
@@ -263,7 +263,7 @@ def test_size_of_the_targets_errors():
 
 @pytest.mark.slow
 def test_size_of_the_targets_tilt():
-    """Put up anew for every recording, it is turned about X and Y, not about Z."""
+    """The target is mounted again for every recording, with rotations about X and Y, not about Z."""
     drawings = over_seeds("target_tilt_std_deg", [0, 1])
     tilts = np.array([[plate(found[name]).rotation_deg for name in TARGETS] for found in drawings])
     assert (tilts[..., 2] == 0).all()
@@ -309,7 +309,7 @@ def test_size_of_the_stages_misalignment():
     assert_spread(along_x[:, 1:], 0.2)
     assert_spread(along_z[:, :2], 0.2)
     assert_independent(along_x[:, 1], along_x[:, 2])
-    # Before the target the sensor is mounted anew, each time.
+    # The sensor is mounted again for each target.
     assert_independent(along_x[:, 1], along_z[:, 1])
     assert_independent(along_z[:, 0], by_name["target-water"][:, 0])
 
@@ -406,7 +406,7 @@ def test_campaigns_that_are_wrong(tmp_path: Path, text: str, says: str):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (HEAD + PLANE + PLANE, "several recordings would be called plane-standoff-water: give them names"),
+        (HEAD + PLANE + PLANE, "several recordings would be called plane-standoff-water: give each its own name"),
         (HEAD + f'{PLANE}name = "a"\nmedia = ["air", "water"]\n', "several recordings would be called a"),
         (HEAD + '[[recordings]]\nscene = "teapot"\n', "nothing is called 'teapot'; known are"),
         (HEAD + '[[recordings]]\nscene = "teapot.toml"\n', "no description at"),

@@ -11,7 +11,7 @@ from twin.recording.studio import check_scene, medium_of
 from twin.scene.description import Scene, load_scene
 from twin.scene.motion import Motion
 from twin.scene.objects import Objects, build_objects
-from twin.scene.placed import Pose
+from twin.scene.scene_object import Pose
 from uwlts.errors import DescriptionError, RangeError
 from uwlts.model.library import library_folder, load_sensor, names
 from uwlts.model.sensor import Sensor
@@ -54,7 +54,7 @@ def written(folder, text: str, *, name: str = "sensor.toml"):
     return path
 
 
-# What is wrong, and what the message must name.
+# Mistake, and expected part of the message.
 BAD_SENSORS = {
     "unknown key": ("[camera]\nfocal_lenght_mm = 12.5", r"camera\.focal_lenght_mm: unknown key"),
     "wrong unit": ("[laser]\nbaseline_m = 0.265", r"laser\.baseline_m: unknown key.*unit"),
@@ -186,9 +186,9 @@ BAD_SCENES = {
     "backwards in time": ("base = 'plane'\n[motion]\nspeed_mm_per_s = -1.0", r"motion\.speed_mm_per_s: .*found -1"),
     "unknown finish": (PLATE + "finish = 'velvet'", r"finish: .*'diffuse', 'painted', 'pvc' or 'metal'.*'velvet'"),
     "too smooth": (PLATE + "finish = 'metal'\nalpha = 0.001", r"alpha: .*0\.02.*found 0\.001"),
-    "rough gloss of none": (PLATE + "alpha = 0.2", r"alpha 0\.2 .* finish 'diffuse' has none: leave alpha out"),
+    "rough gloss of none": (PLATE + "alpha = 0.2", r"alpha 0\.2 .* finish is 'diffuse': omit alpha"),
     "negative height": (PLATE + "roughness_um = -1.0", r"roughness_um: .*found -1"),
-    "more than all light": (PLATE + "mirror = 0.5", r"reflectance 0\.8 and mirror 0\.5 add up to more than all light"),
+    "more than all light": (PLATE + "mirror = 0.5", r"reflectance 0\.8 and mirror 0\.5 add up to more than 1"),
     "coated mirror": (PLATE + "reflectance = 0.1\nfinish = 'pvc'\nmirror = 0.5", r"mirror 0\.5 under a coat"),
     "round mirror": (
         "title = 't'\n[[objects]]\nkind = 'sphere'\ndiameter_mm = 5.0\nmirror = 0.1",

@@ -23,7 +23,7 @@ def water(thesis):
 def test_the_thesis_sensor_has_the_thesis_view(thesis, water):
     view = check_design(thesis, water)
     assert view.standoff_mm == pytest.approx(265 / math.tan(math.radians(35)) - 62.8 - 5.93)
-    # By hand: the edge lies at 0.27136 of the focal length, an angle whose sine is 0.26189 in air, 0.17230 in glass and
+    # By hand: the edge is at 0.27136 of the focal length, an angle whose sine is 0.26189 in air, 0.17230 in glass and
     # 0.19673 in water. 62.8 * 0.27136 + 5.93 * 0.17492 + 309.733 * 0.20065 = 80.226 mm to each side.
     assert view.line_length_mm == pytest.approx(2 * 80.226, abs=0.01)
     # Across the stripe the view widens from 14.469 mm by 0.16142 mm per mm of depth; the sheet leaves its middle by
@@ -55,7 +55,7 @@ def test_the_depth_range_is_what_the_image_shows_of_the_sheet(thesis, water):
 
 
 def test_a_camera_window_smaller_than_the_cone_of_view_is_refused(thesis, water):
-    # Where the image's corner ray leaves the window, by least time, and half the pupil more.
+    # Exit point of the image's corner ray at the window, by least time, plus half the pupil.
     corner = np.array([640.0, 512.0, thesis.camera.focal_length_px()])
     plane = fermat.Face(np.array([0.0, 0.0, 300.0]), np.array([0.0, 0.0, 1.0]))
     faces, indices = oracle_window(thesis.camera.window, water)
@@ -143,7 +143,7 @@ def test_a_scan_that_never_meets_the_sheet_is_refused(thesis, water):
     ball = {"kind": "sphere", "diameter_mm": 20.0, "position_mm": (50.0, 0.0, 0.0)}
     short = scene_of(ball, motion={"start_mm": 0.0, "step_mm": 1.0, "count": 40})
     renderer = Renderer(thesis, water, short)
-    with pytest.raises(DesignError, match=r"between X = 1\.0 and 60\.0 mm, the sheet is at X = 0"):
+    with pytest.raises(DesignError, match=r"between X = 1\.0 and 60\.0 mm, but the sheet is at X = 0"):
         check_scene(renderer, short)
     check_scene(renderer, scene_of(ball, motion={"start_mm": 0.0, "step_mm": 1.0, "count": 42}))
 

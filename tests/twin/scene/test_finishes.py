@@ -1,4 +1,4 @@
-"""Finishes against the laws of reflection: energy, reciprocity, Fresnel; and what the objects tell of a place hit."""
+"""Finishes against the laws of reflection: energy, reciprocity, Fresnel; and surface properties of the objects hit."""
 
 import cv2
 import drjit as dr
@@ -107,8 +107,8 @@ def test_smooth_steel_reflects_as_fresnel_says_relative_to_the_medium():
 
 
 def test_rough_steel_loses_the_light_that_would_be_reflected_twice():
-    # Single scattering only: shares of the smooth steel's albedo at normal view that remain, so that a change in
-    # Mitsuba's model does not pass unnoticed.
+    # Single scattering only: remaining fractions of the albedo of smooth steel at normal incidence, to detect changes
+    # in Mitsuba's model.
     smooth, usual, rough = (
         directional_albedo(bsdf_of({"reflectance": 1.0, "finish": "metal", "alpha": alpha}), np.ones(1))[0]
         for alpha in (0.02, 0.3, 1.0)
@@ -127,8 +127,8 @@ def test_a_coat_shines_less_under_water_than_in_air():
 
 
 def test_a_white_body_under_a_smooth_coat_keeps_nothing():
-    # What the coat does not reflect comes out of a white body again; Mitsuba's table of a rough face's transmittance
-    # is good to 1 %.
+    # Light not reflected by the coat leaves a white body again; Mitsuba's table of rough transmittance is accurate to
+    # 1 %.
     white = bsdf_of({"reflectance": 1.0, "finish": "painted", "alpha": 0.02})
     np.testing.assert_allclose(directional_albedo(white, np.array([0.3, 0.6, 1.0])), 1.0, rtol=0, atol=0.015)
 
@@ -149,7 +149,7 @@ def test_iron_lies_between_the_tables_neighbours():
     assert iron_index(wavelength_nm=635.0) == pytest.approx(2.88 + 0.04 * 3 / 7 + 1j * (3.05 + 0.05 * 3 / 7))
 
 
-# --- what the objects tell of a place -------------------------------------------------------------------------------
+# --- surface properties ---------------------------------------------------------------------------------------------
 
 
 def built(scene: Scene, **changes: object) -> Objects:
@@ -157,14 +157,14 @@ def built(scene: Scene, **changes: object) -> Objects:
 
 
 def hit(objects: Objects, start: np.ndarray, towards: np.ndarray) -> mi.SurfaceInteraction3f:
-    """What rays (N, 3) meet."""
+    """Intersect rays (N, 3) with the objects."""
     start, towards = np.broadcast_arrays(np.asarray(start, float), np.asarray(towards, float))
     o, d = (mi.Vector3f(*(to_jit(mi.Float, np.atleast_1d(c)) for c in v.T)) for v in (start, towards))
     return objects.scene.ray_intersect(mi.Ray3f(mi.Point3f(o), d))
 
 
 def row_of(*finishes: dict[str, object]) -> Scene:
-    """Plates 10 mm apart along X."""
+    """Return plates in a row along X with a spacing of 10 mm."""
     return scene_of(*(plate(side=8.0, x=10.0 * i) | finish for i, finish in enumerate(finishes)))
 
 
@@ -323,7 +323,7 @@ def test_a_texture_multiplies_the_reflectance_and_lies_on_a_plate_as_the_sensor_
 
 @pytest.mark.parametrize("thing", [{"kind": "sphere"}, {"kind": "pipe", "length_mm": 40.0}], ids=["sphere", "pipe"])
 def test_a_texture_follows_a_round_shapes_own_coordinates(tmp_path, thing):
-    # Grey rises along a wide picture, so that the value tells u.
+    # Grey increases along a wide picture, so that the value determines u.
     ramp = np.tile(np.arange(256, dtype=np.uint8), (4, 1))
     assert cv2.imwrite(str(tmp_path / "ramp.png"), ramp)
     thing = thing | {"diameter_mm": 30.0, "reflectance": 0.5, "texture": str(tmp_path / "ramp.png")}

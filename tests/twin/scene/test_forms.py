@@ -12,7 +12,7 @@ from twin.scene.forms.cables_and_ropes import rope_radius
 from twin.scene.forms.flange import flange_face
 from twin.scene.forms.overgrown_pipe import overgrown_radius
 from twin.scene.forms.seabed import seabed_height
-from twin.scene.placed import FreeForm
+from twin.scene.scene_object import FreeForm
 
 
 def mesh_of(form: FreeForm) -> trimesh.Trimesh:
@@ -33,7 +33,7 @@ def test_a_flange_is_closed_and_holds_the_material_of_its_drawing(given):
     assert mesh.is_watertight and mesh.is_winding_consistent
     area = flange.outer_diameter_mm**2 - flange.bore_diameter_mm**2 - flange.holes * flange.hole_diameter_mm**2
     heads = flange.bolts * math.sqrt(3) / 2 * flange.head_width_mm**2 * (flange.head_height_mm + 0.5)
-    # A polygon whose sides lie up to s = 0.004 mm within a circle lacks two thirds of s along its length.
+    # A polygon whose sides are up to s = 0.004 mm inside a circle lacks two thirds of s along its length.
     length = flange.outer_diameter_mm + flange.bore_diameter_mm + flange.holes * flange.hole_diameter_mm
     lacking = math.pi * length * 0.004 * flange.thickness_mm
     assert mesh.volume == pytest.approx(math.pi / 4 * area * flange.thickness_mm + heads, abs=lacking)
@@ -62,7 +62,7 @@ def test_a_bent_cable_is_a_piece_of_a_torus():
     cable = Cable(kind="cable", diameter_mm=20.0, length_mm=180.0, bend_radius_mm=150.0)
     x, y, z = middles(mesh_of(cable)).T
     distance = np.hypot(np.hypot(x, y - 150.0) - 150.0, z)
-    # 0.005 mm round the jacket and as much along the arc, whose chords lie inside of the bend's outer side only.
+    # 0.005 mm around the jacket and as much along the arc, whose chords are inside only on the outer side of the bend.
     assert distance.min() > 10.0 - 0.011 and distance.max() < 10.0055
     assert np.abs(np.arctan2(x, 150.0 - y)).max() == pytest.approx(90.0 / 150.0, abs=1e-9)
     straight = mesh_of(Cable(kind="cable", diameter_mm=20.0, length_mm=180.0))
@@ -126,7 +126,7 @@ def test_a_sea_floor_has_ripples_and_stones():
     assert mesh.euler_number == 6 and mesh.face_normals[:, 2].max() < 0
     x, y, z = middles(mesh).T
     above = -z - seabed_height(stony, x, y)
-    # What is seen lies on the formula, what does not lies below it: chords along both axes, at most twice 0.04 mm.
+    # Visible points agree with the formula or are below it: chords along both axes, at most twice 0.04 mm.
     assert above.max() < 0.08
     shown = above > -0.08
     nearest = np.min([np.hypot(x - u, y - v) for u, v in at], axis=0)

@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from twin.scene.guide_and_table import LinearGuide, RotaryTable
-from twin.scene.placed import Pose
 from twin.scene.platforms import IdealPath
 from twin.scene.robot import Robot
-from twin.scene.vehicle import Navigation, Sea, Vehicle, drift_of, waves_of
+from twin.scene.scene_object import Pose
+from twin.scene.vehicle import Navigation, Sea, Vehicle, sample_waves, simulate_drift
 from uwlts.errors import DescriptionError
 from uwlts.model.trajectory import Trajectory
 from uwlts.storage.pose_files import read_trajectory
@@ -145,7 +145,7 @@ def test_waves_have_their_height_and_die_out_below():
     """
     times = np.arange(0, 7200, 0.5)
     surface, below = (
-        waves_of(Sea(significant_height_mm=1000.0, depth_mm=depth, tilt_deg=2.0), np.random.default_rng(0))(times)
+        sample_waves(Sea(significant_height_mm=1000.0, depth_mm=depth, tilt_deg=2.0), np.random.default_rng(0))(times)
         for depth in (0.0, 10_000.0)
     )
     assert 4 * surface[:, 2].std() == pytest.approx(1000, rel=0.08)
@@ -156,9 +156,9 @@ def test_waves_have_their_height_and_die_out_below():
 
 @pytest.mark.slow
 def test_the_navigation_states_the_covariance_of_its_errors():
-    """200 vehicles: chi-square of the errors after 100 s by the stated covariance, 6 degrees of freedom each.
+    """Chi-square of the errors of 200 vehicles after 100 s with the stated covariance, 6 degrees of freedom each.
 
-    Its sum has mean 1200 and standard deviation 49; the gate lies at 5 of them (6e-7 of false alarms).
+    The sum has the mean 1200 and the standard deviation 49; the gate is at 5 of them (false-alarm probability 6e-7).
     """
     navigation = Navigation(
         velocity_mm_per_sqrt_s=5.0,
@@ -176,11 +176,11 @@ def test_the_navigation_states_the_covariance_of_its_errors():
 
     total, at = 0.0, np.array([100.0])
     for number in range(200):
-        drift = drift_of(navigation, poses, lead_s=1.0, lasting_s=100.0, rng=np.random.default_rng(number))
+        drift = simulate_drift(navigation, poses, lead_s=1.0, lasting_s=100.0, rng=np.random.default_rng(number))
         error, covariance = drift.errors(at)[0], drift.covariance(at)[0]
         total += error @ np.linalg.solve(covariance, error)
     assert abs(total - 1200) < 5 * 49
-    assert np.sqrt(covariance[1, 1]) > 50, "the heading carries the vehicle aside"
+    assert np.sqrt(covariance[1, 1]) > 50, "heading errors cause cross-track errors"
 
 
 def test_a_vehicle_shakes_and_reports_a_path_that_drifts(tmp_path):

@@ -6,7 +6,7 @@ import trimesh
 from pydantic import ValidationError
 from scipy.signal import argrelmin
 
-from twin.scene import placed
+from twin.scene import scene_object
 from twin.scene.forms import Head, PittedPipe, Weld
 from twin.scene.forms.head import head_depth
 from twin.scene.forms.pitted_pipe import pit_places, pitted_radius
@@ -71,7 +71,7 @@ def test_the_profile_is_that_of_a_face():
     sockets = head_depth(np.array([-0.095, 0.095]) * HEIGHT, np.array([0.1, 0.1]) * HEIGHT, height_mm=HEIGHT) / HEIGHT
     brows = head_depth(np.array([-0.095, 0.095]) * HEIGHT, np.array([0.15, 0.15]) * HEIGHT, height_mm=HEIGHT) / HEIGHT
     assert (sockets > brows + 0.005).all()
-    # Flanks steeper than the line of sight at 35 deg to the laser's axis hide what lies beside them.
+    # Flanks steeper than the line of sight at 35 deg to the laser's axis hide adjacent points.
     x = np.linspace(0, 0.1, 401)
     flank = np.gradient(head_depth(x * HEIGHT, np.full_like(x, nose * HEIGHT), height_mm=HEIGHT) / HEIGHT, x)
     assert flank.max() > 1 / np.tan(np.radians(35))
@@ -149,7 +149,7 @@ def test_irregular_beads_follow_their_seed():
 def test_surfaces_are_the_same_every_time_and_kept_unharmed():
     for make in (lambda: Head(kind="head", height_mm=20.0).surface(), lambda: Weld(kind="weld", beads=1).surface()):
         first = make()
-        placed._kept.cache_clear()
+        scene_object._cache_triangles.cache_clear()
         for old, new in zip(first, make(), strict=True):
             assert old is not new
             np.testing.assert_array_equal(old, new)
@@ -188,7 +188,7 @@ def test_a_pitted_pipe_has_the_diameters_and_pits_that_were_asked_for():
     axial = np.stack([mesh.triangles_center[:, 0], *np.zeros((2, len(mesh.faces)))], axis=1)
     outwards = np.sum((mesh.triangles_center - axial) * mesh.face_normals, axis=1)
     assert outwards.min() > 0
-    # Behind there are no pits: the smallest diameter lies across, the largest along z.
+    # The back has no pits: the smallest diameter is across, the largest along z.
     end = mesh.vertices[np.isclose(mesh.vertices[:, 0], -60.0)]
     assert 2 * end[:, 2].max() == pytest.approx(102.0, abs=0.02)
     assert np.ptp(end[:, 1]) == pytest.approx(98.0, abs=0.02)

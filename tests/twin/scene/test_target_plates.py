@@ -1,4 +1,4 @@
-"""Targets that the twin draws from the descriptions by which they are found: every kind, exact to its edges."""
+"""Targets drawn by the twin from the descriptions used for detection: every kind, exact to its edges."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ from twin.light.renderer import Renderer
 from twin.options import NONE
 from twin.recording.studio import with_window
 from twin.scene.description import TargetPlate
-from twin.scene.finish import pattern_texture, printed_shifts, register_pattern
+from twin.scene.finish import draw_print_errors, pattern_texture, register_pattern
 from uwlts.model.sensor import Sensor
 from uwlts.targets import CharucoTarget, ChessboardTarget, CircleTarget, Target
 
@@ -33,7 +33,7 @@ def bare(thesis) -> Sensor:
 
 
 def covered(target: Target, points: np.ndarray) -> np.ndarray:
-    """Whether points (N, 2) in mm lie on ink; asks every patch of every point."""
+    """Return whether points (N, 2) in mm are on ink, by testing every patch for every point."""
     ink = np.zeros(len(points), bool)
     for patch in target.patches():
         low, high = np.array([patch.x_min_mm, patch.y_min_mm]), np.array([patch.x_max_mm, patch.y_max_mm])
@@ -48,7 +48,7 @@ def covered(target: Target, points: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("legacy", [False, True])
 def test_the_print_of_a_charuco_board_is_opencvs(columns, rows, legacy):
     target = CharucoTarget(columns=columns, rows=rows, square_mm=12.0, marker_mm=9.0, legacy=legacy)
-    # Two pixels a mm: borders of squares (24), margins (3) and cells (3) lie between pixels.
+    # Two pixels per mm: borders of squares (24), margins (3) and cells (3) are between pixels.
     picture = target.board().generateImage((24 * columns, 24 * rows))
     u, v = np.meshgrid(np.arange(24 * columns), np.arange(24 * rows))
     ink = covered(target, np.column_stack([u.ravel(), v.ravel()]) / 2 + 0.25)
@@ -98,7 +98,7 @@ def test_rendered_boards_are_found_where_a_pinhole_sees_them(bare, target):
     assert np.ptp(expected, axis=0).min() > 150
     # Measured 0.02 px (chessboard) and 0.05 px (ChArUco), which OpenCV's own refinement in 8 bit leaves.
     assert np.sqrt(((view.pixels - expected) ** 2).mean()) < 0.06
-    # Refined alike, in 16 bit, both show 0.03 px about the same place: what 64 samples a pixel leave.
+    # With equal refinement and 16 bits, both agree to 0.03 px, the noise of 64 samples per pixel.
     start, stop = view.pixels.astype(np.float32).reshape(-1, 1, 2), (cv2.TERM_CRITERIA_COUNT, 100, 0.0)
     refined = cv2.cornerSubPix(grey.astype(np.float32), start, (5, 5), (-1, -1), stop).reshape(-1, 2)
     errors = refined - expected
@@ -113,7 +113,7 @@ def test_the_print_about_each_point_is_off_by_its_error(target):
         kind="target_plate", target=target, reflectance=GROUND, ink_reflectance=INK, centre_std_mm=0.3, errors_seed=2
     )
     rng = np.random.default_rng(1)
-    shifts = printed_shifts(thing).reshape(-1, 2)
+    shifts = draw_print_errors(thing).reshape(-1, 2)
     assert len(shifts) == len(target.points_mm)
     # Within a third of the spacing no other point is nearer, and with the shift the print is that about the same point.
     beside = target.spacing_mm / 3 * (2 * rng.random((200, len(shifts), 2)) - 1)

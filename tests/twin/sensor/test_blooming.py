@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from twin.sensor.detector import grey_values, spilled
+from twin.sensor.detector import grey_values, spread_blooming
 from uwlts.model.sensor import Detector
 
 FULL = 1000.0
@@ -18,7 +18,7 @@ def point(charge: float, *, rows: int = 21, row: int = 10) -> np.ndarray:
 
 def test_the_charge_fills_pixels_above_and_below():
     # 6.5 full wells: one stays, 2.75 go each way, filling two pixels and three quarters of a third.
-    after = spilled(point(6.5 * FULL), full_well_e=FULL, share=1.0)
+    after = spread_blooming(point(6.5 * FULL), full_well_e=FULL, share=1.0)
     expected = np.zeros(21)
     expected[7:14] = [0.75, 1, 1, 1, 1, 1, 0.75]
     np.testing.assert_allclose(after[:, 1], FULL * expected, rtol=1e-6)
@@ -26,16 +26,17 @@ def test_the_charge_fills_pixels_above_and_below():
 
 
 def test_a_share_is_drained_at_every_step():
-    # 9 full wells, half drained: of 8 too many a quarter arrives each way: 2. One stays, half of the other goes on.
-    after = spilled(point(9 * FULL), full_well_e=FULL, share=0.5)
+    # 9 full wells, half drained: a quarter of the excess of 8 arrives on each side: 2. One stays, half of the other
+    # moves on.
+    after = spread_blooming(point(9 * FULL), full_well_e=FULL, share=0.5)
     expected = np.zeros(21)
     expected[8:13] = [0.5, 1, 1, 1, 0.5]
     np.testing.assert_allclose(after[:, 1], FULL * expected, rtol=1e-6)
 
 
 def test_charge_leaves_the_image_at_its_edges():
-    # 9 full wells in row 1 of 21: 4 each way, of which row 0 keeps one and 3 leave.
-    after = spilled(point(9 * FULL, row=1), full_well_e=FULL, share=1.0)
+    # 9 full wells in row 1 of 21: 4 to each side; row 0 keeps one, and 3 leave.
+    after = spread_blooming(point(9 * FULL, row=1), full_well_e=FULL, share=1.0)
     expected = np.zeros(21)
     expected[:6] = 1.0
     np.testing.assert_allclose(after[:, 1], FULL * expected, rtol=1e-6)
@@ -43,10 +44,10 @@ def test_charge_leaves_the_image_at_its_edges():
 
 def test_what_fits_is_not_touched():
     image = np.random.default_rng(0).uniform(0, FULL, (50, 40)).astype(np.float32)
-    assert spilled(image, full_well_e=FULL, share=1.0) is image
+    assert spread_blooming(image, full_well_e=FULL, share=1.0) is image
     untouched = image.copy()
     image[20, 7] = 3 * FULL
-    after = spilled(image, full_well_e=FULL, share=1.0)
+    after = spread_blooming(image, full_well_e=FULL, share=1.0)
     assert image[20, 7] == 3 * FULL, "the argument is left alone"
     others = np.arange(40) != 7
     np.testing.assert_array_equal(after[:, others], untouched[:, others])
@@ -61,7 +62,7 @@ def test_charge_is_conserved_or_drained_never_made(seed, sources, share):
     image = np.zeros((900, 12), np.float32)
     image[400:500] = rng.uniform(0, 0.9 * FULL, (100, 12))
     image[rng.integers(400, 500, sources), rng.integers(0, 6, sources)] = rng.uniform(1, 10, sources) * FULL
-    after = spilled(image, full_well_e=FULL, share=share)
+    after = spread_blooming(image, full_well_e=FULL, share=share)
     before_sum, after_sum = image.sum(axis=0, dtype=float), after.sum(axis=0, dtype=float)
     over = np.maximum(image.astype(float) - FULL, 0).sum(axis=0)
     assert (over > 0).any()
@@ -74,7 +75,7 @@ def test_charge_is_conserved_or_drained_never_made(seed, sources, share):
         assert (after_sum >= np.minimum(image, FULL).sum(axis=0, dtype=float) * (1 - 2e-7)).all()
     assert after.max() <= FULL * (1 + 1e-6)
     assert (after >= np.minimum(image, FULL) - 1e-3).all(), "no pixel gives away what it can hold"
-    mirrored = spilled(image[::-1], full_well_e=FULL, share=share)[::-1]
+    mirrored = spread_blooming(image[::-1], full_well_e=FULL, share=share)[::-1]
     np.testing.assert_allclose(mirrored, after, rtol=1e-6, atol=1e-3)
 
 

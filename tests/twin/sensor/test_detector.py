@@ -93,7 +93,7 @@ def test_few_electrons_arrive_as_poisson_says():
 def test_the_full_well_clips_before_read_noise_is_added():
     full = flat(50000.0, detector(read_noise_e=30.0, black_level_dn=0.0), seed=1)
     assert full.max() == 4095
-    # Clipped electrons have no shot noise: what read noise leaves below is half a normal of 12.3 grey values.
+    # Clipped electrons are without shot noise: read noise gives half a normal distribution of 12.3 grey values below.
     assert np.mean(full == 4095) == pytest.approx(0.5, abs=0.03)
     spread = 30.0 * 4095 / 10000
     assert 4095 - full.astype(float).mean() == pytest.approx(spread / np.sqrt(2 * np.pi), rel=0.03)

@@ -138,8 +138,8 @@ def test_hot_pixels_grow_with_exposure_and_temperature_and_are_noisy():
         image = grey_values(dark, camera, exposure_ms=500.0, rng=None, pattern=pattern_of(camera)).astype(float)
         expected = np.minimum(factor * rates, 3895.0)
         assert np.abs(image - 200.0 - expected).max() <= 0.5 + 1e-3
-    # Some 1800 hot pixels in 16 images: their counts scatter as Poisson numbers and read noise do. The variances'
-    # sum over the pixels is known to sqrt(2 / (1800 * 15)), of which the unequal rates leave no more than twice.
+    # About 1800 hot pixels in 16 images: their counts have Poisson and read noise. The sum of the variances over the
+    # pixels has a relative error of sqrt(2 / (1800 * 15)), or at most twice that with unequal rates.
     images = stack(0.0, chip, exposure_ms=500.0)
     hot = rates > 0
     shot = images.var(axis=0, ddof=1)[hot].mean() - 1 / 12 - 22.0**2

@@ -9,7 +9,7 @@ from PIL import Image
 
 from tests.virtual_sensors import altered
 from twin.options import Flaws
-from twin.sensor.flaws import GLARE_REACH, as_built, delivered, laser_shares, veiled, vignette
+from twin.sensor.flaws import GLARE_REACH, add_glare, as_built, deliver_image, laser_shares, vignette
 from uwlts.errors import DescriptionError
 
 
@@ -18,7 +18,7 @@ def test_glare_is_the_sum_over_all_pixels_of_light_that_falls_off_exponentially(
     light = rng.exponential(size=(150, 203)).astype(np.float32)
     light[70:74] += 40.0  # a stripe
     light[20, 160] = 3000.0  # a reflection
-    seen, reach = veiled(light, 0.1), GLARE_REACH * 203
+    seen, reach = add_glare(light, 0.1), GLARE_REACH * 203
     rows, columns = np.mgrid[:150, :203]
     places = rng.integers((0, 0), (150, 203), (200, 2))
     veil = np.array(
@@ -37,7 +37,7 @@ def test_glare_is_the_sum_over_all_pixels_of_light_that_falls_off_exponentially(
 def test_glare_keeps_light_that_does_not_leave_the_image():
     light = np.zeros((640, 320), np.float32)
     light[320, 160] = 1.0
-    seen = veiled(light, 0.2).astype(float)
+    seen = add_glare(light, 0.2).astype(float)
     rows, columns = np.mgrid[-320:320, -160:160]
     reach = GLARE_REACH * 320
     within = np.exp(-np.hypot(rows, columns) / reach).sum() / (2 * np.pi * reach**2)
@@ -58,9 +58,9 @@ def test_vignetting_is_the_stated_loss_at_the_farthest_corner(thesis):
 
 def test_light_of_the_lamp_passes_the_colour_filters_unchanged():
     image = np.full((48, 64), 137, np.uint8)
-    np.testing.assert_array_equal(delivered(image, Flaws(colour_filter=True)), image)
+    np.testing.assert_array_equal(deliver_image(image, Flaws(colour_filter=True)), image)
     wide = np.full((48, 64), 3000, np.uint16)
-    np.testing.assert_array_equal(delivered(wide, Flaws(colour_filter=True)), wide)
+    np.testing.assert_array_equal(deliver_image(wide, Flaws(colour_filter=True)), wide)
 
 
 def test_light_of_the_laser_is_seen_by_one_pixel_in_four():
@@ -69,10 +69,10 @@ def test_light_of_the_laser_is_seen_by_one_pixel_in_four():
     assert (shares[::2, ::2] == 1).all()
     assert (shares[1::2] < 0.1).all() and (shares[:, 1::2] < 0.1).all()
     raw = np.rint(200 * shares).astype(np.uint8)
-    np.testing.assert_array_equal(delivered(raw, Flaws(colour_filter=True)), 200)
-    # Between two red rows of 200 and 100 lies their mean: nothing is taken from green and blue.
+    np.testing.assert_array_equal(deliver_image(raw, Flaws(colour_filter=True)), 200)
+    # The mean of two red rows of 200 and 100 is between them: green and blue do not contribute.
     raw[0::4] //= 2
-    red = delivered(raw, Flaws(colour_filter=True))
+    red = deliver_image(raw, Flaws(colour_filter=True))
     np.testing.assert_array_equal(red[3:-4:4, 2:-2], 150)
 
 
@@ -81,11 +81,11 @@ def test_compression_is_that_of_another_encoder(quality):
     rng = np.random.default_rng(2)
     smooth = cv2.GaussianBlur(rng.normal(size=(96, 128)), (0, 0), 6.0)
     image = np.clip(120 + 600 * smooth + rng.normal(size=smooth.shape), 0, 255).astype(np.uint8)
-    seen = delivered(image, Flaws(jpeg=quality))
+    seen = deliver_image(image, Flaws(jpeg=quality))
     file = io.BytesIO()
     Image.fromarray(image).save(file, "JPEG", quality=quality)
     other = Image.open(file)
-    # Both round what the cosine transform gives in their own ways.
+    # Both round the result of the cosine transform differently.
     assert np.abs(seen.astype(int) - np.asarray(other)).max() <= 1
     assert seen.dtype == np.uint8 and (seen != image).any()
     # An even error of a step q of the quantisation has the rms q / sqrt(12); most coefficients are smaller than that.
@@ -99,7 +99,7 @@ def test_compression_blurs_light_of_one_colour():
     shares = laser_shares(64, 64)
     raw = np.rint(raw * shares).astype(np.uint8)
     width = [
-        np.count_nonzero(delivered(raw, flaws)[:, 32] > 20)
+        np.count_nonzero(deliver_image(raw, flaws)[:, 32] > 20)
         for flaws in (Flaws(colour_filter=True), Flaws(colour_filter=True, jpeg=95))
     ]
     assert width[0] == 3, "between red rows the mean of both"

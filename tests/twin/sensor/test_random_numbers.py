@@ -15,7 +15,7 @@ DRAWS = 250_000
 
 @pytest.fixture(scope="module")
 def drawn() -> dict[float, np.ndarray]:
-    """Draws of every mean from one image in which the means alternate from pixel to pixel."""
+    """Return draws of every mean from one image with means that alternate between pixels."""
     image = np.tile(np.array(MEANS, np.float32), (DRAWS, 1))
     numbers = poisson_numbers(image, np.random.default_rng(5))
     assert numbers.shape == image.shape
@@ -24,7 +24,10 @@ def drawn() -> dict[float, np.ndarray]:
 
 
 def p_value(numbers: np.ndarray, mean: float) -> float:
-    """Of the chi-square test against Poisson's law; counts of which fewer than 10 are expected share the end bins."""
+    """Return the p-value of the chi-square test against Poisson's law.
+
+    Counts expected fewer than 10 times share the end bins.
+    """
     lowest, highest = stats.poisson.ppf([10 / numbers.size, 1 - 10 / numbers.size], mean).astype(int)
     inner = np.arange(lowest + 1, highest)
     probability = np.concatenate(
@@ -59,7 +62,7 @@ def test_the_distributions_neighbours_would_be_noticed(drawn):
 
 
 def test_the_tail_is_there(drawn):
-    # 250000 draws reach the counts of which 1e-5 of all are expected; means of 2.5 draws exceed 12 once in 2e5 seeds.
+    # 250000 draws reach counts with a probability of 1e-5; counts with a mean of 2.5 draws exceed 12 once in 2e5 seeds.
     for mean in (1.0, 2.8, 9.99, 24.3):
         rare = stats.poisson.isf(1e-5, mean)
         beyond = np.count_nonzero(drawn[mean] > rare)
@@ -68,7 +71,7 @@ def test_the_tail_is_there(drawn):
 
 
 def test_pixels_are_independent():
-    # Neighbours, and pixels a row apart: 200 x 5000 products of unit spread scatter by 1e-3.
+    # Neighbours, and pixels of adjacent rows: 200 x 5000 products of unit variance scatter by 1e-3.
     image = np.full((200, 5000), 1.37, np.float32)
     numbers = poisson_numbers(image, np.random.default_rng(6)).astype(float)
     standard = (numbers - 1.37) / np.sqrt(1.37)
@@ -107,8 +110,8 @@ def normal() -> np.ndarray:
 
 
 def test_normal_numbers_have_the_normal_distribution(normal):
-    # Bins of 0.01 in the middle resolve the layers' edges, which are 0.014 apart where they are densest. A right
-    # generator fails once in 1e4 seeds, and this seed is fixed.
+    # Bins of 0.01 in the middle resolve the layers' edges, whose smallest spacing is 0.014. A correct generator fails
+    # for one in 1e4 seeds, and this seed is fixed.
     edges = np.concatenate([[-np.inf], np.linspace(-4, 4, 801), [np.inf]])
     observed = sum(np.histogram(row, edges)[0] for row in normal)
     assert stats.chisquare(observed, np.diff(stats.norm.cdf(edges)) * normal.size).pvalue > 1e-4
@@ -117,8 +120,8 @@ def test_normal_numbers_have_the_normal_distribution(normal):
 @pytest.mark.parametrize("beyond", (3.0, 3.6541529, 4.0, 4.5))
 @pytest.mark.parametrize("sign", (-1, 1))
 def test_normal_numbers_have_their_tails(normal, beyond, sign):
-    # The last layer's tail begins at 3.654, where a tail that is drawn anew once too seldom is 7 % short: there 5
-    # standard deviations of the 5,160 numbers expected are 7 %.
+    # The last layer's tail begins at 3.654. A tail that is redrawn once too rarely would have 7 % fewer numbers: 5
+    # standard deviations of the 5,160 numbers expected.
     expected = stats.norm.sf(beyond) * normal.size
     assert np.count_nonzero(sign * normal > beyond) == pytest.approx(expected, abs=5 * np.sqrt(expected))
 

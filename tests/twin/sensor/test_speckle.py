@@ -1,7 +1,7 @@
 """Speckle against the statistics of Gaussian fields: distribution, grain, averaging over pixels, and change in motion.
 
-A region of many grains is a sample of so many independent values as it holds correlation areas,
-A_c = (4 / pi) (lambda N (1 + m))^2, the integral of |2 J1(z) / z|^2 over the plane.
+The number of independent values in a region of many grains is its area divided by the correlation area A_c = (4 / pi)
+(lambda N (1 + m))^2, the integral of |2 J1(z) / z|^2 over the plane.
 """
 
 import math
@@ -28,7 +28,7 @@ def grain_px(f_number: float) -> float:
 
 
 def independent(pixels: float, f_number: float) -> float:
-    """Number of correlation areas in a region of so many pixels, at most one per pixel."""
+    """Return the number of correlation areas in a region of ``pixels`` pixels, at most one per pixel."""
     return pixels * min(1.0, math.pi / 4 / grain_px(f_number) ** 2)
 
 
@@ -78,10 +78,10 @@ def block(
 
 
 def coarse_sample(lens: Lens, *, frames: int = 30, **kwargs) -> np.ndarray:
-    """Nearly independent values of a pattern with grains of 12.4 pixels, taken 15 pixels apart.
+    """Return nearly independent values of a pattern with grains of 12.4 pixels, sampled every 15 pixels.
 
-    That is the first zero of the correlation, 1.22 grains; the pixel averages over little. The pattern repeats across
-    the stripe after 16 grains at least.
+    This is the first zero of the correlation, 1.22 grains; averaging over the pixel is small. The pattern repeats
+    across the stripe after 16 grains at least.
     """
     speckle = Speckle(lens(100.0), wavelength_nm=WAVELENGTH_NM, seed=1)
     frame = 3 * speckle.renewal_mm
@@ -121,7 +121,7 @@ def test_the_mean_is_one(lens, f_number, side):
 
 @pytest.mark.parametrize("side", ["width", "height"])
 def test_the_grain_is_an_airy_pattern_in_every_direction(lens, side):
-    # Grains of 7.9 pixels, of which the pixel averages little: its mean over a square moves the half width by 1 %.
+    # Grains of 7.9 pixels, so that averaging over a square pixel changes the half width by 1 % only.
     f_number, frames, reach = 64.0, 16, 14
     speckle = Speckle(lens(f_number, stripe_along=side), wavelength_nm=WAVELENGTH_NM, seed=3)
     shape = (120, 1000) if side == "width" else (1000, 120)
@@ -224,7 +224,7 @@ def test_the_ends_of_the_stripe_are_not_neighbours(lens):
     travels = 3 * speckle.renewal_mm * np.arange(40)
     rows, columns = np.repeat(np.arange(0, 120, 10), 2), np.tile([0, 1279], 12)
     found = np.array([speckle.factors(rows, columns, travel_mm=t, polarisation=1.0) for t in travels])
-    # 480 nearly independent pairs, of which neighbours would be correlated by 0.96.
+    # 480 nearly independent pairs; neighbours would be correlated by 0.96.
     assert abs(np.corrcoef(found[:, ::2].ravel(), found[:, 1::2].ravel())[0, 1]) < 5 / math.sqrt(480)
 
 
@@ -256,7 +256,7 @@ def test_renewal_follows_an_airy_pattern_that_the_surface_carries_along(lens):
     found = renewal_correlation(moved_mm / speckle.renewal_mm)
     np.testing.assert_allclose(found**2, airy(moved_mm / cell_mm), rtol=0, atol=0.03)
     np.testing.assert_allclose(found[moved_mm >= 2 * speckle.renewal_mm], 0, atol=1e-15)
-    # Half the correlation lies at the same displacement, where 2 J1(z) / z is at z = 2.2151. The 0.9 is rounded from
+    # The correlation is one half at the same displacement as 2 J1(z) / z, at z = 2.2151. The 0.9 is rounded from
     # 0.896, by 4e-3 of a length over which the correlation falls by 0.7.
     half = 2.2151 / math.pi
     assert renewal_correlation(half * cell_mm / speckle.renewal_mm) == pytest.approx(0.5, abs=4e-3)

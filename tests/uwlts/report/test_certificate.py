@@ -19,20 +19,20 @@ from uwlts.optics.triangulation import reconstruct_pixels
 from uwlts.report.certificate import (
     NOT_JOINT,
     JointCertificate,
-    canonical,
     certificate_of,
     check_certificate,
+    compute_seal,
     read_certificate,
-    seal_of,
+    to_canonical_json,
 )
 from uwlts.report.certificate_page import certificate_page, write_certificate
 from uwlts.report.certificate_volume import (
-    change_from,
-    ends_over,
-    in_use,
+    compare_calibrations,
+    find_ends,
     length_uncertainties,
+    prepare_use,
+    remove_rigid_motion,
     uncertainty_maps,
-    without_rigid_motion,
 )
 from uwlts.storage.calibration_file import read_calibration
 
@@ -59,7 +59,7 @@ def calibration(path):
 
 @pytest.fixture(scope="module")
 def use(calibration):
-    return in_use(calibration, regions(calibration)[0])
+    return prepare_use(calibration, regions(calibration)[0])
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +71,9 @@ def test_the_same_calibration_gives_the_same_json(calibration, path, content):
     again = certificate_of(read_calibration(path), path, issued=ISSUED)
     stored = content.in_file()
     assert json.dumps(again.in_file()) == json.dumps(stored)
-    # What is sealed does not depend on the order of keys, nor on the seal itself.
-    assert canonical(dict(reversed(stored.items()))) == canonical(stored)
-    assert seal_of(stored) == content.sha256 == stored["sha256"]
+    # The seal depends neither on the order of keys nor on the stored seal.
+    assert to_canonical_json(dict(reversed(stored.items()))) == to_canonical_json(stored)
+    assert compute_seal(stored) == content.sha256 == stored["sha256"]
 
 
 def test_a_changed_byte_is_found(calibration, path, content, tmp_path):
@@ -109,7 +109,10 @@ def test_the_calibration_itself_is_never_replaced(path):
 
 
 def test_it_says_where_it_holds(calibration, content, thesis):
-    """Stripes lie on the plate of 235 mm and in the image, over the travel of 180 mm less where they miss it."""
+    """Stripes are on the plate of 235 mm and in the image.
+
+    They cover the travel of 180 mm minus the part that misses the plate.
+    """
     validity = content.validity[0]
     assert validity.name == "water"
     assert validity.index == calibration.media[0].index
@@ -143,9 +146,9 @@ def points(calibration, known, values, pixels):
 
 @pytest.mark.slow
 def test_uncertainties_of_lengths_agree_with_draws(calibration, use):
-    """By drawing parameters and reconstructing with them: a standard deviation of 300 draws is right to 4 % (1 sigma).
+    """Draw parameters and reconstruct with them: the standard deviation of 300 draws has an error of 4 % (1 sigma).
 
-    The largest of 81 places is compared with the largest by draws, which lies a little higher.
+    The largest of 81 positions is compared with the largest by draws, which is slightly higher.
     """
     known = use.known
     drawn = np.random.default_rng(1).multivariate_normal(known.values, use.covariance, DRAWS, method="svd")
@@ -153,7 +156,7 @@ def test_uncertainties_of_lengths_agree_with_draws(calibration, use):
     for stated in length_uncertainties(use):
         if stated.axis == "X" or stated.length_mm not in (20.0, 100.0):
             continue
-        pixels = pixels_at(known, ends_over(use.region, stated.axis, stated.length_mm).reshape(-1, 2))
+        pixels = pixels_at(known, find_ends(use.region, stated.axis, stated.length_mm).reshape(-1, 2))
         found = np.array([points(calibration, known, values, pixels) for values in drawn])
         lengths = np.linalg.norm(found[:, 1::2] - found[:, ::2], axis=2)
         assert stated.calibration_mm == pytest.approx(2 * np.std(lengths, axis=0).max(), rel=0.2)
@@ -180,7 +183,7 @@ def test_drift_of_the_water_counts(calibration):
     for kelvin in (0.0, 5.0):
         provenance = calibration.provenance | {"known_before": known | {"drift_k": kelvin}}
         warmer = calibration.model_copy(update={"media": (medium,), "provenance": provenance})
-        found = length_uncertainties(in_use(warmer, regions(warmer)[0]))
+        found = length_uncertainties(prepare_use(warmer, regions(warmer)[0]))
         std.append(next(w.calibration_mm for w in found if w.axis == "Y" and w.length_mm == 100.0))
     assert std[1] > 2 * std[0]
 
@@ -191,9 +194,9 @@ def test_rigid_motions_leave_the_form():
     full = np.column_stack([np.zeros(40), at])
     motion = np.cross([1e-3, -2e-3, 3e-3], full) + [0.1, 0.2, -0.3]
     bent = np.column_stack([np.zeros((40, 2)), 1e-5 * at[:, 0] ** 2])
-    assert np.abs(without_rigid_motion(at, motion[None])).max() < 1e-12
-    left = without_rigid_motion(at, (motion + bent)[None])[0]
-    assert np.allclose(left, without_rigid_motion(at, bent[None])[0])
+    assert np.abs(remove_rigid_motion(at, motion[None])).max() < 1e-12
+    left = remove_rigid_motion(at, (motion + bent)[None])[0]
+    assert np.allclose(left, remove_rigid_motion(at, bent[None])[0])
     assert left.std() > 0.2 * bent.std()
 
 
@@ -222,17 +225,17 @@ def test_lengths_shown_where_they_are_measured_stay_in_the_volume(use):
 def test_against_another_calibration(calibration, thesis):
     """Half a per cent of the focal length changes all distances across the axis by as much, and none to itself."""
     region = regions(calibration)[0]
-    same = change_from(calibration, calibration, region)
+    same = compare_calibrations(calibration, calibration, region)
     assert same.largest_mm < 1e-9
     camera = calibration.camera.model_copy(
         update={"fx_px": 1.005 * calibration.camera.fx_px, "fy_px": 1.005 * calibration.camera.fy_px}
     )
-    change = change_from(calibration, calibration.model_copy(update={"camera": camera}), region)
+    change = compare_calibrations(calibration, calibration.model_copy(update={"camera": camera}), region)
     width = change.moved_mm[8, -1, 1] - change.moved_mm[8, 0, 1]
     assert width == pytest.approx(0.005 * (change.at_mm[8, -1, 0] - change.at_mm[8, 0, 0]), rel=0.4)
     small = calibration.camera.model_copy(update={"width_px": 640})
     with pytest.raises(CalibrationError, match="image size is 1280 x 1024 px in one and 640 x 1024"):
-        change_from(calibration, calibration.model_copy(update={"camera": small}), region)
+        compare_calibrations(calibration, calibration.model_copy(update={"camera": small}), region)
 
 
 def test_the_page_holds_everything_and_asks_nothing_of_the_network(calibration, content, thesis):
@@ -241,7 +244,7 @@ def test_the_page_holds_everything_and_asks_nothing_of_the_network(calibration, 
         "Uncertainty of lengths",
         "Weakly determined parameters",
         "Correlation of the parameters",
-        "Against drawings",
+        "Comparison with drawings",
         content.sha256,
         content.calibration.sha256,
         "turn of the laser&#39;s window",
@@ -250,7 +253,7 @@ def test_the_page_holds_everything_and_asks_nothing_of_the_network(calibration, 
     assert "://" not in page.replace("http://www.w3.org/2000/svg", "")
     assert "<script" not in page
     assert page.count("<svg") == 3 + 8 + 3
-    # Maps hold pixels, in which any letters may occur.
+    # Maps contain encoded pixels with arbitrary letters.
     text = re.sub(r'base64,[^"]*', "", page).lower()
     assert len(text) > 10_000 and "nan" not in text.replace("nanometre", "")
 

@@ -16,9 +16,9 @@ SCATTER_MM, MORE_MM = 0.02, 0.01
 
 
 def chosen(*, dry: int, wet: int, more_in_water_mm: float) -> Choice:
-    """A choice between a pane and a single refraction, which misses the images in water by something more.
+    """Return a choice between a plate and a single refraction, which has an additional error for images in water.
 
-    In air both predict the same. Both ways of holding out have as many images.
+    In air both predict the same. Equally many images are held out inside and outside.
     """
     ways = {
         where: frozenset([(AIR, start + n) for n in range(dry)] + [(WATER, start + n) for n in range(wet)])
@@ -47,7 +47,7 @@ def said_of_glass(choice: Choice) -> str:
 
 def verdicts_of_parts(choice: Choice) -> list[str]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("uwlts.report.model_comparison._of_distortion", lambda *_: "k1 k2 is enough")
+        patch.setattr("uwlts.report.model_comparison._describe_distortion", lambda *_: "k1 k2 is enough")
         return verdicts(choice)
 
 
@@ -56,7 +56,7 @@ def test_images_in_air_do_not_show_that_the_glass_is_not_needed(wet):
     choice = chosen(dry=20, wet=wet, more_in_water_mm=0.0)
     line = said_of_glass(choice)
     assert line.startswith("whether the glass plate is needed is not shown") and f" {wet} are in water" in line
-    # What air shows as well is said as before.
+    # Verdicts that air supports are unchanged.
     assert any(line.startswith("the bow of the sheet is not needed") for line in verdicts_of_parts(choice))
 
 
@@ -68,9 +68,9 @@ def test_images_in_water_show_that_the_glass_is_not_needed():
 
 
 def test_few_images_in_water_tell_that_the_glass_is_needed_among_many_in_air():
-    """Of 5 images in water, 1,000 values, the excess 0.01² lies 5 of its standard errors above 0.
+    """For 5 images in water, 1,000 values, the excess 0.01² is 8 of its standard errors above 0.
 
-    It is 2 * 0.02 * 0.01 / sqrt(1000) = 1.3e-5 mm², against 1e-4.
+    The standard error is 2 * 0.02 * 0.01 / sqrt(1000) = 1.3e-5 mm², against 1e-4.
     """
     line = said_of_glass(chosen(dry=200, wet=5, more_in_water_mm=MORE_MM))
     assert line.startswith("the glass plate is needed: with a single refraction points"), line
@@ -79,7 +79,7 @@ def test_few_images_in_water_tell_that_the_glass_is_needed_among_many_in_air():
 def test_long_names_of_models_wrap_in_the_page():
     """A table of 15 columns is as wide as the page only if its names break; a narrower page scrolls it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("uwlts.report.model_comparison._of_distortion", lambda *_: "k1 k2 is enough")
+        patch.setattr("uwlts.report.model_comparison._describe_distortion", lambda *_: "k1 k2 is enough")
         content = content_of(
             Comparison("thesis", ["a.h5"], chosen(dry=8, wet=8, more_in_water_mm=0.0), None, "none", [])
         )

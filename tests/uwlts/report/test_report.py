@@ -77,7 +77,7 @@ def write_capture(path, *, name="capture", artefact=None) -> None:
 
 
 def two_spheres(spacing: float) -> np.ndarray:
-    """Exact points (N, 3) on two caps that face the sensor, the centres a spacing apart along Y."""
+    """Return exact points (N, 3) on two caps that face the sensor, with centres one spacing from each other along Y."""
     across, around = np.meshgrid(np.radians(np.linspace(2, 55, 24)), np.linspace(0, 2 * np.pi, 60, endpoint=False))
     away = np.stack([np.sin(across) * np.cos(around), np.sin(across) * np.sin(around), -np.cos(across)], axis=-1)
     caps = [d / 2 * away.reshape(-1, 3) + (0, y, 30) for d, y in ((50.12, -spacing / 2), (50.14, spacing / 2))]
@@ -157,7 +157,7 @@ def folder(tmp_path_factory):
         write_capture(folder / f"{name}.h5", artefact=SPHERES)
         write_measurement(folder, name, two_spheres(spacing), SPHERES, calibration)
     points = step(23.18)
-    # The true lower tread, half of the points, lies 0.02 mm deeper; the upper one is exact.
+    # The true lower tread, half of the points, is 0.02 mm deeper; the upper one is exact.
     lower = points[:, 1] < 0
     true = (points + np.where(lower, 0.02, 0.0)[:, None] * (0, 0, 1)).reshape(IMAGES, 80, 3)
     nothing = np.zeros((IMAGES, 80))
@@ -314,7 +314,7 @@ def test_the_truth_is_pooled_over_points(campaign):
     wanted = np.where(points[:, 1] < 0, 0.02, 0.0) - 0.01
     y, z = (points[:, 1:] - points[:, 1:].mean(axis=0)).T
     left = wanted - y * (y @ wanted) / (y @ y + z @ z)
-    # The turn of 0.0004 is small to that share of itself.
+    # The rotation of 0.0004 rad is small: relative errors are of this order.
     assert truth["after_best_fit"]["rms_mm"] == pytest.approx(np.sqrt(np.mean(left**2)), rel=1e-3)
     step_only = next(m for m in campaign.measurements if m.name == "step")
     better = {"matched": 1200, "share_within_tolerance": 1.0, "rms_mm": 0.0, "after_best_fit": None}
@@ -344,13 +344,13 @@ def test_rows_hold_true_measured_error_and_published(campaign):
     assert rows["spheres-near", "diameter, sphere 2"] == ("50.140", "50.140", "0.000", "-", "-")
     assert rows["spheres-near", "deviations STD"] == ("-", "0.000", "-", "-", "0.12, 0.14")
     assert rows["step", "step height"] == ("23.170", "23.180", "+0.010", "-", "-")
-    # Where there is a best-fit motion, the share is the one after it; the motion takes out a part of the distances.
+    # The fraction is that after the best-fit motion, if any; the motion removes a part of the distances.
     assert ("step", "within 0.010 of truth") not in rows
     assert float(rows["step", "within 0.010 after best fit"][1].removesuffix(" %")) > 50
     assert float(rows["step", "rms distance after best fit"][1]) < 0.014
     assert rows["step", "rms distance to truth"] == ("-", "0.014", "-", "-", "-")
     assert rows["calibration", "window distance"] == ("47.300", "47.350", "+0.050", "-", "40.7")
-    # A single interface has no true distance, and the published one is for two refractions.
+    # No true distance of a single interface exists, and the published one is for two refractions.
     assert rows["calibration-one-refraction", "interface distance (1 refraction)"] == ("-", "45.000", "-", "-", "-")
 
 
@@ -682,7 +682,7 @@ def test_the_histogram_counts_every_point_once():
     cloud = PointCloud(np.zeros((len(deviation), 3)), nothing, nothing, nothing, deviation_mm=deviation)
     ax = plot.deviation_histogram(cloud)
     (bars,) = ax.containers
-    beyond = int(re.search(r"(\d+) of 5,001 lie farther out", bars.get_label()).group(1))
+    beyond = int(re.search(r"(\d+) of 5,001 outside", bars.get_label()).group(1))
     assert beyond >= 1 and sum(bar.get_height() for bar in bars) == 5001 - beyond
     with pytest.raises(ValueError, match="evaluate it first"):
         plot.deviation_histogram(replace(cloud, deviation_mm=None))

@@ -1,6 +1,6 @@
-"""Objects of forms that are known in closed form, as fine triangle meshes; they face -z, towards the sensor.
+"""Objects with closed-form surfaces as fine triangle meshes; they face -z, towards the sensor.
 
-A new one is a module with its description, its formula and its triangles, and an entry of `AnyForm`.
+A new form is a module with its description, formula and triangles, and an entry in `AnyForm`.
 """
 
 from twin.scene.forms.cables_and_ropes import Cable, Rope

@@ -1,23 +1,24 @@
-"""Cable and rope: a smooth round jacket on an arc, and strands laid about each other."""
+"""Cable and rope: a smooth round jacket on an arc, and twisted strands."""
 
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.scene.forms.triangles import require_few, step_of, tube
-from twin.scene.placed import FreeForm
+from twin.scene.forms.triangles import chord_step, require_few_vertices, tube
+from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import Positive
 
 _SAG_MM = 0.005
-"""Largest distance of the facets from the surfaces; at the valleys between strands ten times that."""
+"""Largest distance of the facets from the surfaces; ten times that in the valleys between strands."""
 
 
 class Cable(FreeForm):
-    """The jacket of a cable that lies on an arc in its own x-y plane; its middle is its origin, there it runs along x.
+    """The jacket of a cable along an arc in its own x-y plane; at its origin, the centre, it runs along x.
 
-    ``length_mm`` is that of the arc of ``bend_radius_mm``, whose centre lies on y; without it the cable is straight.
-    The surface is that of a torus: sqrt((rho - bend_radius)^2 + z^2) = diameter / 2, rho the distance from its axis.
+    ``length_mm`` is the arc length and ``bend_radius_mm`` its radius, with the centre on y; without it the cable is
+    straight. The surface is a torus: sqrt((rho - bend_radius)^2 + z^2) = diameter / 2, where rho is the distance from
+    its axis.
     """
 
     kind: Literal["cable"]
@@ -36,27 +37,27 @@ class Cable(FreeForm):
         return self
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """A tube that is open at its ends, whose facets deviate by `_SAG_MM`."""
+        """Return a tube with open ends whose facets deviate by `_SAG_MM`."""
         radius = self.diameter_mm / 2
-        step = step_of(_SAG_MM, 1 / radius)
+        step = chord_step(_SAG_MM, 1 / radius)
         around = np.linspace(0, 2 * np.pi, int(np.ceil(2 * np.pi * radius / step)), endpoint=False)
         bend = self.bend_radius_mm
-        along = self.length_mm if bend is None else step_of(_SAG_MM, 1 / (bend + radius))
+        along = self.length_mm if bend is None else chord_step(_SAG_MM, 1 / (bend + radius))
         rings = int(np.ceil(self.length_mm / along)) + 1
-        require_few(rings * len(around), step_mm=step, advice="make it shorter or thinner")
+        require_few_vertices(rings * len(around), step_mm=step, advice="make it shorter or thinner")
         x = np.linspace(-0.5, 0.5, rings) * self.length_mm
         vertices, faces = tube(x, around, np.full((rings, len(around)), radius))
         if bend is None:
             return vertices, faces
-        # The straight tube, rolled up about the axis at y = bend.
+        # Bend the straight tube about the axis at y = bend.
         angle, rho = vertices[:, 0] / bend, bend - vertices[:, 1]
         return np.stack([rho * np.sin(angle), bend - rho * np.cos(angle), vertices[:, 2]], axis=1), faces
 
 
 class Rope(FreeForm):
-    """A laid rope along its own x axis, its middle its origin; ``diameter_mm`` is that of the circle about it.
+    """A twisted rope along its own x axis, centred at its origin; ``diameter_mm`` is that of its circumscribed circle.
 
-    ``strands`` round strands touch each other and wind once about the axis over ``lay_mm`` (`rope_radius`).
+    ``strands`` round strands touch each other; ``lay_mm`` is the length of one turn about the axis (`rope_radius`).
     """
 
     kind: Literal["rope"]
@@ -66,23 +67,25 @@ class Rope(FreeForm):
     lay_mm: Positive = 80.0
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """A tube that is open at its ends, whose facets deviate by `_SAG_MM` away from the valleys."""
+        """Return a tube with open ends whose facets deviate by `_SAG_MM` away from the valleys."""
         strand, _ = _strand(self)
-        step = step_of(_SAG_MM, 1 / strand)
+        step = chord_step(_SAG_MM, 1 / strand)
         around = np.linspace(0, 2 * np.pi, int(np.ceil(np.pi * self.diameter_mm / step)), endpoint=False)
-        # Along the rope a strand turns by as much as round it over so much more.
+        # A strand turns more slowly along the rope than around it, by this ratio.
         rings = int(np.ceil(self.length_mm / (step * max(1.0, self.lay_mm / (np.pi * self.diameter_mm))))) + 1
-        require_few(rings * len(around), step_mm=step, advice="make it shorter or thinner, or its strands fewer")
+        require_few_vertices(
+            rings * len(around), step_mm=step, advice="make it shorter or thinner, or its strands fewer"
+        )
         x = np.linspace(-0.5, 0.5, rings) * self.length_mm
         return tube(x, around, rope_radius(self, x[:, None], around))
 
 
 def rope_radius(rope: Rope, x: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Distance of a rope's surface from its axis at ``x`` in mm and angles in rad from -z towards y.
+    """Return the distance of a rope's surface from its axis at ``x`` in mm and angles in rad from -z towards y.
 
-    In a section square to the axis, strands are circles of the radius r whose n middles lie on a circle of the radius
-    c: r = c sin(pi / n), as they touch, and c + r = diameter / 2. At an angle b from the nearest middle the surface is
-    c cos(b) + sqrt(r^2 - c^2 sin^2(b)) from the axis.
+    In a section perpendicular to the axis, strands are circles of radius r. Their n centres are on a circle of radius c
+    with r = c sin(pi / n), as they touch, and c + r = diameter / 2. At an angle b from the nearest centre, the distance
+    is c cos(b) + sqrt(r^2 - c^2 sin^2(b)).
     """
     strand, circle = _strand(rope)
     pitch = 2 * np.pi / rope.strands
@@ -92,7 +95,7 @@ def rope_radius(rope: Rope, x: np.ndarray, angle: np.ndarray) -> np.ndarray:
 
 
 def _strand(rope: Rope) -> tuple[float, float]:
-    """Radius of the strands, and of the circle of their middles."""
+    """Return the radius of the strands, and of the circle of their centres."""
     share = np.sin(np.pi / rope.strands)
     circle = 0.5 * rope.diameter_mm / (1 + share)
     return float(circle * share), float(circle)

@@ -1,4 +1,4 @@
-"""A pipe flange: a ring with a circle of bolt holes, some of them with bolts, and a face that is not quite flat."""
+"""Pipe flange: a ring with a circle of bolt holes, bolt heads, and a slightly uneven face."""
 
 from itertools import pairwise
 from typing import Annotated, Literal, Self
@@ -7,22 +7,22 @@ import numpy as np
 from pydantic import Field, model_validator
 from scipy.spatial import Delaunay
 
-from twin.scene.forms.triangles import quads, require_few, step_of
-from twin.scene.placed import FreeForm
+from twin.scene.forms.triangles import chord_step, quads, require_few_vertices
+from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
 _SAG_MM = 0.004
-"""Largest distance of the facets' corners and sides from the round edges and the face."""
+"""Largest distance of the facets from the round edges and the face."""
 _EMBEDDED_MM = 0.5
-"""Part of a bolt's head that lies behind the face, which need not be flat there; also the least `thickness_mm`."""
+"""Depth of bolt heads below the face, which may be uneven there; also the smallest `thickness_mm`."""
 
 
 class Flange(FreeForm):
-    """A flange in its own x-y plane about its own origin; its face lies at z = 0 and faces -z, the ring is behind it.
+    """A flange in its own x-y plane, centred at its origin; its face is at z = 0 and faces -z, with the ring behind it.
 
-    ``holes`` holes lie evenly on the bolt circle, the first ``first_hole_deg`` from x towards y; the first ``bolts`` of
-    them carry hexagonal heads of ``head_width_mm`` across flats, standing ``head_height_mm`` before the face, two flats
-    square to the radius. The face is a saddle, ``flatness_mm`` from its lowest to its highest point
+    ``holes`` holes are evenly spaced on the bolt circle, the first at ``first_hole_deg`` from x towards y. The first
+    ``bolts`` holes have hexagonal heads of ``head_width_mm`` across flats and ``head_height_mm``, with two flats
+    perpendicular to the radius. The face is a saddle with ``flatness_mm`` from its lowest to its highest point
     (`flange_face`).
     """
 
@@ -63,28 +63,28 @@ class Flange(FreeForm):
         return self
 
     def land_mm(self) -> float:
-        """Least width of material between a hole and the next one, the bore or the rim."""
+        """Return the smallest width of material between a hole and the next one, the bore or the rim."""
         circle, hole = self.bolt_circle_mm / 2, self.hole_diameter_mm / 2
         to_next = 2 * circle * np.sin(np.pi / self.holes) - 2 * hole if self.holes > 1 else np.inf
         edges = circle - hole - self.bore_diameter_mm / 2, self.outer_diameter_mm / 2 - circle - hole
         return float(min(to_next, *edges))
 
     def hole_places(self) -> np.ndarray:
-        """Middles (holes, 2) of the bolt holes in the flange's own x-y plane, in mm."""
+        """Return the centres (holes, 2) of the bolt holes in the flange's own x-y plane, in mm."""
         angle = np.radians(self.first_hole_deg) + 2 * np.pi * np.arange(self.holes) / max(self.holes, 1)
         return self.bolt_circle_mm / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """The closed surface of the ring, and those of the bolts' heads, each closed on its own.
+        """Return the closed surface of the ring, and those of the bolt heads, each closed separately.
 
-        Facets deviate from the round edges and from `flange_face` by `_SAG_MM`. DescriptionError where holes so close
-        together on so large a ring need too many vertices.
+        Facets deviate from the round edges and from `flange_face` by `_SAG_MM`. DescriptionError if small gaps between
+        holes on a large ring require too many vertices.
         """
         flat, faces, circles = self._ring()
         z = flange_face(self, *flat.T, edges=True)
         count = len(flat)
         solid = [np.c_[flat, z], np.c_[flat, np.full(count, self.thickness_mm)]]
-        # Seen from before, anticlockwise in x and y is clockwise.
+        # Seen from the front, anticlockwise in x and y is clockwise.
         parts = [faces[:, ::-1], faces + count]
         for number, circle in enumerate(circles):
             beside = np.roll(circle, -1)
@@ -98,21 +98,21 @@ class Flange(FreeForm):
         return corners, np.concatenate(parts)
 
     def _ring(self) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Vertices (V, 2) of the plane ring, faces (F, 3), and the vertices of its round edges, the rim first.
+        """Return vertices (V, 2) of the plane ring, faces (F, 3), and the vertices of its round edges, the rim first.
 
-        Delaunay's triangles keep a circle's chords where no other vertex is nearer than they are long.
+        Delaunay triangulation keeps the chords of a circle if all other vertices are farther away than their length.
         """
         outer, bore, hole = (d / 2 for d in (self.outer_diameter_mm, self.bore_diameter_mm, self.hole_diameter_mm))
         width = min(self.land_mm(), outer - bore) if self.holes else outer - bore
-        # The saddle's second derivative is flatness / R^2, far less than that of the edges.
+        # The saddle's second derivative, flatness / R^2, is far smaller than that of the edges.
         rings = [((0.0, 0.0), outer), ((0.0, 0.0), bore), *(((x, y), hole) for x, y in self.hole_places())]
         edges, steps = [], []
         for middle, radius in rings:
-            steps.append(min(step_of(_SAG_MM, 1 / radius), 0.5 * width))
+            steps.append(min(chord_step(_SAG_MM, 1 / radius), 0.5 * width))
             angle = np.linspace(0, 2 * np.pi, max(24, int(np.ceil(2 * np.pi * radius / steps[-1]))), endpoint=False)
             edges.append(np.array(middle) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
         coarse = max(steps)
-        require_few(
+        require_few_vertices(
             int(np.pi * outer**2 / coarse**2) + sum(map(len, edges)), step_mm=coarse, advice="leave more between holes"
         )
         x, y = np.meshgrid(*[np.arange(-outer, outer, coarse)] * 2)
@@ -126,7 +126,7 @@ class Flange(FreeForm):
         a, b, c = (points[faces[:, k]] for k in range(3))
         turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
         faces = np.where(turn[:, None] > 0, faces, faces[:, ::-1])
-        # A facet in a hole has its corners on the hole's edge, as nothing else lies in there.
+        # Facets in a hole have all corners on its edge, as there are no vertices inside.
         first = np.cumsum([0, *map(len, edges)])
         holes = [(faces >= low) & (faces < high) for low, high in pairwise(first[1:])]
         filled = np.any([every.all(axis=1) for every in holes], axis=0)
@@ -137,7 +137,7 @@ class Flange(FreeForm):
         )
 
     def _head(self, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (12, 3) and faces of a hexagonal head over a hole."""
+        """Return vertices (12, 3) and faces of a hexagonal head over a hole."""
         angle = np.arctan2(y, x) + np.pi / 6 + np.pi / 3 * np.arange(6)
         edge = np.array([x, y]) + self.head_width_mm / np.sqrt(3) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
         vertices = np.concatenate([np.c_[edge, np.full(6, z)] for z in (-self.head_height_mm, _EMBEDDED_MM)])
@@ -148,11 +148,11 @@ class Flange(FreeForm):
 
 
 def flange_face(flange: Flange, x: np.ndarray, y: np.ndarray, *, edges: bool = False) -> np.ndarray:
-    """Position z in mm of a flange's face at places ``x``, ``y`` (N,) of its own frame; NaN where there is no face.
+    """Return z in mm of a flange's face at ``x``, ``y`` (N,) in its own frame; NaN where there is no face.
 
-    z = flatness / 2 (r / R)^2 cos(2 angle), with the rim's radius R: a saddle, whose least-squares plane is z = 0 and
-    whose rim touches two parallel planes ``flatness_mm`` apart in two points each. ``edges`` gives values beyond its
-    edges too. Bolts stand before it.
+    z = flatness / 2 (r / R)^2 cos(2 angle), with the rim radius R. The least-squares plane of this saddle is z = 0, and
+    its rim touches two parallel planes, ``flatness_mm`` apart, in two points each. ``edges`` includes values beyond its
+    edges. Bolts are not included.
     """
     z = 0.5 * flange.flatness_mm * (np.square(x) - np.square(y)) / (flange.outer_diameter_mm / 2) ** 2
     radius = np.hypot(x, y)

@@ -1,15 +1,15 @@
-"""A dummy head with the stub of its neck."""
+"""Dummy head with the stub of its neck."""
 
 from typing import Literal
 
 import numpy as np
 
 from twin.scene.forms.triangles import quads
-from twin.scene.placed import FreeForm
+from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import Positive
 
-# Unit of the head's tables is its height, from the neck's cut at y = -0.5 to the crown at 0.5.
-# Bodies of half-ellipses, front and back, about the y axis: y of the middle, half height, flatness of the ends, half
+# Tables in units of the head's height, from the end of the neck at y = -0.5 to the crown at 0.5.
+# Bodies of front and back half-ellipses about the y axis: y of the centre, half height, flatness of the ends, half
 # width, front, back.
 _BODIES = np.array(
     [
@@ -19,7 +19,7 @@ _BODIES = np.array(
     ]
 )
 _UNION_POWER = 6
-# Gaussian hills on the face: x (with its mirror image, where it is not 0), y, their sigmas, and how far they stand out.
+# Gaussian features of the face: x (with its mirror image if not 0), y, standard deviations, and height.
 _FEATURES = np.array(
     [
         (0.090, 0.155, 0.055, 0.025, 0.018),  # brows
@@ -37,29 +37,29 @@ _FEATURES = np.array(
     ]
 )
 _ROWS = 900
-"""Rows of facets from crown to neck."""
+"""Number of rows of facets from crown to neck."""
 _COLUMNS = 640
-"""Facets round the head."""
+"""Number of facets around the head."""
 _FINER_IN_FRONT = 0.45
-"""How much finer than even these are on the face."""
+"""Relative refinement of the facets on the face."""
 
 
 class Head(FreeForm):
-    """A dummy head with the stub of its neck, about its own origin; its face looks along -z, its crown lies at +y.
+    """A dummy head with the stub of its neck, centred at its origin; the face looks along -z, the crown is at +y.
 
-    ``height_mm`` runs from the neck's cut to the crown.
+    ``height_mm`` is measured from the end of the neck to the crown.
     """
 
     kind: Literal["head"]
     height_mm: Positive = 160.0
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """A closed surface; everything is in proportion to its height: 0.57 wide, and 0.79 from nose to back."""
+        """Return a closed surface, scaled to its height: 0.57 wide, and 0.79 from nose to back."""
         return _triangles(self.height_mm)
 
 
 def head_depth(x: np.ndarray, y: np.ndarray, *, height_mm: float) -> np.ndarray:
-    """Position of a head's front along z at places ``x``, ``y`` (N,), all in mm; NaN beside its outline."""
+    """Return z of the front of a head at ``x``, ``y`` (N,), all in mm; NaN outside its outline."""
     x, y = x / height_mm, y / height_mm
     half_width, front, _ = _outline(y)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -68,12 +68,8 @@ def head_depth(x: np.ndarray, y: np.ndarray, *, height_mm: float) -> np.ndarray:
 
 
 def _triangles(height_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """A dummy head with the stub of its neck: vertices (V, 3) in mm and faces (F, 3) of a closed surface.
-
-    The y axis runs from the neck through the middle of the skull to the crown; the face looks along -z. ``height_mm``
-    is the whole height; everything else is in proportion: 0.57 wide, and 0.79 from nose to back.
-    """
-    # Rows at equal distances along the front's outline, from the crown, where it is level, to the neck.
+    """Return vertices (V, 3) in mm and faces (F, 3) of a dummy head with the stub of its neck, a closed surface."""
+    # Rows at equal distances along the front outline, from the crown, where it is level, to the neck.
     y = 0.5 - np.square(np.linspace(0, 1, 20 * _ROWS))
     way = np.concatenate([[0], np.cumsum(np.hypot(np.diff(y), np.diff(_outline(y)[1])))])
     y = np.interp(np.linspace(0, way[-1], _ROWS + 1), way, y)[1:, None]
@@ -100,14 +96,14 @@ def _triangles(height_mm: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _outline(y: np.ndarray) -> np.ndarray:
-    """Half width, front and back (3, ...) of the head's bodies at heights y (...), melted into each other."""
+    """Return half width, front and back (3, ...) of the head at heights y (...), as a smooth union of its bodies."""
     middle, half, flatness, *radii = (column[:, *[None] * np.ndim(y)] for column in _BODIES.T)
     share = np.sqrt(np.maximum(1 - np.abs((y - middle) / half) ** flatness, 0))
     return np.stack([np.sum((radius * share) ** _UNION_POWER, axis=0) ** (1 / _UNION_POWER) for radius in radii])
 
 
 def _front(x: np.ndarray, y: np.ndarray, front: np.ndarray, facing: np.ndarray) -> np.ndarray:
-    """Depth z of the face; ``facing`` (1 in the middle, 0 at the sides) fades the features out."""
+    """Return z of the face; ``facing`` (1 in the middle, 0 at the sides) fades the features out."""
     relief = sum(
         height * np.exp(-0.5 * (np.square((x - side * at_x) / sigma_x) + np.square((y - at_y) / sigma_y)))
         for at_x, at_y, sigma_x, sigma_y, height in _FEATURES

@@ -1,30 +1,31 @@
-"""A pipe with marine growth: a soft, uneven layer, and barnacles on it."""
+"""Pipe with marine growth: a soft, uneven layer with barnacles."""
 
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.scene.forms.triangles import finer_in_front, require_few, step_of, tube, waves
-from twin.scene.placed import FreeForm
+from twin.scene.forms.triangles import chord_step, require_few_vertices, space_angles, tube, waves
+from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
 _SAG_MM = 0.04
-"""Largest distance of the facets from the surface; growth itself is not known as well."""
+"""Largest distance of the facets from the surface, well below the uncertainty of real growth."""
 _GROWN_DEG = 60.0
-"""Barnacles lie within this angle of the side that faces the sensor."""
+"""Barnacles are within this angle of the side that faces the sensor."""
 _SHORTEST = 0.5
-"""Shortest wavelength of the layer's waves over its ``patch_mm``."""
+"""Shortest wavelength of the layer's waves, divided by ``patch_mm``."""
 _LONGEST = 2.0
-"""The longest one."""
+"""Longest wavelength, divided by ``patch_mm``."""
 
 
 class OvergrownPipe(FreeForm):
-    """The outside of a pipe under marine growth; its axis is its own x axis, its middle its origin.
+    """The outer surface of a pipe under marine growth, along its own x axis and centred at its origin.
 
-    ``diameter_mm`` is that of the pipe itself. The growth is ``growth_mm`` thick in the mean and ``unevenness`` times
-    that more or less, in patches some ``patch_mm`` wide. ``barnacles`` of ``barnacle_diameter_mm`` and
-    ``barnacle_height_mm``, with craters, sit within 60 deg of -z; ``seed`` chooses where (`overgrown_radius`).
+    ``diameter_mm`` is that of the bare pipe. The growth has the mean thickness ``growth_mm`` and varies by the fraction
+    ``unevenness`` of it, in patches about ``patch_mm`` wide. ``barnacles`` of ``barnacle_diameter_mm`` and
+    ``barnacle_height_mm``, with craters, are within 60 deg of -z at random positions from ``seed``
+    (`overgrown_radius`).
     """
 
     kind: Literal["overgrown_pipe"]
@@ -48,32 +49,35 @@ class OvergrownPipe(FreeForm):
         return self
 
     def barnacle_places(self) -> np.ndarray:
-        """Places (barnacles, 2) of their middles: x in mm, and the angle in rad from -z towards y."""
+        """Return positions (barnacles, 2) of their centres: x in mm, and the angle in rad from -z towards y."""
         most = 0.5 * (self.length_mm - self.barnacle_diameter_mm), np.radians(_GROWN_DEG)
         return np.random.default_rng([self.seed, 1]).uniform(-1, 1, (self.barnacles, 2)) * most
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """A tube that is open at its ends, whose facets deviate by `_SAG_MM`, more where barnacles meet."""
+        """Return a tube with open ends whose facets deviate by `_SAG_MM`, more where barnacles meet."""
         radius = self.diameter_mm / 2 + self.growth_mm
         wavy = self.unevenness * self.growth_mm * (2 * np.pi / (_SHORTEST * self.patch_mm)) ** 2 / 4
-        # That of a barnacle's flank, and in its narrower crater.
+        # Curvature of a barnacle's flank, and of its narrower crater.
         shell = 24 * self.barnacle_height_mm / (0.5 * self.barnacle_diameter_mm) ** 2 if self.barnacles else 0.0
-        step = step_of(_SAG_MM, 1 / radius + wavy + shell)
-        plain = step_of(_SAG_MM, 1 / radius + wavy)
+        step = chord_step(_SAG_MM, 1 / radius + wavy + shell)
+        plain = chord_step(_SAG_MM, 1 / radius + wavy)
         reach = np.radians(_GROWN_DEG) + 0.5 * self.barnacle_diameter_mm / (self.diameter_mm / 2)
-        around = finer_in_front(reach, radius, step=step, plain=plain)
+        around = space_angles(reach, radius, step=step, plain=plain)
         rings = int(np.ceil(self.length_mm / step)) + 1
-        require_few(rings * len(around), step_mm=step, advice="make its barnacles wider or lower, or the pipe smaller")
+        require_few_vertices(
+            rings * len(around), step_mm=step, advice="make its barnacles wider or lower, or the pipe smaller"
+        )
         x = np.linspace(-0.5, 0.5, rings) * self.length_mm
         return tube(x, around, overgrown_radius(self, x[:, None], np.where(around > np.pi, around - 2 * np.pi, around)))
 
 
 def overgrown_radius(pipe: OvergrownPipe, x: np.ndarray, angle: np.ndarray) -> np.ndarray:
-    """Distance of the growth's surface from the axis at ``x`` in mm and angles in rad, -pi to pi, from -z towards y.
+    """Return the distance of the growth's surface from the axis at ``x`` in mm and angles in rad.
 
-    On the pipe's radius lies growth (1 + unevenness w) with smooth waves w between -1 and 1, and on it the highest
-    barnacle there: height ((1 - t^2)^2 - 0.6 (1 - (t / 0.4)^2)^2), with t from 0 in its middle to 1 at its foot and the
-    second term, the crater, only up to t = 0.4; distances are measured along the surface of the bare pipe.
+    Angles are -pi to pi, from -z towards y. The pipe's radius is increased by growth (1 + unevenness w), with smooth
+    waves w between -1 and 1, and by the highest barnacle: height ((1 - t^2)^2 - 0.6 (1 - (t / 0.4)^2)^2). Here t is 0
+    at its centre and 1 at its foot, and the second term, the crater, applies up to t = 0.4. Distances are measured
+    along the bare pipe.
     """
     bare = pipe.diameter_mm / 2
     places = np.stack([*np.broadcast_arrays(x, bare * np.cos(angle), bare * np.sin(angle))]) / pipe.patch_mm

@@ -1,29 +1,29 @@
-"""A patch of the sea floor: rippled, rough sediment with stones half buried in it."""
+"""Patch of the sea floor: rippled, rough sediment with half-buried stones."""
 
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.scene.forms.triangles import grid_faces, require_few, step_of, tube, waves
-from twin.scene.placed import FreeForm
+from twin.scene.forms.triangles import chord_step, grid_faces, require_few_vertices, tube, waves
+from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
 _SAG_MM = 0.02
-"""Largest distance of the sediment's facets from the surface; that of the stones' facets is twice as large."""
+"""Largest distance of the sediment's facets from the surface; twice as much for stones."""
 _SHORTEST = 0.2
-"""Shortest wavelength of the roughness over the ripples' pitch."""
+"""Shortest wavelength of the roughness, divided by the ripples' pitch."""
 _LONGEST = 1.0
-"""The longest one."""
+"""Longest wavelength, divided by the ripples' pitch."""
 
 
 class Seabed(FreeForm):
-    """Sediment in its own x-y plane about its own origin, facing -z (towards the sensor).
+    """Sediment in its own x-y plane, centred at its origin, facing -z (towards the sensor).
 
-    Ripples run along y, with ``ripple_pitch_mm`` from crest to crest along x and ``ripple_height_mm`` from trough to
-    crest; the surface between is uneven by up to ``roughness_mm``. ``stones`` of ``stone_diameter_mm`` lie half buried,
-    at places that ``seed`` chooses (`seabed_height`). With ``smallest_stone_mm`` the logarithms of their diameters are
-    evenly spread from that on.
+    Ripples are parallel to y, with ``ripple_pitch_mm`` between crests along x and ``ripple_height_mm`` from trough to
+    crest. The surface has a roughness of up to ``roughness_mm``. ``stones`` of ``stone_diameter_mm`` are half buried at
+    random positions from ``seed`` (`seabed_height`). With ``smallest_stone_mm``, diameters are log-uniform between
+    both.
     """
 
     kind: Literal["seabed"]
@@ -52,25 +52,25 @@ class Seabed(FreeForm):
         return self
 
     def stone_places(self) -> np.ndarray:
-        """Middles (stones, 2) of the stones in the x-y plane, in mm."""
+        """Return the centres (stones, 2) of the stones in the x-y plane, in mm."""
         most = 0.5 * (np.array([self.width_mm, self.height_mm]) - self.stone_diameter_mm)
         return np.random.default_rng([self.seed, 1]).uniform(-1, 1, (self.stones, 2)) * most
 
     def stone_diameters(self) -> np.ndarray:
-        """Diameters (stones,) of the stones, in mm."""
+        """Return the diameters (stones,) of the stones, in mm."""
         smallest = self.smallest_stone_mm or self.stone_diameter_mm
         share = np.random.default_rng([self.seed, 2]).uniform(0, 1, self.stones)
         return self.stone_diameter_mm * (smallest / self.stone_diameter_mm) ** share
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """The open surface of the sediment and, above it and into it, those of the stones."""
+        """Return the open surface of the sediment, and those of the stones, which intersect it."""
         k = 2 * np.pi / self.ripple_pitch_mm
         curvature = 0.5 * self.ripple_height_mm * k**2 + 0.25 * self.roughness_mm * (k / _SHORTEST) ** 2
-        step = step_of(_SAG_MM, max(curvature, 8 * _SAG_MM / min(self.width_mm, self.height_mm) ** 2))
+        step = chord_step(_SAG_MM, max(curvature, 8 * _SAG_MM / min(self.width_mm, self.height_mm) ** 2))
         columns, rows = (int(np.ceil(side / step)) + 1 for side in (self.width_mm, self.height_mm))
         diameters = self.stone_diameters()
         count = rows * columns + sum(int(np.prod(_stone_facets(each))) for each in diameters)
-        require_few(count, step_mm=step, advice="make it smaller, its ripples longer, or its stones fewer")
+        require_few_vertices(count, step_mm=step, advice="make it smaller, its ripples longer, or its stones fewer")
         x, y = (np.linspace(-0.5, 0.5, count) for count in (columns, rows))
         x, y = np.meshgrid(x * self.width_mm, y * self.height_mm, indexing="ij")
         vertices = [np.stack([x, y, -_sediment_height(self, x, y)], axis=-1).reshape(-1, 3)]
@@ -84,22 +84,22 @@ class Seabed(FreeForm):
 
 
 def _stone_facets(diameter_mm: float) -> tuple[int, int]:
-    """Rings from a stone's rim to its top, and facets around it.
+    """Return the number of rings from a stone's rim to its top, and of facets around it.
 
-    On an ellipse whose larger half axis is a, a chord over the angle p of its parameter deviates by a p^2 / 8 at most.
+    On an ellipse with the larger half axis a, a chord over the parameter angle p deviates by at most a p^2 / 8.
     """
-    angle = step_of(2 * _SAG_MM, 0.5 * diameter_mm)
+    angle = chord_step(2 * _SAG_MM, 0.5 * diameter_mm)
     return int(np.ceil(0.5 * np.pi / angle)) + 1, int(np.ceil(2 * np.pi / angle))
 
 
 def _stone(diameter_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) and faces (F, 3) of the upper half of a spheroid, half as high as wide, about its middle."""
+    """Return vertices (V, 3) and faces (F, 3) of the upper half of a spheroid, half as high as wide."""
     rings, around = _stone_facets(diameter_mm)
     angle = np.linspace(0, 0.5 * np.pi, rings)
     radius = np.tile(0.5 * diameter_mm * np.cos(angle)[:, None], around)
     turns = np.linspace(0, 2 * np.pi, around, endpoint=False)
     vertices, faces = tube(0.25 * diameter_mm * np.sin(angle), turns, radius)
-    # The last ring is the top, one place.
+    # The last ring is a single point, the top.
     faces = np.minimum(faces, (rings - 1) * around)
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     # The tube's axis, x, becomes -z.
@@ -107,10 +107,10 @@ def _stone(diameter_mm: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def seabed_height(bed: Seabed, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Height of the sea floor towards -z at places ``x``, ``y`` (N,), all in mm.
+    """Return the height of the sea floor towards -z at ``x``, ``y`` (N,), all in mm.
 
-    Cosine ripples and smooth waves between -roughness and roughness, and above them the upper halves of spheroids,
-    half as high as wide: height d / 4 sqrt(1 - t^2) over the plane, with t from 0 in a stone's middle to 1 at its rim.
+    Sum of cosine ripples and smooth waves between -roughness and roughness, or the upper half of a spheroid, half as
+    high as wide, where it is higher: d / 4 sqrt(1 - t^2), where t is 0 at a stone's centre and 1 at its rim.
     """
     height = _sediment_height(bed, x, y)
     for (at_x, at_y), diameter in zip(bed.stone_places(), bed.stone_diameters(), strict=True):
@@ -121,7 +121,7 @@ def seabed_height(bed: Seabed, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _sediment_height(bed: Seabed, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """The same without stones."""
+    """Return the height of the sea floor without stones."""
     places = np.stack(np.broadcast_arrays(x, y)) / bed.ripple_pitch_mm
     height = 0.5 * bed.ripple_height_mm * np.cos(2 * np.pi * places[0])
     rng = np.random.default_rng([bed.seed, 0])

@@ -1,4 +1,4 @@
-"""Triangles between vertices that lie on smooth functions, whose facets cut corners by a known distance."""
+"""Triangle meshes of smooth surfaces, with facets of a known deviation."""
 
 from collections.abc import Iterable
 
@@ -9,16 +9,16 @@ from uwlts.errors import DescriptionError
 _MOST_VERTICES = 4_000_000
 
 
-def require_few(vertices: int, *, step_mm: float, advice: str) -> None:
-    """DescriptionError where a surface in such steps needs more vertices than memory is meant for."""
+def require_few_vertices(vertices: int, *, step_mm: float, advice: str) -> None:
+    """Check the number of vertices; DescriptionError if they would need too much memory."""
     if vertices > _MOST_VERTICES:
         raise DescriptionError(
             f"a surface in steps of {step_mm:.3g} mm needs {vertices} vertices, more than {_MOST_VERTICES}: {advice}"
         )
 
 
-def step_of(sag_mm: float, curvature: float) -> float:
-    """Step in mm over which a chord deviates by ``sag_mm`` from a curve of a second derivative ``curvature`` (1/mm).
+def chord_step(sag_mm: float, curvature: float) -> float:
+    """Return the step in mm whose chord deviates by ``sag_mm`` from a curve of a curvature in 1/mm.
 
     A chord over a step h deviates by c h^2 / 8.
     """
@@ -26,9 +26,9 @@ def step_of(sag_mm: float, curvature: float) -> float:
 
 
 def tube(x: np.ndarray, around: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (V, 3) and faces (F, 3) of a tube about the x axis that is open at its ends.
+    """Return vertices (V, 3) and faces (F, 3) of a tube with open ends about the x axis.
 
-    ``x`` (N,) are places along it, ``around`` (M,) angles from -z towards y over one turn, ``radius`` (N, M).
+    ``x`` (N,) are positions along it, ``around`` (M,) angles from -z towards y over one turn, ``radius`` (N, M).
     """
     places = np.broadcast_to(x[:, None], radius.shape), radius * np.sin(around), -radius * np.cos(around)
     corner = np.arange(radius.size).reshape(radius.shape)
@@ -37,33 +37,36 @@ def tube(x: np.ndarray, around: np.ndarray, radius: np.ndarray) -> tuple[np.ndar
     return np.stack(places, axis=-1).reshape(-1, 3), faces
 
 
-def finer_in_front(reach: float, radius: float, *, step: float, plain: float) -> np.ndarray:
-    """Angles (M,) from -z towards y round a tube: steps of ``step`` mm within ``reach`` of -z, of ``plain`` behind."""
+def space_angles(reach: float, radius: float, *, step: float, plain: float) -> np.ndarray:
+    """Return angles (M,) around a tube from -z towards y.
+
+    Steps are ``step`` mm within ``reach`` of -z, else ``plain`` mm.
+    """
     front = np.linspace(-reach, reach, int(np.ceil(2 * reach * radius / step)) + 1)
     back = np.linspace(reach, 2 * np.pi - reach, int(np.ceil(2 * (np.pi - reach) * radius / plain)) + 1)
     return np.concatenate([front, back[1:-1]])
 
 
 def grid_faces(shape: tuple[int, int]) -> np.ndarray:
-    """Triangles (F, 3) between the vertices of a grid (rows, columns), numbered row by row."""
+    """Return triangles (F, 3) between the vertices of a grid (rows, columns), numbered row by row."""
     corner = np.arange(shape[0] * shape[1]).reshape(shape)
     return quads(*(part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1])))
 
 
 def quads(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Triangles (2 N, 3) of quadrangles whose corners (N,) run round in this order."""
+    """Return triangles (2 N, 3) of quadrilaterals with corners (N,) in this order."""
     return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
 def nodes(middles: Iterable[float], reach: float, *, step: float, length: float) -> np.ndarray:
-    """Places of vertices along one side of the plate: fine up to ``reach`` from each middle, none on flat ground."""
+    """Return vertex positions along one side of a plate: fine within ``reach`` of each of ``middles``, none between."""
     count = int(np.ceil(2 * reach / step)) + 1
     fine = [np.linspace(middle - reach, middle + reach, count) for middle in middles]
     return np.unique(np.concatenate([[-0.5 * length, 0.5 * length], *fine]))
 
 
 def wave(place: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A smooth irregular function between -1 and 1, with waves of 2 to 8 units of ``place``."""
+    """Return a smooth irregular function between -1 and 1, with wavelengths of 2 to 8 units of ``place``."""
     frequency, phase = rng.uniform(1 / 8, 1 / 2, 4), rng.uniform(0, 2 * np.pi, 4)
     return np.mean([np.sin(2 * np.pi * f * place + p) for f, p in zip(frequency, phase, strict=True)], axis=0)
 
@@ -71,10 +74,10 @@ def wave(place: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def waves(
     places: np.ndarray, rng: np.random.Generator, *, shortest: float, longest: float, count: int = 24
 ) -> np.ndarray:
-    """A smooth irregular function between -1 and 1 at ``places`` (D, ...): plane waves of all directions.
+    """Return a smooth irregular function between -1 and 1 at ``places`` (D, ...), a sum of plane waves.
 
-    Their wavelengths, from ``shortest`` to ``longest``, are evenly spread over the logarithm, and their amplitudes grow
-    with them, as on natural surfaces, which look alike at every scale.
+    Wavelengths are spaced logarithmically from ``shortest`` to ``longest``. Amplitudes are proportional to them, as on
+    self-similar natural surfaces.
     """
     direction = rng.normal(size=(count, len(places)))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -88,9 +91,9 @@ def waves(
 def bowed_plate(
     first_mm: np.ndarray, last_mm: np.ndarray, *, bow_mm: float, cells: int = 64
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (V, 3), faces (F, 3) and uv (V, 2) of a plate between two opposite corners (2,) that faces -z.
+    """Return vertices (V, 3), faces (F, 3) and uv (V, 2) of a plate between opposite corners (2,), facing -z.
 
-    Its middle stands ``bow_mm`` before its corners, as on a sphere. uv run from 0 to 1 along x and against y.
+    Its centre is ``bow_mm`` in front of its corners (paraboloid). uv run from 0 to 1 along x and against y.
     """
     (width, height), middle = last_mm - first_mm, (first_mm + last_mm) / 2
     u, v = np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1))

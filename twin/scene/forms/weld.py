@@ -5,12 +5,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from twin.scene.forms.triangles import grid_faces, nodes, require_few, step_of, wave
-from twin.scene.placed import FreeForm
+from twin.scene.forms.triangles import chord_step, grid_faces, nodes, require_few_vertices, wave
+from twin.scene.scene_object import FreeForm
 from uwlts.model.sensor import NotNegative, Positive
 
 _TRAIL = 1 / 3
-"""Distance that ripples trail at a bead's toes, in its widths."""
+"""Lag of the ripples at a bead's toes, in units of its width."""
 _SAG_MM = 0.004
 """Largest distance of a weld's facets from its surface."""
 
@@ -18,11 +18,10 @@ _SAG_MM = 0.004
 class Weld(FreeForm):
     """Rippled weld beads on the front of a plate in its own x-y plane, facing -z (towards the sensor).
 
-    The beads run along the plate's x or y axis (``along``), side by side, ``spacing_mm`` from middle to middle;
-    ``length_mm``, ``width_mm`` and ``height_mm`` are those of one bead, ``ripple_height_mm`` is that from trough to
-    crest. ``irregularity`` is how much width and height change on the way, as a share of them, and how far the path
-    and the ripples' places wander, in widths and pitches; ``seed`` chooses how. Grooves of ``undercut_depth_mm`` and
-    ``undercut_width_mm`` run along both toes of each bead.
+    The beads run along the plate's x or y axis (``along``), ``spacing_mm`` apart. ``length_mm``, ``width_mm`` and
+    ``height_mm`` are those of one bead; ``ripple_height_mm`` is measured from trough to crest. ``irregularity`` is the
+    relative variation of width and height, and the displacement of path and ripples in units of width and pitch; it is
+    drawn from ``seed``. Grooves of ``undercut_depth_mm`` and ``undercut_width_mm`` run along both toes of each bead.
     """
 
     kind: Literal["weld"]
@@ -41,7 +40,7 @@ class Weld(FreeForm):
     seed: Annotated[int, Field(ge=0)] = 0
 
     def bead_reach_mm(self) -> float:
-        """Largest distance that a bead reaches sideways from its straight middle line, irregularities included."""
+        """Return the largest lateral extent of a bead from its nominal centre line, including irregularities."""
         groove = 0.5 * self.undercut_width_mm if self.undercut_depth_mm else 0.0
         return self.width_mm * (0.5 + 1.5 * self.irregularity) + groove
 
@@ -67,29 +66,29 @@ class Weld(FreeForm):
         return self
 
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """An open surface whose facets deviate from `weld_height` by `_SAG_MM`.
+        """Return an open surface whose facets deviate from `weld_height` by `_SAG_MM`.
 
-        DescriptionError where ripples so small or steep on so long beads need too many vertices.
+        DescriptionError if small or steep ripples on long beads require too many vertices.
         """
         ripple = 0.5 * self.ripple_height_mm * (2 * np.pi / self.ripple_pitch_mm) ** 2
         toe = 8 * self.height_mm / (0.5 * self.width_mm) ** 2
         undercut = 8 * self.undercut_depth_mm / (0.5 * self.undercut_width_mm) ** 2
-        step = step_of(_SAG_MM, 1.3 * ripple + toe + undercut)
+        step = chord_step(_SAG_MM, 1.3 * ripple + toe + undercut)
         plate = self.plate_mm if self.along == "x" else self.plate_mm[::-1]
         along = nodes([0.0], 0.5 * self.length_mm, step=step, length=plate[0])
         across = nodes(_bead_middles(self), self.bead_reach_mm(), step=step, length=plate[1])
         advice = "make its ripples longer or lower, or its beads fewer or shorter"
-        require_few(len(along) * len(across), step_mm=step, advice=advice)
+        require_few_vertices(len(along) * len(across), step_mm=step, advice=advice)
         x, y = np.meshgrid(*((along, across) if self.along == "x" else (across, along)), indexing="ij")
         return np.stack([x, y, -weld_height(self, x, y)], axis=-1).reshape(-1, 3), grid_faces(x.shape)
 
 
 def weld_height(weld: Weld, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Height of the beads of a weld above its plate, towards -z, at places ``x``, ``y`` (N,), all in mm.
+    """Return the height of weld beads above the plate, towards -z, at ``x``, ``y`` (N,), all in mm.
 
-    A bead is `height_mm` (1 - t^2)^2, with t from 0 in its middle to 1 at its toes and round ends, and cosine ripples
-    on it: crescents that trail at the sides. An undercut is a groove of `undercut_depth_mm` (1 - u^2)^2 about each toe,
-    with u from 0 in its middle to 1 at its rims, which ends with the straight part of the bead.
+    A bead is `height_mm` (1 - t^2)^2, where t is 0 at its centre and 1 at its toes and round ends, with cosine ripples
+    that lag at the sides. An undercut is a groove of `undercut_depth_mm` (1 - u^2)^2 along each toe, where u is 0 at
+    its centre and 1 at its rims. It ends with the straight part of the bead.
     """
     along, across = (x, y) if weld.along == "x" else (y, x)
     height = np.zeros(np.broadcast(x, y).shape)
@@ -110,5 +109,5 @@ def weld_height(weld: Weld, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _bead_middles(weld: Weld) -> np.ndarray:
-    """Places (beads,) of the beads' middle lines across them."""
+    """Return the positions (beads,) of the beads' centre lines across them."""
     return weld.spacing_mm * (np.arange(weld.beads) - 0.5 * (weld.beads - 1))

@@ -1,4 +1,4 @@
-"""What all objects of a scene have: a pose, a finish, and the triangles of free forms."""
+"""Common properties of all objects in a scene: pose, finish, and triangles of free forms."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
@@ -15,34 +15,34 @@ Reflectance = Annotated[float, Field(ge=0, le=1)]
 Finish = Literal["diffuse", "painted", "pvc", "metal"]
 
 TYPICAL_ALPHA = {"diffuse": 1.0, "painted": 0.3, "pvc": 0.15, "metal": 0.3}
-"""GGX roughness: a satin paint, an extruded pipe, ground steel."""
+"""GGX roughness of a satin paint, an extruded pipe, and ground steel."""
 TYPICAL_ROUGHNESS_UM = {"diffuse": 5.0, "painted": 5.0, "pvc": 5.0, "metal": 1.0}
-"""Rms heights in um. Light out of a diffuse body has run through some um of it, whatever its surface."""
+"""Rms heights in um; light from a diffuse body has travelled some um inside it, whatever the surface roughness."""
 
 
 class Pose(Description):
-    """Placement of an object: rotated about the scene's X, then Y, then Z axis, then moved."""
+    """Pose of an object: rotation about the scene's X, then Y, then Z axis, then translation."""
 
     position_mm: Vector = (0.0, 0.0, 0.0)
     rotation_deg: Vector = (0.0, 0.0, 0.0)
 
     def matrix(self) -> np.ndarray:
-        """Rigid transform (4, 4) from the object's own frame to the parent's."""
+        """Return the rigid transform (4, 4) from the object's own frame to the parent frame."""
         transform = np.eye(4)
         transform[:3, :3] = Rotation.from_euler("xyz", self.rotation_deg, degrees=True).as_matrix()
         transform[:3, 3] = self.position_mm
         return transform
 
 
-class Placed(Pose):
+class SceneObject(Pose):
     """Base of all objects: a pose and a finish.
 
-    ``finish`` says how the surface reflects: "diffuse" as Lambert's law says; "painted" and "pvc" as a diffuse body
-    under a clear, slightly rough coat; "metal" as rough steel. ``reflectance`` is the diffuse reflectance, that of the
-    body under a coat, and scales the reflection of a metal. The grey values (0 to 1) of picture ``texture`` multiply
-    it, laid out by the shape's own uv coordinates with the picture's last row at v = 0; a relative path starts at the
-    scene's folder. ``alpha`` is the GGX roughness of coat or metal (Walter et al. 2007), ``roughness_um`` the surface's
-    rms height.
+    ``finish`` selects the reflection model: "diffuse" is Lambertian; "painted" and "pvc" are a diffuse body under a
+    clear, slightly rough coat; "metal" is rough steel. ``reflectance`` is the diffuse reflectance, that of the body
+    under a coat, or the scale of a metal's reflection. It is multiplied by the grey values (0 to 1) of the picture
+    ``texture``, which is mapped by the shape's uv coordinates with the last picture row at v = 0; a relative path
+    starts at the scene's folder. ``alpha`` is the GGX roughness of coat or metal (Walter et al. 2007), ``roughness_um``
+    the rms height of the surface.
     """
 
     reflectance: Reflectance = 0.8
@@ -52,72 +52,72 @@ class Placed(Pose):
     texture: str | None = None
 
     _no_texture: ClassVar[str] = ""
-    """Reason for which objects of a class have no texture."""
+    """Reason why objects of a class have no texture."""
 
     @model_validator(mode="after")
     def _has_what_its_finish_and_shape_take(self) -> Self:
         if self.texture is not None and self._no_texture:
             raise ValueError(f"texture {self.texture} {self._no_texture}")
         if self.finish == "diffuse" and self.alpha is not None:
-            raise ValueError(f"alpha {self.alpha:g} roughens a gloss, but finish 'diffuse' has none: leave alpha out")
+            raise ValueError(f"alpha {self.alpha:g} is for glossy finishes, but finish is 'diffuse': omit alpha")
         return self
 
     def gloss_alpha(self) -> float:
-        """GGX roughness, the finish's usual one unless given."""
+        """Return the GGX roughness; the default depends on the finish."""
         return TYPICAL_ALPHA[self.finish] if self.alpha is None else self.alpha
 
     def rms_height_um(self) -> float:
-        """Rms height of the surface in um, the finish's usual one unless given."""
+        """Return the rms height of the surface in um; the default depends on the finish."""
         return TYPICAL_ROUGHNESS_UM[self.finish] if self.roughness_um is None else self.roughness_um
 
     def mirror_share(self) -> float:
-        """Share of light that is reflected as by a plane mirror."""
+        """Return the specular reflectance of a plane mirror."""
         return getattr(self, "mirror", 0.0)
 
     def polarisation(self) -> float:
-        """Degree of polarisation of scattered laser light: 1 from a metal or mirror, 0 out of a diffuse body."""
+        """Return the degree of polarisation of scattered laser light: 1 for metals and mirrors, else 0."""
         return 1.0 if self.finish == "metal" or self.mirror_share() > 0 else 0.0
 
 
-class Flat(Placed):
+class FlatObject(SceneObject):
     """Base of objects with flat faces, which may be mirrors.
 
-    ``mirror`` is the share of light that the faces reflect as plane mirrors do, beside what they scatter: the weak
-    stripe on a mirror comes from a small ``reflectance``.
+    ``mirror`` is the specular reflectance of the faces, in addition to scattering. A small ``reflectance`` causes the
+    weak stripe on a mirror.
     """
 
     mirror: Reflectance = 0.0
 
     @model_validator(mode="after")
-    def _reflects_at_most_all(self) -> "Flat":
+    def _reflects_at_most_all(self) -> "FlatObject":
         if self.reflectance + self.mirror > 1:
             both = f"reflectance {self.reflectance:g} and mirror {self.mirror:g}"
-            raise ValueError(f"{both} add up to more than all light: lower one of them")
+            raise ValueError(f"{both} add up to more than 1: reduce one of them")
         if self.mirror > 0 and self.finish in ("painted", "pvc"):
-            raise ValueError(f"mirror {self.mirror:g} under a coat: a mirror's finish is 'diffuse' or 'metal'")
+            raise ValueError(f"mirror {self.mirror:g} under a coat: use the finish 'diffuse' or 'metal' for a mirror")
         return self
 
 
-class FreeForm(Placed, ABC):
-    """Base of free-form surfaces, known in closed form. They have no uv coordinates for a texture.
+class FreeForm(SceneObject, ABC):
+    """Base of free-form surfaces given by closed-form equations. They have no uv coordinates for a texture.
 
-    Such an object is one module of `twin.scene.forms`: its description, its formula and its triangles.
+    Each class is a module of `twin.scene.forms`, with its description, formula and triangles.
     """
 
     _no_texture: ClassVar[str] = "on a surface without uv coordinates: leave it out, or use a mesh"
 
     @abstractmethod
     def triangles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (V, 3) in mm in the object's own frame and faces (F, 3), anticlockwise seen from outside."""
+        """Return vertices (V, 3) in mm in the object's own frame and faces (F, 3), anticlockwise seen from outside."""
 
     def surface(self) -> tuple[np.ndarray, np.ndarray]:
-        """The same arrays, kept for the next caller: they cannot be written to."""
+        """Return the arrays of `triangles`, cached and read-only."""
         # Frozen models are hashable, which type checkers do not see.
-        return _kept(cast(Hashable, self))
+        return _cache_triangles(cast(Hashable, self))
 
 
 @lru_cache(maxsize=4)
-def _kept(form: FreeForm) -> tuple[np.ndarray, np.ndarray]:
+def _cache_triangles(form: FreeForm) -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = form.triangles()
     vertices.flags.writeable = faces.flags.writeable = False
     return vertices, faces
