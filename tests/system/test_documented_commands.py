@@ -232,7 +232,7 @@ PAGES_RUN = {
         before=ROBOT + "twin simulate vehicle-pass --out pass.h5\ncp pass.trajectory.csv corrected.csv",
         not_run={"uwlts align pass.ply": ALIGNED_ELSEWHERE},
     ),
-    "docs/how-to/scan-from-a-moving-platform.md": Page(
+    "docs/how-to/scan-from-a-vehicle.md": Page(
         before=ROBOT.replace("robot.h5", "first.h5")
         + "twin simulate vehicle-pipe --out scan.h5\ncp scan.trajectory.csv path.csv",
         again=("uwlts reconstruct scan.h5 --calibration calibration.json --mount mount.json --traj",),
