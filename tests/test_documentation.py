@@ -104,6 +104,18 @@ def test_mentioned_commands_and_options_exist(page):
             pytest.fail(f"{name_of(page)}:{line}: '{command}': {error}")
 
 
+@pytest.mark.parametrize("package", ["uwlts", "twin"])
+def test_the_layers_are_those_of_the_contract(package):
+    text = (ROOT / "docs" / "explanation" / "architecture.md").read_text(encoding="utf-8")
+    rows = text.split(f"## Layers of {package}")[1].split("\n## ")[0].splitlines()
+    documented = [re.findall(r"`(\w+)`", row.split("|")[1]) for row in rows if row.startswith("| `")]
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
+        "contracts"
+    ]
+    layers = next(contract["layers"] for contract in contracts if contract["id"] == f"layers-{package}")
+    assert documented == [layer.split(" | ") for layer in layers]
+
+
 def test_the_readme_shows_commands():
     shown = {command.split()[0] for block in blocks(README) if block.kind == "commands" for command in block.commands}
     assert shown == {"make", "twin", "uwlts"}
