@@ -3,6 +3,7 @@
 ``python docs/studies/geometry_figure.py`` writes docs/pictures/geometry.svg.
 """
 
+import argparse
 from pathlib import Path
 
 import matplotlib
@@ -80,4 +81,5 @@ def draw(path: Path) -> None:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__.split("\n")[0]).parse_args()
     draw(PICTURE)
