@@ -1,7 +1,7 @@
 """How much of a surface in which nothing changed `uwlts compare` claims to have changed.
 
 Clouds are drawn with the errors that they state: noise of single points, the position of each image, and a shift and a
-tilt that all points share. Prints the rows of the table in docs/how-to/compare-scans.md; numbers choose some of them.
+tilt that all points share. Prints the rows of the table in docs/results/comparison.md; numbers choose some of them.
 """
 
 import numpy as np

@@ -4,7 +4,7 @@
     uwlts gauge runs/gauge/heights.csv --tolerance 0.2
 
 Who sets up the sensor at another distance is another operator; noise, speckle and stage positions are drawn anew for
-each scan. Writes the table of docs/how-to/gauge-study.md and prints the study.
+each scan. Writes the table of docs/results/gauge.md and prints the study.
 """
 
 from pathlib import Path

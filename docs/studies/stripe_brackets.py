@@ -1,6 +1,6 @@
 """Dark beside shining surfaces at one exposure and in a bracket of three, against the true stripe.
 
-``python docs/studies/stripe_brackets.py`` prints the table of docs/explanation/stripe-methods.md.
+``python docs/studies/stripe_brackets.py`` prints the table of docs/results/stripe-methods.md.
 """
 
 from collections.abc import Iterator

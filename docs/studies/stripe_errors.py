@@ -17,7 +17,7 @@ from twin.options import use_variant
 from uwlts.pages.numbers import fixed
 from uwlts.runtime.console import progress_bar
 
-PAGE = Path(__file__).parents[1] / "explanation" / "stripe-errors.md"
+PAGE = Path(__file__).parents[1] / "results" / "stripe-errors.md"
 SHOWN = (CROSSING, MASS, "quadratic", FILTERED, VERTEX)
 
 
@@ -73,7 +73,7 @@ def main() -> None:
         for number, case in enumerate(cases, start=1):
             measure(case)
             progress(number, len(cases))
-    draw_all(plan, PAGE.parent / "pictures")
+    draw_all(plan, PAGE.parents[1] / "pictures")
     tables = {"effects": effects_table(plan), "methods": methods_table(plan), "unknown": unknown_table(plan)}
     write_tables(PAGE, tables)
     print(f"{len(cases)} cases, {sum(case.frames for case in cases)} frames in {time.perf_counter() - start:.0f} s")

@@ -22,7 +22,7 @@ from twin.options import use_variant
 from uwlts.runtime.console import progress_bar
 from uwlts.stripe import StripeOptions, extract_stripe, method_names
 
-PAGE = Path(__file__).parents[1] / "explanation" / "stripe-methods.md"
+PAGE = Path(__file__).parents[1] / "results" / "stripe-methods.md"
 FIT, FIT_FIVE, CROSSING = "profile fit", "profile fit, 5 lines averaged", "zero crossing"
 ALL_METHODS = {
     FIT: StripeOptions(method="profile-fit"),

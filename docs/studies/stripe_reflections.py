@@ -1,6 +1,6 @@
 """Wrong and lost points on scenes with mirrors and inside corners: the brightest peak, and the direct stripe.
 
-``python docs/studies/stripe_reflections.py`` prints the tables of docs/explanation/stripe-methods.md and draws their
+``python docs/studies/stripe_reflections.py`` prints the tables of docs/results/reflections.md and draws their
 picture. A point is wrong that lies more than 3 px from every place where the laser lights a surface: where the sheet's
 middle meets one, and where the light that comes straight from surfaces has a stripe, which lies elsewhere if an edge
 cuts the sheet. A profile line on which the sheet's middle lights a surface is lost without a right point. The numbers

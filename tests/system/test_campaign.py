@@ -108,7 +108,7 @@ def test_calibrated_sensor_beats_the_thesis(campaign: tuple[Path, CalibrationRes
     )
     figures = measured(path, result.calibration).artefact.figures_mm
     assert abs(figures["SSE"]) <= 0.11
-    # Speckle leaves the profile fit 0.022 to 0.025 mm on spheres (docs/explanation/stripe-methods.md); half of it and
+    # Speckle leaves the profile fit 0.022 to 0.025 mm on spheres (docs/results/stripe-methods.md); half of it and
     # twice of it.
     assert 0.012 < figures["STD"] <= 0.05, "speckle is there, and no more than speckle"
     assert abs(figures["diameter error sphere 1"]) <= 0.3

@@ -139,6 +139,11 @@ def trajectory_for_tum(runner: Runner) -> None:
     shutil.copy(runner.folder / "vehicle.h5", runner.folder / "scan.h5")
 
 
+def correct_nothing(runner: Runner) -> None:
+    """The navigation's trajectory as the corrected one."""
+    shutil.copy(runner.folder / "pass.trajectory.csv", runner.folder / "corrected.csv")
+
+
 def study_of_the_page(runner: Runner) -> None:
     shutil.copy(runner.names["folder"] / "study.toml", runner.folder)
 
@@ -228,16 +233,10 @@ PAGES_RUN = {
         tables={"mine.toml": 0}, instead={"--scenes 200": "--scenes 1", "scenes = 40": "scenes = 2"}
     ),
     "docs/how-to/make-a-mesh.md": Page(given=THREE_VIEWS | {"merged.ply": "pipe.ply"}),
-    "docs/how-to/register-scans.md": Page(
-        given=THREE_VIEWS,
-        texts={"start.csv": NO_MOVEMENT},
-        before=ROBOT + "twin simulate vehicle-pass --out pass.h5\ncp pass.trajectory.csv corrected.csv",
+    "docs/how-to/register-scans.md": Page(given=THREE_VIEWS, texts={"start.csv": NO_MOVEMENT}),
+    "docs/how-to/scan-from-a-vehicle.md": Page(
+        prepare={"uwlts reconstruct pass.h5 --calibration calibration.json --mount mount.json --traj": correct_nothing},
         not_run={"uwlts align pass.ply": ALIGNED_ELSEWHERE},
-    ),
-    "docs/how-to/scan-from-a-moving-platform.md": Page(
-        before=ROBOT.replace("robot.h5", "first.h5")
-        + "twin simulate vehicle-pipe --out scan.h5\ncp scan.trajectory.csv path.csv",
-        again=("uwlts reconstruct scan.h5 --calibration calibration.json --mount mount.json --traj",),
     ),
     "docs/reference/api.md": Page(given={name: name for name in ("target-air.h5", "target-water.h5", "spheres.h5")}),
     "docs/tutorials/calibrate-a-sensor.md": Page(small_python=True),
