@@ -138,7 +138,7 @@ def test_a_way_alone_says_that_its_latency_is_not_known(hill, tmp_path):
     warned = []
     moving = f"speed_mm_per_s = {SPEED}, both_ways = false"
     uwlts.scan(plan(tmp_path, hill, moving), tmp_path / "a.h5", home=True, warn=warned.append)
-    assert any("latency of the stage is not known" in text for text in warned)
+    assert any("latency of the stage is unknown" in text for text in warned)
 
 
 @pytest.mark.slow

@@ -74,7 +74,7 @@ def test_the_camera_says_who_it_is_and_what_it_set(camera):
 def test_what_the_camera_cannot_do_is_an_error(camera):
     with pytest.raises(HardwareError, match="no setting for gain"):
         camera.configure(gain_db=6)
-    with pytest.raises(HardwareError, match="does not give Mono12, only .*Mono8"):
+    with pytest.raises(HardwareError, match="does not offer Mono12, only .*Mono8"):
         camera.configure(bits=12)
     with pytest.raises(HardwareError, match="not within the image sensor of 1280 x 1024"):
         camera.configure(region=Region(1000, 0, 281, 10))
@@ -145,10 +145,10 @@ def test_free_running_frames_follow_each_other_past_the_end_of_the_counter(scene
 @pytest.mark.parametrize(
     ("inject", "status", "message"),
     [
-        (lambda served: served.inject("drop", 2), "dropped", "before it were dropped"),
-        (lambda served: served.inject("repeat"), "duplicated", "the previous frame once more"),
-        (lambda served: served.inject("cut"), "short", "lost on the way"),
-        (lambda served: served.inject("delay", delay_s=0.3), "late", "more than a frame's period"),
+        (lambda served: served.inject("drop", 2), "dropped", "preceded by dropped frames"),
+        (lambda served: served.inject("repeat"), "duplicated", "it repeats the previous frame"),
+        (lambda served: served.inject("cut"), "short", "incomplete: packets were lost"),
+        (lambda served: served.inject("delay", delay_s=0.3), "late", "more than one frame period"),
     ],
 )
 def test_each_fault_of_a_free_running_camera_is_named(served, camera, inject, status, message):

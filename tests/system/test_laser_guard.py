@@ -184,7 +184,7 @@ def test_a_suspended_scan_is_dark_and_ends_when_it_is_continued(start, stop):
     # The controller has ended the light; the guard waits for 0.8 s beyond the exposure.
     time.sleep(EXPOSURE_S + 0.8)
     os.killpg(scan.program.pid, signal.SIGCONT)
-    scan.ended(2, "switched off by its guard.*suspended")
+    scan.ended(2, "guard switched the laser off.*suspended")
     assert not scan.controller.state().laser_on
     with Capture(part_path(scan.out)) as capture:
         kept = len(capture)
@@ -249,7 +249,7 @@ def test_without_its_guard_a_scan_is_dark_and_ends(start, ending):
     os.kill(guard, ending)
     print(f"dark after {scan.dark_after_s(at_most_s=1.0):.3f} s")
     scan.program.stdout.read()
-    scan.ended(2, "the process that switches the laser off .* is gone")
+    scan.ended(2, "guard process, which switches the laser off .* is gone")
 
 
 def test_without_any_process_the_controller_switches_the_laser_off(start):

@@ -117,7 +117,10 @@ def test_what_comes_nearer_later_is_taken_again_with_a_shorter_exposure(folder, 
     # The dim board behind the bar is faint from there on, which is said at the end.
     assert said.count("saturated on many lines: exposed by") == said.count("from here on") == 1
     # A machine that has other work may lose images on their way, which are taken again and mentioned.
-    assert said.count("warning:") - said.count("lost on their way") == 2 and "laser images are faint" in said
+    assert (
+        said.count("warning:") - said.count("lost between camera and computer") == 2
+        and "laser images are faint" in said
+    )
 
 
 def watched(folder: Path, served: ServedTwin, out: Path, *, count: int) -> subprocess.Popen[str]:

@@ -29,8 +29,8 @@ DESCRIPTIONS = {
 }
 
 STAGE_FAULTS = {
-    "stall": "stall: the stage has stood at",
-    "stop-short:200": "missed steps: .* read back where",
+    "stall": "stall: the stage has been at",
+    "stop-short:200": "missed steps: the position is .* where",
     "alarm:1": "ALARM:1",
     "hold": "feed hold|is held",
     "restart": "restarted by itself",
@@ -140,7 +140,7 @@ def test_frames_lost_on_their_way_are_taken_again(board, sensor, folder, tmp_pat
 def test_a_camera_that_loses_every_frame_ends_the_scan(board, sensor, folder, tmp_path):
     with serving(board, sensor, "cut:3@3") as served:
         plan, out = written(folder, served, count=4), tmp_path / "scan.h5"
-        ended(scan(plan, out), "short: parts of it were lost .* 3 times")
+        ended(scan(plan, out), "incomplete: packets were lost.* 3 times")
         assert dark(served)
         np.testing.assert_allclose(positions(part_path(out)), planned(served, 1), atol=0.011)
         assert scan(plan, out, "--resume").returncode == 0

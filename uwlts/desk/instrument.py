@@ -31,7 +31,7 @@ from uwlts.hardware.camera_interface import CameraDevice
 from uwlts.hardware.grbl import GrblStage
 from uwlts.hardware.guided.plan import GuidedPlan
 from uwlts.hardware.guided.record import guide
-from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, brightness, stripe_of
+from uwlts.hardware.rig import START_MS, HandSwitchedLaser, LaserStage, Rig, get_stripe, measure_brightness
 from uwlts.hardware.scan_plan import Light, ScanPlan
 from uwlts.hardware.scanning import check_camera, record_scan
 from uwlts.model.any_calibration import AnyCalibration
@@ -324,7 +324,7 @@ class Instrument:
         light = self._shown_light(connected)
         if light is None:
             raise HardwareError("choose first which light is shown")
-        found = self._rig_of(connected).settled_exposure(light, start_ms=self.exposure_ms[light])
+        found = self._rig_of(connected).find_exposure(light, start_ms=self.exposure_ms[light])
         if found is None:
             self._board.say(f"too dark for a {light} image even at the longest exposure", "warning")
             return
@@ -348,12 +348,12 @@ class Instrument:
                 raise
             return
         self._lost = 0
-        seen = brightness(frame.seen, connected.sensor, light)
+        seen = measure_brightness(frame.seen, connected.sensor, light)
         full, exposure_ms = connected.sensor.detector.full_scale_dn(), frame.exposure_ms or self.exposure_ms[light]
         level = "centre line" if math.isnan(seen.level) else f"{100 * seen.level:.0f} % of full scale"
         caption, pixels = f"live, {light}, exposure {exposure_ms:.4g} ms, {level}", None
         if light == "laser":
-            stripe = stripe_of(frame.seen, connected.sensor)
+            stripe = get_stripe(frame.seen, connected.sensor)
             pixels = stripe.pixels()
             caption += f"; stripe on {len(pixels)} of {len(stripe.status)} profile lines"
         saturated = seen.saturated / max(seen.counted, 1)

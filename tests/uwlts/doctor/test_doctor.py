@@ -316,7 +316,7 @@ def test_a_camera_that_does_not_give_ten_frames_is_missing(tmp_path):
     (short,) = devices.try_camera(images(tmp_path / "few", 51, count=9))
     assert short.status == "missing" and "all 9 images" in short.found
     (unknown,) = devices.try_camera("webcam:0")
-    assert unknown.status == "missing" and "is not the address of a camera" in unknown.found
+    assert unknown.status == "missing" and "is not a camera address" in unknown.found
     assert "genicam:PRODUCER.cti" in unknown.advice
 
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from uwlts.hardware.rig import brightness, settled_exposure
-from uwlts.hardware.scan_watch import shows_laser, spread
+from uwlts.hardware.rig import find_exposure, measure_brightness
+from uwlts.hardware.scan_watch import select_evenly, shows_laser
 from uwlts.model.sensor import Sensor
 
 LIT = slice(300, 700)
@@ -37,7 +37,7 @@ class Exposed:
 @pytest.mark.parametrize("light", ["laser", "lamp"])
 def test_the_brightest_lines_come_to_the_level(thesis, dn_per_ms, light):
     take = Exposed(stripe(thesis, dn_per_ms))
-    exposure_ms = settled_exposure(take, sensor=thesis, light=light)
+    exposure_ms = find_exposure(take, sensor=thesis, light=light)
     # The row beside the peak is 0.3 px off it, 2 % lower; the brightest of some noisy pixels lies 2 DN above 204.
     assert exposure_ms * dn_per_ms == pytest.approx(0.8 * 255, rel=0.04)
     assert take.count <= 8
@@ -46,22 +46,22 @@ def test_the_brightest_lines_come_to_the_level(thesis, dn_per_ms, light):
 def test_what_is_darker_or_without_stripe_does_not_count(thesis):
     """A tenth of the lines as bright as 200 DN/ms, the others with a stripe a thirtieth of it, or none."""
     light = stripe(thesis, 7.0) + stripe(thesis, 193.0, lines=slice(300, 340))
-    assert settled_exposure(Exposed(light), sensor=thesis, light="laser") == pytest.approx(204 / 200, rel=0.05)
-    seen = brightness(Exposed(light)(1.0), thesis, "laser")
+    assert find_exposure(Exposed(light), sensor=thesis, light="laser") == pytest.approx(204 / 200, rel=0.05)
+    seen = measure_brightness(Exposed(light)(1.0), thesis, "laser")
     assert seen.lines == 1280 and 36 <= seen.counted <= 44
     # Daylight on lines without a stripe, brighter than the stripe: smooth, so that none is found.
     light = stripe(thesis, 100.0)
     light[:, :200] += 110.0
-    assert settled_exposure(Exposed(light), sensor=thesis, light="laser") == pytest.approx(204 / 100, rel=0.05)
+    assert find_exposure(Exposed(light), sensor=thesis, light="laser") == pytest.approx(204 / 100, rel=0.05)
 
 
 def test_darkness_has_no_exposure(thesis):
     for light in ("laser", "lamp"):
         dark = Exposed(np.zeros((1024, 1280)), noise_dn=0.0)
-        assert settled_exposure(dark, sensor=thesis, light=light) is None
-    assert settled_exposure(Exposed(np.zeros((1024, 1280))), sensor=thesis, light="laser") is None
+        assert find_exposure(dark, sensor=thesis, light=light) is None
+    assert find_exposure(Exposed(np.zeros((1024, 1280))), sensor=thesis, light="laser") is None
     faint = Exposed(stripe(thesis, 0.1))
-    assert settled_exposure(faint, sensor=thesis, light="laser") == thesis.exposure.longest_ms
+    assert find_exposure(faint, sensor=thesis, light="laser") == thesis.exposure.longest_ms
 
 
 def test_saturation_on_many_lines_is_distinguished_from_a_reflection(thesis):
@@ -69,8 +69,8 @@ def test_saturation_on_many_lines_is_distinguished_from_a_reflection(thesis):
     glint, much = light.copy(), light.copy()
     glint[498:503, 400:412] = 1000.0
     much[498:503, 400:440] = 1000.0
-    assert not brightness(Exposed(glint)(1.0), thesis, "laser").overexposed
-    assert brightness(Exposed(much)(1.0), thesis, "laser").overexposed
+    assert not measure_brightness(Exposed(glint)(1.0), thesis, "laser").overexposed
+    assert measure_brightness(Exposed(much)(1.0), thesis, "laser").overexposed
 
 
 def test_the_laser_is_distinguished_from_daylight(thesis):
@@ -93,5 +93,5 @@ def test_the_laser_is_distinguished_from_daylight(thesis):
 
 
 def test_positions_are_spread_over_all():
-    assert spread([float(k) for k in range(101)], 5) == [0.0, 25.0, 50.0, 75.0, 100.0]
-    assert spread([3.0], 5) == [3.0] and spread([1.0, 2.0, 3.0], 9) == [1.0, 2.0, 3.0]
+    assert select_evenly([float(k) for k in range(101)], 5) == [0.0, 25.0, 50.0, 75.0, 100.0]
+    assert select_evenly([3.0], 5) == [3.0] and select_evenly([1.0, 2.0, 3.0], 9) == [1.0, 2.0, 3.0]

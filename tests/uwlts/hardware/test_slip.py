@@ -16,7 +16,7 @@ def centres(position_mm: float, slope_px_per_mm: np.ndarray, rng: np.random.Gene
 def watched(slope: np.ndarray, rng: np.random.Generator, count: int = 6) -> SlipWatch:
     watch = SlipWatch()
     for k in range(count):
-        watch.see(Place(2.0 * k, 1.0, centres(2.0 * k, slope, rng)))
+        watch.add(Place(2.0 * k, 1.0, centres(2.0 * k, slope, rng)))
     return watch
 
 
@@ -46,7 +46,7 @@ def test_the_earliest_place_with_relief_counts():
     rng, watch = np.random.default_rng(3), SlipWatch()
     for k in range(10):
         empty = np.full(LINES, np.nan)
-        watch.see(Place(float(k), 1.0, empty if k < 4 else centres(float(k), np.full(LINES, 2.0), rng)))
+        watch.add(Place(float(k), 1.0, empty if k < 4 else centres(float(k), np.full(LINES, 2.0), rng)))
     assert watch.relief.place.position_mm == 5.0
 
 
