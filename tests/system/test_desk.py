@@ -235,7 +235,7 @@ def test_a_scan_is_paused_stopped_and_continued(desk, page, served):
     done = re.findall(r"(\d+) of 60", page.locator("header").inner_text())
     page.wait_for_timeout(1500)
     assert done and re.findall(r"(\d+) of 60", page.locator("header").inner_text()) == done
-    press(page, "go on")
+    press(page, "resume")
     page.wait_for_timeout(500)
     press(page, "stop")
     says(page, "stopped")
@@ -471,7 +471,7 @@ def test_mistakes_are_said_and_cost_nothing(desk, page, served):
     (desk.folder / "taken.h5").write_bytes(b"a capture")
     connected(page)
     tab(page, "Scan")
-    for name, words in (("taken", "taken.h5 exists"), ("../away", "is no name for a file"), ("", "is no name")):
+    for name, words in (("taken", "taken.h5 exists"), ("../away", "is not a name for a file"), ("", "is not a name")):
         page.get_by_label("name of the capture").fill(name)
         press(page, "start")
         says(page, words)

@@ -177,7 +177,7 @@ def test_images_with_a_hole(says, scan_images, tmp_path: Path, suffix: str):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (turned, "512 x 640 pixels; expected 640 x 512 .* turned by a quarter turn: turn them back"),
+        (turned, "512 x 640 pixels; expected 640 x 512 .* rotated by 90 deg: rotate them back"),
         (lambda image: cv2.resize(image, (320, 256)), "320 x 256 pixels; expected 640 x 512"),
         (black, "all 5 laser images are black, no pixel reaches 2 % of full scale: is the laser on"),
         (white, "laser0.png is white: 100 % of its pixels are saturated"),
@@ -336,7 +336,7 @@ def test_truncated_captures(says, scan_images, calibration, tmp_path: Path, shar
     scan = write(tmp_path / "scan.h5", scan_images, stage_mm=STAGE_MM)
     whole = scan.read_bytes()
     scan.write_bytes(whole[: int(share * len(whole))])
-    words = "no HDF5 file" if share == 0 else f"truncated: {int(share * len(whole)):,} of its {len(whole):,} bytes"
+    words = "not an HDF5 file" if share == 0 else f"truncated: {int(share * len(whole)):,} of its {len(whole):,} bytes"
     says(f"reconstruct {scan} --calibration {calibration} --out {tmp_path / 'x.ply'}", words)
 
 

@@ -239,7 +239,7 @@ def test_a_frame_that_does_not_come_leaves_no_laser_on(start):
     scan.lit()
     scan.lit()
     scan.program.stdout.read()
-    scan.ended(2, "did not answer a trigger.*asked for 3 times")
+    scan.ended(2, "did not answer a trigger.*tried 3 times")
 
 
 @pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGTERM, signal.SIGSTOP])

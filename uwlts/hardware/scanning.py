@@ -34,7 +34,7 @@ from uwlts.model.sensor import Sensor
 from uwlts.runtime.progress import ProgressListener, unheard
 from uwlts.storage.capture import Capture, Frame, part_path
 from uwlts.storage.capture_writer import CaptureWriter
-from uwlts.storage.import_.grey_values import without_background
+from uwlts.storage.import_.grey_values import subtract_background
 from uwlts.stripe import Stripe, StripeStatus
 
 _FAINT = 0.1
@@ -300,7 +300,7 @@ class _Taking:
             self._count(stripe, bright)
         seen.repeated = rig.repeated
         if zero_dn and isinstance(image, np.ndarray):
-            image = image.astype(np.uint16) if unlit is None else without_background(image, unlit, zero_dn=zero_dn)
+            image = image.astype(np.uint16) if unlit is None else subtract_background(image, unlit, zero_dn=zero_dn)
         return Frame(image, position, light == "laser", exposure_ms, 0.0, encoder=frame.encoder)
 
     def check_steps(self) -> None:

@@ -1,4 +1,4 @@
-"""Reading of any file of the program: what it holds decides what is returned."""
+"""Reading of any file of the program; the content determines the type of the result."""
 
 from pathlib import Path
 

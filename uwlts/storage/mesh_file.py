@@ -18,7 +18,7 @@ from uwlts.model.sensor import Table
 MESH_FORMATS = (".stl", ".ply", ".glb")
 
 _FARTHEST_SINGLE_MM = 16_000.0
-"""Numbers of 32 bits have steps of a micrometre there."""
+"""Beyond this distance 32-bit numbers are coarser than a micrometre."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -28,18 +28,18 @@ class SurfaceMesh(Brief):
     Attributes
     ----------
     vertices_mm, normals : (V, 3) float64
-        Vertices in the clouds' frame, and unit normals there, towards the sensor.
+        Vertices in the clouds' frame, and unit normals at them, towards the sensor.
     faces : (F, 3) int64
         Vertices of each triangle, anticlockwise from the sensor.
     noise_mm, shared_mm : (V,) float64
-        Standard uncertainty along the normal by noise and the positions of images, and by what all points of a scan
-        share; 0 where the clouds do not state it.
+        Standard uncertainty along the normal due to noise and the positions of images, and due to errors common to a
+        scan; 0 if the clouds do not state it.
     cube_mm, radius_mm : float
-        Edge of the cubes, and the radius of the patches.
+        Edge of the cubes, and radius of the patches.
     left_out : float
-        Share of the clouds' points that are farther from the mesh than the patches' radius.
+        Fraction of the clouds' points farther from the mesh than the patches' radius.
     metadata : dict
-        What the clouds are and come from.
+        Origin of the clouds.
     """
 
     vertices_mm: np.ndarray
@@ -58,12 +58,12 @@ class SurfaceMesh(Brief):
         return np.hypot(self.noise_mm, self.shared_mm)
 
     def area_mm2(self) -> float:
-        """Area of all triangles."""
+        """Return the area of all triangles."""
         a, b, c = (self.vertices_mm[self.faces[:, k]] for k in range(3))
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
     def lines(self) -> list[str]:
-        """The summary as text."""
+        """Return the summary as lines of text."""
         std = np.quantile(self.std_mm, [0.5, 0.95])
         return [
             f"mesh                      {len(self.vertices_mm)} vertices, {len(self.faces)} triangles, "
@@ -74,7 +74,7 @@ class SurfaceMesh(Brief):
         ]
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the mesh in the format that the path's suffix names, whole or not at all.
+        """Write the mesh in the format of the path's ending, completely or not at all.
 
         - ``.ply``: binary, mm. Vertices have x, y, z (double), nx, ny, nz, and the standard uncertainty along the
           normal: uncertainty, and its parts uncertainty_noise and uncertainty_shared (float, mm).
@@ -85,8 +85,8 @@ class SurfaceMesh(Brief):
         Raises
         ------
         OutputError
-            The suffix is another one, the file exists and ``overwrite`` is not set, the mesh lies too far from the
-            origin for STL, or the file cannot be written.
+            The ending is unknown, the file exists and ``overwrite`` is not set, the mesh is too far from the origin for
+            STL, or the file cannot be written.
         """
         path = Path(path)
         match path.suffix.lower():
@@ -123,7 +123,7 @@ def _stl(mesh: SurfaceMesh) -> bytes:
     farthest = float(np.abs(mesh.vertices_mm).max())
     if farthest > _FARTHEST_SINGLE_MM:
         raise OutputError(
-            f"the mesh reaches {farthest:.6g} mm from the origin, where the numbers of STL have steps of more than a "
+            f"the mesh reaches {farthest:.6g} mm from the origin, where the numbers of STL are coarser than a "
             "micrometre: write PLY or glTF"
         )
     content: Any = trimesh.Trimesh(mesh.vertices_mm, mesh.faces, process=False).export(file_type="stl")
@@ -133,7 +133,7 @@ def _stl(mesh: SurfaceMesh) -> bytes:
 def _glb(mesh: SurfaceMesh) -> bytes:
     import trimesh
 
-    # Small numbers about the middle keep their digits in 32 bits.
+    # Coordinates about the middle keep their precision in 32 bits.
     middle = np.round(1e-3 * mesh.vertices_mm.mean(axis=0), 3)
     local = trimesh.Trimesh(1e-3 * mesh.vertices_mm - middle, mesh.faces, vertex_normals=mesh.normals, process=False)
     local.vertex_attributes["_uncertainty"] = mesh.std_mm.astype(np.float32)

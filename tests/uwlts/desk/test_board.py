@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from uwlts.desk.board import KEPT_LINES, Board, Picture, png_of
+from uwlts.desk.board import KEPT_LINES, Board, Picture, encode_png
 
 FULL = 255
 
@@ -180,5 +180,5 @@ def test_showing_counts_pictures():
 
 def test_a_png_keeps_its_colours():
     colours = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
-    again = cv2.imdecode(np.frombuffer(png_of(colours), np.uint8), cv2.IMREAD_COLOR)
+    again = cv2.imdecode(np.frombuffer(encode_png(colours), np.uint8), cv2.IMREAD_COLOR)
     np.testing.assert_array_equal(again[..., ::-1], colours)

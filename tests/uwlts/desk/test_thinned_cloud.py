@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from uwlts.desk.thinned_cloud import FIELDS, ThinnedCloud, packed
+from uwlts.desk.thinned_cloud import FIELDS, ThinnedCloud, pack
 
 PIECES = st.lists(st.integers(0, 60), max_size=30)
 
@@ -76,7 +76,7 @@ def test_what_is_packed_can_be_unpacked(at_most: int, sizes: list[int], far: flo
         piece = points(total, size) + [far, 0, -far]
         cloud.add(piece, uncertainty=np.full(size, 0.125))
         total += size
-    origin, data = packed(cloud.points())
+    origin, data = pack(cloud.points())
     kept, table = cloud.points(), np.frombuffer(data, "<f4").reshape(-1, 6)
     assert origin.shape == (3,) and (origin == np.round(origin)).all()
     assert len(table) == len(kept)
@@ -98,7 +98,7 @@ def test_points_that_stand_for_more_are_counted_as_what_they_stand_for(at_most: 
 
 
 def test_an_empty_cloud_is_packed_too():
-    origin, data = packed(ThinnedCloud().points())
+    origin, data = pack(ThinnedCloud().points())
     assert origin.tolist() == [0, 0, 0] and data == b""
 
 

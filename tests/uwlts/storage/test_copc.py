@@ -83,7 +83,7 @@ def test_the_command_cuts_out_a_region(cloud, tmp_path, monkeypatch):
     box = ["--region-mm", "0", "-100", "0", "40", "100", "1000"]
     app(["export", "pipe.copc.laz", "--out", "end.ply", *box, "--at-most", "500"], result_action="return_value")
     assert 100 < len(uwlts.read("end.ply")) <= 500
-    with pytest.raises(CaptureError, match="is no cloud"):
+    with pytest.raises(CaptureError, match="is not a cloud"):
         uwlts.export(tmp_path / "scan.h5", tmp_path / "part.ply", at_most=5)
 
 
