@@ -1,4 +1,4 @@
-"""The shared library of Aravis, by which sensor and twin both speak to cameras.
+"""Shared library of Aravis, with which sensor and twin communicate with cameras.
 
 `python -m uwlts.runtime.shared_library` prints the library in use. Exit status 0, or 1 if there is none.
 """

@@ -330,8 +330,7 @@ def _metadata(comments: list[str]) -> Table:
 
 
 def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
-    with opened(path, called="cloud") as file:
-        _refuse_impossible_header(file.read(_LONGEST_PLY_HEADER), size=os.fstat(file.fileno()).st_size, path=path)
+    require_ply_size(path, called="cloud")
     try:
         ply = PlyData.read(str(path))
     except OSError as error:
@@ -386,8 +385,10 @@ def _read_ply(path: Path, rows: _Rows) -> tuple[PointCloud, int]:
     return cloud, len(whole)
 
 
-def _refuse_impossible_header(start: bytes, *, size: int, path: Path) -> None:
+def require_ply_size(path: Path, *, called: str) -> None:
     """Raise CaptureError if a PLY file is shorter than its header declares; the reader finds other faults."""
+    with opened(path, called=called) as file:
+        start, size = file.read(_LONGEST_PLY_HEADER), os.fstat(file.fileno()).st_size
     header, end, _ = start.partition(b"end_header")
     if not end:
         raise CaptureError(f"{path} is not a complete PLY file: its header has no end in the first 16 MiB")

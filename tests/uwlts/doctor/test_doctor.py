@@ -261,8 +261,8 @@ def test_producers_that_are_not_there_or_for_another_machine_are_warnings(tmp_pa
     assert [each.status for each in found] == ["warning"] * 4
     said = [each.found.removeprefix(str(tmp_path)) for each in found]
     assert said == [
-        "/other.cti is no library for this machine",
-        "/text.cti is no library for this machine",
+        "/other.cti is not a library for this machine",
+        "/text.cti is not a library for this machine",
         "/empty holds no producer (*.cti)",
         "/none is no folder",
     ]
@@ -347,7 +347,7 @@ def test_a_stage_as_documented_is_in_order():
         build, settings, state, laser = devices.try_stage(controller.port)
     assert build.found == f"{controller.port}: Grbl 1.1h, options V"
     assert [each.status for each in (build, settings, state, laser)] == ["ok"] * 4
-    assert "NOT when program and guard are killed" in laser.found
+    assert "NOT if program and guard are killed" in laser.found
     assert state.found == "locked until it is homed, as after every start"
 
 
