@@ -104,17 +104,17 @@ def write_coloured(path: Path, cloud: "PointCloud", limit_mm: Callable[..., floa
 
 
 def wrote(lines: Iterable[str], warnings: Iterable[str], *paths: Path | None) -> None:
-    """Print a result, its warnings, and the files to which it was written."""
+    """Print a result, its warnings, and the files written."""
     show(lines)
     warn(*warnings)
     wrote_files(*paths)
 
 
 def wrote_files(*paths: Path | None) -> None:
-    """Print the files to which a result was written."""
+    """Print the files written for a result."""
     print(f"wrote {', '.join(str(path) for path in paths if path is not None)}")
 
 
 def wrote_page(page: Path) -> None:
-    """Print the page, and the JSON beside it, to which a result was written."""
+    """Print the page written for a result, and the JSON beside it."""
     print(f"wrote {page} and {page.with_suffix('.json').name}")

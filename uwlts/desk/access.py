@@ -1,7 +1,7 @@
 """Access control of the page: requests of other sites are refused, and only the operator can control anything.
 
 The rules apply in front of the whole application (ASGI): to pages, files and the connection for the browsers' events.
-Viewers get a page without controls, so that the server has no events of theirs to obey.
+Viewers get a page without controls, so that they cannot send events.
 """
 
 import hmac

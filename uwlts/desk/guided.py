@@ -167,7 +167,7 @@ def record_guided(
     HardwareError
         Camera, stage or laser fail.
     CalibrationError
-        The target does not determine a calibration with which the step standard can be judged.
+        The target does not determine a calibration to judge the step standard.
     OutputError
         A capture exists, or cannot be written.
     """

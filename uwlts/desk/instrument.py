@@ -173,7 +173,7 @@ class Instrument:
             screen.press(answer)
 
     def close(self) -> None:
-        """End all tasks and switch the laser off; has no effect the second time."""
+        """End all tasks and switch the laser off, once."""
         self._ending.set()
         self.stop()
         self._ask(lambda: None)

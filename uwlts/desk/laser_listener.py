@@ -107,7 +107,7 @@ async def _within(wait_s: float, event: asyncio.Event) -> bool:
 
 
 class _Request(asyncio.Protocol):
-    """One request, of which only the head is read; the connection ends with the answer."""
+    """One request without a body; the connection ends with the answer."""
 
     def __init__(self, listener: LaserListener):
         self._listener, self._head, self._headers = listener, b"", Headers()

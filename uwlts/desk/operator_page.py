@@ -71,7 +71,7 @@ def serve_desk(
     plan : str or Path, optional
         Plan of a scan (docs/how-to/scan.md) to begin with; others can be chosen on the page.
     host : str
-        Address at which the page is served; the default can be reached from this machine only.
+        Address of the page; the default can be reached from this machine only.
     port : int
         Port of the page; if it is in use, the next free one is taken.
     report : callable, optional

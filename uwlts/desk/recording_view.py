@@ -144,7 +144,7 @@ def watch(
     calibration : Calibration, PolynomialCalibration or path, optional
         Calibration of the sensor, or polynomial calibration, for the cloud.
     host : str
-        Address at which the page is served; the default can be reached from this machine only.
+        Address of the page; the default can be reached from this machine only.
     port : int
         Port of the page; if it is in use, the next free one is taken.
     report : callable, optional

@@ -60,7 +60,7 @@ class ThinnedCloud:
                 self._table[self._count : self._count + len(fitting)] = fitting
                 self._count += len(fitting)
                 if self._count == self._at_most:
-                    # Keep every second point of both parts, because the kept points are one stride apart.
+                    # Keep every second point of both parts, because one stride separates the kept points.
                     self._stride *= 2
                     halved = self._table[::2].copy()
                     self._table[: len(halved)], self._count = halved, len(halved)

@@ -27,7 +27,7 @@ def examine(
     folder
         Folder for captures; 64 MB are written there and removed.
     camera
-        Address of a camera with which ten frames are taken: gige:NAME, genicam:PRODUCER.cti or replay:PATH. Its trigger
+        Address of a camera to take ten frames: gige:NAME, genicam:PRODUCER.cti or replay:PATH. Its trigger
         is switched off, and its whole image is read out.
     stage
         Serial port of a stage, whose version, settings and state are read. It is not moved and the laser stays off, but

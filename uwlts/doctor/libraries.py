@@ -95,7 +95,7 @@ def examine_optional(purposes: Mapping[str, str], *, requirements: Sequence[str]
 
 
 def _examined(requirements: Iterable[Requirement]) -> list[tuple[Requirement, str, str]]:
-    """Return every library with its version and its fault, empty if there is none."""
+    """Return every library with its version and its fault, or an empty text."""
     states: list[tuple[Requirement, str, str]] = []
     for requirement in requirements:
         version = fault = ""

@@ -98,7 +98,7 @@ class RecordFile(ABC):
 
 
 def differences(there: object, now: object) -> str:
-    """Describe the entries in which two JSON values differ, with both values; empty if they are equal.
+    """Describe the different entries of two JSON values, with both values; empty if they are equal.
 
     ``there`` is the content of a file, ``now`` the wanted one.
     """

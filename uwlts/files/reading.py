@@ -142,7 +142,7 @@ def with_article(called: str) -> str:
 def parsed_json(text: str) -> "JsonValue":
     """Parse JSON; raises ValueError if it is not valid, too large, or not plain (`require_plain`).
 
-    Duplicate keys are refused as well, because readers differ in which one they take.
+    Duplicate keys are refused as well, because readers differ in their choice.
     """
     if text.count(",") + text.count("[") + text.count("{") > MOST_VALUES:
         raise ValueError(f"it holds more than {MOST_VALUES:,} values")

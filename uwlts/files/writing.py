@@ -79,7 +79,7 @@ def refuse_unsuitable(target: Path, *, overwrite: bool, endings: Sequence[str] =
 
 
 def require_ending(target: Path, endings: Sequence[str]) -> None:
-    """Raise OutputError if a name has none of the endings, if there are any."""
+    """Raise OutputError if a name lacks the required ending."""
     if endings and not target.name.lower().endswith(tuple(endings)):
         raise OutputError(
             f"{target} ends with none of {', '.join(endings)}, which name the format of this file; give a name like "
@@ -196,7 +196,7 @@ def _holder(path: Path) -> str:
 
 
 def _unlock(path: Path) -> None:
-    """Release a lock and remove its file, unless another process has it; has no effect the second time."""
+    """Release a lock and remove its file, unless another process has it; may be called twice."""
     try:
         # An interrupt may have prevented its registration.
         descriptor = _locks[path] if path in _locks else os.open(path, os.O_RDWR)

@@ -375,7 +375,7 @@ class AravisCamera(CameraDevice):
         return self._profiles(image, frame, chunk)
 
     def _chunk(self, buffer: int, feature: str, row: int) -> int | None:
-        """Return the chunk value that came with a frame, or with one of its profiles; None if there is none."""
+        """Return the chunk value that came with a frame, or with one of its profiles, or None."""
         functions = self._functions
         if feature.removeprefix("Chunk") not in self._chunks or not functions.arv_buffer_has_chunks(buffer):
             return None

@@ -50,8 +50,8 @@ class FrameStatus(StrEnum):
     """Fault of a frame; the worst comes first if several apply.
 
     SHORT: parts of the image are missing. DUPLICATED: a repetition of the previous frame, by number or time stamp.
-    DROPPED: a good frame after lost frames. LATE: a good frame whose time stamp is more than a period too late for its
-    number, or that arrived after a later frame or after the end of its timeout.
+    DROPPED: a good frame after lost frames. LATE: a good frame with a time stamp more than a period too late for its
+    number. LATE also marks a frame that arrived after a later frame or after its timeout.
     """
 
     SHORT = "short"
@@ -91,7 +91,7 @@ class FrameCheck:
         return FrameCounts(**self._counts)
 
     def judge(self, *, frame_id: int, time_s: float | None, complete: bool) -> FrameStatus:
-        """Return the status of the next frame; ``time_s`` is None if the frame has no time stamp."""
+        """Return the status of the next frame; ``time_s`` is None without a time stamp."""
         advance = 1 if self._last_id is None else _advance(self._last_id, frame_id)
         since_s = None if time_s is None or self._last_time_s is None else time_s - self._last_time_s
         self._counts["dropped"] += max(advance - 1, 0)
@@ -260,12 +260,12 @@ class CameraDevice(ABC):
         return self._started
 
     def open(self) -> None:
-        """Connect to the camera for exclusive use; has no effect if the camera is open."""
+        """Connect to the camera for exclusive use, unless it is open."""
         if self._info is None:
             self._info = self._open()
 
     def close(self) -> None:
-        """Stop and release the camera; has no effect if the camera is closed or gone."""
+        """Stop and release the camera, unless it is closed or gone."""
         if self._info is None:
             return
         try:
@@ -342,7 +342,7 @@ class CameraDevice(ABC):
         self._started = True
 
     def stop(self) -> None:
-        """Stop the acquisition; has no effect if the camera is not running."""
+        """Stop the acquisition, if it is running."""
         if self._started:
             self._started = False
             self._stop()

@@ -1,8 +1,8 @@
 """Continuous recording: the stage travels at a constant speed while the camera runs at its own frame rate.
 
-Frames are assigned positions by time. The camera stamps each frame, the stage reports its position about ten times a
-second, and a line fitted to the reports of a pass gives the position at any time. Alternatively, an encoder wired to
-the camera delivers a count with each frame. The delay between the two clocks is measured by a return pass over the same
+Frames are assigned positions by time. The camera stamps each frame, and the stage reports its position about ten times
+a second. A line fitted to the reports of a pass gives the position at any time. Alternatively, an encoder wired to the
+camera delivers a count with each frame. The delay between the two clocks is measured by a return pass over the same
 surface (`measure_latency`).
 """
 
@@ -48,7 +48,7 @@ _BUSY = 0.9
 
 @dataclass(frozen=True)
 class FramePlaces:
-    """How positions were assigned to the frames of a continuous scan.
+    """Assignment of positions to the frames of a continuous scan.
 
     ``latency_std_s`` is the standard uncertainty of ``latency_s``, or None if the latency was given. ``scatter_s`` is
     the residual standard deviation of the stage's reports about the fitted line, as a time. ``speeds_mm_per_s`` has one
@@ -95,7 +95,7 @@ def plan_passes(plan: ScanPlan, continuous: Continuous, stage: GrblStage) -> lis
 
 
 def _ramp_mm(speed: float, stage: GrblStage) -> float:
-    """Return the distance in mm in which the stage reaches a speed in mm/s."""
+    """Return the acceleration distance in mm to a speed in mm/s."""
     return speed**2 / (2 * stage.settings.acceleration_mm_per_s2)
 
 

@@ -242,7 +242,7 @@ class GenicamCamera(CameraDevice):
         return self._profiles(image, frame, self._chunk)
 
     def _chunk(self, feature: str, row: int) -> int | None:
-        """Return the chunk value of the latest frame, or of one of its profiles; None if there is none."""
+        """Return the chunk value of the latest frame, or of one of its profiles, or None."""
         with suppress(*self._faults):
             if self._has(feature):
                 if self._has(LINE_SELECTOR):

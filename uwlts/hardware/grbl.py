@@ -49,7 +49,7 @@ _REPORTS_TO_OFFSET = 31
 _PIN_MARGIN_MM = 0.5
 LIVE_S = 0.4
 """Dwell of a renewed light. The controller holds at most two, so that the light ends within 0.9 s. It holds at least
-one after a call of `GrblStage.keep_lit`, which may be half a second apart, as the guard allows 0.8 s."""
+one after a call of `GrblStage.keep_lit`, whose interval may be half a second, as the guard allows 0.8 s."""
 _LIGHTS_S = 0.3
 """Time limit of the controller to switch the laser, which takes a few ms."""
 _SWEEP_S = 0.9
@@ -200,7 +200,7 @@ class GrblStage:
         Raises
         ------
         RangeError
-            The target lies outside the travel, or the feed outside the stage's range; nothing has moved.
+            The target is outside the travel, or the feed outside the stage's range; nothing has moved.
         HardwareError
             The position is unknown, or a fault occurred: alarm, stall, hold, lost steps, restart, silence, noise, lost
             connection.
@@ -296,7 +296,7 @@ class GrblStage:
         return reached_mm
 
     def _start_of(self, position_mm: float, feed_mm_per_min: float) -> float:
-        """Return the position in mm at which a movement starts; raises the errors of `move_to`."""
+        """Return the start position of a movement in mm; raises the errors of `move_to`."""
         low, high = self.limits_mm
         if not low <= position_mm <= high:
             raise RangeError(f"{position_mm:g} mm is outside the stage's travel from {low:g} to {high:g} mm")
@@ -387,7 +387,7 @@ class GrblStage:
             "Door": "the safety door is open: close it, then home or unlock",
             "Alarm": "locked by an alarm: home",
             "Sleep": "asleep: home",
-            "Check": "in check mode, in which nothing moves: send $C",
+            "Check": "in check mode, without movements: send $C",
             "Jog": "jogging",
         }
         if report.state in advice:

@@ -170,7 +170,7 @@ def code_text(kind: Literal["error", "ALARM"], number: int) -> str:
 _ALARMS = {
     1: "hard limit: the limit switch was hit, or there was noise on its line; the position is lost: find the cause, "
     "then home",
-    2: "soft limit: the target lies outside the travel; the position is kept: unlock, and stay within the travel",
+    2: "soft limit: the target is outside the travel; the position is kept: unlock, and stay within the travel",
     3: "reset while moving; the position is lost: home",
     4: "probe: not in the expected state at the start; check the wiring of A5, then unlock",
     5: "probe: no contact within the movement; check the probe, then unlock",
@@ -377,7 +377,7 @@ class GrblLine:
         return {each.number: each.value for each in self.command("$$") if each.kind == "setting"}
 
     def options(self) -> str:
-        """Return the letters of the firmware's options in the answer to ``$I``; empty if there are none."""
+        """Return the letters of the firmware's options in the answer to ``$I``; empty without options."""
         texts = [each.text for each in self.command("$I")]
         return next((text.removeprefix("OPT:").split(",")[0] for text in texts if text.startswith("OPT:")), "")
 

@@ -1,4 +1,4 @@
-"""Program's side of the laser guard: starts its process and tells it how long the laser may stay on.
+"""Program's side of the laser guard: starts its process and sends the times until which the laser may stay on.
 
 The thread that works with camera and stage sends the beats, between the calls of their drivers. A thread that only
 sends beats would continue while a driver hangs.

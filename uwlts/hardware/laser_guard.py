@@ -27,7 +27,7 @@ WATCHING, SWITCHED_OFF = b"w", b"o"
 _SOFT_RESET = b"\x18"
 _WATCH_S, _GIVE_UP_S = 0.2, 2.0
 _AGAIN_S = 0.5
-"""Interval at which the reset is repeated after a late beat: the program may resume just before a laser command."""
+"""Interval between resets after a late beat: the program may resume just before a laser command."""
 
 
 def watch(parent: int, port: int) -> None:

@@ -36,7 +36,7 @@ _DIM_SHARE = 0.05
 _MANY_SHARE = 0.05
 """A larger fraction of saturated lines cannot be attributed to a reflection."""
 _CLOSE = 0.1
-"""Relative change of the exposure at which the search ends."""
+"""Relative change of the exposure that ends the search."""
 _SHORTEST_MS = 1e-3
 """Shortest exposure of usual cameras."""
 _STEPS = 12
@@ -106,7 +106,7 @@ def measure_brightness(image: Seen, sensor: Sensor, light: Light) -> Brightness:
 def find_exposure(
     take: Callable[[float], np.ndarray], *, sensor: Sensor, light: Light, start_ms: float = START_MS
 ) -> float | None:
-    """Find the exposure in ms at which an image reaches the sensor's ``auto_level``; None if all are too dark.
+    """Find the exposure in ms that brings an image to the sensor's ``auto_level``; None if all are too dark.
 
     ``take(exposure_ms)`` returns an image (H, W) in the light. The longest exposure is the sensor's ``longest_ms``.
     """
@@ -140,7 +140,7 @@ _LIGHT_S = 0.5
 """Longest light beyond an exposure: the camera's delay before the exposure and, because the light usually ends with the
 frame, the transfer time. The controller ends the light within 0.1 s more, so that the total stays below a second."""
 _LATENCIES = 8
-"""Frames with which a late one is compared: only a few, as the clocks of camera and computer drift apart."""
+"""Frames for comparison with a late one: only a few, because the clocks of camera and computer drift."""
 _PROMPT_S = 0.1
 """Longest delay between a trigger and the start of the exposure."""
 _RUN_UP_MM = 1.0
@@ -201,7 +201,7 @@ class Rig:
     A switched laser is on only while the camera exposes. If a frame is late, the laser is switched off while waiting,
     and the frame is accepted if its time stamp shows that it was exposed in the light.
 
-    ``ahead`` is the direction from which the stage approaches every position, 1 or -1, to eliminate backlash.
+    ``ahead`` is the direction of motion towards every position, 1 or -1, to eliminate backlash.
     ``repeated`` counts images that were taken again because their frames were lost or damaged.
     """
 

@@ -35,7 +35,7 @@ Direction = Annotated[Vector, AfterValidator(_unit)]
 class StageSettings(Description):
     """A stage and its motion.
 
-    ``direction`` is the unit vector in which growing positions move the sensor, in the OCS. ``settle_s`` is the rest
+    ``direction`` is the sensor's motion for growing positions, a unit vector in the OCS. ``settle_s`` is the rest
     before an image, by default that of the sensor's description.
     """
 
@@ -78,7 +78,7 @@ class RigPlan(Description):
         return load_sensor(self.sensor)
 
     def planned_ms(self) -> dict[Light, float]:
-        """Return the exposures in ms of the lights for which they are given."""
+        """Return the given exposures in ms by light."""
         exposures: tuple[tuple[Light, float | str], ...] = ("laser", self.laser_ms), ("lamp", self.lamp_ms)
         return {light: ms for light, ms in exposures if not isinstance(ms, str)}
 
@@ -87,7 +87,7 @@ class RigPlan(Description):
     ) -> CaptureHeader:
         """Return the header of a capture of a ``target`` or ``artefact``; raises DescriptionError if one is not valid.
 
-        ``zero_dn`` is the grey value of zero difference in images from which a background is subtracted.
+        ``zero_dn`` is the grey value of zero difference in images with a subtracted background.
         """
         table = {
             "name": name,

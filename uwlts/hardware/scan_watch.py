@@ -23,13 +23,13 @@ from uwlts.storage.capture import Seen
 from uwlts.stripe import Stripe, StripeStatus
 
 LOOKS = 9
-"""Positions at which a stripe is searched for before a scan is given up."""
+"""Number of positions searched for a stripe before a scan is given up."""
 _DROP = 0.5
 """A stripe whose number of lines or level is below this fraction of the previous image's is checked."""
 _AGAIN = 25
 """Number of images without a stripe after which the laser is checked again."""
 _SAME_PX = 1.0
-"""Stripes of two images within this distance are the same; edges caused by noise are farther apart."""
+"""Stripes of two images within this distance are the same; edges caused by noise are displaced more."""
 _ITS_OWN = 0.5
 """Smallest fraction of the stripe's height that vanishes when the laser is switched off."""
 
@@ -64,7 +64,7 @@ def shows_laser(lit: Seen, unlit: Seen, sensor: Sensor, *, difference: bool) -> 
 
 @dataclass(frozen=True)
 class LitPlace:
-    """Position in mm at which the laser's stripe was seen, and the exposure in ms."""
+    """Position in mm with a visible stripe, and its exposure in ms."""
 
     position_mm: float
     exposure_ms: float
@@ -168,7 +168,7 @@ class Relief:
         if good.sum() < _FEWEST_LINES:
             return np.inf, np.inf
         motion, away = self.motion_px_per_mm[good], away[good]
-        # The weighted median is robust to lines on which another stripe is found now.
+        # The weighted median is robust to lines that now show another stripe.
         slips, weights = away / motion, np.abs(motion)
         order = np.argsort(slips)
         heaped = np.cumsum(weights[order])

@@ -48,7 +48,7 @@ class ScanProgress:
     """Summary of the images of a scan so far.
 
     ``lines`` and ``found`` count the profile lines of laser images and those with a stripe. ``saturated`` and ``faint``
-    count the laser images on which many lines reach full scale, or stay below a tenth of it. ``repeated`` counts images
+    count the laser images with many lines at full scale, or with all below a tenth of it. ``repeated`` counts images
     taken again. ``exposure_ms`` are the latest exposures.
     """
 

@@ -39,7 +39,7 @@ def print_pdf(page: str, path: Path, *, overwrite: bool = False) -> None:
 
 
 def find_browser() -> str:
-    """Return the path of the browser that prints; raises SetupError if there is none."""
+    """Return the path of the browser that prints; raises SetupError without a browser."""
     if chosen := os.environ.get("CHROMIUM"):
         if found := shutil.which(chosen):
             return found

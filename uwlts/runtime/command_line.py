@@ -122,7 +122,7 @@ class Derived:
 
     @property
     def function(self) -> Callable[..., Any]:
-        """The function from which the command is made."""
+        """The function of the command."""
         return getattr(self._package, self._function)
 
     @property

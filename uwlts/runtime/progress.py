@@ -1,4 +1,4 @@
-"""Interface by which long calculations of both packages report their progress."""
+"""Interface for reports of progress by long calculations of both packages."""
 
 from typing import Protocol
 

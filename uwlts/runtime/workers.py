@@ -1,9 +1,9 @@
 """Worker processes on this machine, or workers of a Dask cluster, for many jobs in parallel.
 
 `work_through` runs a list of jobs in processes that it starts and ends. `open_workers` keeps processes (or the workers
-of a Dask scheduler) for several rounds of jobs, and survives jobs whose process dies. Unlike those of
-`concurrent.futures`, which completes running and queued jobs before a command ends and leaves processes behind if the
-command is killed, these processes always end with their command.
+of a Dask scheduler) for several rounds of jobs, and survives jobs whose process dies. These processes
+always end with their command. `concurrent.futures` completes running and queued jobs before a command ends, and leaves
+processes behind if the command is killed.
 """
 
 import gc
@@ -141,7 +141,7 @@ def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Ite
 
 def processors() -> int:
     """Return the number of processors that this process may use."""
-    # Only Linux reports the processors to which a process is restricted.
+    # Only Linux reports a restriction of the process to some processors.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -122,7 +122,7 @@ def _number(file: h5py.File, name: str) -> int | None:
 
 
 def find_dataset(file: h5py.File, name: str, *, path: str | Path) -> h5py.Dataset | None:
-    """Return a dataset of plain numbers stored in the file itself, or None if there is none with this name.
+    """Return a dataset of plain numbers stored in the file itself, or None if the name is unknown.
 
     Raises CaptureError if the name is a link, or the values are not numbers or booleans, are stored in other files, or
     are compressed by an unknown filter.

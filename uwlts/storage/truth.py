@@ -39,9 +39,9 @@ class TruthHeader(Description):
 class Truth(Brief):
     """True stripe of every profile line of every frame; F frames, L lines.
 
-    ``centre_px (F, L)`` is the image coordinate across the stripe at which the line's centre sees the middle of the
-    sheet. ``point_mm (F, L, 3)`` and ``normal (F, L, 3)`` are the surface there in scene coordinates. ``status (F, L)``
-    is a `TruthStatus`. ``crossings (F, L)`` counts the lit crossings of the sheet; the brightest one is stored.
+    ``centre_px (F, L)`` is the image coordinate across the stripe of the middle of the sheet, as seen by the line's
+    centre. ``point_mm (F, L, 3)`` and ``normal (F, L, 3)`` are the surface there in scene coordinates. ``status (F,
+    L)`` is a `TruthStatus`. ``crossings (F, L)`` counts the lit crossings of the sheet; the brightest one is stored.
     ``depth_mm (H, W)`` is the camera-frame z of the surface at every pixel in the first frame. Missing values are NaN.
     ``pose (F, 4, 4)`` is ``T_scene_object`` of the sensor's OCS in mm, or None in files of earlier versions.
     """

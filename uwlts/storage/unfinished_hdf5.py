@@ -15,7 +15,7 @@ _SIGNATURE_AND_VERSION = b"\x89HDF\r\n\x1a\n\x03"
 # Superblock version 3 with 8-byte offsets (HDF5 File Format Specification 3.0, II.A): offsets of its entries.
 _FLAGS, _END_OF_FILE, _ROOT, _CHECKSUM, _SIZE = 11, 28, 36, 44, 48
 _ROOM = 2**28
-"""Bytes by which a file may grow while it is read."""
+"""Largest growth of a file in bytes while it is read."""
 
 
 def has_writer(path: str | Path) -> bool:

@@ -169,7 +169,7 @@ class Accepted(Found):
 
 
 class PoseJudge:
-    """Judgement of target images, new or recorded; ``full_dn`` is the grey value at which pixels clip."""
+    """Judgement of target images, new or recorded; ``full_dn`` is the saturation grey value."""
 
     def __init__(self, setting: Setting, wanted: Wanted, *, full_dn: int):
         self._setting, self._wanted, self._full = setting, wanted, full_dn
@@ -332,7 +332,7 @@ class TargetPhase:
         return () if gain >= _USEFUL * advice.gain else ("adds little to what there is",)
 
     def _lead(self, found: Found, state: State, advice: PoseAdvice | None, reasons: tuple[str, ...]) -> None:
-        """Show the image, and tell the operator what to do next."""
+        """Show the image and the next request to the operator."""
         pose = None if found.usable is None else pose_of(found.usable, state.camera)
         sheet = missing_sheet(state)
         request = "move the target" if advice is None else format_pose_advice(advice, state, pose)
@@ -398,7 +398,7 @@ class StepJudge:
         )
 
     def depths_mm(self, path: Path) -> list[float]:
-        """Return the depths outside the window at which a recording shows the standard."""
+        """Return the standard's depths outside the window in a recording."""
         with Capture(path) as capture:
             qualities = [self.judge(image) for _, image in capture.frames(laser_on=True)]
         return [each.depth_mm for each in qualities if each.depth_mm is not None and not each.reasons]

@@ -24,8 +24,9 @@ _SAME_POSITION_MM = 0.02
 class GuidedStage(StageSettings):
     """The stage, which also switches the laser; for free poses it does not move.
 
-    The target is shown at ``positions_mm``, or at ``count`` positions from ``first_mm`` to ``last_mm``, in the stage's
-    own coordinate. With ``home`` the stage is homed first; otherwise the controller's position is accepted.
+    The target is shown at ``positions_mm``, or at ``count`` positions from ``first_mm`` to ``last_mm``. Positions are
+    in the stage's own coordinate. With ``home`` the stage is homed first; otherwise the controller's position is
+    accepted.
     """
 
     positions_mm: tuple[float, ...] = ()
@@ -69,7 +70,7 @@ class GuidedStep(Description):
 
 
 class WantedPlan(Description):
-    """Goals at which the target images suffice."""
+    """Goals for the target images."""
 
     focal_std_px: Positive = 0.5
     centre_std_px: Positive = 0.5

@@ -1,6 +1,6 @@
 """Guided calibration: leads through poses of the target and of the step standard, and records accepted images.
 
-The captures are ordinary ones, from which the calibration can be repeated. However the recording ends, accepted images
+The captures are ordinary ones, so that the calibration can be repeated. However the recording ends, accepted images
 are kept and the laser goes off.
 """
 
@@ -82,7 +82,7 @@ def guide(
 
 @dataclass(frozen=True)
 class _Phases:
-    """Both phases of the recording, each of which opens camera and stage: in between the tank is worked at."""
+    """Both phases of the recording; each opens camera and stage, because in between the tank is worked at."""
 
     plan: GuidedPlan
     setting: Setting

@@ -30,7 +30,7 @@ _SafeLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 class _Loader(_SafeLoader):
-    """Plain YAML in which OpenCV's matrices are tables."""
+    """Plain YAML with OpenCV's matrices as tables."""
 
 
 _Loader.add_multi_constructor(

@@ -129,7 +129,7 @@ def import_images(
 ) -> Imported:
     """Convert a folder of images of any camera to a capture, written completely or not at all.
 
-    If laser images have a background, all images are stored with 16 bit, and the laser images are the difference plus
+    If laser images have a background, all images are stored with 16 bit. The laser images are then the difference plus
     2^bits, which keeps the sign of the noise about zero.
 
     Parameters

@@ -27,7 +27,7 @@ _OF_THE_HEADER += ("provenance", "bits", "aligned")
 class StageMotion(Description):
     """Positions of the stage: by start and step, by a list, or none if every image has its own pose (free).
 
-    ``direction`` is the unit vector in which growing positions move the sensor, in the OCS.
+    ``direction`` is the sensor's motion for growing positions, a unit vector in the OCS.
     """
 
     start_mm: float | None = None

@@ -57,7 +57,7 @@ class Matched:
 
 
 def natural_key(name: str) -> list[str | int]:
-    """Return a sort key for which image9 comes before image10."""
+    """Return a sort key that orders image9 before image10."""
     return [int(part) if part.isascii() and part.isdigit() else part.casefold() for part in re.split(r"([0-9]+)", name)]
 
 
@@ -139,7 +139,7 @@ def _refuse_any(names: list[str], before: str, after: str) -> None:
 def image_files(folder: Path, *, more: tuple[str, ...] = ()) -> list[str]:
     """Return the paths of the images in a folder and its subfolders, in natural order.
 
-    Files with ``more`` endings count as well. Raises ImageError if there are none.
+    Files with ``more`` endings count as well. Raises ImageError if there is no image.
     """
     wanted = (*SUFFIXES, *more)
     found = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in wanted]
