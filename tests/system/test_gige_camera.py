@@ -1,6 +1,6 @@
 """The served GigE Vision camera, read by the real driver over the loopback interface.
 
-Both sides run Aravis in one process. Where it is not installed these tests fail and say how to install it.
+Both sides run Aravis in one process. If it is not installed, these tests fail and state how to install it.
 """
 
 import threading
@@ -25,7 +25,7 @@ WAIT_S = 3.0
 
 
 class Scene:
-    """Images that tell when and how they were taken: stage position and exposure in the corner, noise elsewhere."""
+    """Images that contain stage position and exposure in the corner, and noise elsewhere."""
 
     def __init__(self):
         self.stage_mm = 0
@@ -110,7 +110,7 @@ def test_every_trigger_gives_one_frame_of_its_moment(scene, camera):
     for position in range(1, 6):
         scene.stage_mm = position
         camera.trigger()
-        # Seen only if the image were made later than the trigger's answer.
+        # Visible only if the image were made later than the trigger's answer.
         frame = camera.grab(WAIT_S)
         scene.stage_mm = 99
         assert (frame.image[0, 0], frame.image[0, 1], frame.frame_id) == (position, 7, position)
@@ -138,7 +138,7 @@ def test_free_running_frames_follow_each_other_past_the_end_of_the_counter(scene
         frames = [camera.grab(WAIT_S) for _ in range(20)]
     assert [frame.frame_id for frame in frames] == [*range(2**16 - 10, 2**16), *range(1, 11)]
     assert camera.counts.dropped == camera.counts.short == camera.counts.duplicated == 0
-    # Between the frames lie at least their periods, but for the camera's clock, which ticks in whole milliseconds.
+    # At least one period separates the frames, apart from the camera's clock, which ticks in whole milliseconds.
     assert frames[-1].time_s - frames[0].time_s > 19 / 50 - 2e-3 - 0.1
 
 
@@ -161,7 +161,7 @@ def test_each_fault_of_a_free_running_camera_is_named(served, camera, inject, st
         for _ in range(5):
             camera.grab(WAIT_S)
     assert getattr(camera.counts, status) == (2 if status == "dropped" else 1)
-    # It can go on.
+    # It can continue.
     camera.stop()
     camera.start()
     camera.grab(WAIT_S)

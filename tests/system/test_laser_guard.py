@@ -26,7 +26,7 @@ ROOT = Path(__file__).resolve().parents[2]
 EXPOSURE_S = 0.5
 ALLOWED_S = EXPOSURE_S + 1.0
 LOAD_S = 0.5
-"""For machines so busy that a process which is ready does not run at once. The guard itself needs some ms."""
+"""Allowance for busy machines, where a ready process does not run at once. The guard itself needs some ms."""
 COUNT = 4
 
 PROGRAM = """
@@ -113,7 +113,7 @@ class Scanning:
     def dark_after_s(self, *, at_most_s: float = ALLOWED_S) -> float:
         """Time in s until the controller's laser pin is off.
 
-        What this process is kept from running is allowed on top, as the machine keeps the others from it as well.
+        Delays of this process are added as an allowance, because the machine delays the others as well.
         """
         began = before = time.monotonic()
         late_s = 0.0
@@ -206,7 +206,7 @@ def test_a_scan_that_is_suspended_in_the_dark_goes_on(start):
         scan.program.send_signal(signal.SIGSTOP)
         if not scan.controller.state().laser_on:
             break
-        # The next image has begun before the signal came: go on before its guard finds the program late.
+        # The next image has begun before the signal came: continue before its guard finds the program late.
         scan.program.send_signal(signal.SIGCONT)
     else:
         raise AssertionError("every signal came during an image")
@@ -253,7 +253,7 @@ def test_without_its_guard_a_scan_is_dark_and_ends(start, ending):
 
 
 def test_without_any_process_the_controller_switches_the_laser_off(start):
-    """By the line that it was sent with the one that lit the laser."""
+    """By the line that was sent together with the one that switched the laser on."""
     scan = start()
     guard = scan.lit()
     os.kill(guard, signal.SIGKILL)

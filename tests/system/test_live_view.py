@@ -1,4 +1,4 @@
-"""The page of a growing recording: what is seen of each image, and the command that serves it."""
+"""The page of a recording in progress: display of each image, and the command that serves it."""
 
 import signal
 import socket
@@ -69,7 +69,7 @@ def test_an_image_shows_its_stripe_points_and_faults(thesis, tmp_path):
     good, faint, bright, empty, lamp = (seen(tmp_path / "live.h5", number, calibration) for number in range(5))
     assert "image 1, laser" in good.picture.caption and "stripe on 1,280 of 1,280 profile lines" in good.picture.caption
     assert warnings(good) == "" and good.picture.saturated == 0.0
-    # On a row near the image's middle the stripe lies near the stand-off, all along one depth.
+    # On a row near the image's middle the stripe is near the stand-off, at one depth.
     points = good.cloud.points()
     assert len(points) == 1280 and np.abs(points[:, 2]).max() < 20
     assert points[:, 3] == pytest.approx(150, abs=20)
@@ -101,7 +101,7 @@ def test_a_warning_is_said_once_and_a_cloud_grows(thesis, tmp_path):
     # The stage moves by 1 mm from image to image.
     last = board.cloud.points()[-1280:, 0] - board.cloud.points()[totals[0] : totals[0] + 1280, 0]
     np.testing.assert_allclose(last, 2.0, atol=0.01)
-    # The next recording begins anew.
+    # The next recording starts from the beginning.
     RecordingView(board, header(thesis), None)
     assert (board.cloud.total, board.cloud_name) == (0, "live")
 

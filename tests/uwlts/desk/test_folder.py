@@ -1,4 +1,4 @@
-"""The desk's folder: what is listed as what, and names that lead elsewhere."""
+"""The desk's folder: kinds of the listed files, and names outside the folder."""
 
 import os
 from pathlib import Path
@@ -77,7 +77,7 @@ def test_labels_tell_what_names_do_not(folder):
         "damaged.json": "damaged file",
         "figures.json": "evaluation",
     }
-    # A file of the same name that is written anew is another one.
+    # A rewritten file of the same name is a different file.
     (folder / "other.json").write_text('{"format": "uwlts-evaluation", "more": 1}', encoding="utf-8")
     os.utime(folder / "other.json", (1e9, 1e9))
     assert {file.name: file.kind for file in list_files(folder)}["other.json"] == "evaluation"

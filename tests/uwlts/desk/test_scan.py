@@ -1,4 +1,4 @@
-"""The page beside a scan."""
+"""The page of a scan."""
 
 import sys
 from pathlib import Path

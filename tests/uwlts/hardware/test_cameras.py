@@ -46,7 +46,7 @@ def judged(frames: list[tuple[int, float | None, bool]], *, period_s: float | No
         ([(5, 0.5, True), (4, 0.4, True), (6, 0.6, True)], [OK, LATE, OK], FrameCounts(ok=2, late=1)),
         ([(1, 0.0, True), (2, 0.21, True)], [OK, LATE], FrameCounts(ok=1, late=1)),
         ([(1, 0.0, True), (2, 0.19, True)], [OK, OK], FrameCounts(ok=2)),
-        # Numbers of 16 bits begin anew, at 1 or at 0.
+        # Counters of 16 bits restart at 1 or at 0.
         ([(65535, 0.0, True), (1, 0.1, True), (2, 0.2, True)], [OK, OK, OK], FrameCounts(ok=3)),
         ([(65535, 0.0, True), (0, 0.1, True), (1, 0.2, True)], [OK, OK, OK], FrameCounts(ok=3)),
         ([(65534, 0.0, True), (2, 0.3, True)], [OK, DROPPED], FrameCounts(ok=1, dropped=2)),
@@ -77,7 +77,7 @@ def test_an_unknown_address_lists_the_known_ones(address):
 
 
 def pictures(folder: Path, count: int, *, suffix: str = ".png", kind: type = np.uint8) -> Path:
-    """A folder of images that hold their number; sorted as texts 10 would come before 2."""
+    """A folder of images that contain their number; sorted as texts, 10 would precede 2."""
     folder.mkdir()
     for number in range(count):
         image = np.arange(24 * 32, dtype=kind).reshape(24, 32) % 251
@@ -136,7 +136,7 @@ def test_a_replay_keeps_its_frame_rate_and_drops_what_a_slow_program_leaves(tmp_
         camera.start(faults="skip")
         began = time.monotonic()
         frames = [camera.grab(1.0) for _ in range(20)]
-        # The first comes at once, the last 19 periods later.
+        # The first frame is due at once, the last one 19 periods later.
         assert time.monotonic() - began >= 19 / 200 - 1e-3
         assert np.allclose(np.diff([frame.time_s for frame in frames]), 1 / 200, atol=1e-9)
         assert camera.counts.dropped == 0

@@ -1,4 +1,4 @@
-"""A stage that stands beside its count, from the stripe's way through the image."""
+"""Detection of a stage whose position differs from its count, from the stripe's motion in the image."""
 
 import numpy as np
 import pytest
@@ -28,8 +28,8 @@ def test_the_slip_is_found_to_its_standard_error(slip_mm):
     assert relief.place.position_mm == 2.0
     found = [relief.slip(centres(2.0 + slip_mm, slope, rng)) for _ in range(30)]
     slips, errors = np.array(found).T
-    # Noise of two centres over a root mean square way of 1.7 px/mm on 400 lines is 0.004 mm; twice is reported, as
-    # lines that share speckle would need. All draws share the place's own noise.
+    # Noise of two centres divided by a root mean square motion of 1.7 px/mm on 400 lines is 0.004 mm; twice that is
+    # reported, for lines that share speckle. All draws share the place's own noise.
     assert 0.006 < errors.mean() < 0.012
     assert abs(slips.mean() - slip_mm) < 0.02 and slips.std() < errors.mean()
     assert all(relief.is_significant(*each) == (abs(slip_mm) > 0.05) for each in found)
@@ -54,7 +54,7 @@ def test_an_object_that_is_gone_is_no_slip():
     rng = np.random.default_rng(4)
     relief = watched(np.full(LINES, 2.0), rng).relief
     assert not relief.is_significant(*relief.slip(np.full(LINES, np.nan)))
-    # A third of the lines now show something else.
+    # A third of the lines now shows another surface.
     again = centres(2.0, np.full(LINES, 2.0), rng)
     again[: LINES // 3] += 40
     assert not relief.is_significant(*relief.slip(again))

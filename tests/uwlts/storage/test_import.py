@@ -1,4 +1,4 @@
-"""Images of others become a capture: formats, channels, bits, positions, and refusals that name the cause."""
+"""Import of foreign images as a capture: formats, channels, bits, positions, and refusals with their cause."""
 
 import contextlib
 from pathlib import Path
@@ -65,7 +65,7 @@ def without(*keys: str, **changes) -> dict:
     return {key: value for key, value in GIVEN.items() if key not in keys} | changes
 
 
-# --- what comes in
+# --- accepted inputs
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -137,7 +137,7 @@ def test_the_laser_s_light_is_separated_by_a_difference_of_colours(tmp_path: Pat
     assert (found.laser, found.lamp) == (2, 2)
     with Capture(tmp_path / "out.h5") as capture:
         assert capture.laser_on.tolist() == [False, True, False, True]
-        # No light of the laser is 256, so that the sign of what is left is kept.
+        # Zero laser light is 256, so that the sign of the remaining noise is kept.
         wanted = 256 + red.astype(int) - np.maximum(green, blue)
         np.testing.assert_array_equal(capture.image(1), wanted)
         np.testing.assert_array_equal(capture.image(0), green)
@@ -314,11 +314,11 @@ def test_intrinsics_fill_the_sensor(tmp_path: Path):
     assert tuple(camera.distortion.used().values()) == tuple(coefficients)
 
 
-# --- what is refused
+# --- refusals
 
 
 def refused(folder: Path, tmp_path: Path, error: type[Exception], words: str) -> None:
-    """An import that fails with the words and leaves nothing behind."""
+    """Check that an import fails with these words and leaves no files."""
     out = tmp_path / "refused.h5"
     with pytest.raises(error, match=words):
         import_images(folder, out)
