@@ -15,6 +15,7 @@ from twin.cli import app as twin_app
 from uwlts.cli import app as uwlts_app
 from uwlts.files.inputs import OUTPUTS
 from uwlts.pages.toolkit import json_beside
+from uwlts.runtime.command_line import PathText
 
 ROOT = Path(__file__).resolve().parents[2]
 APPS = {"uwlts": uwlts_app, "twin": twin_app}
@@ -43,7 +44,7 @@ def _values(kind: Any) -> list[tuple[list[str], object]]:
     """Two values of a kind: their words on the command line, and what they mean."""
     if get_origin(kind) is Literal:
         return [([word], word) for word in get_args(kind)[1:3]]
-    if kind in (str, Path):
+    if kind in (str, PathText, Path):
         return [(["one"], kind("one")), (["two"], kind("two"))]
     assert set(get_args(kind)) == {float}, f"no example of {kind}: add one"
     numbers = [[float(start + number) for number in range(len(get_args(kind)))] for start in (-1, 5)]

@@ -24,6 +24,7 @@ from uwlts.errors import OutputError
 from uwlts.files.inputs import OUTPUTS, inputs_kept
 from uwlts.files.reading import read_text
 from uwlts.files.writing import one_writer, refuse_unsuitable, written_aside
+from uwlts.runtime.command_line import PathText
 from uwlts.storage.cloud import PointCloud
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,7 +35,7 @@ def _takes_text(hint: Any) -> bool:
     """Return whether a parameter's value can be the name of a file."""
     if get_origin(hint) is Literal:
         return False
-    return hint in (Path, str) or any(_takes_text(part) for part in get_args(hint) if part is not Ellipsis)
+    return hint in (Path, PathText, str) or any(_takes_text(part) for part in get_args(hint) if part is not Ellipsis)
 
 
 def _pairs() -> Iterator[tuple[str, str, str, str]]:
