@@ -64,7 +64,7 @@ def export(
     region_mm : pair of (3,), optional
         Only the points in a box: x y z of one corner, x y z of the other.
     at_most : int, optional
-        Write only an even sample of about this many points.
+        Only an even sample of about this many points.
     overwrite : bool
         Replace an existing cloud.
     progress : callable, optional
