@@ -314,7 +314,7 @@ def test_another_recording_is_told_by_its_entries(tmp_path: Path):
     for header, plan, says in (
         (a_header(provenance={"seed": 5}), {}, "header.provenance.seed is 4 in it, 5 now"),
         (a_header(), {"laser_ms": 2.0}, r'plan.laser_ms is "auto" in it, 2.0 now'),
-        (a_header(), {"stage": {"start_mm": 0.0, "count": 9}}, "plan.stage.count is 4 in it, 9 now. Go on"),
+        (a_header(), {"stage": {"start_mm": 0.0, "count": 9}}, "plan.stage.count is 4 in it, 9 now. Continue"),
         (a_header(stage_direction=(0.0, 0.6, 0.8)), {}, "header.stage_direction[0] is 0.6 in it, 0.0 now"),
         (a_header(), {"background": True}, "plan.background is not stated in it, true now"),
         (a_header(name="x"), {"a": 1, "b": 2, "c": 3}, "plan.c is not stated in it, 3 now; and 1 more"),
