@@ -357,7 +357,7 @@ def test_rotated(tmp_path: Path):
     folder = folder_of(tmp_path, {"l1.png": stripe_image().T})
     refused(folder, tmp_path, ImageError, "64 x 96 pixels; .* rotated by 90 deg: rotate them back, or exchange")
     folder = three(tmp_path, l2=stripe_image().T)
-    refused(folder, tmp_path, ImageError, "l2.png has 64 x 96 .*it is turned by a quarter turn")
+    refused(folder, tmp_path, ImageError, "l2.png has 64 x 96 .*it is rotated by 90 deg")
 
 
 def test_another_depth_in_the_middle(tmp_path: Path):
@@ -430,7 +430,7 @@ def test_sixteen_bits_of_unknown_use(tmp_path: Path):
     image = stripe_image().astype(np.uint16)
     refused(folder_of(tmp_path, {"l.png": image}), tmp_path, ImageError, "16 bit: give the number that the camera used")
     given = GIVEN | {"bits": 10}
-    refused(folder_of(tmp_path, {"l.png": image * 16}, given), tmp_path, ImageError, "more than 10 bits have: .*'high'")
+    refused(folder_of(tmp_path, {"l.png": image * 16}, given), tmp_path, ImageError, "exceeds 10 bits: .*'high'")
     refused(
         folder_of(tmp_path, {"l.png": stripe_image()}, given), tmp_path, ImageError, "a file of 8 bit, but bits = 10"
     )
