@@ -264,7 +264,7 @@ def test_producers_that_are_not_there_or_for_another_machine_are_warnings(tmp_pa
         "/other.cti is not a library for this machine",
         "/text.cti is not a library for this machine",
         "/empty holds no producer (*.cti)",
-        "/none is no folder",
+        "/none is not a folder",
     ]
     monkeypatch.delenv(devices.PRODUCERS, raising=False)
     assert "is not set" in devices.examine_producers()[0].found
